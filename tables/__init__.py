@@ -1,0 +1,134 @@
+"""Data of the engine, its controller and its bus, and the one function that reads and checks a table."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+__all__ = ["Axis", "InputError", "Quantity", "Table", "path", "read"]
+
+_HERE = Path(__file__).parent
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class InputError(ValueError):
+    """Something from outside cannot be used. One line: the thing, its value, what is allowed."""
+
+
+class Table(BaseModel):
+    """A table file or a part of one: unknown and missing keys are refused, values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(Table):
+    """A physical number with its unit and where it comes from.
+
+    value      in ``unit``
+    unit       checked against what the model that holds it expects (`unit_of`)
+    origin     published (where), derived (how) or chosen (why)
+    tolerance  half-width of the plausible interval around ``value``, in ``unit``; 0 = exactly known.
+               A parameter that moved within it is recalibrated, not a missing effect.
+    """
+
+    value: Finite
+    unit: str
+    origin: str = Field(min_length=4)
+    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+class Axis(Table):
+    """A list of numbers with one unit and one origin, for example the breakpoints of a schedule."""
+
+    values: Annotated[list[Finite], Field(min_length=2)]
+    unit: str
+    origin: str = Field(min_length=4)
+
+    def increasing(self, key: str) -> Axis:
+        """Return self, or refuse a list that is not strictly increasing, naming ``key``."""
+        for i, (a, b) in enumerate(zip(self.values, self.values[1:], strict=False)):
+            if not b > a:
+                raise ValueError(f"{key}.values[{i + 1}] (={b:g}) must be greater than the value before it (={a:g})")
+        return self
+
+
+class Bound:
+    """Marks a `Quantity` field with the unit it must have and the range its value must lie in."""
+
+    def __init__(self, unit: str, low: float = -math.inf, high: float = math.inf):
+        self.unit, self.low, self.high = unit, low, high
+
+
+class Bounded(Table):
+    """A table whose `Quantity` fields carry a `Bound` in their annotation, checked on reading."""
+
+    @model_validator(mode="after")
+    def _check_bounds(self) -> Bounded:
+        for key, field in type(self).model_fields.items():
+            bound = next((m for m in field.metadata if isinstance(m, Bound)), None)
+            q = getattr(self, key)
+            if bound is None or not isinstance(q, Quantity | Axis):
+                continue
+            if q.unit != bound.unit:
+                raise ValueError(f"{key}.unit (={q.unit!r}) must be {bound.unit!r}")
+            for v in q.values if isinstance(q, Axis) else [q.value]:
+                if not bound.low <= v <= bound.high:
+                    raise ValueError(f"{key} (={v:g} {q.unit}) must be in [{bound.low:g}, {bound.high:g}]")
+        return self
+
+
+def path(name: str) -> Path:
+    """Return the path of a shipped data file, for example ``vgv.dbc``."""
+    return _HERE / name
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read(source: str | Path, model: type[M]) -> M:
+    """Read a TOML table into ``model``.
+
+    source: a file's path, or the name of a shipped table such as ``plant.toml``.
+    Raises InputError, in one line, naming file, key, value and what is allowed.
+    """
+    file = Path(source)
+    if not file.is_file() and path(str(source)).is_file():
+        file = path(str(source))
+    try:
+        data: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as e:
+        raise InputError(f"{file}: cannot be read ({e.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise InputError(f"{file}: not a TOML table ({e})".replace("\n", " ")) from None
+    try:
+        return model.model_validate(data)
+    except ValidationError as e:
+        raise InputError(f"{file}: {_one_line(e, model)}") from None
+
+
+def _one_line(e: ValidationError, model: type[BaseModel]) -> str:
+    """First complaint of pydantic as ``key (=value): what is allowed``."""
+    err = e.errors()[0]
+    key = ".".join(str(p) for p in err["loc"])
+    more = "" if e.error_count() == 1 else f" (and {e.error_count() - 1} more)"
+    if err["type"] == "missing":
+        return f"key {key!r} is missing; allowed here: {_allowed(model, err['loc'][:-1])}{more}"
+    if err["type"] == "extra_forbidden":
+        return f"key {key!r} is unknown; allowed here: {_allowed(model, err['loc'][:-1])}{more}"
+    message = err["msg"].removeprefix("Value error, ")
+    if err["type"] == "value_error":
+        return f"{key}{': ' if key else ''}{message}{more}"
+    return f"{key} (={err['input']!r}): {message}{more}"
+
+
+def _allowed(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+    """Names of the keys allowed at ``loc`` inside ``model``."""
+    here: Any = model
+    for step in loc:
+        field = getattr(here, "model_fields", {}).get(step)
+        here = field.annotation if field is not None else here
+    return ", ".join(getattr(here, "model_fields", {})) or "?"
