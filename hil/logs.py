@@ -1,0 +1,703 @@
+"""Measured runs: read any log into channels in the product's names and units, write channels into any log.
+
+A log is a CAN recording (`.log` of candump, `.asc`, `.blf`, `.trc`, bus-logging `.mf4`) with a DBC, MDF4 channel groups
+(`.mf4`), CSV or Parquet. Whatever it is, it ends as a `Log`: per signal the times, strictly increasing, in seconds from the
+start, and the values, finite, in the unit of docs/architecture.md. Each channel keeps its own raster; nothing is
+interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line; what had to be left out is said in `Log.notes`.
+docs/logs.md is the user's page.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import tables
+from hil import canlog
+from hil.canlog import LogError
+
+__all__ = ["UNITS", "Channel", "Log", "LogError", "read_log", "write_log"]
+
+# Signals and units at every border (docs/architecture.md).
+UNITS = {
+    "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "p_s": "MPa", "t_oil": "degC",
+    "vigv": "deg", "vgv1": "deg", "vgv2": "deg", "state": "-",
+}  # fmt: skip
+
+_TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
+_EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
+_HOLD = 5  # frame periods a value is repeated on the bus before its channel counts as silent
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Samples of one signal: t in s, strictly increasing; values in the signal's unit, finite."""
+
+    t: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Log:
+    """A measured run: where it is from, its channels by name, and what was left out or assumed on reading."""
+
+    path: str
+    channels: dict[str, Channel]
+    notes: list[str] = field(default_factory=list)
+
+
+# --- sources: what a file offers, before names and units ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Series:
+    """Samples as they stand in the file; ``where`` names a sample for the reader: row 17, sample 3."""
+
+    t: np.ndarray
+    values: np.ndarray
+    unit: str
+    first: int = 0
+    word: str = "sample"
+
+
+class Source(Protocol):
+    """A file that has been opened: ``names`` maps what it offers to the names it may be asked by."""
+
+    kind: str
+    names: dict[str, tuple[str, ...]]
+    notes: list[str]
+    sorted: bool
+
+    def series(self, keys: list[str]) -> dict[str, Series]: ...
+
+    def absent(self, name: str) -> str: ...
+
+
+class Bus:
+    """A CAN log seen through a database: `MESSAGE.SIGNAL`, or `SIGNAL` where one message has it."""
+
+    kind = "signal"
+    sorted = True
+
+    def __init__(self, frames: canlog.Frames, messages: list[canlog.Message], notes: list[str], dbc: Path):
+        self.frames, self.dbc = frames, dbc
+        self.notes = notes + frames.notes
+        self.names: dict[str, tuple[str, ...]] = {}
+        self._of: dict[str, canlog.Message] = {}
+        self._silent: dict[str, str] = {}
+        self._rows: dict[str, np.ndarray] = {}
+        seen = np.unique(frames.ident)
+        groups = canlog.pgn(seen[seen >> 31 == 1])
+        for m in messages:
+            here = m.ident in seen or (m.ident >> 31 and canlog.pgn(m.ident & 0x1FFFFFFF) in groups)
+            for s in m.layout.signals:
+                key = f"{m.layout.name}.{s.name}"
+                if here:
+                    self.names[key] = (key, s.name)
+                    self._of[key] = m
+                else:
+                    self._silent[s.name] = self._silent[key] = f"{m.layout.name} (0x{m.ident & 0x1FFFFFFF:X})"
+
+    def absent(self, name: str) -> str:
+        if name in self._silent:
+            return f"{self.dbc.name} has it in {self._silent[name]}, but the log has no such frame"
+        return ""
+
+    def series(self, keys: list[str]) -> dict[str, Series]:
+        out = {}
+        for key in keys:
+            m = self._of[key]
+            signal = m.layout.get_signal_by_name(key.split(".", 1)[1])
+            if m.layout.name not in self._rows:
+                self._rows[m.layout.name], notes = canlog.select(self.frames, m)
+                self.notes += notes
+            rows, values, missing = canlog.cut_signal(self.frames, self._rows[m.layout.name], m, signal)
+            if missing:
+                self.notes.append(f"{key}: {missing} frames say not available: left out")
+            out[key] = Series(self.frames.t[rows], values, signal.unit or "")
+        return out
+
+
+class Table:
+    """Columns of a CSV or Parquet file. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`."""
+
+    kind = "column"
+    sorted = False
+
+    def __init__(self, headers: list[str], load: Callable[[list[str]], dict[str, np.ndarray]], first: int, time: str):
+        self.notes: list[str] = []
+        self._load, self._first, self._time = load, first, time
+        self.names = {h: tuple(dict.fromkeys((h, h.strip(), _split_unit(h)[0]))) for h in headers if h != time}
+
+    def absent(self, name: str) -> str:
+        return ""
+
+    def series(self, keys: list[str]) -> dict[str, Series]:
+        columns = self._load([self._time, *keys])
+        t = columns[self._time]
+        return {k: Series(t, columns[k], _split_unit(k)[1], self._first, "row") for k in keys}
+
+
+def _split_unit(header: str) -> tuple[str, str]:
+    """`n_r [rpm]` is n_r in rpm; no bracket, no unit."""
+    m = re.fullmatch(r"\s*(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", header)
+    return (m[1], (m[2] if m[2] is not None else m[3]).strip()) if m else (header.strip(), "")
+
+
+def _time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> str:
+    """The column of a table that holds the time: mapped to t, called t, or called like it."""
+    for log_name, signal in mapping.items():
+        if signal == "t":
+            if log_name in headers:
+                return log_name
+            raise LogError(f"{path}: no column {log_name!r} to map to t{_close(log_name, headers)}")
+    for fold in (str, str.casefold):
+        for name in _TIME_NAMES:
+            for h in headers:
+                if name in (fold(h.strip()), fold(_split_unit(h)[0])):
+                    return h
+    raise LogError(f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (or --map NAME=t){_has('column', headers)}")
+
+
+def _close(name: str, have: Iterable[str]) -> str:
+    """Suggestions for a misspelt name."""
+    near = difflib.get_close_matches(name.casefold(), {h.casefold(): h for h in have}, 4, 0.6)
+    back = {h.casefold(): h for h in have}
+    return "; close: " + ", ".join(back[n] for n in near) if near else ""
+
+
+def _has(kind: str, have: Iterable[str]) -> str:
+    """What the file offers, shortened."""
+    names = [str(h)[:60] for h in have]
+    more = f" and {len(names) - 12} more" if len(names) > 12 else ""
+    return f"; the file has {len(names)} {kind}s: {', '.join(names[:12])}{more}" if names else f"; the file has no {kind}"
+
+
+# --- CSV and Parquet ---------------------------------------------------------------------------------------------------------------------
+
+
+def _open_csv(path: Path, options: _Options) -> Source:
+    """CSV with one header line; separator , ; or tab, decimal comma with ; allowed; empty cell = no sample there."""
+    import polars as pl
+
+    raw = canlog.read_bytes(path)
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raw = raw.decode("utf-16", errors="replace").encode()
+    if b"\0" in raw:
+        raise LogError(f"{path}: is not a CSV (binary bytes in it)")
+    try:
+        raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raw = raw.decode("cp1252", errors="replace").encode()
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    head, _, rest = raw.partition(b"\n")
+    line = head.decode().strip("\r")
+    separator = max(",;\t", key=line.count)
+    headers = [h.strip().strip('"') for h in line.split(separator)]
+    if '"' in line.replace('""', "") and len(set(headers)) != len(headers):
+        raise LogError(f"{path}: header line cannot be read: {line[:80]!r}")
+    again = sorted({h for h in headers if headers.count(h) > 1})
+    if again:
+        raise LogError(f"{path}: column {again[0]!r} is there more than once")
+    comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
+
+    def load(keys: list[str]) -> dict[str, np.ndarray]:
+        where = {h: i for i, h in enumerate(headers)}
+        indices = [where[k] for k in keys]
+
+        def read(text: bool) -> Any:
+            kind = pl.String if text else pl.Float64
+            return pl.read_csv(
+                io.BytesIO(rest), has_header=False, new_columns=[f"c{i}" for i in range(len(headers))], separator=separator,
+                schema={f"c{i}": kind if i in indices else pl.String for i in range(len(headers))},
+                decimal_comma=comma and not text, null_values=["", "NA", "N/A", "null", "-"], truncate_ragged_lines=True,
+                columns=sorted(indices), quote_char='"',
+            )  # fmt: skip
+
+        try:
+            frame = read(False)
+        except pl.exceptions.PolarsError:
+            frame = _csv_text(path, read, headers, indices, comma)
+        return {k: _numbers(frame[f"c{where[k]}"]) for k in keys}
+
+    return Table(headers, load, 2, _time_column(path, headers, options.mapping))
+
+
+def _csv_text(path: Path, read: Callable[[bool], Any], headers: list[str], indices: list[int], comma: bool) -> Any:
+    """Second reading of a CSV whose cells are not all numbers: with blanks around them, or naming the first that is none."""
+    import polars as pl
+
+    try:
+        frame = read(True)
+    except pl.exceptions.PolarsError as e:
+        raise LogError(f"{path}: is not a CSV ({' '.join(str(e).split())[:120]})") from None
+    out = []
+    for i in indices:
+        text = frame[f"c{i}"].str.strip_chars()
+        text = text.set(text == "", None)
+        number = (text.str.replace(",", ".", literal=True) if comma else text).cast(pl.Float64, strict=False)
+        bad = (number.is_null() & text.is_not_null()).arg_true()
+        if bad.len():
+            raise LogError(f"{path}: column {headers[i]!r}, row {bad[0] + 2}: {text[bad[0]][:40]!r} is not a number")
+        out.append(number)
+    return pl.DataFrame(out)
+
+
+def _numbers(column: Any) -> np.ndarray:
+    """float64 of a polars column; no sample = NaN with the quiet sign bit set aside by `_absent`."""
+    values = column.to_numpy().astype(np.float64, copy=True)
+    values[column.is_null().to_numpy()] = _ABSENT
+    return values
+
+
+# A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.
+_ABSENT = np.array([0x7FF8_0000_0000_0A0B], np.uint64).view(np.float64)[0]
+
+
+def _is_absent(values: np.ndarray) -> np.ndarray:
+    return values.view(np.uint64) == np.uint64(0x7FF8_0000_0000_0A0B)
+
+
+def _open_parquet(path: Path, options: _Options) -> Source:
+    """Parquet with numeric columns; null = no sample there."""
+    import polars as pl
+
+    raw = canlog.read_bytes(path)
+    if len(raw) < 12 or raw[:4] != b"PAR1" or raw[-4:] != b"PAR1":
+        raise LogError(f"{path}: is not a whole Parquet file (it must begin and end with PAR1)")
+    try:
+        schema = dict(pl.read_parquet_schema(io.BytesIO(raw)))
+    except (pl.exceptions.PolarsError, OSError, ValueError) as e:
+        raise LogError(f"{path}: is not a Parquet file ({' '.join(str(e).split())[:120]})") from None
+
+    def load(keys: list[str]) -> dict[str, np.ndarray]:
+        for k in keys:
+            if not (schema[k].is_numeric() or schema[k].is_temporal() or schema[k] == pl.Boolean):
+                raise LogError(f"{path}: column {k!r} holds {schema[k]}, not numbers")
+        try:
+            frame = pl.read_parquet(io.BytesIO(raw), columns=keys)
+        except (pl.exceptions.PolarsError, OSError, ValueError) as e:
+            raise LogError(f"{path}: cannot be read ({' '.join(str(e).split())[:120]})") from None
+        out = {}
+        for k in keys:
+            column = frame[k]
+            if schema[k].is_temporal():
+                column = column.cast(pl.Datetime("ns") if schema[k] in (pl.Date, pl.Datetime) else pl.Duration("ns"))
+                column = column.to_physical().cast(pl.Float64) / 1e9
+            out[k] = _numbers(column.cast(pl.Float64))
+        return out
+
+    return Table(list(schema), load, 1, _time_column(path, list(schema), options.mapping))
+
+
+def _raster(channels: dict[str, Channel]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """All times of all channels, and each channel on them, NaN where it has no sample."""
+    t = np.unique(np.concatenate([c.t for c in channels.values()]))
+    columns = {}
+    for name, c in channels.items():
+        columns[name] = np.full(t.size, np.nan)
+        columns[name][np.searchsorted(t, c.t)] = c.values
+    return t, columns
+
+
+def _frame(channels: dict[str, Channel]) -> Any:
+    """Channels as a polars table, t first, null where a channel has no sample."""
+    import polars as pl
+
+    t, columns = _raster(channels)
+    return pl.DataFrame({"t": t, **columns}).with_columns(pl.all().fill_nan(None))
+
+
+def _write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    _frame(channels).write_csv(path)
+
+
+def _write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    _frame(channels).write_parquet(path, compression="zstd")
+
+
+# --- CAN ---------------------------------------------------------------------------------------------------------------------------------
+
+
+def _bus_reader(read: Callable[[Path], canlog.Frames]) -> Callable[[Path, _Options], Source]:
+    """Reader of a CAN log format: its frames, seen through the database."""
+
+    def open_bus(path: Path, options: _Options) -> Source:
+        return _bus(read(path), options)
+
+    return open_bus
+
+
+def _bus(frames: canlog.Frames, options: _Options) -> Bus:
+    dbc = options.dbc or tables.path("vgv.dbc")
+    messages, notes = canlog.load_dbc(dbc)
+    return Bus(frames, messages, list(notes), dbc)
+
+
+def _bus_writer(write: Callable[[Path, canlog.Frames], None]) -> Callable[[Path, dict[str, Channel], Path | None], None]:
+    """Writer of a CAN log format: channels to the frames of the database, then these to the file."""
+
+    def write_bus(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+        write(path, _encode(channels, dbc or tables.path("vgv.dbc"), path))
+
+    return write_bus
+
+
+def _encode(channels: dict[str, Channel], dbc: Path, path: Path) -> canlog.Frames:
+    """Frames as the nodes would send them: each message at its period, with the value then valid.
+
+    A value is repeated until its channel's next sample, but no longer than `_HOLD` frame periods or steps of the channel: after
+    that the signal says "not available", and a message without any value is not sent. i_cmd is the mean since the last frame.
+    """
+    messages, _ = canlog.load_dbc(dbc)
+    start = min(float(c.t[0]) for c in channels.values())
+    parts = []
+    left = set(channels)
+    for m in messages:
+        names = [s.name for s in m.layout.signals if s.name in channels]
+        if not names:
+            continue
+        left -= set(names)
+        period = (m.layout.cycle_time or 10) / 1000
+        first = min(float(channels[n].t[0]) for n in names)
+        last = max(float(channels[n].t[-1]) for n in names)
+        if (last - first) / period > 1e8:
+            raise LogError(f"{path}: {last - first:.3g} s are too long for a CAN log with a frame every {period:g} s")
+        k = np.arange(math.ceil((first - start) / period - 1e-6), math.floor((last - start) / period + 1e-6) + 1)
+        t = start + k * period
+        values = {n: _sample(channels[n], t, period, n == "i_cmd") for n in names}
+        sent = ~np.logical_and.reduce([np.isnan(v) for v in values.values()])
+        t, values = t[sent], {n: v[sent] for n, v in values.items()}
+        if "mode_request" in m.missing:
+            values["mode_request"] = np.ones(t.size)
+        parts.append((t - start, np.full(t.size, m.ident, np.uint32), canlog.encode(m, values, t.size)))
+    if left:
+        raise LogError(f"{path}: {dbc.name} has no signal for {', '.join(sorted(left))}")
+    t = np.concatenate([p[0] for p in parts])
+    ident = np.concatenate([p[1] for p in parts])
+    width = max(8, *(p[2].shape[1] for p in parts))
+    data = np.zeros((t.size, width), np.uint8)
+    length = np.concatenate([np.full(len(p[2]), p[2].shape[1], np.uint8) for p in parts])
+    at = 0
+    for p in parts:
+        data[at : at + len(p[2]), : p[2].shape[1]] = p[2]
+        at += len(p[2])
+    order = np.lexsort((ident & 0x1FFFFFFF, np.rint(t * 1e6)))  # the lower identifier wins arbitration
+    return canlog.Frames(t[order], ident[order], np.zeros(t.size, np.int32), length[order], data[order])
+
+
+def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:
+    """The channel's value valid at each ``t``: its latest sample, or the mean since the sample before; NaN where it is silent."""
+    now = np.searchsorted(c.t, t + 1e-6, side="right")
+    age = t - c.t[np.maximum(now - 1, 0)]
+    step = float(np.median(np.diff(c.t))) if c.t.size > 1 else 0.0
+    there = (now > 0) & (age <= _HOLD * max(period, step))
+    values = c.values[np.maximum(now - 1, 0)].copy()
+    if mean and t.size:
+        before = np.searchsorted(c.t, t - period + 1e-6, side="right")
+        total = np.concatenate(([0.0], np.cumsum(c.values)))
+        several = now - before > 1
+        values[several] = (total[now] - total[before])[several] / (now - before)[several]
+    return np.where(there, values, np.nan)
+
+
+# --- formats -----------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What a reader may need beyond the path."""
+
+    dbc: Path | None
+    mapping: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class _Format:
+    read: Callable[[Path, _Options], Source]
+    write: Callable[[Path, dict[str, Channel], Path | None], None]
+
+
+_FORMATS: dict[str, _Format] = {
+    ".log": _Format(_bus_reader(canlog.read_candump), _bus_writer(canlog.write_candump)),
+    ".csv": _Format(_open_csv, _write_csv),
+    ".parquet": _Format(_open_parquet, _write_parquet),
+}
+
+
+def _format(path: Path) -> _Format:
+    found = _FORMATS.get(path.suffix.lower())
+    if found is None:
+        raise LogError(f"{path}: suffix {path.suffix!r} is not a log's; allowed: {', '.join(_FORMATS)}")
+    return found
+
+
+# --- units -------------------------------------------------------------------------------------------------------------------------------
+
+_SPEED = ("n_dem", "n_r")
+_ALIASES = {
+    "%": "percent", "pct": "percent", "per cent": "percent", "-": "", "1": "", "ratio": "",
+    "°": "degree", "deg": "degree", "grad": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC", "degc": "degC",
+    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
+    "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second", "hz": "turn/second", "khz": "kiloturn/second",
+    "sec": "second", "s": "second", "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
+}  # fmt: skip
+
+
+@functools.lru_cache(maxsize=1)
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+
+
+@functools.lru_cache(maxsize=256)
+def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
+    """(a, b) with value_in_into = a * value_in_unit + b; None where ``unit`` is no unit, its name where it cannot be converted.
+
+    Frequencies are turns: 1 Hz of a rotor is 60 rpm (pint alone would take it for 1 rad/s).
+    """
+    import pint
+
+    text = unit.strip()
+    text = _ALIASES.get(text.casefold(), text)
+    if len(text) > 32 or not re.fullmatch(r"[A-Za-z%°µμΩ_/*^.0-9 ()-]*", text) or re.search(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}", text):
+        return None
+    registry = _registry()
+    into = _ALIASES.get(into.casefold(), into)
+    try:
+        parsed = registry.parse_units(text)
+    except (pint.errors.PintError, ValueError, TypeError, AttributeError, KeyError, SyntaxError, RecursionError, ArithmeticError):
+        return None
+    except Exception as e:  # the tokenizer of pint's grammar has error types of its own
+        if type(e).__module__ in ("tokenize", "builtins"):
+            return None
+        raise
+    try:
+        a, b = (float(registry.Quantity(v, parsed).to(into).magnitude) for v in (0.0, 1.0))
+    except (pint.errors.PintError, ValueError, TypeError, ArithmeticError):
+        return text
+    if not (math.isfinite(a) and math.isfinite(b)) or a == b:
+        return None
+    return b - a, a
+
+
+def _convert(path: Path, signal: str, key: str, values: np.ndarray, unit: str, stated: bool, design_rpm: float | None, notes: list[str]) -> np.ndarray:
+    """Values in the signal's own unit; ``stated`` where the user named the unit, else the file did."""
+    own = UNITS.get(signal, "s")
+    if signal == "state" or unit.strip() in ("", own):
+        return values
+    factor = _factor(unit, own)
+    allowed = f"{own} or what converts to it"
+    if isinstance(factor, str) and signal in _SPEED:
+        allowed = "%, or rpm, Hz, rad/s with the design speed"
+        speed = _factor(unit, "rpm")
+        if isinstance(speed, tuple):
+            if design_rpm is None:
+                raise LogError(f"{path}: {signal} ({key}) is in {unit}; the design speed is needed to make it % (--design-rpm R), or --unit {signal}=%")
+            return values * (speed[0] * 100.0 / design_rpm)
+    if isinstance(factor, tuple):
+        return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
+    if factor is None and not stated:
+        notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
+        return values
+    if factor is None:
+        raise LogError(f"{path}: {signal}: unit {unit!r} is not known; allowed: {allowed}")
+    raise LogError(f"{path}: {signal} ({key}) is in {unit}, which does not convert; allowed: {allowed} (--unit {signal}=...)")
+
+
+# --- reading -----------------------------------------------------------------------------------------------------------------------------
+
+
+def _pairs(path: Path, mapping: Mapping[str, str] | None) -> dict[str, str]:
+    """Mapping as signal -> name in the log; both directions are understood, {"N1": "n_dem"} and {"n_dem": "N1"}."""
+    known = {*UNITS, "t"}
+    out: dict[str, str] = {}
+    for a, b in (mapping or {}).items():
+        if b in known:
+            name, signal = a, b
+        elif a in known:
+            name, signal = b, a
+        else:
+            raise LogError(f"{path}: map {a}={b}: {b!r} is not a signal{_close(b, known)}; allowed: {', '.join(UNITS)}, t")
+        if signal in out and out[signal] != name:
+            raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
+        out[signal] = name
+    return out
+
+
+def _find(source: Source, name: str) -> list[str]:
+    """What the file offers under ``name``: exact before any case, full name before short."""
+    if name in source.names:
+        return [name]
+    for fold in (str, str.casefold):
+        hits = [k for k, aliases in source.names.items() if any(fold(name) == fold(a) for a in aliases)]
+        if hits:
+            return hits
+    return []
+
+
+def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: list[str]) -> Channel | None:
+    """Samples that can be used: both numbers finite, time strictly increasing; None where nothing is left."""
+    t, values = s.t, s.values
+    finite = np.isfinite(t) & np.isfinite(values)
+    if not finite.all():
+        lost = ~finite & ~(_is_absent(values) | _is_absent(t))
+        if lost.any():
+            notes.append(f"{signal} ({key}): {int(lost.sum())} of {t.size} samples are NaN or infinite: left out")
+        t, values = t[finite], values[finite]
+    if not in_order and t.size:
+        back = np.flatnonzero(np.diff(t) < 0)
+        if back.size:
+            row = np.flatnonzero(finite)[back[0] + 1] + s.first
+            a, b = t[back[0]], t[back[0] + 1]
+            raise LogError(f"{path}: {signal} ({key}): time runs backwards at {s.word} {row}, from {a:.9g} s to {b:.9g} s")
+    if t.size:
+        last = np.append(np.diff(t) > 0, True)
+        if not last.all():
+            notes.append(f"{signal} ({key}): {int((~last).sum())} samples share their time with the next: the last is kept")
+            t, values = t[last], values[last]
+    if not t.size:
+        return None
+    return Channel(np.ascontiguousarray(t, np.float64), np.ascontiguousarray(values, np.float64))
+
+
+def read_log(
+    path: str | Path,
+    *,
+    dbc: str | Path | None = None,
+    mapping: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    design_rpm: float | None = None,
+    require: Iterable[str] = ("n_dem",),
+) -> Log:
+    """Read a log of any format into channels with the product's names and units.
+
+    path        the file; its suffix says the format
+    dbc         database of a CAN log; default: tables/vgv.dbc
+    mapping     name in the log -> signal, {"N1_DEM": "n_dem"}; a CAN name may be MESSAGE.SIGNAL, an MDF name GROUP.CHANNEL
+    units       signal -> unit that the log uses for it, {"n_r": "rpm"}; goes before a unit in the file
+    design_rpm  design speed, rpm; needed where a rotor speed is not in %
+    require     signals without which the log is of no use
+
+    Raises LogError, one line, for whatever cannot be used.
+    """
+    path = Path(path)
+    named = _pairs(path, mapping)
+    stated = dict(units or {})
+    for signal in stated:
+        if signal not in UNITS and signal != "t":
+            raise LogError(f"{path}: unit {signal}={stated[signal]}: {signal!r} is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}, t")
+    require = tuple(require)
+    for signal in require:
+        if signal not in UNITS:
+            raise LogError(f"{path}: {signal!r} is required but is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}")
+    if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
+        raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
+    source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {v: k for k, v in named.items()}))
+
+    keys: dict[str, list[str]] = {}
+    for signal in UNITS:
+        name = named.get(signal, signal)
+        keys[signal] = _find(source, name)
+        if signal in named and not keys[signal]:
+            reason = source.absent(name)
+            raise LogError(
+                f"{path}: no {source.kind} {name!r} to map to {signal}"
+                + (f" ({reason})" if reason else _close(name, {a for aliases in source.names.values() for a in aliases}))
+                + _has(source.kind, source.names)
+            )
+    series = source.series(sorted({k for ks in keys.values() for k in ks}))
+    notes: list[str] = []
+    channels: dict[str, Channel] = {}
+    for signal, candidates in keys.items():
+        key = _choose(path, signal, candidates, series, notes)
+        if key is None:
+            continue
+        s = series[key]
+        t = s.t
+        if "t" in stated:
+            t = _convert(path, "t", "t", t, stated["t"], True, None, notes)
+        values = _convert(path, signal, key, s.values, stated.get(signal, s.unit), signal in stated, design_rpm, notes)
+        values = np.where(_is_absent(s.values), _ABSENT, values) if values is not s.values else values
+        channel = _clean(path, signal, key, Series(t, values, "", s.first, s.word), source.sorted, notes)
+        if channel is None:
+            notes.append(f"{signal} ({key}): no sample that can be used")
+        else:
+            channels[signal] = channel
+    for signal in require:
+        if signal not in channels:
+            name = named.get(signal, signal)
+            why = [n for n in source.notes + notes if key_in(n, keys[signal], signal)]
+            reason = "; ".join(why) or source.absent(name)
+            raise LogError(
+                f"{path}: no {signal}: looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
+                + f"; --map NAME={signal} names another" + _has(source.kind, source.names)
+            )  # fmt: skip
+    _shift(channels, notes)
+    return Log(str(path), channels, list(source.notes) + notes)
+
+
+def key_in(note: str, keys: list[str], signal: str) -> bool:
+    """Whether a note speaks of one of ``keys``, their messages, or the signal."""
+    return any(note.startswith((f"{k}:", k.split(".")[0] + ":")) for k in keys) or note.startswith(f"{signal} (")
+
+
+def _choose(path: Path, signal: str, candidates: list[str], series: dict[str, Series], notes: list[str]) -> str | None:
+    """The one candidate, or among several the only one that moves (databases repeat a name in messages that never carry it)."""
+    if len(candidates) <= 1:
+        return candidates[0] if candidates else None
+    moving = [k for k in candidates if series[k].values.size and np.ptp(series[k].values) > 0]
+    if len(moving) != 1:
+        raise LogError(f"{path}: {signal} may be {' or '.join(candidates)}; name one: --map {candidates[0]}={signal}")
+    notes.append(f"{signal}: took {moving[0]}; {', '.join(k for k in candidates if k != moving[0])} never changes")
+    return moving[0]
+
+
+def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
+    """Count time from the start of the log where the file counts from 1970."""
+    if channels and (start := min(c.t[0] for c in channels.values())) > _EPOCH:
+        notes.append(f"time counts from 1970: {start:.6f} s taken for the start of the log")
+        for name, c in channels.items():
+            t = c.t - start
+            keep = np.append(np.diff(t) > 0, True)
+            channels[name] = Channel(t[keep], c.values[keep])
+
+
+# --- writing -----------------------------------------------------------------------------------------------------------------------------
+
+
+def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path | None = None) -> None:
+    """Write channels as a log; the suffix says the format.
+
+    Tables and MDF4 hold every sample as it is. CAN formats hold what the bus would carry: the frames of ``dbc`` (default
+    tables/vgv.dbc) at their periods, in their resolution, with valid counter and CRC, from 0 s on.
+    Raises LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
+    """
+    path = Path(path)
+    write = _format(path).write
+    if not channels:
+        raise LogError(f"{path}: no channel to write")
+    checked = {}
+    for name, c in channels.items():
+        if name not in UNITS:
+            raise LogError(f"{path}: {name!r} is not a signal{_close(name, UNITS)}; allowed: {', '.join(UNITS)}")
+        t, values = np.asarray(c.t, np.float64), np.asarray(c.values, np.float64)
+        if t.ndim != 1 or t.shape != values.shape or not t.size:
+            raise LogError(f"{path}: {name}: t {t.shape} and values {values.shape} must be lists of one length, not empty")
+        if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
+            raise LogError(f"{path}: {name}: samples must be finite and their times increasing")
+        checked[name] = Channel(t, values)
+    try:
+        write(path, checked, Path(dbc) if dbc is not None else None)
+    except OSError as e:
+        raise LogError(f"{path}: cannot be written ({e.strerror or e})") from None
