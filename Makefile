@@ -1,0 +1,109 @@
+# VaneLoop: `make` lists what can be done. Everything runs in a private environment, .venv, made on first use.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-all bench lint clean
+
+VENV := .venv
+PY := $(VENV)/bin/python
+SAY := printf '[vaneloop] %s\n'
+JOBS ?= 2
+
+# An environment serves only the checkout that it was made in: a copied, moved or broken one is made anew.
+HOME_OF_VENV := $(VENV)/.made-in
+READY := $(VENV)/.ready-test
+READY_BENCH := $(VENV)/.ready-bench
+ifneq ($(shell cat $(HOME_OF_VENV) 2>/dev/null && $(PY) -c '' 2>/dev/null && echo works),$(CURDIR) works)
+  $(shell rm -f $(HOME_OF_VENV) $(READY) $(READY_BENCH))
+endif
+
+help:  ## list the targets
+	@printf 'VaneLoop\n\n'
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
+
+demo: $(READY)  ## replay a recorded engine run and the long engine test; writes demo/*.html
+	@$(PY) -m app.demo
+
+test: lint  ## lint, types, and every test but the slow ones
+	@$(SAY) 'pytest'
+	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow'
+
+test-all: lint  ## lint, types, and every test, with the slow campaigns
+	@$(SAY) 'pytest, with the slow campaigns'
+	@$(PY) -m pytest -n $(JOBS) --dist worksteal
+
+bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
+	@$(need_gcc)
+	@$(PY) -m benchmarks
+
+lint: $(READY)  ## ruff and mypy
+	@$(SAY) 'ruff'
+	@$(PY) -m ruff check --output-format concise .
+	@$(SAY) 'mypy'
+	@$(PY) -m mypy
+
+clean:  ## remove what the other targets made, the environment too
+	@rm -rf $(VENV) build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(HOME_OF_VENV):
+	@$(make_venv)
+	@echo '$(CURDIR)' >$@
+
+$(READY): pyproject.toml constraints.txt | $(HOME_OF_VENV)
+	@$(call install,test)
+	@touch $@
+
+$(READY_BENCH): $(READY) pyproject.toml constraints.txt
+	@$(call install,bench)
+	@touch $@
+
+# The editable install makes edits count at once. A slow or failing package index is asked again.
+define install
+$(SAY) 'installing the pinned packages for $(1) (a minute or two on first use; full log: $(VENV)/pip.log)'; \
+export PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_RETRIES=8 PIP_DEFAULT_TIMEOUT=$${PIP_DEFAULT_TIMEOUT:-60}; \
+for try in 1 2 3; do \
+  if $(PY) -m pip install -e '.[$(1)]' 2>&1 | tee $(VENV)/pip.log \
+    | { grep --line-buffered -E '^ +Downloading .*MB|^Installing|^ *(ERROR|error:)|[Rr]etrying' || true; } | cut -c1-110; \
+  then exit 0; fi; \
+  if [ $$try != 3 ]; then $(SAY) 'not installed; trying again'; sleep $$((try * 5)); fi; \
+done; \
+$(SAY) 'the packages could not be installed; the lines above and $(VENV)/pip.log say why'; exit 1
+endef
+
+# The first Python from 3.11 on that can make an environment; Debian and Ubuntu keep that part in a package of its own.
+define make_venv
+can() { "$$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null; }; \
+whole() { "$$1" -c 'import ensurepip, venv' 2>/dev/null; }; \
+candidates="python3.13 python3.12 python3.11 python3.14"; \
+if python3 -c 'import sys; sys.exit(sys.version_info >= (3, 14))' 2>/dev/null; then candidates="python3 $$candidates"; fi; \
+found=; bare=; \
+for p in $$candidates; do \
+  if can $$p; then if whole $$p; then found=$$p; break; fi; bare=$${bare:-$$p}; fi; \
+done; \
+if [ -z "$$found" ] && [ -n "$$bare" ]; then \
+  v=$$("$$bare" -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+    $(SAY) "installing python$$v-venv with apt-get"; \
+    export DEBIAN_FRONTEND=noninteractive; \
+    apt-get update -qq >/dev/null || true; \
+    apt-get install -y -qq "python$$v-venv" >/dev/null || apt-get install -y -qq python3-venv >/dev/null || true; \
+  fi; \
+  if whole "$$bare"; then found=$$bare; \
+  else $(SAY) "$$bare lacks its venv module: install the package python$$v-venv (Debian, Ubuntu) and try again"; exit 1; fi; \
+fi; \
+if [ -z "$$found" ]; then $(SAY) 'no Python 3.11 or newer found (looked for python3, python3.11 to python3.14): install one and try again'; exit 1; fi; \
+$(SAY) "making $(VENV) with $$("$$found" --version)"; \
+rm -rf $(VENV); "$$found" -m venv $(VENV)
+endef
+
+define need_gcc
+if ! command -v gcc >/dev/null; then \
+  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+    $(SAY) 'installing gcc with apt-get, for the comparison with C'; \
+    export DEBIAN_FRONTEND=noninteractive; \
+    apt-get update -qq >/dev/null || true; \
+    apt-get install -y -qq gcc libc6-dev >/dev/null; \
+  else $(SAY) 'the comparison with C needs gcc: install it and try again'; exit 1; fi; \
+fi
+endef

@@ -1,0 +1,35 @@
+"""What every test may use: where the real logs are, a C compiler, and Hypothesis settings that suit compiled code."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# The first call of a compiled function takes seconds, so no single example has a time limit.
+settings.register_profile("vaneloop", deadline=None, print_blob=True)
+settings.load_profile("vaneloop")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the real logs: VANELOOP_DATA, or shared/data beside the checkout. Skips where there is none."""
+    named = os.environ.get("VANELOOP_DATA")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no real logs: {folder} is not a folder (set VANELOOP_DATA to the folder that holds them)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def gcc() -> str:
+    """Path of the C compiler. Skips where there is none."""
+    found = shutil.which("gcc")
+    if found is None:
+        pytest.skip("no C compiler: gcc is not installed")
+    return found
