@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-__all__ = ["Axis", "InputError", "Quantity", "Table", "path", "read"]
+__all__ = ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"]
 
 _HERE = Path(__file__).parent
 Finite = Annotated[float, Field(allow_inf_nan=False)]

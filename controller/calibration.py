@@ -1,0 +1,175 @@
+"""The controller's calibration: the tables it is flashed with, checked and laid out flat for the compiled tick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import model_validator
+
+from controller import firmware
+from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
+
+__all__ = ["Calibration", "STRATEGIES", "load_calibration", "new_state"]
+
+STRATEGIES = ("single", "dual")
+_SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3}  # mA/mm = A/m and the other ratios need no factor
+
+
+class Calibration(NamedTuple):
+    """What `controller.tick` reads.
+
+    k      float64[N_SCALARS], SI, in the order of `firmware.SCALARS`
+    table  float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
+    """
+
+    k: np.ndarray
+    table: np.ndarray
+
+
+class Trend(Bounded):
+    """Direction of the demand."""
+
+    trend_alpha: Annotated[Quantity, Bound("-", 1e-3, 1.0)]
+    trend_beta: Annotated[Quantity, Bound("-", 1e-6, 2.0)]
+    trend_rate_on: Annotated[Quantity, Bound("%/s", 0.0, 10.0)]
+    trend_change: Annotated[Quantity, Bound("%", 0.0, 10.0)]
+    trend_hold: Annotated[Quantity, Bound("s", 0.0, 10.0)]
+
+
+class Schedule(Bounded):
+    """From speed to stroke demand."""
+
+    strategy: str
+    table_input: str
+    speed_filter: Annotated[Quantity, Bound("s", 0.0, 10.0)]
+    blend_time: Annotated[Quantity, Bound("s", 0.01, 10.0)]
+    stroke_rate: Annotated[Quantity, Bound("mm/s", 1.0, 1000.0)]
+    stroke_min: Annotated[Quantity, Bound("mm", 0.0, 100.0)]
+    stroke_max: Annotated[Quantity, Bound("mm", 0.0, 100.0)]
+
+    @model_validator(mode="after")
+    def _choices(self) -> Schedule:
+        if self.strategy not in STRATEGIES:
+            raise ValueError(f"strategy (={self.strategy!r}) must be one of {', '.join(STRATEGIES)}")
+        if self.table_input not in ("n_r", "n_dem"):
+            raise ValueError(f"table_input (={self.table_input!r}) must be n_r or n_dem")
+        if not self.stroke_min.value < self.stroke_max.value:
+            raise ValueError(f"stroke_min (={self.stroke_min.value:g} mm) must be below stroke_max (={self.stroke_max.value:g} mm)")
+        return self
+
+
+class Servo(Bounded):
+    """Stroke loop."""
+
+    kp: Annotated[Quantity, Bound("mA/mm", 0.0, 1000.0)]
+    ki: Annotated[Quantity, Bound("mA/(mm s)", 0.0, 100000.0)]
+    kff: Annotated[Quantity, Bound("mA/(mm/s)", 0.0, 10.0)]
+    current_limit: Annotated[Quantity, Bound("mA", 0.1, 1000.0)]
+
+
+class FailSafe(Bounded):
+    """Start, loss and return."""
+
+    init_time: Annotated[Quantity, Bound("s", 0.0, 60.0)]
+    fail_safe_stroke: Annotated[Quantity, Bound("mm", 0.0, 100.0)]
+    fail_safe_current: Annotated[Quantity, Bound("mA", -1000.0, 1000.0)]
+    fail_safe_rate: Annotated[Quantity, Bound("mm/s", 0.1, 1000.0)]
+    degraded_hold: Annotated[Quantity, Bound("s", 0.0, 3600.0)]
+    recover_time: Annotated[Quantity, Bound("s", 0.001, 3600.0)]
+
+
+class DemandMonitor(Bounded):
+    """When the ECU's demand is not to be believed."""
+
+    demand_timeout: Annotated[Quantity, Bound("s", 0.001, 60.0)]
+    demand_reject_limit: Annotated[Quantity, Bound("-", 1.0, 10000.0)]
+    demand_reject_leak: Annotated[Quantity, Bound("1/s", 0.0, 10000.0)]
+    demand_low: Annotated[Quantity, Bound("%", -10.0, 100.0)]
+    demand_high: Annotated[Quantity, Bound("%", 1.0, 150.0)]
+
+
+class LvdtMonitor(Bounded):
+    """When the stroke measurement is not to be believed."""
+
+    lvdt_low: Annotated[Quantity, Bound("mm", -100.0, 100.0)]
+    lvdt_high: Annotated[Quantity, Bound("mm", 0.0, 200.0)]
+    lvdt_rate: Annotated[Quantity, Bound("mm/s", 1.0, 100000.0)]
+    lvdt_debounce: Annotated[Quantity, Bound("s", 0.001, 60.0)]
+    lvdt_heal: Annotated[Quantity, Bound("s", 0.001, 3600.0)]
+    stuck_current: Annotated[Quantity, Bound("mA", 0.0, 1000.0)]
+    stuck_motion: Annotated[Quantity, Bound("mm", 0.0, 100.0)]
+    stuck_time: Annotated[Quantity, Bound("s", 0.001, 60.0)]
+    stuck_margin: Annotated[Quantity, Bound("mm", 0.0, 100.0)]
+
+
+class ServoMonitor(Bounded):
+    """When the loop does not follow."""
+
+    tracking_limit: Annotated[Quantity, Bound("mm", 0.001, 100.0)]
+    tracking_time: Annotated[Quantity, Bound("s", 0.001, 60.0)]
+    saturated_time: Annotated[Quantity, Bound("s", 0.001, 60.0)]
+
+
+class CalibrationTable(Table):
+    """``calibration.toml``: every scalar of the controller, by job."""
+
+    trend: Trend
+    schedule: Schedule
+    servo: Servo
+    fail_safe: FailSafe
+    demand_monitor: DemandMonitor
+    lvdt_monitor: LvdtMonitor
+    servo_monitor: ServoMonitor
+
+
+class StrokeTable(Bounded):
+    """``stroke_tables.toml``: stroke against speed, one curve per direction and their mean."""
+
+    speed: Annotated[Axis, Bound("%", 0.0, 150.0)]
+    extension: Annotated[Axis, Bound("mm", 0.0, 100.0)]
+    retraction: Annotated[Axis, Bound("mm", 0.0, 100.0)]
+    single: Annotated[Axis, Bound("mm", 0.0, 100.0)]
+
+    @model_validator(mode="after")
+    def _axes(self) -> StrokeTable:
+        self.speed.increasing("speed")
+        n = len(self.speed.values)
+        for key in ("extension", "retraction", "single"):
+            if len(getattr(self, key).values) != n:
+                raise ValueError(f"{key}.values has {len(getattr(self, key).values)} numbers; speed has {n}")
+        return self
+
+
+def load_calibration(
+    calibration: str | Path = "calibration.toml", strokes: str | Path = "stroke_tables.toml", strategy: str | None = None
+) -> Calibration:
+    """Read, check and flatten the controller's tables.
+
+    strategy: overrides the table's choice, one of `STRATEGIES`.
+    Raises InputError with file, key, value and what is allowed.
+    """
+    cal = read(calibration, CalibrationTable)
+    stroke = read(strokes, StrokeTable)
+    if strategy is not None and strategy not in STRATEGIES:
+        raise InputError(f"strategy (={strategy!r}) must be one of {', '.join(STRATEGIES)}")
+    flat = {
+        "strategy": float(STRATEGIES.index(strategy or cal.schedule.strategy)),
+        "table_input": 0.0 if cal.schedule.table_input == "n_r" else 1.0,
+    }
+    for section in cal.__class__.model_fields:
+        for key, q in getattr(cal, section):
+            if isinstance(q, Quantity):
+                flat[key] = q.value * _SI.get(q.unit, 1.0)
+    k = np.array([flat[name] for name in firmware.SCALARS])
+    table = np.array([stroke.speed.values] + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")])
+    return Calibration(k, table)
+
+
+def new_state() -> np.ndarray:
+    """State of a controller that has just been switched on."""
+    z = np.zeros(firmware.N_STATE)
+    z[firmware.DIRECTION] = 1.0
+    z[firmware.BLEND] = 1.0
+    return z

@@ -1,0 +1,527 @@
+"""The controller's firmware: rotor-speed demand in, servo-valve current out, 1,000 times a second.
+
+Signal flow of one tick (Kim & Ki 2020, figure 7)::
+
+    n_dem --> trend (10 ms) --> which curve ---+
+    n_r ----> filter (10 ms) ------------------+--> stroke tables --> x_dem --> PI (1 ms) --> i_cmd
+    x_lvdt -> range, rate, stuck (1 ms) ---------------------------------------^
+
+`tick` has no clock, no file and no bus: the same inputs and state give the same state, bit for bit. It writes into ``state`` in place and
+allocates nothing. Every threshold is calibration (`controller.calibration`).
+
+Units: SI, speeds in % of design speed. Positive current extends.
+
+This file holds all compiled code of the controller on purpose: numba's cache looks at one file's date only.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+# ---- inputs -------------------------------------------------------------------------------------------------------------------------
+INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt")
+N_INPUTS = len(INPUTS)
+(
+    IN_N_DEM,  # %, demand of the last good ECU frame
+    IN_N_R,  # %, measured speed of the last good ECU frame
+    IN_FRESH,  # 1 if a good ECU frame came since the last tick
+    IN_REJECTED,  # ECU frames refused since the last tick (CRC, counter, length)
+    IN_MODE_REQUEST,  # 0 standby, 1 run
+    IN_X_LVDT,  # m, stroke as the LVDT gives it
+) = range(N_INPUTS)
+
+# ---- modes --------------------------------------------------------------------------------------------------------------------------
+INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE = range(5)
+MODES = ("INIT", "STANDBY", "RUN", "DEGRADED", "FAIL_SAFE")
+
+# ---- fault codes: bit numbers in the state's `faults` and in the frame VGV_SERVO ----------------------------------------------------
+FAULTS = (
+    "demand_stale",
+    "demand_rejected",
+    "lvdt_range",
+    "lvdt_rate",
+    "lvdt_stuck",
+    "tracking",
+    "current_saturated",
+    "demand_range",
+)
+N_FAULTS = len(FAULTS)
+(F_STALE, F_REJECTED, F_LVDT_RANGE, F_LVDT_RATE, F_LVDT_STUCK, F_TRACKING, F_SATURATED, F_DEMAND_RANGE) = range(N_FAULTS)
+
+# ---- calibration scalars ------------------------------------------------------------------------------------------------------------
+SCALARS = (
+    "strategy",  # 0 single mean curve, 1 dual curves
+    "table_input",  # 0 table entered with filtered n_r, 1 with n_dem
+    "trend_alpha",  # - fixed gains of the trend's Kalman filter, per 10 ms
+    "trend_beta",
+    "trend_rate_on",  # %/s: rate of demand against the direction that counts as moving
+    "trend_change",  # %: way back from the farthest demand that turns the direction; half of it while moving
+    "trend_hold",  # s: for how long both must stand
+    "speed_filter",  # s: lag of the n_r filter
+    "blend_time",  # s: full change from one curve to the other
+    "stroke_rate",  # m/s: fastest stroke demand
+    "stroke_min",  # m
+    "stroke_max",  # m
+    "kp",  # A/m
+    "ki",  # A/(m s)
+    "kff",  # A/(m/s)
+    "current_limit",  # A
+    "init_time",  # s
+    "fail_safe_stroke",  # m
+    "fail_safe_current",  # A, when the LVDT cannot be used
+    "fail_safe_rate",  # m/s, on the way to the fail-safe stroke
+    "degraded_hold",  # s: longest time in DEGRADED before FAIL_SAFE
+    "recover_time",  # s: all clear for this long before RUN returns
+    "demand_timeout",  # s without a good frame: stale
+    "demand_reject_limit",  # refused frames in the bucket: rejected
+    "demand_reject_leak",  # refused frames forgiven per second
+    "demand_low",  # %
+    "demand_high",  # %
+    "lvdt_low",  # m
+    "lvdt_high",  # m
+    "lvdt_rate",  # m/s
+    "lvdt_debounce",  # s of bad samples: fault
+    "lvdt_heal",  # s of good samples: healed
+    "stuck_current",  # A: a current above this must move the piston
+    "stuck_motion",  # m: less motion than this is none
+    "stuck_time",  # s
+    "stuck_margin",  # m from the end stops within which no motion is expected
+    "tracking_limit",  # m
+    "tracking_time",  # s
+    "saturated_time",  # s
+)
+N_SCALARS = len(SCALARS)
+(
+    STRATEGY,
+    TABLE_INPUT,
+    TREND_ALPHA,
+    TREND_BETA,
+    TREND_RATE_ON,
+    TREND_CHANGE,
+    TREND_HOLD,
+    SPEED_FILTER,
+    BLEND_TIME,
+    STROKE_RATE,
+    STROKE_MIN,
+    STROKE_MAX,
+    KP,
+    KI,
+    KFF,
+    CURRENT_LIMIT,
+    INIT_TIME,
+    FAIL_SAFE_STROKE,
+    FAIL_SAFE_CURRENT,
+    FAIL_SAFE_RATE,
+    DEGRADED_HOLD,
+    RECOVER_TIME,
+    DEMAND_TIMEOUT,
+    DEMAND_REJECT_LIMIT,
+    DEMAND_REJECT_LEAK,
+    DEMAND_LOW,
+    DEMAND_HIGH,
+    LVDT_LOW,
+    LVDT_HIGH,
+    LVDT_RATE,
+    LVDT_DEBOUNCE,
+    LVDT_HEAL,
+    STUCK_CURRENT,
+    STUCK_MOTION,
+    STUCK_TIME,
+    STUCK_MARGIN,
+    TRACKING_LIMIT,
+    TRACKING_TIME,
+    SATURATED_TIME,
+) = range(N_SCALARS)
+
+# ---- state --------------------------------------------------------------------------------------------------------------------------
+STATE = (
+    "mode",
+    "ticks",
+    "n_dem",  # %, demand in use
+    "n_r_raw",  # %, measured speed of the last good frame
+    "n_r",  # %, filtered measured speed
+    "demand_age",  # s since the last good frame
+    "reject_bucket",
+    "demand_seen",
+    "trend_n",  # %, filtered demand
+    "trend_rate",  # %/s
+    "trend_turn",  # %, farthest demand along the present direction
+    "trend_timer",  # s for which a turn has been due
+    "direction",  # +1 demand rises (extension curve), -1 falls (retraction curve)
+    "blend",  # 0 retraction curve .. 1 extension curve
+    "x_target",  # m, stroke from the tables
+    "x_dem",  # m, stroke demand, rate-limited (the end of the present 10 ms)
+    "x_from",  # m, stroke demand 10 ms before
+    "x_meas",  # m, last plausible stroke
+    "x_last",  # m, last raw sample
+    "lvdt_good",  # 1 if the last sample was plausible
+    "stuck_x",  # m, where the stuck timer started
+    "stuck_timer",
+    "integral",  # A
+    "i_cmd",  # A
+    "saturated",
+    "recover_timer",
+    "degraded_timer",
+    "faults",  # bit mask
+    "t_stale",
+    "t_rejected",
+    "t_lvdt_range",
+    "t_lvdt_rate",
+    "t_lvdt_stuck",
+    "t_tracking",
+    "t_saturated",
+    "t_demand_range",
+    "x_servo",  # m, reference of the servo at this tick
+)
+N_STATE = len(STATE)
+(
+    MODE,
+    TICKS,
+    N_DEM,
+    N_R_RAW,
+    N_R,
+    DEMAND_AGE,
+    REJECT_BUCKET,
+    DEMAND_SEEN,
+    TREND_N,
+    TREND_RATE,
+    TREND_TURN,
+    TREND_TIMER,
+    DIRECTION,
+    BLEND,
+    X_TARGET,
+    X_DEM,
+    X_FROM,
+    X_MEAS,
+    X_LAST,
+    LVDT_GOOD,
+    STUCK_X,
+    STUCK_TIMER,
+    INTEGRAL,
+    I_CMD,
+    SATURATED,
+    RECOVER_TIMER,
+    DEGRADED_TIMER,
+    FAULT_BITS,
+    T_STALE,
+    T_REJECTED,
+    T_LVDT_RANGE,
+    T_LVDT_RATE,
+    T_LVDT_STUCK,
+    T_TRACKING,
+    T_SATURATED,
+    T_DEMAND_RANGE,
+    X_SERVO,
+) = range(N_STATE)
+
+TICK = 1e-3  # s, servo rate 1 kHz
+SLOW = 10  # ticks: demand, trend and schedule run every 10 ms
+SLOW_TICK = 1e-2  # s
+
+# ---- rows of the stroke table -------------------------------------------------------------------------------------------------------
+ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
+
+
+@njit(cache=True, error_model="numpy")
+def look_up(axis, row, table, v):
+    """Linear interpolation of ``table[row]`` over the increasing ``table[axis]``, held constant beyond both ends."""
+    last = table.shape[1] - 1
+    if not v > table[axis, 0]:
+        return table[row, 0]
+    if v >= table[axis, last]:
+        return table[row, last]
+    lo, hi = 0, last
+    while hi - lo > 1:
+        mid = (lo + hi) // 2
+        if table[axis, mid] <= v:
+            lo = mid
+        else:
+            hi = mid
+    w = (v - table[axis, lo]) / (table[axis, hi] - table[axis, lo])
+    return table[row, lo] + w * (table[row, hi] - table[row, lo])
+
+
+@njit(cache=True, error_model="numpy")
+def trend_step(z, k, n_dem):
+    """Is the demand rising or falling? One 10 ms step.
+
+    The rate comes from a constant-rate Kalman filter in its steady-state form (alpha-beta)::
+
+        n- = n + rate T,   r = n_dem - n-,   n = n- + alpha r,   rate = rate + beta r / T
+
+    ``back`` is how far the demand has come back from its farthest point along the present direction. The direction turns once the demand
+    has been moving against it (rate beyond ``trend_rate_on``) and is back by half of ``trend_change``, or has crept back by the whole of
+    it, and this has stood without a gap for ``trend_hold``. The turning point is taken from the demand itself: the filter overshoots after
+    a slam and would turn falsely at its end.
+    """
+    predicted = z[TREND_N] + z[TREND_RATE] * SLOW_TICK
+    r = n_dem - predicted
+    z[TREND_N] = predicted + k[TREND_ALPHA] * r
+    z[TREND_RATE] = z[TREND_RATE] + k[TREND_BETA] * r / SLOW_TICK
+    d = z[DIRECTION]
+    if d * (n_dem - z[TREND_TURN]) > 0.0:
+        z[TREND_TURN] = n_dem
+    back = d * (z[TREND_TURN] - n_dem)
+    moving = -d * z[TREND_RATE] > k[TREND_RATE_ON] and back > 0.5 * k[TREND_CHANGE]
+    if moving or back > k[TREND_CHANGE]:
+        z[TREND_TIMER] += SLOW_TICK
+        if z[TREND_TIMER] >= k[TREND_HOLD]:
+            z[DIRECTION] = -d
+            z[TREND_TURN] = n_dem
+            z[TREND_TIMER] = 0.0
+    else:
+        z[TREND_TIMER] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def schedule_step(z, k, table):
+    """Stroke demand from the speed: one 10 ms step.
+
+    The extension curve serves a rising demand, the retraction curve a falling one. Between them ``blend`` moves at a limited rate, so the
+    change of table is bumpless; the demand itself is limited to ``stroke_rate``.
+    """
+    n = z[N_DEM] if k[TABLE_INPUT] == 1.0 else z[N_R]
+    if k[STRATEGY] == 0.0:
+        target = look_up(ROW_SPEED, ROW_SINGLE, table, n)
+    else:
+        goal = 1.0 if z[DIRECTION] > 0.0 else 0.0
+        step = SLOW_TICK / k[BLEND_TIME]
+        z[BLEND] += min(max(goal - z[BLEND], -step), step)
+        retraction = look_up(ROW_SPEED, ROW_RETRACTION, table, n)
+        extension = look_up(ROW_SPEED, ROW_EXTENSION, table, n)
+        target = retraction + z[BLEND] * (extension - retraction)
+    z[X_TARGET] = min(max(target, k[STROKE_MIN]), k[STROKE_MAX])
+
+
+@njit(cache=True, error_model="numpy")
+def move_demand(z, k, target, rate):
+    """Let the stroke demand follow ``target`` (m) no faster than ``rate`` (m/s): one 10 ms step."""
+    step = rate * SLOW_TICK
+    z[X_FROM] = z[X_DEM]
+    z[X_DEM] += min(max(target - z[X_DEM], -step), step)
+    z[X_DEM] = min(max(z[X_DEM], k[STROKE_MIN]), k[STROKE_MAX])
+
+
+@njit(cache=True, error_model="numpy")
+def servo_step(z, k, x_ref, dx_ref):
+    """Servo-valve current: PI on the stroke error with feed-forward of the demanded speed, one tick of 1 ms.
+
+    ::
+
+        e = x_ref - x_meas,   i = kp e + integral + kff dx_ref,   d(integral)/dt = ki e
+
+    The current is limited to +-``current_limit``; while it is, the integral does not grow further into the limit (anti-windup).
+    """
+    e = x_ref - z[X_MEAS]
+    limit = k[CURRENT_LIMIT]
+    integral = z[INTEGRAL] + k[KI] * e * TICK
+    i = k[KP] * e + integral + k[KFF] * dx_ref
+    if i > limit:
+        i = limit
+        z[SATURATED] = 1.0
+        if e < 0.0:
+            z[INTEGRAL] = integral
+    elif i < -limit:
+        i = -limit
+        z[SATURATED] = 1.0
+        if e > 0.0:
+            z[INTEGRAL] = integral
+    else:
+        z[SATURATED] = 0.0
+        z[INTEGRAL] = integral
+    z[INTEGRAL] = min(max(z[INTEGRAL], -limit), limit)
+    z[I_CMD] = i
+
+
+@njit(cache=True, error_model="numpy")
+def _debounce(z, timer, bad, bit, rise, heal):
+    """Set fault ``bit`` after ``rise`` seconds of bad ticks, clear it after ``heal`` seconds of good ones.
+
+    The timer counts up to ``rise`` while bad; once the fault stands it counts down from 0 to -``heal`` while good.
+    """
+    mask = int(z[FAULT_BITS])
+    if mask & (1 << bit):
+        z[timer] = 0.0 if bad else z[timer] - TICK
+        if z[timer] <= -heal:
+            z[FAULT_BITS] = float(mask & ~(1 << bit))
+            z[timer] = 0.0
+    else:
+        z[timer] = z[timer] + TICK if bad else 0.0
+        if bad and z[timer] >= rise:
+            z[FAULT_BITS] = float(mask | (1 << bit))
+            z[timer] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _condition_lvdt(z, k, x):
+    """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one."""
+    in_range = k[LVDT_LOW] <= x <= k[LVDT_HIGH]  # False for NaN
+    first = z[TICKS] == 0.0
+    jump = in_range and not first and abs(x - z[X_LAST]) > k[LVDT_RATE] * TICK
+    if in_range:
+        z[X_LAST] = x
+    z[LVDT_GOOD] = 1.0 if in_range and not jump else 0.0
+    if z[LVDT_GOOD] == 1.0:
+        z[X_MEAS] = x
+    _debounce(z, T_LVDT_RANGE, not in_range, F_LVDT_RANGE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
+    # a single jump is one sample; repeated jumps are a fault, so each counts as five samples of the debounce time
+    if jump:
+        z[T_LVDT_RATE] += 4.0 * TICK
+    _debounce_leaky(z, T_LVDT_RATE, jump, F_LVDT_RATE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
+
+    # stuck: a current that must move the piston, and no motion, away from the end stops
+    inside = k[STROKE_MIN] + k[STUCK_MARGIN] < z[X_MEAS] < k[STROKE_MAX] - k[STUCK_MARGIN]
+    if abs(z[I_CMD]) > k[STUCK_CURRENT] and inside and abs(z[X_MEAS] - z[STUCK_X]) < k[STUCK_MOTION]:
+        z[STUCK_TIMER] += TICK
+    else:
+        z[STUCK_X] = z[X_MEAS]
+        z[STUCK_TIMER] = 0.0
+    _debounce(z, T_LVDT_STUCK, z[STUCK_TIMER] >= k[STUCK_TIME], F_LVDT_STUCK, TICK, k[LVDT_HEAL])
+
+
+@njit(cache=True, error_model="numpy")
+def _debounce_leaky(z, timer, bad, bit, rise, heal):
+    """Like `_debounce`, but good ticks only count the timer down: intermittent faults add up."""
+    mask = int(z[FAULT_BITS])
+    if mask & (1 << bit):
+        _debounce(z, timer, bad, bit, rise, heal)
+        return
+    z[timer] = z[timer] + TICK if bad else max(0.0, z[timer] - 0.1 * TICK)
+    if z[timer] >= rise:
+        z[FAULT_BITS] = float(mask | (1 << bit))
+        z[timer] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _monitor_demand(inputs, z, k):
+    """Age, refusals and range of the ECU's demand; take the values of a good frame."""
+    n_dem, n_r = inputs[IN_N_DEM], inputs[IN_N_R]
+    fresh = inputs[IN_FRESH] > 0.5
+    in_range = (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH]) and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH])  # False for NaN
+    good = fresh and in_range
+    rejected = inputs[IN_REJECTED]
+    if not (rejected >= 0.0):
+        rejected = 0.0
+    bucket = z[REJECT_BUCKET] + min(rejected, 100.0) - k[DEMAND_REJECT_LEAK] * TICK
+    z[REJECT_BUCKET] = min(max(bucket, 0.0), 2.0 * k[DEMAND_REJECT_LIMIT])
+    if good:
+        z[DEMAND_AGE] = 0.0
+        z[N_DEM] = n_dem
+        z[N_R_RAW] = n_r
+        if z[DEMAND_SEEN] == 0.0:
+            z[DEMAND_SEEN] = 1.0
+            z[N_R] = n_r
+            z[TREND_N] = n_dem
+            z[TREND_TURN] = n_dem
+    else:
+        z[DEMAND_AGE] = min(z[DEMAND_AGE] + TICK, 1e6)
+    _debounce(z, T_STALE, z[DEMAND_AGE] > k[DEMAND_TIMEOUT], F_STALE, TICK, k[RECOVER_TIME])
+    _debounce(z, T_REJECTED, z[REJECT_BUCKET] >= k[DEMAND_REJECT_LIMIT], F_REJECTED, TICK, k[RECOVER_TIME])
+    _debounce(z, T_DEMAND_RANGE, fresh and not in_range, F_DEMAND_RANGE, TICK, k[RECOVER_TIME])
+
+
+LVDT_MASK = (1 << F_LVDT_RANGE) | (1 << F_LVDT_RATE) | (1 << F_LVDT_STUCK)
+DEMAND_MASK = (1 << F_STALE) | (1 << F_REJECTED) | (1 << F_DEMAND_RANGE)
+SERVO_MASK = (1 << F_TRACKING) | (1 << F_SATURATED)
+
+
+@njit(cache=True, error_model="numpy")
+def _choose_mode(z, k, mode_request):
+    """Next mode. The transitions that can happen are listed in docs/controller.md; this is all of them."""
+    mode = int(z[MODE])
+    faults = int(z[FAULT_BITS])
+    lvdt_lost = (faults & LVDT_MASK) != 0
+    trouble = (faults & (DEMAND_MASK | SERVO_MASK)) != 0
+    wants_run = mode_request > 0.5
+    if mode == INIT:
+        if lvdt_lost:
+            mode = FAIL_SAFE
+        elif z[TICKS] * TICK >= k[INIT_TIME] and z[LVDT_GOOD] == 1.0:
+            mode = STANDBY
+    elif lvdt_lost:
+        mode = FAIL_SAFE
+    elif mode == STANDBY:
+        if wants_run and z[DEMAND_SEEN] == 1.0 and not trouble:
+            mode = RUN
+    elif mode == RUN:
+        if trouble:
+            mode = DEGRADED
+        elif not wants_run:
+            mode = STANDBY
+    elif mode == DEGRADED:
+        z[DEGRADED_TIMER] += TICK
+        if not trouble:
+            mode = RUN
+        elif z[DEGRADED_TIMER] >= k[DEGRADED_HOLD]:
+            mode = FAIL_SAFE
+    elif mode == FAIL_SAFE:
+        z[RECOVER_TIMER] = 0.0 if trouble else z[RECOVER_TIMER] + TICK
+        if z[RECOVER_TIMER] >= k[RECOVER_TIME]:
+            mode = RUN if wants_run and z[DEMAND_SEEN] == 1.0 else STANDBY
+    if mode != int(z[MODE]):
+        z[RECOVER_TIMER] = 0.0
+        z[DEGRADED_TIMER] = 0.0
+        if mode == STANDBY or mode == FAIL_SAFE or int(z[MODE]) == INIT or int(z[MODE]) == STANDBY:
+            z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])  # bumpless: start from where the piston is
+            z[X_FROM] = z[X_DEM]
+    z[MODE] = float(mode)
+
+
+@njit(cache=True, error_model="numpy")
+def tick(inputs, state, calibration):
+    """Run the controller for one servo tick of 1 ms.
+
+    inputs       float64[N_INPUTS], see `INPUTS`; any value, NaN and infinity included, is safe
+    state        float64[N_STATE], changed in place, see `STATE`; start from `controller.new_state()`
+    calibration  `controller.Calibration` (scalars ``k``, stroke ``table``)
+
+    Invariants: ``state[I_CMD]`` within +-current_limit, ``state[X_DEM]`` within [stroke_min, stroke_max], mode one of `MODES`.
+    """
+    z, k = state, calibration.k
+    _condition_lvdt(z, k, inputs[IN_X_LVDT])
+    _monitor_demand(inputs, z, k)
+    if z[TICKS] == 0.0:
+        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])
+        z[X_FROM] = z[X_DEM]
+
+    phase = int(z[TICKS]) % SLOW
+    if phase == 0:
+        mode = int(z[MODE])
+        if z[DEMAND_SEEN] == 1.0:
+            z[N_R] += (z[N_R_RAW] - z[N_R]) * SLOW_TICK / (k[SPEED_FILTER] + SLOW_TICK)
+            trend_step(z, k, z[N_DEM])
+            schedule_step(z, k, calibration.table)
+        if mode == RUN or mode == DEGRADED:
+            move_demand(z, k, z[X_TARGET], k[STROKE_RATE])
+        elif mode == FAIL_SAFE:
+            move_demand(z, k, k[FAIL_SAFE_STROKE], k[FAIL_SAFE_RATE])
+        else:
+            z[X_FROM] = z[X_DEM]
+
+    # the servo's reference runs straight through the 10 ms from the last demand to the new one
+    dx_ref = (z[X_DEM] - z[X_FROM]) / SLOW_TICK
+    x_ref = z[X_FROM] + dx_ref * TICK * (phase + 1)
+    z[X_SERVO] = x_ref
+    mode = int(z[MODE])
+    lvdt_lost = (int(z[FAULT_BITS]) & LVDT_MASK) != 0
+    if mode == INIT:
+        z[I_CMD] = 0.0
+        z[INTEGRAL] = 0.0
+        z[SATURATED] = 0.0
+    elif mode == FAIL_SAFE and lvdt_lost:
+        limit = k[CURRENT_LIMIT]
+        z[I_CMD] = min(max(k[FAIL_SAFE_CURRENT], -limit), limit)
+        z[INTEGRAL] = 0.0
+        z[SATURATED] = 0.0
+    else:
+        servo_step(z, k, x_ref, dx_ref)
+    servo_on = mode == RUN or mode == DEGRADED
+    _debounce(z, T_TRACKING, servo_on and abs(x_ref - z[X_MEAS]) > k[TRACKING_LIMIT], F_TRACKING, k[TRACKING_TIME], k[RECOVER_TIME])
+    _debounce(z, T_SATURATED, servo_on and z[SATURATED] == 1.0, F_SATURATED, k[SATURATED_TIME], k[RECOVER_TIME])
+    z[TICKS] += 1.0
+    _choose_mode(z, k, inputs[IN_MODE_REQUEST])
+    # NaN cannot enter through the inputs; this guards the outputs against a calibration edited by hand
+    if math.isnan(z[I_CMD]):
+        z[I_CMD] = 0.0

@@ -1,0 +1,60 @@
+"""How the plant's functions are compiled, and where the compiled code is kept.
+
+numba keeps compiled code beside a source file and throws it away when that file changes, but not when a file that it calls changes. The
+folder used here carries a digest of all sources in its name, so that an edited effect is never served from stale code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import numba
+from numba import njit
+
+__all__ = ["cache_folder", "compiled", "is_cached"]
+
+_PACKAGES = ("controller", "plant", "hil", "discrepancy")
+
+
+def _digest() -> str:
+    root = Path(__file__).parent.parent
+    h = hashlib.sha256(numba.__version__.encode())
+    for package in _PACKAGES:
+        for f in sorted((root / package).rglob("*.py")):
+            h.update(f.name.encode() + f.read_bytes())
+    return h.hexdigest()[:16]
+
+
+def cache_folder() -> Path:
+    """Return the folder for compiled code: in the package where that can be written, else in the user's cache."""
+    places = [Path(__file__).parent / "__pycache__", Path.home() / ".cache" / "vaneloop", Path(tempfile.gettempdir()) / f"vaneloop-{os.getuid()}"]
+    for place in places:
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(place, os.W_OK):
+            return place / f"compiled-{_digest()}"
+    return places[-1]
+
+
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    _folder = cache_folder()
+    for old in _folder.parent.glob("compiled-*"):
+        if old != _folder:
+            for f in [*old.rglob("*.nb?"), *sorted(old.rglob("*"), reverse=True), old]:
+                try:
+                    f.rmdir() if f.is_dir() else f.unlink()
+                except OSError:
+                    pass  # another process is using it; it goes next time
+    numba.config.CACHE_DIR = str(_folder)
+
+compiled = njit(cache=True, error_model="numpy")
+
+
+def is_cached() -> bool:
+    """Return True if compiled code of these sources is there already (the first run takes seconds to compile)."""
+    return any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))
