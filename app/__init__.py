@@ -1,0 +1,3 @@
+"""The ``vaneloop`` command line."""
+
+__all__: list[str] = []

@@ -1,0 +1,26 @@
+"""Hardware in the loop, in software: lockstep runner, logs, replay, error figures, pages."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_HOME = {
+    "Channel": "hil.logs",
+    "Log": "hil.logs",
+    "LogError": "hil.logs",
+    "read_log": "hil.logs",
+    "write_log": "hil.logs",
+    "Run": "hil.lockstep",
+    "Stimulus": "hil.lockstep",
+    "ReplayResult": "hil.replay",
+}
+
+__all__ = ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for: ``vaneloop --help`` must not wait for numpy and numba."""
+    if name in _HOME and name in __all__:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,60 @@
+"""``vaneloop``: one verb, one function, one command. Each command's module is imported only when it is used."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from hil import cli
+
+__all__ = ["COMMANDS", "main", "run"]
+
+# command -> (module with add_options, command and DESCRIPTION; one line of help)
+COMMANDS = {
+    "replay": ("hil.replay", "run a logged engine run through firmware and plant; errors in figures and pictures"),
+    "compare": ("hil.replay", "the same, under the name that the search for missing physics uses"),
+    "engine-test": ("app.engine_test", "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures"),
+    "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
+}
+
+_HELP = f"""Real-time engine-controller firmware simulator: variable guide vanes, their controller, their bus.
+
+usage: vaneloop COMMAND [options]        vaneloop COMMAND --help explains a command
+
+{chr(10).join(f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items())}
+
+first steps:
+  vaneloop engine-test --report engine_test.html
+  vaneloop replay LOG --report replay.html
+
+exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input"""
+
+
+def main(argv: list[str]) -> int:
+    """Run the command line ``argv`` (without the program's name); return the exit code."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_HELP)
+        return 0 if argv else 2
+    if argv[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"vaneloop {version('vaneloop')}")
+        return 0
+    name = argv[0]
+    if name not in COMMANDS:
+        print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    module = importlib.import_module(COMMANDS[name][0])
+    parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+    module.add_options(parser)
+    args = parser.parse_args(argv[1:])
+    return cli.run(lambda: module.command(args))
+
+
+def run() -> None:
+    """Entry point of the console script."""
+    sys.exit(main(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,163 @@
+"""What every command line of ours shares: one-line errors, exit codes, log options, JSON, progress bar.
+
+Exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input. Only the standard library is imported here, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+__all__ = ["Parser", "add_log_options", "add_output_options", "pairs", "print_table", "progress_bar", "read_log_of", "run", "say", "write_json"]
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaint is one line, and which does not guess abbreviated options."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(*args, allow_abbrev=False, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the complaint in one line and exit 2."""
+        self.exit(2, f"{self.prog}: {message} ({self.prog} --help explains)\n")
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Options that say how to read a log: the same for every command that takes one."""
+    parser.add_argument("log", metavar="LOG", help="candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
+    group = parser.add_argument_group("reading the log (docs/logs.md)")
+    group.add_argument("--dbc", metavar="F", help="database of a CAN log (default: the product's own vgv.dbc)")
+    group.add_argument("--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem")
+    group.add_argument("--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm")
+    group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
+
+
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """Options that say where results go."""
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", metavar="FILE", help="write the result as JSON; - is standard output")
+    group.add_argument("--quiet", action="store_true", help="no text, no progress bar")
+
+
+def pairs(options: list[str], name: str, allowed: Callable[[str], bool] | None = None, known: str = "") -> dict[str, str]:
+    """Split ``a=b`` options into a dict. Raises InputError for anything else."""
+    from tables import InputError
+
+    out = {}
+    for option in options:
+        key, eq, value = option.partition("=")
+        if not (eq and key.strip() and value.strip()):
+            raise InputError(f"--{name} {option!r} must look like NAME=value")
+        if allowed is not None and not allowed(key.strip()):
+            raise InputError(f"--{name} {option!r}: {key.strip()!r} is not known; allowed: {known}")
+        out[key.strip()] = value.strip()
+    return out
+
+
+def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",)) -> Any:
+    """Read the log that ``args`` name."""
+    from hil.logs import read_log
+
+    return read_log(
+        args.log,
+        dbc=args.dbc,
+        mapping=pairs(args.map, "map"),
+        units=pairs(args.unit, "unit"),
+        design_rpm=args.design_rpm,
+        require=require,
+    )
+
+
+def say(args: argparse.Namespace, text: str) -> None:
+    """Tell the user something, unless quiet; where JSON goes to standard output, text goes to standard error."""
+    if not args.quiet:
+        print(text, file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
+
+
+def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """Print rows of text as a table, numbers to the right."""
+    if args.quiet:
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    for i, c in enumerate(columns):
+        table.add_column(c, justify="left" if i == 0 or not any(ch.isdigit() for ch in "".join(r[i] for r in rows)) else "right", overflow="fold")
+    for r in rows:
+        table.add_row(*r)
+    console = Console(file=sys.stderr if args.json == "-" else sys.stdout, soft_wrap=False, width=None if sys.stdout.isatty() else 150, markup=False)
+    console.print(table)
+
+
+def write_json(args: argparse.Namespace, data: dict[str, Any]) -> None:
+    """Write ``data`` where ``--json`` says; NaN and infinity become null."""
+    if not args.json:
+        return
+    text = json.dumps(_plain(data), indent=2, allow_nan=False)
+    if args.json == "-":
+        print(text, flush=True)
+        return
+    from pathlib import Path
+
+    from tables import InputError
+
+    try:
+        Path(args.json).write_text(text + "\n", encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"{args.json}: cannot be written ({e.strerror})") from None
+
+
+def _plain(v: Any) -> Any:
+    if isinstance(v, dict):
+        return {str(k): _plain(x) for k, x in v.items()}
+    if isinstance(v, list | tuple):
+        return [_plain(x) for x in v]
+    if isinstance(v, str | bool | int | type(None)):
+        return v
+    if hasattr(v, "item") and getattr(v, "ndim", 1) == 0:
+        return _plain(v.item())
+    if hasattr(v, "tolist"):
+        return _plain(v.tolist())
+    f = float(v)
+    return f if f - f == 0.0 else None
+
+
+@contextmanager
+def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[float], None] | None]:
+    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no terminal."""
+    if args.quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(text, total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)
+
+
+def run(command: Callable[[], int]) -> int:
+    """Call ``command``; turn what users can cause into one line on standard error and an exit code."""
+    try:
+        return command()
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except Exception as e:
+        from tables import InputError
+
+        if not isinstance(e, InputError):
+            raise
+        print(f"vaneloop: {e}", file=sys.stderr)
+        return 2
