@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 Figure = dict[str, Any]
 Tone = Literal["neutral", "good", "bad"]
 
-MAX_POINTS = 6000  # points a line: three times the pixels of a wide screen; 64 kB of the file
+MAX_POINTS = 4500  # points a line, three times the pixels of a wide plot; 48 kB of the file
 GAP = 10.0  # a hole in the samples this many times the usual distance breaks the line
 
 # Blue and orange stay apart for all common colour-vision deficiencies; both themes keep a contrast above 4.5 on their background.
@@ -115,6 +115,8 @@ def number(value: object, digits: int = 3) -> str:
         if not 1e-3 <= abs(v) < 1e5:
             return f"{v:.{digits - 1}e}"
         decimals = max(0, digits - 1 - math.floor(math.log10(abs(v))))
+        while decimals > 0 and round(v, decimals - 1) == v:  # 0.55 as published, not 0.550
+            decimals -= 1
         return f"{v:,.{decimals}f}"
     return str(value)
 
@@ -211,6 +213,7 @@ class Line:
     role: str = "model"
     width: float = 1.4
     dash: str = "solid"
+    opacity: float = 1.0
     shown: bool = True  # False: hidden until the reader clicks its name
 
 
@@ -272,6 +275,7 @@ def overlay(panels: Sequence[Panel], x_title: str = "time [s]", height: int | No
                     "yaxis": "y" + _nth(k),
                     "x": _packed(x),
                     "y": _packed(y),
+                    "opacity": line.opacity,
                     "line": {"color": _role(line.role), "width": line.width, "dash": line.dash},
                     "connectgaps": False,
                     "hovertemplate": "%{y:.4g}",
@@ -287,6 +291,8 @@ def _band_and_marks(layout: Figure, panel: Panel, axis: str) -> None:
     if panel.band:
         rect = {"type": "rect", "y0": -panel.band, "y1": panel.band, "fillcolor": "@noise", "opacity": 0.22, "line": {"width": 0}}
         layout["shapes"].append(across | rect)
+        edge = {"type": "line", "line": {"color": "@text", "width": 1, "dash": "dot"}, "opacity": 0.7, "layer": "above"}
+        layout["shapes"] += [across | edge | {"y0": level, "y1": level} for level in (-panel.band, panel.band)]
     for name, level in panel.marks.items():
         layout["shapes"].append(across | {"type": "line", "y0": level, "y1": level, "line": {"color": "@soft", "width": 1, "dash": "dot"}})
         layout["annotations"].append(
@@ -361,10 +367,11 @@ def histogram(
 
 def loop(lines: Sequence[Line], x_title: str, y_title: str, height: int = 440, markers: bool = False) -> Figure:
     """One quantity against another; a loop that stays open is hysteresis."""
-    data = []
+    data, reach = [], []
     for line in lines:
         x, y = _thin_path(np.asarray(line.x, dtype=float), np.asarray(line.y, dtype=float))
         colour = _role(line.role)
+        reach += [float(y.min()), float(y.max())] if y.size and line.shown else []
         data.append(
             {
                 "type": "scatter",
@@ -378,12 +385,15 @@ def loop(lines: Sequence[Line], x_title: str, y_title: str, height: int = 440, m
                 "hovertemplate": "%{x:.4g}, %{y:.4g}",
             }
         )
-    layout = {
+    layout: Figure = {
         "height": height,
         "hovermode": "closest",
         "xaxis": {"title": {"text": _label(x_title)}},
         "yaxis": {"title": {"text": _label(y_title)}},
     }
+    if reach and max(reach) > min(reach):
+        margin = 0.06 * (max(reach) - min(reach))
+        layout["yaxis"]["range"] = [min(reach) - margin, max(reach) + margin]
     return {"data": data, "layout": layout}
 
 
@@ -634,7 +644,7 @@ class Page:
         head = "".join(
             f"<th{_right(all(_is_number(r[i]) for r in rows) and bool(rows))}>{e(str(c))}</th>" for i, c in enumerate(columns)
         )
-        body = "".join("<tr>" + "".join(f"<td{_right(_is_number(v))}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
+        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self._body.append(f'<div class="scroll"><table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
 
@@ -715,6 +725,11 @@ def _is_number(value: object) -> bool:
     return value is None or (isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool))
 
 
+def _kind(value: object) -> str:
+    """Class of a table cell: numbers flush right, short text unbroken."""
+    return ' class="num"' if _is_number(value) else ' class="short"' if len(str(value)) <= 24 else ""
+
+
 def _right(yes: bool) -> str:
     return ' class="num"' if yes else ""
 
@@ -786,7 +801,7 @@ table{border-collapse:collapse;width:100%;font-size:15px;font-variant-numeric:ta
 caption{caption-side:bottom;text-align:left;color:var(--soft);font-size:14px;padding:8px 14px}
 th,td{padding:7px 14px;text-align:left;border-bottom:1px solid var(--grid)}
 th{font-weight:600;color:var(--soft);font-size:14px;vertical-align:bottom}
-th.num,td.num{text-align:right}
+th.num,td.num{text-align:right}td.num,td.short{white-space:nowrap}
 tbody tr:last-child td{border-bottom:0}
 footer{margin-top:36px;border-top:1px solid var(--grid);color:var(--soft);font-size:13.5px}
 dl{display:grid;gap:2px;margin:12px 0}dl div{display:flex;gap:12px}dt{flex:0 0 90px}
@@ -823,13 +838,14 @@ _SCRIPT = """
   const template = c => ({layout: {
     font: {family: 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif', size: 13, color: c.text},
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", xaxis: axis(c), yaxis: axis(c),
-    margin: {l: 66, r: 24, t: 44, b: 50}, dragmode: "zoom",
+    margin: {l: 66, r: 44, t: 44, b: 50}, dragmode: "zoom",
     legend: {orientation: "h", x: 0, xanchor: "left", y: 1, yanchor: "bottom", yref: "container"},
     hoverlabel: {bgcolor: c.panel, bordercolor: c.muted, font: {color: c.text}},
-    modebar: {bgcolor: "rgba(0,0,0,0)", color: c.muted, activecolor: c.text},
+    modebar: {orientation: "v", bgcolor: "rgba(0,0,0,0)", color: c.muted, activecolor: c.text},
     colorway: [c.measured, c.model, c.target, c.error, c.other]}});
-  const config = {responsive: true, displaylogo: false, displayModeBar: "hover",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]};
+  // the buttons are named one by one: Plotly's own list has one that sends the plot to a server
+  const config = {responsive: true, displaylogo: false, displayModeBar: "hover", plotlyServerURL: "",
+    modeBarButtons: [["zoom2d", "pan2d", "resetScale2d"], ["toImage"]]};
   const draw = (name, width) => figures.forEach((figure, i) => {
     const c = themes[name], painted = paint(figure, c), element = document.getElementById("p" + i);
     painted.layout.template = template(c);

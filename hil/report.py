@@ -64,6 +64,7 @@ NAMES = {
     "vgv2": ("VGV2 angle", "deg"),
     "state": ("controller mode", ""),
 }
+DETAIL = 40.0  # s around the worst moment: a whole rise or fall of the engine
 VANES = ("vigv", "vgv1", "vgv2")
 ZOOM = "Drag across a plot to zoom, double-click to return; click a name in the legend to hide its curve."
 
@@ -87,8 +88,10 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
 
     page.section(
         "All figures",
-        "Error is simulated minus reference. The reference is either the signal as the log measured it, or, for vane angles, the angle that the "
-        "schedule asks for at the measured rotor speed. The noise floor is the scatter of the sensor itself: a perfect model has an RMS error of "
+        "Error is simulated minus reference. The reference is either the signal as the log measured it, or, for vane angles, the "
+        "angle that "
+        "the schedule asks for at the measured rotor speed. The noise floor is the scatter of the sensor itself: a perfect model has "
+        "an RMS error of "
         "1 noise floor, so the last column tells how much is left to explain.",
     )
     _figures_table(page, result.signals)
@@ -99,23 +102,28 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
     if measured:
         page.section(
             "Signal by signal",
-            "Blue is what was measured, orange what the model says. The error below each pair has a grey band three noise floors wide on each "
+            "Blue is what was measured, orange what the model says. The error below each pair has a grey band three noise floors "
+            "wide on each "
             "side of zero: what stays inside cannot be told from sensor noise.",
         )
         worst_first = sorted(measured, key=lambda s: -_ratio(s))
         for s in worst_first:
             if s.signal in result.model and s.signal in result.measured:
                 page.plot(_against_measurement(result, s), _in_words(s))
+        _worst_moment(page, result, worst_first[0])
         page.section(
             "How the errors are spread",
-            "Share of samples at each size of error. A hill on zero as narrow as the dotted curve is noise alone; a shifted hill is a bias, two "
+            "Share of samples at each size of error. A hill on zero as narrow as the dotted curve is noise alone; a shifted hill is "
+            "a bias, two "
             "hills are a hysteresis that the model has too wide or too narrow, a long tail is a disagreement in a few moments.",
         )
         for s in worst_first:
             if s.signal in result.model and s.signal in result.measured:
                 page.plot(
                     histogram(
-                        {f"{s.signal}: simulated − measured": _error(result, s.signal)[1]}, f"{s.signal} error [{s.unit}]", noise=s.noise_floor
+                        {"simulated − measured": _error(result, s.signal)[1]},
+                        f"{_name(s.signal)}, error [{s.unit}]",
+                        noise=s.noise_floor,
                     ),
                     half=True,
                 )
@@ -126,7 +134,8 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
     if any(v in result.target for v in vanes):
         page.section(
             "Vane angle against rotor speed",
-            "The job of the whole system: at each speed the vanes shall stand where the schedule (green) says. Distance from the green curve is "
+            "The job of the whole system: at each speed the vanes shall stand where the schedule (green) says. Distance from the "
+            "green curve is "
             "the error the compressor feels.",
         )
         for v in vanes:
@@ -135,7 +144,13 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
     return page.write(path)
 
 
-def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] | None, path: str | Path, command: str = "") -> Path:
+def engine_test_report(
+    single: Result,
+    dual: Result,
+    paper: Mapping[str, float] | None,
+    path: str | Path,
+    command: str = "",
+) -> Path:
     """Write the page of the engine test: one mean curve against two curves, beside the paper's Table 5; return its path.
 
     paper  max_abs, mean_abs, mean_abs_99_100 and hysteresis in deg; None: `PAPER_TABLE_5`
@@ -147,7 +162,8 @@ def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] 
     page = Page(
         "Engine test: one schedule curve against two",
         f"With separate curves for rising and falling speed the VIGV stays within {number(two.mean_abs)} deg of its target on average "
-        f"({number(two.max_abs)} deg at worst); the published engine test had {number(paper['mean_abs'])} and {number(paper['max_abs'])} deg. "
+        f"({number(two.max_abs)} deg at worst); the published engine test had {number(paper['mean_abs'])} "
+        f"and {number(paper['max_abs'])} deg. "
         f"With a single mean curve it is {number(one.mean_abs)} deg: the linkage's hysteresis stays in.",
         tone="good" if within else "bad",
         subtitle="VIGV, closed loop of firmware and plant",
@@ -155,21 +171,23 @@ def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] 
         log=dual.log,
         state_hash=f"single {single.state_hash}, dual {dual.state_hash}",
     )
-    page.tile("Mean error, two curves", two.mean_abs, "deg", f"paper {paper['mean_abs']:g}, one curve {number(one.mean_abs)}", _tone(two.mean_abs, paper["mean_abs"]))
-    page.tile("Maximum error, two curves", two.max_abs, "deg", f"paper {paper['max_abs']:g}, one curve {number(one.max_abs)}", _tone(two.max_abs, paper["max_abs"]))
-    page.tile(
-        "Mean error, 99 to 100 % speed",
-        two.mean_abs_99_100,
-        "deg",
-        f"paper {paper['mean_abs_99_100']:g}, one curve {number(one.mean_abs_99_100)}",
-        _tone(two.mean_abs_99_100, paper["mean_abs_99_100"]),
-    )
-    page.tile("Gap between rise and fall", gap_two, "deg", f"mean over speed; one curve {number(gap_one)}, linkage alone {paper['hysteresis']:g}")
+    tiles = {
+        "mean_abs": "Mean error, two curves",
+        "max_abs": "Maximum error, two curves",
+        "mean_abs_99_100": "Mean error, 99 to 100 % speed",
+    }
+    for key, label in tiles.items():
+        value = _three(two)[key]
+        note = f"paper {number(paper[key])}, one curve {number(_three(one)[key])}"
+        page.tile(label, value, "deg", note, _tone(value, paper[key]))
+    note = f"mean over speed; one curve {number(gap_one)}, linkage alone {number(paper['hysteresis'])}"
+    page.tile("Gap between rise and fall", gap_two, "deg", note)
     page.tile("Length of the test", dual.simulated_s, "s", f"{two.samples:,} samples, computed in {number(dual.wall_s)} s")
 
     page.section(
         "Against the published engine test",
-        "Three figures of the VIGV's error against the schedule's target at the measured speed, as in Table 5 of Kim & Ki 2020. Lower is better. The "
+        "Three figures of the VIGV's error against the schedule's target at the measured speed, as in Table 5 of Kim & Ki 2020. Lower is "
+        "better. The "
         f"hysteresis of the linkage itself, from its clearances, is {paper['hysteresis']:g} deg between rise and fall.",
     )
     labels = ["maximum", "mean", "mean, 99 to 100 % speed"]
@@ -198,8 +216,11 @@ def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] 
 
     page.section(
         "Where the hysteresis goes",
-        "Mean error at each rotor speed, separately while the speed rises (solid) and while it falls (dashed). With one curve the two lie on "
-        "opposite sides of zero, half the hysteresis each: a compromise for both directions. With two curves they close up.",
+        "Mean error at each rotor speed, separately while the speed rises (solid) and while it falls (dashed). With one curve the "
+        "two lie on "
+        "opposite sides of zero, half the hysteresis each: a compromise for both directions. With two curves they close up. Dips "
+        "stand where "
+        "the run often turns back: there the clearance is just being crossed.",
     )
     lines = []
     for name, run, role in (("one curve", single, "model"), ("two curves", dual, "measured")):
@@ -209,22 +230,20 @@ def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] 
 
     page.section(
         "VIGV angle against rotor speed",
-        "The whole run, all rises and falls on top of each other; green is the schedule's target. The paper shows this picture as its figure 14.",
+        "The whole run, all rises and falls on top of each other; green is the schedule's target. The paper shows this picture as "
+        "its figure 14.",
     )
     page.plot(_against_speed(single, "vigv", "one mean curve", "model"), "One mean curve.", half=True)
     page.plot(_against_speed(dual, "vigv", "two curves", "measured"), "Two curves.", half=True)
 
     page.section("Error over the run", f"VIGV angle minus its target, and the rotor speed that caused it. {ZOOM}")
-    page.plot(
-        overlay(
-            [
-                Panel("VIGV error [deg]", [_error_line(single, "one curve", "model"), _error_line(dual, "two curves", "measured")], zero=True, height=1.3),
-                Panel("rotor speed [%]", _speed_lines(dual)),
-            ]
-        )
-    )
+    both = [_error_line(single, "one curve", "model"), _error_line(dual, "two curves", "measured")]
+    page.plot(overlay([Panel("VIGV error [deg]", both, zero=True, height=1.3), Panel("rotor speed [%]", _speed_lines(dual))]))
 
-    page.section("How the errors are spread", "Share of the samples at each size of error: one curve leaves two hills, one for each direction.")
+    page.section(
+        "How the errors are spread",
+        "Share of the samples at each size of error: one curve leaves two hills, one for each direction.",
+    )
     page.plot(
         histogram(
             {"one curve": _schedule_error(single), "two curves": _schedule_error(dual)},
@@ -235,8 +254,9 @@ def engine_test_report(single: Result, dual: Result, paper: Mapping[str, float] 
 
     page.section(
         "The linkage's own hysteresis",
-        "VIGV angle against stroke. The loop is a property of the joints' clearances and the same under both schedules: the controller cannot take it "
-        "out, it can only aim at the right side of it. On the right the mean curve is taken off, so that the width can be read.",
+        "VIGV angle against stroke. The loop is a property of the joints' clearances and the same under both schedules: the "
+        "controller cannot "
+        "take it out, it can only aim at the right side of it. On the right the mean curve is taken off, so that the width can be read.",
     )
     runs = [("one curve", single, "model"), ("two curves", dual, "measured")]
     paths = [(n, r.model["x_lvdt"], r.model["vigv"], role) for n, r, role in runs if "x_lvdt" in r.model]
@@ -254,9 +274,10 @@ def _replay_verdict(result: Result, measured: Sequence[SignalError], schedule: S
         ratio = _ratio(worst)
         what, size = _name(worst.signal), f"{number(worst.mean_abs)} {worst.unit} on average"
         at = _time_of_worst(result, worst.signal)
-        peak = f"{number(worst.max_abs)} {worst.unit} at worst" + (f", at t = {number(at, 4)} s" if at is not None else "")
+        peak = f"{number(worst.max_abs)} {worst.unit} at worst" + (f", at t = {number(at, 4)} s" if at is not None else "")
         if ratio <= 1.2:
-            return f"The model follows the log to within the sensors' noise: the largest disagreement, in {what}, is {size} and {peak}.", "good"
+            text = f"The model follows the log to within the sensors' noise: the largest disagreement, in {what}, is {size} and {peak}."
+            return text, "good"
         times = f"{number(ratio, 2)} times what sensor noise explains" if np.isfinite(ratio) else "and its sensor shows no noise"
         return f"The largest disagreement is in {what}: {size} ({peak}), {times}.", "neutral" if ratio < 3 else "bad"
     if schedule:
@@ -271,7 +292,7 @@ def _replay_verdict(result: Result, measured: Sequence[SignalError], schedule: S
 
 def _replay_tiles(page: Page, result: Result, measured: Sequence[SignalError], schedule: Sequence[SignalError]) -> None:
     for s in sorted(measured, key=lambda s: -_ratio(s))[:3]:
-        note = f"{number(_ratio(s), 2)} noise floors, worst {number(s.max_abs)} {s.unit}" if s.noise_floor else f"worst {number(s.max_abs)} {s.unit}"
+        note = (f"{number(_ratio(s), 2)} noise floors, " if s.noise_floor else "") + f"worst {number(s.max_abs)} {s.unit}"
         page.tile(f"{_name(s.signal)} against measurement, RMS", s.rms, s.unit, note)
     for s in [s for s in schedule if s.signal == "vigv"] or list(schedule)[:1]:
         page.tile(f"{_name(s.signal)} against schedule, mean", s.mean_abs, s.unit, f"worst {number(s.max_abs)} {s.unit}")
@@ -281,7 +302,7 @@ def _replay_tiles(page: Page, result: Result, measured: Sequence[SignalError], s
 
 def _figures_table(page: Page, signals: Sequence[SignalError]) -> None:
     page.table(
-        ["signal", "", "stage", "held against", "unit", "RMS", "mean", "maximum", "mean, 99 to 100 %", "noise floor", "RMS / noise", "samples"],
+        ["signal", "", "stage", "against", "unit", "RMS", "mean", "maximum", "mean, 99 to 100 %", "noise floor", "RMS/noise", "samples"],
         [
             [
                 s.signal,
@@ -304,7 +325,7 @@ def _figures_table(page: Page, signals: Sequence[SignalError]) -> None:
 
 
 def _in_words(s: SignalError) -> str:
-    text = f"{_name(s.signal)}: on average {number(s.mean_abs)} {s.unit} off, at worst {number(s.max_abs)} {s.unit}"
+    text = f"{_capital(_name(s.signal))}: on average {number(s.mean_abs)} {s.unit} off, at worst {number(s.max_abs)} {s.unit}"
     if s.noise_floor:
         text += f"; RMS {number(s.rms)} {s.unit} is {number(_ratio(s), 2)} times the noise floor of {number(s.noise_floor)} {s.unit}"
     return text + "."
@@ -312,6 +333,10 @@ def _in_words(s: SignalError) -> str:
 
 def _name(signal: str) -> str:
     return NAMES.get(signal, (signal, ""))[0]
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _axis(signal: str, unit: str | None = None) -> str:
@@ -355,6 +380,19 @@ def _at(result: Result, values: Array, t: Array) -> Array:
     return np.interp(t, result.t, values, left=np.nan, right=np.nan)
 
 
+def _error_lines(t: Array, e: Array) -> list[Line]:
+    """The error and, on rasters that allow it, its mean over 1 s: what is left once noise is averaged out."""
+    dt = float(np.median(np.diff(t))) if t.size > 1 else 0.0
+    width = round(1.0 / dt) if dt > 0 else 0
+    if width < 5 or t.size < 10 * width:
+        return [Line("simulated − measured", t, e, "error", 1.1)]
+    groups = e[: e.size // width * width].reshape(-1, width)
+    when = t[: e.size // width * width].reshape(-1, width)
+    whole = np.isfinite(groups).all(axis=1) & (np.ptp(when, axis=1) < 2.0)
+    mean = np.where(whole, groups.mean(axis=1), np.nan)
+    return [Line("simulated − measured", t, e, "error", 1.0, opacity=0.4), Line("its mean over 1 s", when.mean(axis=1), mean, "error", 1.7)]
+
+
 def _time_of_worst(result: Result, signal: str) -> float | None:
     if signal not in result.model or signal not in result.measured:
         return None
@@ -393,7 +431,7 @@ def _rise_and_fall(result: Result) -> tuple[Array, Array, Array]:
         use = moving & np.isfinite(e)
         count = np.bincount(where[use], minlength=30)
         total = np.bincount(where[use], weights=e[use], minlength=30)
-        out.append(np.where(count >= 5, total / np.maximum(count, 1), np.nan))
+        out.append(np.where(count >= 20, total / np.maximum(count, 1), np.nan))
     return 0.5 * (edges[1:] + edges[:-1]), out[0], out[1]
 
 
@@ -442,9 +480,43 @@ def _against_measurement(result: Result, s: SignalError) -> Any:
     return overlay(
         [
             Panel(_axis(s.signal, s.unit), values, height=1.2),
-            Panel(f"error [{s.unit}]", [Line("simulated − measured", t, e, "error", 1.1)], band=3 * s.noise_floor, height=0.75, zero=True),
+            Panel(f"error [{s.unit}]", _error_lines(t, e), band=3 * s.noise_floor, height=0.75, zero=True),
         ]
     )
+
+
+def _worst_moment(page: Page, result: Result, s: SignalError) -> None:
+    """Every sample around the largest error of one signal, with the speed that went with it."""
+    at = _time_of_worst(result, s.signal)
+    if at is None:
+        return
+    start, end = at - 0.4 * DETAIL, at + 0.6 * DETAIL
+
+    def part(line: Line) -> Line:
+        t, y = np.asarray(line.x), np.asarray(line.y)
+        use = (t >= start) & (t <= end)
+        return Line(line.name, t[use], y[use], line.role, line.width, line.dash)
+
+    channel = result.measured[s.signal]
+    t, e = _error(result, s.signal)
+    values = [
+        Line("measured", channel.t, channel.values, "measured", 2.2),
+        Line("simulated", result.t, result.model[s.signal], "model", 1.4),
+    ]
+    if s.signal in result.target:
+        values.append(Line("schedule", result.t, result.target[s.signal], "target", 1.3, "dash"))
+    panels = [
+        Panel(_axis(s.signal, s.unit), [part(v) for v in values], height=1.2),
+        Panel(f"error [{s.unit}]", [part(Line("simulated − measured", t, e, "error"))], band=3 * s.noise_floor, height=0.8, zero=True),
+        Panel("rotor speed [%]", [part(v) for v in _speed_lines(result) if v.shown], height=0.8),
+    ]
+    page.section(
+        "The worst moment",
+        f"{_capital(_name(s.signal))} around t = {number(at, 4)} s, where its error is greatest. "
+        "What the rotor speed does just then is the first hint at the cause: an error that changes sign with the direction of motion is "
+        "hysteresis or friction, one that appears only in motion is a lag, one that stays is a bias.",
+    )
+    page.plot(overlay(panels))
 
 
 def _against_speed(result: Result, vane: str, name: str = "simulated", role: str = "model") -> Any:
@@ -483,9 +555,10 @@ def _hysteresis_section(page: Page, result: Result, vanes: Sequence[str]) -> Non
         return
     page.section(
         "Hysteresis between stroke and vane angle",
-        "The joints between actuator and vane have clearance, so the vane stands elsewhere after extending than after retracting. Left: the angle "
-        "itself. Right: the same with the mean curve taken off, so that the width of the loop and its shape can be read. If the blue and the orange loop differ in width, "
-        "height or tilt, the linkage model misses something.",
+        "The joints between actuator and vane have clearance, so the vane stands elsewhere after extending than after retracting. "
+        "Left: the "
+        "angle itself. Right: the same with the mean curve taken off, so that the width of the loop and its shape can be read. If the "
+        "measured (blue) and the simulated (orange) loop differ in width, height or tilt, the linkage model misses something.",
     )
     for v, paths in pictures:
         _loops(page, v, paths)
@@ -515,12 +588,18 @@ def _middle_curve(x: Array, y: Array) -> Any:
     """Smooth curve midway between the two sides of the loop, or None where the stroke hardly moves."""
     if np.ptp(x) < 10 * noise_floor(np.arange(x.size, dtype=float), x) or np.ptp(x) <= 0:
         return None
+    line = np.polynomial.Polynomial.fit(x, y, 1)
     edges = np.linspace(x.min(), x.max() + 1e-9, 41)
     where = np.digitize(x, edges) - 1
     order = np.argsort(where, kind="stable")
-    at, middle = [], []
+    sides = []
     for group in np.split(order, np.flatnonzero(np.diff(where[order])) + 1):
-        low, high = np.quantile(y[group], [0.02, 0.98])
-        at.append(float(np.mean(x[group])))
-        middle.append(0.5 * float(low + high))
-    return np.polynomial.Polynomial.fit(at, middle, min(3, len(at) - 1)) if len(at) > 1 else None
+        low, high = np.quantile(y[group] - line(x[group]), [0.02, 0.98])
+        sides.append((float(np.mean(x[group])), float(low), float(high)))
+    at, low_side, high_side = np.array(sides).T
+    width = high_side - low_side
+    open_loop = width >= 0.7 * np.median(width)  # at the ends only one side is visited
+    degree = min(3, int(open_loop.sum()) - 1)
+    if degree < 1:
+        return line
+    return line.convert() + np.polynomial.Polynomial.fit(at[open_loop], 0.5 * (low_side + high_side)[open_loop], degree).convert()

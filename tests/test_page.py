@@ -1,0 +1,354 @@
+"""The HTML pages: complete in one file, safe against hostile names, small for long runs, honest about gaps."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import re
+import stat
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil import page as page_module
+from hil.figures import error_figures
+from hil.page import THEMES, Line, Page, Panel, bars, decimate, heat, histogram, loop, number, overlay, ranking, waterfall
+from hil.report import PAPER_TABLE_5, engine_test_report, replay_report
+from tables import InputError
+
+HOSTILE = "</script><img src=x onerror=alert(1)>&\"'\u2028"
+
+
+class Elements(HTMLParser):
+    """Collects the elements of a page and the text outside of scripts."""
+
+    def __init__(self, source):
+        super().__init__()
+        self.tags, self.attributes, self.text, self._inside = [], [], [], None
+        self.feed(source)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+        self._inside = tag
+
+    def handle_endtag(self, tag):
+        self._inside = None
+
+    def handle_data(self, data):
+        if self._inside not in ("script", "style"):
+            self.text.append(data)
+
+
+def embedded(source, name):
+    return json.loads(re.search(rf'<script type="application/json" id="{name}">(.*?)</script>', source, re.S)[1])
+
+
+def unpack(packed):
+    return np.frombuffer(base64.b64decode(packed["bdata"]), dtype="<" + packed["dtype"]).astype(float)
+
+
+def painted(value):
+    """What the page's script makes of a figure in the light scheme, for Plotly's own validators."""
+    if isinstance(value, str) and value.startswith("@"):
+        return THEMES["light"][value[1:].split("/")[0]]
+    if isinstance(value, dict):
+        return value if "bdata" in value else {k: painted(v) for k, v in value.items()}
+    return [painted(v) for v in value] if isinstance(value, list) else value
+
+
+def full_page(name="vigv"):
+    t = np.linspace(0, 100, 2000)
+    page = Page(f"Replay of {name}", f"verdict {name}", subtitle=name, command=name, log=name, state_hash=name)
+    page.tile(name, 0.5, name, name)
+    page.section(name, name)
+    page.text(name)
+    page.table([name, "rms"], [[name, 0.5]], name)
+    page.plot(overlay([Panel(name, [Line(name, t, np.sin(t), "measured")], band=0.1, marks={name: 0.2})], name), name)
+    page.plot(histogram({name: np.sin(t)}, name, noise=0.1), name, half=True)
+    page.plot(loop([Line(name, t, t)], name, name), name, half=True)
+    page.plot(bars([name, "b"], {name: [1.0, None]}, name, marks={name: 0.5}), name)
+    page.plot(waterfall([(name, 1.0), ("effect", 0.3), ("end", 0.2)], name, floor=0.1), name)
+    page.plot(ranking([name, "b"], [0.9, 0.1], name, notes=[name, ""], highlight=[name], low=[0.8, 0.0], high=[0.95, 0.2]), name)
+    page.plot(heat([[1.0, None], [0.2, 0.3]], [name, "c"], [name, "r"], name, name, name), name)
+    return page
+
+
+# ---------------------------------------------------------------- the file
+
+
+def test_the_page_needs_no_network_and_forbids_it():
+    elements = Elements(full_page().html())
+    loads = [v for k, v in elements.attributes if k in ("src", "href", "srcset", "data") and not v.startswith("#")]
+    assert loads == []
+    policy = next(v for k, v in elements.attributes if k == "content" and "default-src" in v)
+    assert "default-src 'none'" in policy and "http" not in policy
+    assert "sendChartToCloud" not in page_module._SCRIPT and "modeBarButtons:" in page_module._SCRIPT
+
+
+def test_plotly_is_inlined_once_and_the_charset_is_declared():
+    source = full_page().html()
+    assert source.count("* plotly.js v") == 1
+    assert source.startswith("<!doctype html>") and '<meta charset="utf-8">' in source[:200]
+
+
+def test_hostile_names_stay_text():
+    source = full_page(HOSTILE).html()
+    harmless = full_page("x").html()
+    assert Elements(source).tags == Elements(harmless).tags
+    assert "<img" not in re.sub(r"<script>.*?</script>", "", source, flags=re.S)
+    assert "onerror" not in {k for k, _ in Elements(source).attributes}
+    assert HOSTILE in "".join(Elements(source).text)  # shown as it is called
+    trace = embedded(source, "figures")[0]["data"][0]
+    assert "<" not in trace["name"] and html.unescape(trace["name"]) == HOSTILE
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.text(max_size=40))
+def test_any_text_leaves_the_structure_of_the_page(name):
+    page = Page(name, name, command=name, log=name)
+    page.section(name, name)
+    page.table([name], [[name]])
+    page.plot(loop([Line(name, [0, 1], [0, 1])], name, name), name)
+    elements = Elements(page.html())
+    assert elements.tags.count("script") == 4 and elements.tags.count("figure") == 1
+    assert len(embedded(page.html(), "figures")) == 1
+
+
+@pytest.mark.parametrize("index", range(7))
+def test_plotly_accepts_every_kind_of_plot(index):
+    go.Figure(painted(full_page()._figures[index]))
+
+
+def test_every_colour_role_exists_in_both_schemes():
+    assert THEMES["light"].keys() == THEMES["dark"].keys()
+    used = set(re.findall(r'"@([a-z0-9]+)', json.dumps(full_page()._figures)))
+    assert used <= THEMES["light"].keys() and {"measured", "noise", "error"} <= used
+
+
+def test_a_plotly_figure_can_be_added():
+    page = Page("t", "v")
+    page.plot(go.Figure(go.Scatter(x=[1, 2], y=[3, float("nan")])))
+    assert embedded(page.html(), "figures")[0]["data"][0]["type"] == "scatter"
+
+
+def test_writing_is_atomic_and_readable_by_others(tmp_path):
+    target = tmp_path / "réport.html"
+    target.write_text("old")
+    assert full_page("Grad °").write(target) == target
+    assert "Grad °" in target.read_text(encoding="utf-8")
+    assert [f.name for f in tmp_path.iterdir()] == [target.name]
+    mask = os.umask(0)
+    os.umask(mask)
+    assert stat.S_IMODE(target.stat().st_mode) == 0o666 & ~mask
+
+
+def test_a_failed_write_leaves_the_old_page(tmp_path, monkeypatch):
+    target = tmp_path / "r.html"
+    target.write_text("old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(InputError, match="No space left"):
+        Page("t", "v").write(target)
+    assert target.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("where", ["missing/r.html", "file/r.html", ".", "a\0b.html"])
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, where):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError) as refusal:
+        Page("t", "v").write(str(tmp_path / where))
+    assert "cannot be written" in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_the_same_page_twice_is_the_same_file(tmp_path):
+    a, b = full_page().write(tmp_path / "a.html"), full_page().write(tmp_path / "b.html")
+    assert a.read_bytes() == b.read_bytes()
+
+
+# ---------------------------------------------------------------- numbers and lines
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (float("nan"), "–"), (0.0, "0"), (0.55, "0.55"), (2.17, "2.17"), (0.12345, "0.123"), (1234.5, "1,234"), (3000.0, "3,000"),
+     (30000, "30,000"), (1e-7, "1.00e-07"), (-0.5, "-0.5"), (True, "yes"), ("vigv", "vigv"), (np.float64(11.72), "11.7")],
+)  # fmt: skip
+def test_numbers_read_as_a_person_writes_them(value, text):
+    assert number(value) == text
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 40000), st.integers(10, 6000), st.integers(0, 2**32 - 1))
+def test_a_thinned_line_keeps_its_extremes_and_its_limit(n, limit, seed):
+    y = np.random.default_rng(seed).normal(size=n)
+    x = np.arange(n) * 0.01
+    u, v = decimate(x, y, limit)
+    assert u.size <= max(limit, 3) and np.all(np.diff(u) > 0)
+    assert v.min() == y.min() and v.max() == y.max()
+    assert u[0] == x[0] and u[-1] == x[-1]
+    assert np.array_equal(v, y[np.round(u * 100).astype(int)])
+
+
+def test_a_spike_of_one_sample_survives():
+    y = np.zeros(3_000_000)
+    y[1_234_567] = 1.0
+    x, v = decimate(np.arange(y.size) * 1e-3, y)
+    assert v.max() == 1.0 and x[v.argmax()] == 1234.567
+
+
+@pytest.mark.parametrize("n", [500, 100_000])
+def test_nan_and_holes_in_time_break_the_line(n):
+    t = np.arange(n) * 0.01
+    y = np.sin(t)
+    y[n // 4 : n // 3] = np.nan
+    keep = (t < t[n // 2]) | (t > t[n // 2 + n // 10])
+    u, v = decimate(t[keep], y[keep])
+    inside = (u > t[n // 2] - 0.005) & (u < t[n // 2 + n // 10])
+    assert np.isnan(v[inside]).any() and not np.isfinite(v[inside]).any()
+    dead = (u > t[n // 4 + n // 50]) & (u < t[n // 3 - n // 50])
+    assert np.isnan(v[dead]).all() and dead.any()
+
+
+@pytest.mark.parametrize("values", [[], [1.0], [np.nan] * 20000, [np.inf, 1.0, -np.inf]])
+def test_poor_series_do_not_break_a_page(values):
+    x = np.arange(len(values), dtype=float)
+    page = Page("t", "v")
+    page.plot(overlay([Panel("a", [Line("b", x, values)])]))
+    page.plot(loop([Line("b", x, values)], "x", "y"))
+    page.plot(histogram({"b": values}, "x"))
+    page.plot(bars([], {}, "y"))
+    page.plot(ranking([], [], "p"))
+    page.plot(heat([[None]], ["a"], ["b"], "deg"))
+    assert len(embedded(page.html(), "figures")) == 6
+
+
+def test_time_stays_exact_enough_to_zoom_into():
+    t = 1e6 + np.arange(2000) * 0.001  # s; single precision would round to 0.06 s
+    assert np.abs(unpack(overlay([Panel("a", [Line("b", t, t * 0)])])["data"][0]["x"]) - t).max() < 1e-5
+
+
+def test_panels_share_one_time_axis():
+    t = np.arange(10.0)
+    figure = overlay([Panel("a", [Line("l", t, t)]), Panel("b", [Line("l", t, t)]), Panel("c", [Line("m", t, t)])])
+    assert {d["xaxis"] for d in figure["data"]} == {"x"}
+    assert [d["yaxis"] for d in figure["data"]] == ["y", "y2", "y3"]
+    domains = [figure["layout"][k]["domain"] for k in ("yaxis", "yaxis2", "yaxis3")]
+    assert all(upper[0] > lower[1] for upper, lower in zip(domains, domains[1:], strict=False))
+
+
+def test_a_histogram_shares_out_all_samples():
+    e = np.concatenate([np.random.default_rng(0).normal(size=5000), [1e6, np.nan]])
+    assert unpack(histogram({"e": e}, "x")["data"][0]["y"]).sum() == pytest.approx(100, abs=1e-3)
+
+
+def test_a_waterfall_hangs_each_fall_from_the_level_before():
+    bar = waterfall([("base", 1.0), ("friction", 0.4), ("offset", 0.1), ("left", 0.1)], "rms")["data"][0]
+    assert bar["base"] == [0, 0.4, 0.1, 0] and bar["y"] == pytest.approx([1.0, 0.6, 0.3, 0.1])
+
+
+# ---------------------------------------------------------------- replay and engine test
+
+
+@dataclass(frozen=True)
+class Channel:
+    """As `hil.logs.Channel`."""
+
+    t: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Result:
+    """As `hil.replay.ReplayResult`."""
+
+    log: str
+    simulated_s: float
+    wall_s: float
+    state_hash: str
+    t: np.ndarray
+    model: dict
+    target: dict
+    measured: dict
+    signals: list = field(default_factory=list)
+
+
+def play(x, gap):
+    """Lost motion of total width ``gap``."""
+    y, s = np.empty_like(x), x[0]
+    for i, v in enumerate(x):
+        s = min(max(s, v - gap / 2), v + gap / 2)
+        y[i] = s
+    return y
+
+
+def result(duration=300.0, rate=50.0, width=1.6, model_width=1.6, dual=True, log="run.csv", channels=("n_r", "x_lvdt", "vigv")):
+    """Rotor speed to and fro between 40 and 100 %, vanes with play, sensors with noise."""
+    t = np.arange(int(duration * rate)) / rate
+    rng = np.random.default_rng(0)
+    n_r = 70 - 30 * np.clip(1.3 * np.cos(2 * np.pi * t / 60), -1, 0.998)
+    target = 50 * (n_r - 40) / 60 - 10
+    ahead = np.sign(np.gradient(n_r)) * 0.5 * model_width * 0.95 if dual else 0.0
+    x = np.clip((target + 10 + ahead) / 1.05, 0, 48)
+    model = {"n_r": n_r, "x_lvdt": x, "vigv": play(1.05 * x - 10, model_width)}
+    noise = {"n_r": 0.02, "x_lvdt": 0.005, "vigv": 0.03}
+    truth = model | {"vigv": play(1.05 * x - 10, width)}
+    measured = {k: Channel(t, truth[k] + rng.normal(0, noise[k], t.size)) for k in channels}
+    measured["n_dem"] = Channel(t, n_r)
+    stage = {"n_r": ("engine", "%"), "x_lvdt": ("actuator", "mm"), "vigv": ("linkage", "deg")}
+    signals = [error_figures(k, *stage[k], "measured", t, model[k], measured[k].values, n_r) for k in channels]
+    signals.append(error_figures("vigv", "linkage", "deg", "schedule", t, model["vigv"], target, n_r, 0.0))
+    return Result(log, duration, 0.1, "ab" * 32, t, model, {"vigv": target}, measured, signals)
+
+
+def verdict(file):
+    return re.search(r'<p class="verdict (\w+)">(.*?)</p>', file.read_text(encoding="utf-8")).groups()
+
+
+def test_a_model_that_fits_is_said_to_fit(tmp_path):
+    tone, text = verdict(replay_report(result(), tmp_path / "r.html", "vaneloop replay run.csv"))
+    assert tone == "good" and "within the sensors" in text
+
+
+def test_a_model_that_misses_hysteresis_is_said_to_miss_it_in_the_vane_angle(tmp_path):
+    tone, text = verdict(replay_report(result(width=2.6), tmp_path / "r.html"))
+    assert tone == "bad" and "VIGV angle" in text and "times what sensor noise explains" in text
+
+
+def test_a_log_with_a_demand_alone_makes_a_page(tmp_path):
+    _, text = verdict(replay_report(result(channels=()), tmp_path / "r.html"))
+    assert "no signal to hold the model against" in text
+
+
+def test_a_log_with_a_hostile_name_makes_a_safe_page(tmp_path):
+    source = replay_report(result(log="/tmp/<img src=x onerror=alert(1)>.csv"), tmp_path / "r.html").read_text()
+    assert "img" not in Elements(source).tags
+
+
+def test_a_run_of_three_thousand_seconds_stays_below_eight_megabytes(tmp_path):
+    file = replay_report(result(3000.0, 100.0), tmp_path / "r.html")
+    assert file.stat().st_size < 8e6
+
+
+def test_the_engine_test_stands_beside_the_paper(tmp_path):
+    single, dual = result(rate=10.0, dual=False, channels=()), result(rate=10.0, channels=())
+    file = engine_test_report(single, dual, PAPER_TABLE_5, tmp_path / "e.html")
+    tone, text = verdict(file)
+    words = " ".join(Elements(file.read_text(encoding="utf-8")).text)
+    assert tone == "good" and "0.55" in text
+    assert all(figure in words for figure in ("2.17", "0.55", "0.47", "1.6"))
+
+
+def test_a_dual_schedule_that_misses_the_paper_is_not_called_good(tmp_path):
+    worse = result(rate=10.0, dual=False, channels=())
+    assert verdict(engine_test_report(worse, worse, None, tmp_path / "e.html"))[0] == "bad"
