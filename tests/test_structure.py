@@ -36,8 +36,8 @@ EXPORTS: dict[str, list[str]] = {
     "app": [],
     "controller": ["Calibration", "FAULTS", "INPUTS", "MODES", "SCALARS", "STATE", "STRATEGIES", "load_calibration", "new_state", "tick"],
     "discrepancy": [],
-    "hil": [],
-    "plant": [],
+    "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
+    "plant": ["Geometry", "Plant", "Schedules", "build_plant", "load_geometry", "load_schedules"],
     "plant.effects": [],
     "tables": ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"],
 }
