@@ -87,7 +87,8 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    say(args, title)
+    table = Table(box=box.SIMPLE_HEAD)
     for i, c in enumerate(columns):
         table.add_column(c, justify="left" if i == 0 or not any(ch.isdigit() for ch in "".join(r[i] for r in rows)) else "right", overflow="fold")
     for r in rows:

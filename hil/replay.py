@@ -288,8 +288,9 @@ def _exceeded(result: ReplayResult, limits: dict[tuple[str, str], float]) -> lis
             raise InputError(f"--tolerance {signal}={limit:g}: {result.log} has no {signal} to compare with")
         judged = next((s for s in of if s.reference == "measured"), of[0])
         value = getattr(judged, statistic)
+        words = "measurement" if judged.reference == "measured" else "schedule"
         if value is not None and value > limit:
-            out.append(f"{signal} {statistic} {value:.4g} {judged.unit} against its {judged.reference} exceeds {limit:g} {judged.unit}")
+            out.append(f"{signal} {statistic} {value:.4g} {judged.unit} against the {words} exceeds {limit:g} {judged.unit}")
     return out
 
 
