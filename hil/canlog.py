@@ -12,11 +12,10 @@ bit; bit k of the frame is bit k % 8 (0 = least significant) of byte k // 8.
 from __future__ import annotations
 
 import functools
-import io
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,11 @@ MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
 class LogError(InputError):
     """A log cannot be used. One line: file, channel, reason."""
 
+    def __init__(self, text: str):
+        # names and cells of a damaged file end up in messages: keep them on one printable line
+        line = "".join(c if c.isprintable() else " " for c in text)
+        super().__init__(" ".join(line.split())[:1000])
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -58,56 +62,75 @@ class Frames:
     notes: list[str] = field(default_factory=list)
 
 
-def _frames(name: str, t: np.ndarray, ident: np.ndarray, bus: np.ndarray, length: np.ndarray, data: np.ndarray, notes: list[str]) -> Frames:
-    """Put frames in order of time from the first; refuse a clock that jumped back (t in s, or int64 ns)."""
+def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | slice]:
+    """Times in s from the first (``t`` in s, or int64 ns) and the order that sorts them; refuse a clock that jumped back."""
     if t.dtype == np.int64:
-        t = (t - t[0]) / 1e9 if t.size else t.astype(np.float64)
-    elif t.size:
-        t = t - t[0]
-    if t.size:
-        back = np.maximum.accumulate(t) - t
-        worst = int(np.argmax(back))
-        if back[worst] > DISORDER_S:
-            raise LogError(
-                f"{name}: time runs backwards by {back[worst]:.6g} s at frame {worst + 1}; allowed: up to {DISORDER_S * 1e3:g} ms (sorted)"
-            )
-        if back[worst] > 0:
-            order = np.argsort(t, kind="stable")
-            notes.append(f"{int(np.count_nonzero(np.diff(t) < 0))} frames out of order by up to {back[worst] * 1e3:.3g} ms: sorted by time")
-            t, ident, bus, length, data = t[order], ident[order], bus[order], length[order], data[order]
-        t = t - t[0]
-    return Frames(t, ident, bus, length, data, notes)
+        t = (t - t[:1]) / 1e9
+    if not np.isfinite(t).all():
+        raise LogError(f"{name}: time of frame {int(np.argmin(np.isfinite(t))) + 1} is not a number")
+    if not t.size or (np.diff(t) >= 0).all():
+        return t, slice(None)
+    back = np.maximum.accumulate(t) - t
+    worst = int(np.argmax(back))
+    if back[worst] > DISORDER_S:
+        limit = f"allowed: up to {DISORDER_S * 1e3:g} ms (sorted)"
+        raise LogError(f"{name}: time runs backwards by {back[worst]:.6g} s at frame {worst + 1}; {limit}")
+    falls = int(np.count_nonzero(np.diff(t) < 0))
+    if falls > 0.3 * t.size and t.size > 10:
+        raise LogError(f"{name}: time runs backwards at {falls} of {t.size} frames; it must count from one start (not from frame to frame)")
+    notes.append(f"{int(np.count_nonzero(back > 0))} frames out of order by up to {back[worst] * 1e3:.3g} ms: sorted by time")
+    return t, np.argsort(t, kind="stable")
 
 
-def read_bytes(path: Path) -> bytes:
-    """The file's bytes, or a LogError for one that is missing, a folder, empty, or too long."""
+def _frames(name: str, t: np.ndarray, ident: np.ndarray, bus: np.ndarray, length: np.ndarray, data: np.ndarray, notes: list[str]) -> Frames:
+    """Frames in order of time from the first."""
+    t, order = in_order(name, t, notes)
+    t = t[order]
+    return Frames(t - t[:1], ident[order], bus[order], length[order], data[order], notes)
+
+
+def check_file(path: Path) -> int:
+    """Size of the file, or a LogError for one that is missing, a folder, empty, or too long."""
     try:
-        if path.is_dir():
-            raise LogError(f"{path}: is a folder, not a log")
-        size = path.stat().st_size
-        if size > MAX_FILE:
-            raise LogError(f"{path}: {size} bytes; allowed: up to {MAX_FILE}")
-        raw = path.read_bytes()
+        folder, size = path.is_dir(), path.stat().st_size
     except (OSError, ValueError) as e:
         raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
-    if not raw:
+    if folder or not path.is_file():
+        raise LogError(f"{path}: is {'a folder' if folder else 'not a file'}, not a log")
+    if size > MAX_FILE:
+        raise LogError(f"{path}: {size} bytes; allowed: up to {MAX_FILE}")
+    if not size:
         raise LogError(f"{path}: is empty")
-    return raw
+    return size
+
+
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The file's bytes, or its first ``most``; LogError where it cannot be read."""
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(most)
+    except (OSError, MemoryError) as e:
+        raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
 
 
 # --- candump -----------------------------------------------------------------------------------------------------------------------------
 
+# `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f, direction behind;
+# and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
 _CANDUMP = re.compile(
-    rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<if>[^\s#]{1,20})\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    rb"(?:(?P<r>R[0-9A-Fa-f]?)|#(?P<fl>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|(?P<d>(?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?)"
-    rb"(?P<tail>(?:\s+[RTrt](?:x|X)?)?[ \t]*)\Z"
+    rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<if>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    rb"(?:#(?:(?P<r>R[0-9A-Fa-f]?)|#(?P<fl>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|(?P<d>(?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?)"
+    rb"|\s+\[\s?\d{1,2}\](?:(?P<rc>\s+remote request)|\s(?P<c>(?:\s[0-9A-Fa-f]{2}){0,64})))"
+    rb"(?:\s+[RTrt][xX]?)?[ \t]*\Z"
 )
 _NIBBLE = np.full(256, 255, np.uint8)
 for _i, _c in enumerate(b"0123456789ABCDEF"):
     _NIBBLE[_c] = _i
 for _i, _c in enumerate(b"abcdef"):
     _NIBBLE[_c] = 10 + _i
-_SHAPES = 64  # layouts tried per line length before the rest is called unreadable
+_SHAPES = 64  # layouts (interface, length of identifier) tried per line length before the rest is called unreadable
+_BAD = 2000  # unreadable lines passed over one by one per line length, likewise
 _LONGEST = 260  # bytes of the longest candump line, CAN FD with direction
 
 
@@ -129,44 +152,38 @@ def read_candump(path: Path) -> Frames:
 
     parts: list[tuple[np.ndarray, ...]] = []
     names: dict[bytes, int] = {}
-    bad = int(np.count_nonzero(size > _LONGEST))
     special = 0  # remote and error frames
-    by_size = np.argsort(size, kind="stable")
-    cuts = np.flatnonzero(np.diff(size[by_size])) + 1
-    for rows in np.split(by_size, cuts) if by_size.size else []:
+    good = np.flatnonzero((buf[start] == ord("(")) & (size <= _LONGEST)) if start.size else start
+    bad = start.size - good.size
+    by_size = good[np.argsort(size[good], kind="stable")]
+    for rows in np.split(by_size, np.flatnonzero(np.diff(size[by_size])) + 1) if by_size.size else []:
         width = int(size[rows[0]])
-        if width > _LONGEST:
-            continue
         windows = np.lib.stride_tricks.sliding_window_view(buf, width)
-        for _ in range(_SHAPES):
-            if not rows.size:
-                break
+        shapes = misses = 0
+        while rows.size and shapes < _SHAPES and misses < _BAD:
             first = int(start[rows[0]])
             m = _CANDUMP.match(raw[first : first + width])
             if m is None:
-                bad += 1
+                misses += 1
                 rows = rows[1:]
                 continue
-            text = windows[start[rows]]
-            fits, got, kind = _parse_shape(text, m, names)
-            if kind is None:
-                special += int(np.count_nonzero(fits))
-            else:
-                ns, ident, number, data = got
-                error = ident >= (1 << 29)  # 0x20000000 marks an error frame
-                special += int(np.count_nonzero(error))
-                keep = ~error
-                parts.append((rows[fits][keep], ns[keep], np.where(kind, ident | np.uint32(EXTENDED), ident)[keep],
-                              np.full(int(keep.sum()), number, np.int32), data[keep]))  # fmt: skip
+            shapes += 1
+            fits, ns, ident, bus, data = _parse_shape(windows[start[rows]], m, names)
+            error = (ident & 0x7FFFFFFF) >= 1 << 29  # socketcan's flag of an error frame
+            if m["r"] is not None or m["rc"] is not None:
+                error[:] = True
+            special += int(np.count_nonzero(error))
+            keep = ~error
+            parts.append((rows[fits][keep], ns[keep], ident[keep], np.full(int(keep.sum()), bus, np.int32), data[keep]))
             rows = rows[~fits]
-        bad += rows.size
+        bad += misses + rows.size
 
     notes = []
     if bad:
         notes.append(f"{bad} of {wanted.size} lines are not candump lines: left out")
     if special:
         notes.append(f"{special} remote or error frames: left out")
-    if not parts:
+    if not sum(p[0].size for p in parts):
         raise LogError(f"{path}: no candump frame in it; a line looks like (1735329625.329586) can0 17C#0000000010000021")
     order = np.argsort(np.concatenate([p[0] for p in parts]))
     wide = 8 if max(p[4].shape[1] for p in parts) <= 8 else 64
@@ -178,21 +195,20 @@ def read_candump(path: Path) -> Frames:
         data[at : at + n, :w] = p[4]
         length[at : at + n] = w
         at += n
-    ns, ident, bus = (np.concatenate([p[k] for p in parts])[order] for k in (1, 2, 3))
-    return _frames(str(path), ns, ident, bus, length[order], data[order], notes)
+    ns, ident, buses = (np.concatenate([p[k] for p in parts])[order] for k in (1, 2, 3))
+    return _frames(str(path), ns, ident, buses, length[order], data[order], notes)
 
 
-def _parse_shape(text: np.ndarray, m: re.Match[bytes], names: dict[bytes, int]) -> tuple[np.ndarray, Any, bool | None]:
-    """Parse the lines (rows of ``text``) that have the columns of ``m``.
-
-    Returns which rows fit, (ns, identifier, bus, data) of these, and whether identifiers are 29-bit; None for remote frames.
-    """
+def _parse_shape(
+    text: np.ndarray, m: re.Match[bytes], names: dict[bytes, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
+    """Parse the lines (rows of ``text``) that have the columns of ``m``: which rows fit, and their ns, identifier, bus and data."""
     line = np.frombuffer(m.string, np.uint8)
     (s0, s1), (f0, f1), (i0, i1) = m.span("s"), m.span("f"), m.span("id")
-    d0, d1 = m.span("fd") if m["fl"] is not None else m.span("d") if m["r"] is None else (m.end("r"), m.end("r"))
-    same = np.ones(line.size, bool)
+    d0, d1 = m.span(next((g for g in ("d", "fd", "c") if m[g] is not None), 0)) if m["r"] is None and m["rc"] is None else (0, 0)
     digits = np.r_[s0:s1, f0:f1]
-    nibbles = np.r_[i0:i1, d0:d1]
+    nibbles = np.r_[i0:i1, d0 + np.flatnonzero(line[d0:d1] != ord(" "))]
+    same = np.ones(line.size, bool)
     same[digits] = False
     same[nibbles] = False
     if m["fl"] is not None:
@@ -209,12 +225,15 @@ def _parse_shape(text: np.ndarray, m: re.Match[bytes], names: dict[bytes, int]) 
     fraction = (number[:, s1 - s0 :] @ 10.0 ** np.arange(8, 8 - (f1 - f0), -1)).astype(np.int64)
     seconds = np.minimum(seconds, 9_000_000_000)  # int64 nanoseconds end in the year 2262
     width = i1 - i0
-    ident = np.zeros(len(half), np.uint32)
+    ident = np.full(len(half), 0, np.uint32)
     for k in range(width):
         ident = (ident << np.uint32(4)) | half[:, k]
+    if width == 8:
+        ident |= np.uint32(EXTENDED)
+    else:
+        ident &= np.uint32(0x7FF)
     data = (half[:, width::2] << 4) | half[:, width + 1 :: 2]
-    bus = names.setdefault(m["if"], len(names))
-    return fits, (seconds * 1_000_000_000 + fraction, ident, bus, data), None if m["r"] is not None else width == 8
+    return fits, seconds * 1_000_000_000 + fraction, ident, names.setdefault(m["if"], len(names)), data
 
 
 def write_candump(path: Path, frames: Frames) -> None:
@@ -227,6 +246,247 @@ def write_candump(path: Path, frames: Frames) -> None:
         for k, (us, i, n) in enumerate(zip(micros, frames.ident.tolist(), frames.length.tolist(), strict=True))
     ]
     path.write_text("".join(lines), encoding="ascii")
+
+
+# --- text formats of other tools ---------------------------------------------------------------------------------------------------------
+
+# python-can's readers end at the first line they cannot read; a log cut off in mid-line, or with a foreign event, is common.
+_ASC = re.compile(
+    rb"^[ \t]*(?P<t>\d+\.\d+)[ \t]+(?:"
+    rb"(?P<bus>\d{1,4})[ \t]+(?P<id>[0-9A-Fa-f]{1,9})(?P<x>x?)[ \t]+\w+[ \t]+d[ \t]+(?P<dlc>[0-9A-Fa-f]{1,2})"
+    rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{1,3}\b)*)"
+    rb"|CANFD[ \t]+(?P<fbus>\d{1,4})[ \t]+\w+[ \t]+(?P<fid>[0-9A-Fa-f]{1,9})(?P<fx>x?)[ \t]+(?:[^\s]*[^\s01][^\s]*[ \t]+)?"
+    rb"[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}[ \t]+(?P<n>\d{1,2})(?P<fd>(?:[ \t]+[0-9A-Fa-f]{1,3}\b)*))",
+    re.M,
+)
+_ASC_TIME = re.compile(rb"^[ \t]*(\d+\.\d+)[ \t]", re.M)
+
+
+def read_asc(path: Path) -> Frames:
+    """Frames of a Vector ASCII log, classic and CAN FD, hex or dec, times absolute or relative to the event before."""
+    raw = read_bytes(path)
+    head = re.search(rb"^[ \t]*base[ \t]+(hex|dec)(?:[ \t]+timestamps[ \t]+(absolute|relative))?", raw[:100_000], re.M | re.I)
+    base = 10 if head and head[1].lower() == b"dec" else 16
+    since: dict[int, float] = {}
+    if head and (head[2] or b"").lower() == b"relative":
+        events = [(m.start(), float(m[1])) for m in _ASC_TIME.finditer(raw)]
+        since = dict(zip((e[0] for e in events), np.cumsum([e[1] for e in events]).tolist(), strict=True))
+    rows = []
+    for m in _ASC.finditer(raw):
+        fd = m["fbus"] is not None
+        ident, x, bus, text = (m["fid"], m["fx"], m["fbus"], m["fd"]) if fd else (m["id"], m["x"], m["bus"], m["d"])
+        n = int(m["n"]) if fd else min(int(m["dlc"], base), 8)
+        row = _text_frame(since.get(m.start(), float(m["t"])), int(ident, base), bool(x), int(bus), n, text.split()[:n], base)
+        if row is not None:
+            rows.append(row)
+    return _text_frames(path, rows, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07")
+
+
+_TRC_LINE = re.compile(rb"^[ \t]*\d+\)?[ \t]+(\d[^\r\n]*)", re.M)
+_TRC_COLUMNS = {b"1.0": "OILD", b"1.1": "OdILD", b"1.2": "OBdILD", b"1.3": "OBdIRLD", b"2.0": "OTIdlD", b"2.1": "OTBIdRLD"}
+_TRC_DATA = {"T": (b"DT", b"FD", b"FB", b"FE", b"BI"), "d": (b"Rx", b"Tx")}
+
+
+def read_trc(path: Path) -> Frames:
+    """Frames of a PEAK trace, versions 1.0 to 2.1; times in ms."""
+    raw = read_bytes(path)
+    version = re.search(rb"^;\$FILEVERSION=(\d\.\d)", raw[:100_000], re.M)
+    if version and version[1] not in _TRC_COLUMNS:
+        raise LogError(f"{path}: TRC version {version[1].decode()} is not known; allowed: 1.0 to 1.3, 2.0, 2.1")
+    columns = _TRC_COLUMNS[version[1] if version else b"1.0"]
+    stated = re.search(rb"^;\$COLUMNS=N,([A-Za-z,]+)", raw[:100_000], re.M)
+    if stated:
+        columns = stated[1].decode().replace(",", "")
+    place = {c: i for i, c in enumerate(columns)}
+    n_at = place.get("l", place.get("L", -1))
+    if n_at < 0 or not {"O", "I", "D"} <= set(place) or place["D"] != len(columns) - 1:
+        raise LogError(f"{path}: TRC columns {columns} are not understood; needed: O, I, L or l, and D last")
+    rows = []
+    for m in _TRC_LINE.finditer(raw):
+        words = m[1].split()
+        if len(words) < len(columns) - 1 or any(words[place[c]] not in _TRC_DATA[c] for c in "Td" if c in place):
+            continue
+        try:
+            ident, n, bus = words[place["I"]], int(words[n_at]), int(words[place["B"]]) if "B" in place else 1
+            if "l" not in place and n > 8:
+                n = (12, 16, 20, 24, 32, 48, 64)[min(n, 15) - 9]
+            row = _text_frame(float(words[place["O"]]) / 1000, int(ident, 16), len(ident) > 4, bus, n, words[place["D"] :][:n], 16)
+        except ValueError:
+            continue
+        if row is not None:
+            rows.append(row)
+    return _text_frames(path, rows, "TRC", "1)  10.0  Rx  00A0  8  00 01 02 03 04 05 06 07")
+
+
+_Row = tuple[float, int, int, int, bytes]
+
+
+def _text_frame(t: float, ident: int, extended: bool, bus: int, n: int, words: list[bytes], base: int) -> _Row | None:
+    """One frame of a text log; None where its numbers cannot be a frame's."""
+    try:
+        data = bytes(int(w, base) for w in words)
+    except ValueError:
+        return None
+    if not t < 1e12 or ident >> (29 if extended else 11) or n > 64 or bus >> 16:
+        return None
+    return t, ident | (EXTENDED if extended else 0), bus, len(data), data
+
+
+def _text_frames(path: Path, rows: list[_Row], kind: str, example: str) -> Frames:
+    if not rows:
+        raise LogError(f"{path}: no {kind} frame in it; a line looks like: {example}")
+    t, ident, bus, length, data = zip(*rows, strict=True)
+    wide = 8 if max(length) <= 8 else 64
+    block = np.frombuffer(b"".join(d.ljust(wide, b"\0") for d in data), np.uint8).reshape(-1, wide)
+    return _frames(str(path), np.array(t), np.array(ident, np.uint32), np.array(bus, np.int32), np.array(length, np.uint8), block, [])
+
+
+# --- BLF ---------------------------------------------------------------------------------------------------------------------------------
+
+_OBJECT = struct.Struct("<4sHHII")  # signature, header size, header version, size, type
+_CONTAINER, _CAN, _CAN2, _FD, _FD64 = 10, 1, 86, 100, 101
+_MOST = 1 << 31  # bytes of all containers together
+
+
+def read_blf(path: Path) -> Frames:
+    """Frames of a Vector binary log.
+
+    python-can's reader does not return from an object of size 0 and believes any container; here the containers are checked and
+    joined, the objects found, and each kind of object decoded as one matrix. A damaged container costs its own frames.
+    """
+    raw = read_bytes(path)
+    if len(raw) < 144 or raw[:4] != b"LOGG":
+        raise LogError(f"{path}: is not a BLF (it must begin with LOGG and a header of 144 bytes)")
+    chunks, damaged, total = [], 0, 0
+    at = min(max(int.from_bytes(raw[4:8], "little"), 144), len(raw))
+    while at + 16 <= len(raw):
+        signature, _, _, size, kind = _OBJECT.unpack_from(raw, at)
+        if signature != b"LOBJ" or size < 16:
+            damaged += 1
+            at = raw.find(b"LOBJ", at + 1)
+            if at < 0:
+                break
+            continue
+        body = raw[at + 32 : at + size]
+        damaged += at + size > len(raw)
+        if kind == _CONTAINER and len(body):
+            method, length = struct.unpack_from("<H6xI", raw, at + 16)
+            if method == 2:
+                inflate = zlib.decompressobj()
+                try:  # deflate cannot shrink more than 1032-fold: a longer promise is a lie
+                    body = inflate.decompress(body, min(length, 1032 * len(body) + 1024) or 1)
+                except zlib.error:
+                    body = b""
+                    damaged += 1
+            elif method != 0:
+                damaged += 1
+                body = b""
+        elif kind != _CONTAINER:
+            body = raw[at : at + size]
+        total += len(body)
+        if total > _MOST:
+            raise LogError(f"{path}: holds more than {_MOST >> 20} MiB of objects; split it")
+        chunks.append(body)
+        at += size + size % 4
+    stream = b"".join(chunks)
+    objects, more = _blf_objects(stream)
+    notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
+    parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
+    if not parts:
+        raise LogError(f"{path}: no CAN frame in it")
+    order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
+    _, ns, ident, bus, length = (np.concatenate([p[k] for p in parts])[order] for k in range(5))
+    wide = 8 if length.max() <= 8 else 64
+    data = np.zeros((order.size, wide), np.uint8)
+    row = 0
+    for p in parts:
+        w = min(wide, p[5].shape[1])
+        data[row : row + len(p[5]), :w] = p[5][:, :w]
+        row += len(p[5])
+    return _frames(str(path), ns, ident, bus, length, data[order], notes)
+
+
+def _blf_objects(stream: bytes) -> tuple[np.ndarray, int]:
+    """Place, header version, size and type of each object, and how many damaged places were met."""
+    unpack, find = _OBJECT.unpack_from, stream.find
+    found: list[tuple[int, int, int, int]] = []
+    at, damaged, end = 0, 0, len(stream)
+    while at + 32 <= end:
+        signature, _, version, size, kind = unpack(stream, at)
+        if signature != b"LOBJ":
+            next_at = find(b"LOBJ", at + 1)
+            if next_at < 0:
+                break
+            damaged += next_at - at > 8
+            at = next_at
+            continue
+        if size < 32 or at + size > end:
+            damaged += 1
+            at += 4
+            continue
+        found.append((at, version, size, kind))
+        at += size
+    return np.array(found, np.int64).reshape(-1, 4), damaged
+
+
+def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Place, ns, identifier, bus, length and data of the data frames of one object type, by header version."""
+    need = {_CAN: 16, _CAN2: 16, _FD: 84, _FD64: 40}[kind]
+    for version, header in ((1, 32), (2, 40)):
+        these = objects[(objects[:, 3] == kind) & (objects[:, 1] == version) & (objects[:, 2] >= header + need)]
+        if not len(these):
+            continue
+        width = header + need + (64 if kind == _FD64 else 0)
+        buf = np.frombuffer(stream + bytes(width), np.uint8)
+        text = np.lib.stride_tricks.sliding_window_view(buf, width)[these[:, 0]]
+
+        def number(at: int, size: int, text: np.ndarray = text) -> np.ndarray:
+            return np.ascontiguousarray(text[:, at : at + size]).view(f"<u{size}")[:, 0]
+
+        step = np.where(number(16, 4) == 1, 10_000, 1).astype(np.uint64)
+        ticks = np.minimum(number(24, 8), np.uint64(9e18) // step)
+        ident = number(header + 4, 4)
+        at = header + (40 if kind == _FD64 else 20 if kind == _FD else 8)
+        if kind == _FD64:
+            room = np.where(text[:, header + 35] > 0, text[:, header + 35], these[:, 2]) - header - 40
+            bus, remote = text[:, header], number(header + 12, 4) & 0x10
+            length = np.clip(np.minimum(text[:, header + 2], room), 0, 64)
+        else:
+            bus, remote = number(header, 2), text[:, header + 2] & 0x80
+            length = np.minimum(text[:, header + 14], 64) if kind == _FD else np.minimum(text[:, header + 3], 8)
+        data = text[:, at : at + (8 if kind in (_CAN, _CAN2) else 64)].copy()
+        data[np.arange(data.shape[1]) >= length[:, None]] = 0
+        keep = remote == 0
+        ns = (ticks * step).astype(np.int64)
+        fields = these[:, 0], ns, ident & np.uint32(0x9FFFFFFF), bus.astype(np.int32), length.astype(np.uint8), data
+        yield tuple(f[keep] for f in fields)
+
+
+# --- writers through python-can ----------------------------------------------------------------------------------------------------------
+
+
+def _write_can(path: Path, frames: Frames, writer: str) -> None:
+    import can
+
+    with getattr(can, writer)(str(path)) as out:
+        for t, i, n, data in zip(frames.t.tolist(), frames.ident.tolist(), frames.length.tolist(), frames.data, strict=True):
+            message = can.Message(round(t, 6), i & 0x1FFFFFFF, i >> 31 == 1, channel=0, data=data[:n].tobytes(), is_fd=n > 8)
+            out.on_message_received(message)
+
+
+def write_asc(path: Path, frames: Frames) -> None:
+    """Write a Vector ASCII log."""
+    _write_can(path, frames, "ASCWriter")
+
+
+def write_blf(path: Path, frames: Frames) -> None:
+    """Write a Vector binary log."""
+    _write_can(path, frames, "BLFWriter")
+
+
+def write_trc(path: Path, frames: Frames) -> None:
+    """Write a PEAK trace, version 2.1."""
+    _write_can(path, frames, "TRCWriter")
 
 
 # --- database ----------------------------------------------------------------------------------------------------------------------------
@@ -278,7 +538,7 @@ def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
     reason = ""
     for content, strict, lost in tries:
         try:
-            db = cantools.database.load_string(content, database_format=kind, strict=strict)
+            db: Any = cantools.database.load_string(content, database_format=kind, strict=strict)
             messages = [_message(m) for m in db.messages]
         except Exception as e:  # cantools raises whatever its grammar meets
             reason = reason or " ".join(str(e).split())[:120]
@@ -349,7 +609,7 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
 
 def _crc_table() -> np.ndarray:
     """CRC-8 SAE J1850, polynomial 0x1D."""
-    c = np.arange(256)
+    c: Any = np.arange(256)
     for _ in range(8):
         c = np.where(c & 0x80, (c << 1) ^ 0x1D, c << 1) & 0xFF
     return c.astype(np.uint8)
@@ -403,12 +663,19 @@ def cut_signal(frames: Frames, rows: np.ndarray, message: Message, signal: Any) 
 
     value = raw * scale + offset; a multiplexed signal is in the frames whose selector says so.
     """
-    selector, wanted = signal.multiplexer_signal, signal.multiplexer_ids
-    while selector is not None and wanted:
-        chooser = message.layout.get_signal_by_name(selector)
+    chain, selector, wanted = [signal], signal.multiplexer_signal, signal.multiplexer_ids
+    while selector is not None and wanted and len(chain) < 8:
+        chain.append(message.layout.get_signal_by_name(selector))
+        selector, wanted = chain[-1].multiplexer_signal, chain[-1].multiplexer_ids
+    need = 1 + max(max(_place(s)[0]) for s in chain)
+    if any(s.length > 64 or (s.is_float and s.length not in (16, 32, 64)) or min(_place(s)[0]) < 0 for s in chain):
+        raise LogError(f"{message.layout.name}.{signal.name}: {signal.length} bits cannot be read; allowed: 64, or an IEEE number")
+    rows = rows[frames.length[rows] >= need]
+    if need > frames.data.shape[1]:
+        return rows[:0], np.empty(0), 0
+    for s, chooser in zip(chain, chain[1:], strict=False):
         raw = cut_raw(frames.data[rows], chooser)
-        rows = rows[np.isin(raw, np.array(wanted, raw.dtype))]
-        selector, wanted = chooser.multiplexer_signal, chooser.multiplexer_ids
+        rows = rows[np.isin(raw.astype(np.int64), np.array(s.multiplexer_ids, np.int64))]
     raw = cut_raw(frames.data[rows], signal)
     there = np.ones(rows.size, bool)
     if signal.name in message.missing:
@@ -428,6 +695,10 @@ def encode(message: Message, values: dict[str, np.ndarray], n: int) -> np.ndarra
         if message.e2e is not None and signal.name in ("crc", "counter"):
             continue
         column = values.get(signal.name)
+        if signal.is_float or signal.length > 52:
+            if column is None:
+                continue
+            raise LogError(f"{signal.name}: its {signal.length} bits in {message.layout.name} cannot be written; allowed: integers, 52 bits")
         low, high = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
         none = message.missing.get(signal.name, 0)
         if column is None:

@@ -9,13 +9,14 @@ docs/logs.md is the user's page.
 
 from __future__ import annotations
 
+import csv
 import difflib
 import functools
 import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,6 +36,7 @@ UNITS = {
 
 _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
+_MOST_FRAMES = 20_000_000  # of one message; 55 h at 10 ms
 _HOLD = 5  # frame periods a value is repeated on the bus before its channel counts as silent
 
 
@@ -60,13 +62,14 @@ class Log:
 
 @dataclass(frozen=True)
 class Series:
-    """Samples as they stand in the file; ``where`` names a sample for the reader: row 17, sample 3."""
+    """Samples as they stand in the file; sample k is called "``word`` ``first`` + k" (row 17)."""
 
     t: np.ndarray
     values: np.ndarray
-    unit: str
-    first: int = 0
+    unit: str = ""
+    t_unit: str = ""
     word: str = "sample"
+    first: int = 1
 
 
 class Source(Protocol):
@@ -77,7 +80,9 @@ class Source(Protocol):
     notes: list[str]
     sorted: bool
 
-    def series(self, keys: list[str]) -> dict[str, Series]: ...
+    def series(self, key: str) -> Series: ...
+
+    def has(self) -> str: ...
 
     def absent(self, name: str) -> str: ...
 
@@ -92,9 +97,9 @@ class Bus:
         self.frames, self.dbc = frames, dbc
         self.notes = notes + frames.notes
         self.names: dict[str, tuple[str, ...]] = {}
-        self._of: dict[str, canlog.Message] = {}
+        self._of: dict[str, tuple[canlog.Message, Any]] = {}
         self._silent: dict[str, str] = {}
-        self._rows: dict[str, np.ndarray] = {}
+        self._rows: dict[int, np.ndarray] = {}
         seen = np.unique(frames.ident)
         groups = canlog.pgn(seen[seen >> 31 == 1])
         for m in messages:
@@ -103,28 +108,30 @@ class Bus:
                 key = f"{m.layout.name}.{s.name}"
                 if here:
                     self.names[key] = (key, s.name)
-                    self._of[key] = m
+                    self._of[key] = m, s
                 else:
                     self._silent[s.name] = self._silent[key] = f"{m.layout.name} (0x{m.ident & 0x1FFFFFFF:X})"
 
-    def absent(self, name: str) -> str:
-        if name in self._silent:
-            return f"{self.dbc.name} has it in {self._silent[name]}, but the log has no such frame"
-        return ""
+    def has(self) -> str:
+        if self.names:
+            return _has(self.kind, self.names)
+        ident, count = np.unique(self.frames.ident & 0x1FFFFFFF, return_counts=True)
+        most = ", ".join(f"0x{i:X}" for i in ident[np.argsort(-count)][:8]) + (", ..." if ident.size > 8 else "")
+        return f"; {self.dbc.name} has no message for the log's {ident.size} identifiers ({most}): --dbc F"
 
-    def series(self, keys: list[str]) -> dict[str, Series]:
-        out = {}
-        for key in keys:
-            m = self._of[key]
-            signal = m.layout.get_signal_by_name(key.split(".", 1)[1])
-            if m.layout.name not in self._rows:
-                self._rows[m.layout.name], notes = canlog.select(self.frames, m)
-                self.notes += notes
-            rows, values, missing = canlog.cut_signal(self.frames, self._rows[m.layout.name], m, signal)
-            if missing:
-                self.notes.append(f"{key}: {missing} frames say not available: left out")
-            out[key] = Series(self.frames.t[rows], values, signal.unit or "")
-        return out
+    def absent(self, name: str) -> str:
+        where = self._silent.get(name)
+        return f"{self.dbc.name} has it in {where}, but the log has no such frame" if where else ""
+
+    def series(self, key: str) -> Series:
+        m, signal = self._of[key]
+        if m.ident not in self._rows:
+            self._rows[m.ident], notes = canlog.select(self.frames, m)
+            self.notes += notes
+        rows, values, missing = canlog.cut_signal(self.frames, self._rows[m.ident], m, signal)
+        if missing:
+            self.notes.append(f"{key}: {missing} frames say not available: left out")
+        return Series(self.frames.t[rows], values, str(signal.unit or ""))
 
 
 class Table:
@@ -133,53 +140,57 @@ class Table:
     kind = "column"
     sorted = False
 
-    def __init__(self, headers: list[str], load: Callable[[list[str]], dict[str, np.ndarray]], first: int, time: str):
+    def __init__(self, headers: list[str], load: Callable[[str], np.ndarray], first: int, time: str):
         self.notes: list[str] = []
         self._load, self._first, self._time = load, first, time
+        self._t: np.ndarray | None = None
         self.names = {h: tuple(dict.fromkeys((h, h.strip(), _split_unit(h)[0]))) for h in headers if h != time}
+
+    def has(self) -> str:
+        return _has(self.kind, [self._time, *self.names])
 
     def absent(self, name: str) -> str:
         return ""
 
-    def series(self, keys: list[str]) -> dict[str, Series]:
-        columns = self._load([self._time, *keys])
-        t = columns[self._time]
-        return {k: Series(t, columns[k], _split_unit(k)[1], self._first, "row") for k in keys}
+    def series(self, key: str) -> Series:
+        if self._t is None:
+            self._t = self._load(self._time)
+        return Series(self._t, self._load(key), _split_unit(key)[1], _split_unit(self._time)[1], "row", self._first)
 
 
 def _split_unit(header: str) -> tuple[str, str]:
     """`n_r [rpm]` is n_r in rpm; no bracket, no unit."""
-    m = re.fullmatch(r"\s*(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", header)
+    m = re.fullmatch(r"\s*([^\[\]()]+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", header)
     return (m[1], (m[2] if m[2] is not None else m[3]).strip()) if m else (header.strip(), "")
 
 
 def _time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> str:
     """The column of a table that holds the time: mapped to t, called t, or called like it."""
-    for log_name, signal in mapping.items():
-        if signal == "t":
-            if log_name in headers:
-                return log_name
-            raise LogError(f"{path}: no column {log_name!r} to map to t{_close(log_name, headers)}")
+    asked = next((name for name, signal in mapping.items() if signal == "t"), None)
     for fold in (str, str.casefold):
-        for name in _TIME_NAMES:
+        for name in _TIME_NAMES if asked is None else (fold(asked),):
             for h in headers:
-                if name in (fold(h.strip()), fold(_split_unit(h)[0])):
+                if name in (fold(h), fold(h.strip()), fold(_split_unit(h)[0])):
                     return h
-    raise LogError(f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (or --map NAME=t){_has('column', headers)}")
+    if asked is not None:
+        raise LogError(f"{path}: no column {asked!r} to map to t{_close(asked, headers)}{_has('column', headers)}")
+    raise LogError(f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names another){_has('column', headers)}")
 
 
 def _close(name: str, have: Iterable[str]) -> str:
     """Suggestions for a misspelt name."""
-    near = difflib.get_close_matches(name.casefold(), {h.casefold(): h for h in have}, 4, 0.6)
     back = {h.casefold(): h for h in have}
-    return "; close: " + ", ".join(back[n] for n in near) if near else ""
+    near = difflib.get_close_matches(name.casefold(), back, 4, 0.6)
+    return "; close: " + ", ".join(back[n][:60] for n in near) if near else ""
 
 
 def _has(kind: str, have: Iterable[str]) -> str:
     """What the file offers, shortened."""
     names = [str(h)[:60] for h in have]
+    if not names:
+        return f"; the file has no {kind}"
     more = f" and {len(names) - 12} more" if len(names) > 12 else ""
-    return f"; the file has {len(names)} {kind}s: {', '.join(names[:12])}{more}" if names else f"; the file has no {kind}"
+    return f"; the file has {len(names)} {kind}{'s' * (len(names) != 1)}: {', '.join(names[:12])}{more}"
 
 
 # --- CSV and Parquet ---------------------------------------------------------------------------------------------------------------------
@@ -187,8 +198,6 @@ def _has(kind: str, have: Iterable[str]) -> str:
 
 def _open_csv(path: Path, options: _Options) -> Source:
     """CSV with one header line; separator , ; or tab, decimal comma with ; allowed; empty cell = no sample there."""
-    import polars as pl
-
     raw = canlog.read_bytes(path)
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raw = raw.decode("utf-16", errors="replace").encode()
@@ -199,66 +208,68 @@ def _open_csv(path: Path, options: _Options) -> Source:
     except UnicodeDecodeError:
         raw = raw.decode("cp1252", errors="replace").encode()
     raw = raw.removeprefix(b"\xef\xbb\xbf")
+    first = 2  # row of the first sample, as an editor counts
     head, _, rest = raw.partition(b"\n")
+    while rest and (head.startswith(b"#") or not head.strip()):
+        head, _, rest = rest.partition(b"\n")
+        first += 1
     line = head.decode().strip("\r")
     separator = max(",;\t", key=line.count)
-    headers = [h.strip().strip('"') for h in line.split(separator)]
-    if '"' in line.replace('""', "") and len(set(headers)) != len(headers):
-        raise LogError(f"{path}: header line cannot be read: {line[:80]!r}")
-    again = sorted({h for h in headers if headers.count(h) > 1})
-    if again:
-        raise LogError(f"{path}: column {again[0]!r} is there more than once")
+    try:
+        headers = [h.strip() for h in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error as e:
+        raise LogError(f"{path}: header line cannot be read ({e}): {line[:80]!r}") from None
+    if len(headers) > _MOST_COLUMNS:
+        raise LogError(f"{path}: {len(headers)} columns; allowed: {_MOST_COLUMNS}")
+    again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
+    if again is not None:
+        raise LogError(f"{path}: column {again!r} is there more than once")
     comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
 
-    def load(keys: list[str]) -> dict[str, np.ndarray]:
-        where = {h: i for i, h in enumerate(headers)}
-        indices = [where[k] for k in keys]
+    def load(key: str) -> np.ndarray:
+        return _csv_column(path, rest, headers, headers.index(key), separator, comma, first)
 
-        def read(text: bool) -> Any:
-            kind = pl.String if text else pl.Float64
-            return pl.read_csv(
-                io.BytesIO(rest), has_header=False, new_columns=[f"c{i}" for i in range(len(headers))], separator=separator,
-                schema={f"c{i}": kind if i in indices else pl.String for i in range(len(headers))},
-                decimal_comma=comma and not text, null_values=["", "NA", "N/A", "null", "-"], truncate_ragged_lines=True,
-                columns=sorted(indices), quote_char='"',
-            )  # fmt: skip
-
-        try:
-            frame = read(False)
-        except pl.exceptions.PolarsError:
-            frame = _csv_text(path, read, headers, indices, comma)
-        return {k: _numbers(frame[f"c{where[k]}"]) for k in keys}
-
-    return Table(headers, load, 2, _time_column(path, headers, options.mapping))
+    return Table([h for h in headers if h], load, first, _time_column(path, headers, options.mapping))
 
 
-def _csv_text(path: Path, read: Callable[[bool], Any], headers: list[str], indices: list[int], comma: bool) -> Any:
-    """Second reading of a CSV whose cells are not all numbers: with blanks around them, or naming the first that is none."""
+def _csv_column(path: Path, rest: bytes, headers: list[str], index: int, separator: str, comma: bool, first: int) -> np.ndarray:
+    """One column as numbers; where a cell is none, once more as text to take blanks off or to name the first bad one."""
     import polars as pl
 
+    def read(kind: Any) -> Any:
+        schema = {f"c{i}": kind if i == index else pl.String for i in range(len(headers))}
+        return pl.read_csv(
+            io.BytesIO(rest), has_header=False, separator=separator, schema=schema, columns=[index], truncate_ragged_lines=True,
+            decimal_comma=comma and kind != pl.String, null_values=["", *_NO_SAMPLE],
+        )[f"c{index}"]  # fmt: skip
+
+    if not rest.strip():
+        return np.empty(0)
     try:
-        frame = read(True)
+        return _numbers(read(pl.Float64))
+    except pl.exceptions.PolarsError:
+        pass
+    try:
+        text = read(pl.String).str.strip_chars()
     except pl.exceptions.PolarsError as e:
-        raise LogError(f"{path}: is not a CSV ({' '.join(str(e).split())[:120]})") from None
-    out = []
-    for i in indices:
-        text = frame[f"c{i}"].str.strip_chars()
-        text = text.set(text == "", None)
-        number = (text.str.replace(",", ".", literal=True) if comma else text).cast(pl.Float64, strict=False)
-        bad = (number.is_null() & text.is_not_null()).arg_true()
-        if bad.len():
-            raise LogError(f"{path}: column {headers[i]!r}, row {bad[0] + 2}: {text[bad[0]][:40]!r} is not a number")
-        out.append(number)
-    return pl.DataFrame(out)
+        raise LogError(f"{path}: column {headers[index]!r}: {str(e)[:160]}") from None
+    text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
+    number = (text.str.replace(",", ".", literal=True) if comma else text).cast(pl.Float64, strict=False)
+    bad = (number.is_null() & text.is_not_null()).arg_true()
+    if bad.len():
+        raise LogError(f"{path}: column {headers[index]!r}, row {bad[0] + first}: {text[bad[0]][:40]!r} is not a number")
+    return _numbers(number)
 
 
 def _numbers(column: Any) -> np.ndarray:
-    """float64 of a polars column; no sample = NaN with the quiet sign bit set aside by `_absent`."""
+    """float64 of a polars column; no sample becomes `_ABSENT`."""
     values = column.to_numpy().astype(np.float64, copy=True)
     values[column.is_null().to_numpy()] = _ABSENT
     return values
 
 
+_NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
+_MOST_COLUMNS = 10_000
 # A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.
 _ABSENT = np.array([0x7FF8_0000_0000_0A0B], np.uint64).view(np.float64)[0]
 
@@ -276,25 +287,20 @@ def _open_parquet(path: Path, options: _Options) -> Source:
         raise LogError(f"{path}: is not a whole Parquet file (it must begin and end with PAR1)")
     try:
         schema = dict(pl.read_parquet_schema(io.BytesIO(raw)))
-    except (pl.exceptions.PolarsError, OSError, ValueError) as e:
-        raise LogError(f"{path}: is not a Parquet file ({' '.join(str(e).split())[:120]})") from None
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as e:
+        raise LogError(f"{path}: is not a Parquet file ({str(e)[:160]})") from None
 
-    def load(keys: list[str]) -> dict[str, np.ndarray]:
-        for k in keys:
-            if not (schema[k].is_numeric() or schema[k].is_temporal() or schema[k] == pl.Boolean):
-                raise LogError(f"{path}: column {k!r} holds {schema[k]}, not numbers")
+    def load(key: str) -> np.ndarray:
+        kind = schema[key]
+        if not (kind.is_numeric() or kind.is_temporal() or kind == pl.Boolean) or kind == pl.Time:
+            raise LogError(f"{path}: column {key!r} holds {kind}, not numbers")
         try:
-            frame = pl.read_parquet(io.BytesIO(raw), columns=keys)
-        except (pl.exceptions.PolarsError, OSError, ValueError) as e:
-            raise LogError(f"{path}: cannot be read ({' '.join(str(e).split())[:120]})") from None
-        out = {}
-        for k in keys:
-            column = frame[k]
-            if schema[k].is_temporal():
-                column = column.cast(pl.Datetime("ns") if schema[k] in (pl.Date, pl.Datetime) else pl.Duration("ns"))
-                column = column.to_physical().cast(pl.Float64) / 1e9
-            out[k] = _numbers(column.cast(pl.Float64))
-        return out
+            column = pl.read_parquet(io.BytesIO(raw), columns=[key])[key]
+            if kind.is_temporal():
+                column = column.cast(pl.Duration("ns") if kind == pl.Duration else pl.Datetime("ns")).to_physical().cast(pl.Float64) / 1e9
+            return _numbers(column.cast(pl.Float64))
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as e:
+            raise LogError(f"{path}: column {key!r} cannot be read ({str(e)[:160]})") from None
 
     return Table(list(schema), load, 1, _time_column(path, list(schema), options.mapping))
 
@@ -370,7 +376,7 @@ def _encode(channels: dict[str, Channel], dbc: Path, path: Path) -> canlog.Frame
         period = (m.layout.cycle_time or 10) / 1000
         first = min(float(channels[n].t[0]) for n in names)
         last = max(float(channels[n].t[-1]) for n in names)
-        if (last - first) / period > 1e8:
+        if (last - first) / period > _MOST_FRAMES:
             raise LogError(f"{path}: {last - first:.3g} s are too long for a CAN log with a frame every {period:g} s")
         k = np.arange(math.ceil((first - start) / period - 1e-6), math.floor((last - start) / period + 1e-6) + 1)
         t = start + k * period
@@ -410,6 +416,59 @@ def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:
     return np.where(there, values, np.nan)
 
 
+# --- MDF4 --------------------------------------------------------------------------------------------------------------------------------
+
+
+class Groups:
+    """Channel groups of an MDF4 file: `CHANNEL`, or `GROUP.CHANNEL` where several groups have it."""
+
+    kind = "channel"
+    sorted = False
+
+    def __init__(self, content: dict[str, Any]):
+        self.notes: list[str] = []
+        self.names = {key: tuple(names) for key, names in content["names"].items()}
+        self._series, self._why = content["series"], content["why"]
+
+    def has(self) -> str:
+        return _has(self.kind, self.names)
+
+    def absent(self, name: str) -> str:
+        return ""
+
+    def series(self, key: str) -> Series:
+        if key not in self._series:
+            self.notes.append(f"{key}: {self._why.get(key, 'has no samples')}")
+            return Series(np.empty(0), np.empty(0))
+        t, values, unit = self._series[key]
+        return Series(t, values, unit)
+
+
+def _open_mdf(path: Path, options: _Options) -> Source:
+    """MDF4: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is asked for."""
+    from hil import mdf
+
+    wanted = [*UNITS, *options.mapping]
+    content, frames = mdf.read_mdf(path, wanted)
+    groups = Groups(content)
+    if frames is not None and (options.dbc is not None or not any(_find(groups, n, n in options.mapping) for n in wanted)):
+        return _bus(frames, options)
+    return groups
+
+
+def _write_mdf(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    """Channel groups, one per raster; bus logging where a DBC is given."""
+    from hil import mdf
+
+    if dbc is not None:
+        mdf.write_bus(path, _encode(channels, dbc, path))
+        return
+    rasters: dict[bytes, tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]] = {}
+    for name, c in channels.items():
+        rasters.setdefault(c.t.tobytes(), (c.t, {}))[1][name] = c.values, UNITS[name].replace("-", "")
+    mdf.write_groups(path, list(rasters.values()))
+
+
 # --- formats -----------------------------------------------------------------------------------------------------------------------------
 
 
@@ -429,6 +488,10 @@ class _Format:
 
 _FORMATS: dict[str, _Format] = {
     ".log": _Format(_bus_reader(canlog.read_candump), _bus_writer(canlog.write_candump)),
+    ".asc": _Format(_bus_reader(canlog.read_asc), _bus_writer(canlog.write_asc)),
+    ".blf": _Format(_bus_reader(canlog.read_blf), _bus_writer(canlog.write_blf)),
+    ".trc": _Format(_bus_reader(canlog.read_trc), _bus_writer(canlog.write_trc)),
+    ".mf4": _Format(_open_mdf, _write_mdf),
     ".csv": _Format(_open_csv, _write_csv),
     ".parquet": _Format(_open_parquet, _write_parquet),
 }
@@ -445,12 +508,17 @@ def _format(path: Path) -> _Format:
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
-    "%": "percent", "pct": "percent", "per cent": "percent", "-": "", "1": "", "ratio": "",
-    "°": "degree", "deg": "degree", "grad": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC", "degc": "degC",
+    "%": "percent", "pct": "percent", "per cent": "percent", "1": "", "ratio": "",
+    "°": "degree", "deg": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC",
     "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
     "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second", "hz": "turn/second", "khz": "kiloturn/second",
     "sec": "second", "s": "second", "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
 }  # fmt: skip
+
+
+# A unit text comes from a file: 9**9**9 would keep pint busy for hours.
+_UNIT = re.compile(r"[A-Za-z%°µμΩ_/*^.0-9 ()-]*")
+_POWER_TOWER = re.compile(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}")
 
 
 @functools.lru_cache(maxsize=1)
@@ -470,7 +538,7 @@ def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
 
     text = unit.strip()
     text = _ALIASES.get(text.casefold(), text)
-    if len(text) > 32 or not re.fullmatch(r"[A-Za-z%°µμΩ_/*^.0-9 ()-]*", text) or re.search(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}", text):
+    if len(text) > 32 or not _UNIT.fullmatch(text) or _POWER_TOWER.search(text):
         return None
     registry = _registry()
     into = _ALIASES.get(into.casefold(), into)
@@ -491,28 +559,41 @@ def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
     return b - a, a
 
 
-def _convert(path: Path, signal: str, key: str, values: np.ndarray, unit: str, stated: bool, design_rpm: float | None, notes: list[str]) -> np.ndarray:
-    """Values in the signal's own unit; ``stated`` where the user named the unit, else the file did."""
-    own = UNITS.get(signal, "s")
-    if signal == "state" or unit.strip() in ("", own):
-        return values
-    factor = _factor(unit, own)
-    allowed = f"{own} or what converts to it"
-    if isinstance(factor, str) and signal in _SPEED:
-        allowed = "%, or rpm, Hz, rad/s with the design speed"
-        speed = _factor(unit, "rpm")
-        if isinstance(speed, tuple):
-            if design_rpm is None:
-                raise LogError(f"{path}: {signal} ({key}) is in {unit}; the design speed is needed to make it % (--design-rpm R), or --unit {signal}=%")
-            return values * (speed[0] * 100.0 / design_rpm)
-    if isinstance(factor, tuple):
-        return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
-    if factor is None and not stated:
-        notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
-        return values
-    if factor is None:
-        raise LogError(f"{path}: {signal}: unit {unit!r} is not known; allowed: {allowed}")
-    raise LogError(f"{path}: {signal} ({key}) is in {unit}, which does not convert; allowed: {allowed} (--unit {signal}=...)")
+_NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
+
+
+@dataclass(frozen=True)
+class _Units:
+    """How to bring a signal's samples to its own unit; ``stated`` are the units that the user named, signal -> unit."""
+
+    path: Path
+    stated: Mapping[str, str]
+    design_rpm: float | None
+    notes: list[str]
+
+    def convert(self, signal: str, key: str, values: np.ndarray, unit: str) -> np.ndarray:
+        own = UNITS.get(signal, "s")
+        stated = signal in self.stated
+        unit = self.stated.get(signal, unit).strip()
+        if signal == "state" or unit == own or unit.casefold() in _NO_UNIT or (unit == "1" and not stated):
+            return values
+        factor = _factor(unit, own)
+        if isinstance(factor, tuple):
+            return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
+        if factor is None and not stated:
+            self.notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
+            return values
+        allowed = f"{own} or what converts to it"
+        if signal in _SPEED:
+            allowed = "%, or rpm, Hz, rad/s with the design speed"
+            speed = _factor(unit, "rpm")
+            if isinstance(speed, tuple):
+                if self.design_rpm is None:
+                    way = f"--design-rpm R gives the design speed, --unit {signal}=% says that it is % already"
+                    raise LogError(f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}")
+                return values * (speed[0] * 100.0 / self.design_rpm)
+        what = "unit is not known" if factor is None else "unit does not convert"
+        raise LogError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed} (--unit {signal}=...)")
 
 
 # --- reading -----------------------------------------------------------------------------------------------------------------------------
@@ -535,15 +616,38 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None) -> dict[str, str]:
     return out
 
 
-def _find(source: Source, name: str) -> list[str]:
-    """What the file offers under ``name``: exact before any case, full name before short."""
+def _find(source: Source, name: str, mapped: bool) -> list[str]:
+    """What the file offers under ``name``: full name before short; in any case of letters only where the user gave the name."""
     if name in source.names:
         return [name]
-    for fold in (str, str.casefold):
+    for fold in (str, str.casefold) if mapped else (str,):
         hits = [k for k, aliases in source.names.items() if any(fold(name) == fold(a) for a in aliases)]
         if hits:
             return hits
     return []
+
+
+def _take(path: Path, source: Source, signal: str, name: str, mapped: bool, needed: bool, notes: list[str]) -> tuple[str, Series] | None:
+    """Key and samples of a signal; None where the file does not offer it. Refuses a name that the user gave in vain."""
+    keys = _find(source, name, mapped)
+    if not keys:
+        if not mapped:
+            return None
+        reason = source.absent(name)
+        close = f" ({reason})" if reason else _close(name, {a for aliases in source.names.values() for a in aliases})
+        raise LogError(f"{path}: no {source.kind} {name!r} to map to {signal}{close}{source.has()}")
+    series = {k: source.series(k) for k in keys}
+    if len(keys) == 1:
+        return keys[0], series[keys[0]]
+    # databases repeat a name in messages that never carry it: the only one that moves is meant
+    moving = [k for k in keys if series[k].values.size and np.ptp(series[k].values) > 0]
+    if len(moving) == 1:
+        notes.append(f"{signal}: took {moving[0]}; {', '.join(k for k in keys if k != moving[0])} never changes")
+        return moving[0], series[moving[0]]
+    if mapped or needed:
+        raise LogError(f"{path}: {signal} may be {' or '.join(keys[:6])}; name one: --map {keys[0]}={signal}")
+    notes.append(f"{signal}: may be {' or '.join(keys[:6])}: left out (--map {keys[0]}={signal} takes one)")
+    return None
 
 
 def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: list[str]) -> Channel | None:
@@ -551,22 +655,22 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
     t, values = s.t, s.values
     finite = np.isfinite(t) & np.isfinite(values)
     if not finite.all():
-        lost = ~finite & ~(_is_absent(values) | _is_absent(t))
-        if lost.any():
-            notes.append(f"{signal} ({key}): {int(lost.sum())} of {t.size} samples are NaN or infinite: left out")
+        lost = int(np.count_nonzero(~finite & ~(_is_absent(values) | _is_absent(t))))
+        if lost:
+            notes.append(f"{signal} ({key}): {lost} of {t.size} samples are NaN or infinite: left out")
         t, values = t[finite], values[finite]
     if not in_order and t.size:
         back = np.flatnonzero(np.diff(t) < 0)
         if back.size:
-            row = np.flatnonzero(finite)[back[0] + 1] + s.first
-            a, b = t[back[0]], t[back[0] + 1]
+            row, (a, b) = np.flatnonzero(finite)[back[0] + 1] + s.first, t[back[0] : back[0] + 2]
             raise LogError(f"{path}: {signal} ({key}): time runs backwards at {s.word} {row}, from {a:.9g} s to {b:.9g} s")
     if t.size:
         last = np.append(np.diff(t) > 0, True)
         if not last.all():
-            notes.append(f"{signal} ({key}): {int((~last).sum())} samples share their time with the next: the last is kept")
+            notes.append(f"{signal} ({key}): {int(np.count_nonzero(~last))} samples share their time with the next: the last is kept")
             t, values = t[last], values[last]
     if not t.size:
+        notes.append(f"{signal} ({key}): no sample that can be used")
         return None
     return Channel(np.ascontiguousarray(t, np.float64), np.ascontiguousarray(values, np.float64))
 
@@ -587,90 +691,54 @@ def read_log(
     mapping     name in the log -> signal, {"N1_DEM": "n_dem"}; a CAN name may be MESSAGE.SIGNAL, an MDF name GROUP.CHANNEL
     units       signal -> unit that the log uses for it, {"n_r": "rpm"}; goes before a unit in the file
     design_rpm  design speed, rpm; needed where a rotor speed is not in %
-    require     signals without which the log is of no use
+    require     signals without which the log is of no use; each needs two samples
 
     Raises LogError, one line, for whatever cannot be used.
     """
-    path = Path(path)
+    path, require = Path(path), tuple(require)
     named = _pairs(path, mapping)
-    stated = dict(units or {})
-    for signal in stated:
-        if signal not in UNITS and signal != "t":
-            raise LogError(f"{path}: unit {signal}={stated[signal]}: {signal!r} is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}, t")
-    require = tuple(require)
-    for signal in require:
-        if signal not in UNITS:
-            raise LogError(f"{path}: {signal!r} is required but is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}")
+    for what, given in (("unit of", dict(units or {})), ("required", dict.fromkeys(require))):
+        for signal in given:
+            if signal not in UNITS and signal != "t":
+                raise LogError(f"{path}: {what} {signal!r}: is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}, t")
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
-    source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {v: k for k, v in named.items()}))
 
-    keys: dict[str, list[str]] = {}
+    source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}))
+    notes: list[str] = []
+    unit = _Units(path, units or {}, design_rpm, notes)
+    channels: dict[str, Channel] = {}
     for signal in UNITS:
         name = named.get(signal, signal)
-        keys[signal] = _find(source, name)
-        if signal in named and not keys[signal]:
-            reason = source.absent(name)
-            raise LogError(
-                f"{path}: no {source.kind} {name!r} to map to {signal}"
-                + (f" ({reason})" if reason else _close(name, {a for aliases in source.names.values() for a in aliases}))
-                + _has(source.kind, source.names)
-            )
-    series = source.series(sorted({k for ks in keys.values() for k in ks}))
-    notes: list[str] = []
-    channels: dict[str, Channel] = {}
-    for signal, candidates in keys.items():
-        key = _choose(path, signal, candidates, series, notes)
-        if key is None:
-            continue
-        s = series[key]
-        t = s.t
-        if "t" in stated:
-            t = _convert(path, "t", "t", t, stated["t"], True, None, notes)
-        values = _convert(path, signal, key, s.values, stated.get(signal, s.unit), signal in stated, design_rpm, notes)
-        values = np.where(_is_absent(s.values), _ABSENT, values) if values is not s.values else values
-        channel = _clean(path, signal, key, Series(t, values, "", s.first, s.word), source.sorted, notes)
-        if channel is None:
-            notes.append(f"{signal} ({key}): no sample that can be used")
-        else:
-            channels[signal] = channel
-    for signal in require:
-        if signal not in channels:
-            name = named.get(signal, signal)
-            why = [n for n in source.notes + notes if key_in(n, keys[signal], signal)]
-            reason = "; ".join(why) or source.absent(name)
-            raise LogError(
-                f"{path}: no {signal}: looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
-                + f"; --map NAME={signal} names another" + _has(source.kind, source.names)
-            )  # fmt: skip
+        said = len(source.notes), len(notes)
+        try:
+            taken = _take(path, source, signal, name, signal in named, signal in require, notes)
+        except LogError as e:
+            raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
+        if taken is not None:
+            key, s = taken
+            t = unit.convert("t", "t", s.t, s.t_unit)
+            values = unit.convert(signal, key, s.values, s.unit)
+            if values is not s.values:
+                values = np.where(_is_absent(s.values), _ABSENT, values)
+            channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
+            if channel is not None:
+                channels[signal] = channel
+        if signal in require and (signal not in channels or channels[signal].t.size < 2):
+            found = "only one sample of" if signal in channels else "no"
+            reason = "; ".join(source.notes[said[0] :] + notes[said[1] :]) or source.absent(name)
+            asked = f"looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
+            raise LogError(f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}")
     _shift(channels, notes)
-    return Log(str(path), channels, list(source.notes) + notes)
-
-
-def key_in(note: str, keys: list[str], signal: str) -> bool:
-    """Whether a note speaks of one of ``keys``, their messages, or the signal."""
-    return any(note.startswith((f"{k}:", k.split(".")[0] + ":")) for k in keys) or note.startswith(f"{signal} (")
-
-
-def _choose(path: Path, signal: str, candidates: list[str], series: dict[str, Series], notes: list[str]) -> str | None:
-    """The one candidate, or among several the only one that moves (databases repeat a name in messages that never carry it)."""
-    if len(candidates) <= 1:
-        return candidates[0] if candidates else None
-    moving = [k for k in candidates if series[k].values.size and np.ptp(series[k].values) > 0]
-    if len(moving) != 1:
-        raise LogError(f"{path}: {signal} may be {' or '.join(candidates)}; name one: --map {candidates[0]}={signal}")
-    notes.append(f"{signal}: took {moving[0]}; {', '.join(k for k in candidates if k != moving[0])} never changes")
-    return moving[0]
+    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])))
 
 
 def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
     """Count time from the start of the log where the file counts from 1970."""
-    if channels and (start := min(c.t[0] for c in channels.values())) > _EPOCH:
+    if channels and (start := min(float(c.t[0]) for c in channels.values())) > _EPOCH:
         notes.append(f"time counts from 1970: {start:.6f} s taken for the start of the log")
         for name, c in channels.items():
-            t = c.t - start
-            keep = np.append(np.diff(t) > 0, True)
-            channels[name] = Channel(t[keep], c.values[keep])
+            channels[name] = Channel(c.t - start, c.values)
 
 
 # --- writing -----------------------------------------------------------------------------------------------------------------------------
