@@ -79,7 +79,7 @@ def test_report_is_one_file_that_needs_no_network(own_log, tmp_path) -> None:
     page = tmp_path / "r.html"
     assert vaneloop("replay", own_log / "own.csv", "--report", page, "--out", tmp_path / "sim.parquet").returncode == 0
     html = page.read_text(encoding="utf-8")
-    assert "vigv" in html.lower() and "<script src=" not in html and "https://cdn" not in html
+    assert "vigv" in html.lower() and "<script src=" not in html and "<link " not in html
     assert (tmp_path / "sim.parquet").stat().st_size > 1000
 
 
