@@ -148,6 +148,8 @@ def _ring_direction(c, s, ax, ay, lb, lc, ld):
     if r > 0.0:
         v = math.sqrt(r)
     elif r <= 0.0:  # stretched or folded
+        if q2 == 0.0:
+            return 1.0, 0.0
         v = 0.0
         u = math.copysign(math.sqrt(q2), u)
     else:  # NaN
@@ -239,20 +241,26 @@ def vane_slope(stroke, g, k):
     d(th0 + th1)/dLx = Lx / sqrt(D^2 Le^2 - m^2)                      from the law of cosines at J2
     d th5 = Lb Re(conj(p) i e) / Re(conj(p) i w) / Ld d(th0 + th1)   p = Q - Ld w along the link: its length does not change
     d thl = `vane_per_ring` d th5
+    0 where the linkage is held stretched or folded.
     """
     x1, y1, le = g[G_X1], g[G_Y1], g[G_LE]
     o = N_CRANK + k * N_PER_STAGE
     lb, ld = g[o + G_LB], g[o + G_LD]
-    c, s = crank(stroke, g[G_LX0], x1, y1, le)
     lx = g[G_LX0] + stroke
     d2 = x1 * x1 + y1 * y1
     m = 0.5 * (d2 + le * le - lx * lx)
-    dcrank = lx / math.sqrt(max(d2 * le * le - m * m, 1e-18))
+    r = d2 * le * le - m * m
+    if r <= 0.0:
+        return 0.0
+    c, s = crank(stroke, g[G_LX0], x1, y1, le)
     cos5, sin5 = _ring_direction(c, s, g[o + G_AX], g[o + G_AY], lb, g[o + G_LC], ld)
     wx, wy = -sin5, cos5
     px = g[o + G_AX] + lb * c - ld * wx
     py = g[o + G_AY] + lb * s - ld * wy
-    dring = dcrank * lb * (py * c - px * s) / (ld * (py * wx - px * wy))
+    turn = py * wx - px * wy
+    if abs(turn) < 1e-9 * ld:
+        return 0.0
+    dring = lx / math.sqrt(r) * lb * (py * c - px * s) / (ld * turn)
     return dring * vane_per_ring(math.atan2(sin5, cos5), g[o + G_LDP], g[o + G_L])
 
 
@@ -314,8 +322,8 @@ def paper_theta4(x5, y5, lb, lc, ld):
 def paper_theta3(x5, y5, lb, lc, ld, theta4):
     """Equation (14): sin th3 = (y5 Ld cos th4 + y5 Lc - (x5 + Lb) Ld sin th4) / ((x5 + Lb)^2 + y5^2), rad.
 
-    The arcsine alone does not suffice: a link square to the lower arm has th3 = 90 deg. The linkage starts there at stroke 0 (VGV1 passes it at
-    -0.2 mm), where the arcsine folds back and keeps half of the digits. The cosine from the same rows of (10) decides the quadrant:
+    The arcsine alone does not suffice: a link square to the lower arm has th3 = 90 deg. The linkage starts there at stroke 0 (VGV1 passes
+    it at -0.2 mm), where the arcsine folds back and keeps half of the digits. The cosine from the same rows of (10) decides the quadrant:
     cos th3 = ((x5 + Lb) (Ld cos th4 + Lc) + y5 Ld sin th4) / ((x5 + Lb)^2 + y5^2).
     """
     b = x5 + lb
