@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.figures import SignalError, noise_floor
-from hil.page import Line, Page, Panel, Tone, bars, histogram, loop, number, overlay
+from hil.page import Line, Page, Panel, Tone, bars, break_at_holes, histogram, loop, number, overlay
 
 __all__ = ["PAPER_TABLE_5", "engine_test_report", "replay_report"]
 
@@ -523,8 +523,8 @@ def _against_speed(result: Result, vane: str, name: str = "simulated", role: str
     speed = _rotor_speed(result)
     lines = []
     if vane in result.measured:
-        c = result.measured[vane]
-        lines.append(Line("measured", np.interp(c.t, result.t, speed, left=np.nan, right=np.nan), c.values, "measured", 1.2))
+        t, angle = break_at_holes(result.measured[vane].t, result.measured[vane].values)
+        lines.append(Line("measured", np.interp(t, result.t, speed, left=np.nan, right=np.nan), angle, "measured", 1.2))
     lines.append(Line(name, speed, result.model[vane], role, 1.2))
     n, target = speed, np.asarray(result.target[vane], dtype=float)
     good = np.isfinite(n) & np.isfinite(target)
@@ -546,7 +546,8 @@ def _hysteresis_section(page: Page, result: Result, vanes: Sequence[str]) -> Non
         paths = []
         if v in result.measured and "x_lvdt" in result.measured:
             x, c = result.measured["x_lvdt"], result.measured[v]
-            paths.append(("measured", np.interp(c.t, x.t, x.values, left=np.nan, right=np.nan), c.values, "measured"))
+            t, angle = break_at_holes(c.t, c.values)
+            paths.append(("measured", np.interp(t, x.t, x.values, left=np.nan, right=np.nan), angle, "measured"))
         if "x_lvdt" in result.model:
             paths.append(("simulated", result.model["x_lvdt"], result.model[v], "model"))
         if paths:

@@ -247,6 +247,38 @@ def test_panels_share_one_time_axis():
     assert all(upper[0] > lower[1] for upper, lower in zip(domains, domains[1:], strict=False))
 
 
+def test_a_thinned_loop_stays_on_the_path_and_covers_it():
+    t = np.arange(400_000) * 0.01
+    angle = 0.3 * t + np.where(np.sin(0.01 * t) > 0.99, 5.0, 0.0)
+    x, y = np.cos(angle), 2 * np.sin(angle)
+    trace = loop([Line("a", x, y)], "x", "y")["data"][0]
+    u, v = unpack(trace["x"]), unpack(trace["y"])
+    assert u.size <= page_module.MAX_POINTS
+    drawn = np.isfinite(u)
+    assert np.abs(u[drawn] ** 2 + (v[drawn] / 2) ** 2 - 1).max() < 1e-5
+    around = np.unwrap(np.sort(np.arctan2(v[drawn] / 2, u[drawn])))
+    assert np.diff(around).max() < 0.02
+
+
+@pytest.mark.parametrize("n", [300, 300_000])
+def test_a_gap_in_the_data_is_a_gap_in_the_loop(n):
+    x = np.linspace(0, 1, n)
+    y = x.copy()
+    y[n // 3 : n // 2] = np.nan
+    trace = loop([Line("a", x, y)], "x", "y")["data"][0]
+    u = unpack(trace["x"])
+    step = np.abs(np.diff(u))
+    assert np.nanmax(step) < 0.02 and np.isnan(u).any()
+
+
+def test_a_long_dwell_takes_no_points_from_a_fast_motion():
+    ramp = np.linspace(0, 1, 200)
+    x = np.concatenate([np.zeros(200_000), ramp, np.ones(200_000), ramp[::-1]])
+    trace = loop([Line("a", x, x**2)], "x", "y")["data"][0]
+    u = unpack(trace["x"])
+    assert np.nanmax(np.abs(np.diff(u))) < 0.011
+
+
 def test_a_histogram_shares_out_all_samples():
     e = np.concatenate([np.random.default_rng(0).normal(size=5000), [1e6, np.nan]])
     assert unpack(histogram({"e": e}, "x")["data"][0]["y"]).sum() == pytest.approx(100, abs=1e-3)
