@@ -11,7 +11,7 @@ from pydantic import model_validator
 from controller import firmware
 from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
 
-__all__ = ["Calibration", "STRATEGIES", "load_calibration", "new_state"]
+__all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_state"]
 
 STRATEGIES = ("single", "dual")
 _SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3}  # mA/mm = A/m and the other ratios need no factor
@@ -123,6 +123,32 @@ class CalibrationTable(Table):
     lvdt_monitor: LvdtMonitor
     servo_monitor: ServoMonitor
 
+    @model_validator(mode="after")
+    def _together(self) -> CalibrationTable:
+        """Refuse values that are possible one by one but not together."""
+        low, high = self.schedule.stroke_min.value, self.schedule.stroke_max.value
+        limit, half = self.servo.current_limit.value, 0.5 * (high - low)
+        d, m = self.demand_monitor, self.lvdt_monitor
+        stroke, current = self.fail_safe.fail_safe_stroke.value, self.fail_safe.fail_safe_current.value
+        for good, key, value, unit, allowed in (
+            (low <= stroke <= high, "fail_safe.fail_safe_stroke", stroke, "mm", f"in [{low:g}, {high:g}], stroke_min to stroke_max"),
+            (abs(current) <= limit, "fail_safe.fail_safe_current", current, "mA", f"in [{-limit:g}, {limit:g}], the current_limit"),
+            (d.demand_low.value < d.demand_high.value, *_named(d, "demand_low"), f"below demand_high (={d.demand_high.value:g} %)"),
+            (m.lvdt_low.value < low, *_named(m, "lvdt_low"), f"below stroke_min (={low:g} mm)"),
+            (m.lvdt_high.value > high, *_named(m, "lvdt_high"), f"above stroke_max (={high:g} mm)"),
+            (m.stuck_margin.value < half, *_named(m, "stuck_margin"), f"below {half:g}, half the way from stroke_min to stroke_max"),
+            (m.stuck_current.value < limit, *_named(m, "stuck_current"), f"below current_limit (={limit:g} mA)"),
+        ):
+            if not good:
+                raise ValueError(f"{key} (={value:g} {unit}) must be {allowed}")
+        return self
+
+
+def _named(section: DemandMonitor | LvdtMonitor, key: str) -> tuple[str, float, str]:
+    """Dotted name, value and unit of a quantity, for a message."""
+    q = getattr(section, key)
+    return f"{'demand' if isinstance(section, DemandMonitor) else 'lvdt'}_monitor.{key}", q.value, q.unit
+
 
 class StrokeTable(Bounded):
     """``stroke_tables.toml``: stroke against speed, one curve per direction and their mean."""
@@ -139,6 +165,14 @@ class StrokeTable(Bounded):
         for key in ("extension", "retraction", "single"):
             if len(getattr(self, key).values) != n:
                 raise ValueError(f"{key}.values has {len(getattr(self, key).values)} numbers; speed has {n}")
+        for key in ("extension", "retraction", "single"):
+            strokes = getattr(self, key).values
+            for i, (a, b) in enumerate(zip(strokes, strokes[1:], strict=False)):
+                if b < a:
+                    raise ValueError(f"{key}.values[{i + 1}] (={b:g}) must not be less than the value before it (={a:g})")
+        for i, (e, m, r) in enumerate(zip(self.extension.values, self.single.values, self.retraction.values, strict=True)):
+            if not e >= m >= r:
+                raise ValueError(f"single.values[{i}] (={m:g}) must lie between retraction (={r:g}) and extension (={e:g})")
         return self
 
 
@@ -172,4 +206,5 @@ def new_state() -> np.ndarray:
     z = np.zeros(firmware.N_STATE)
     z[firmware.DIRECTION] = 1.0
     z[firmware.BLEND] = 1.0
+    z[firmware.X_REACH] = firmware.FAR
     return z

@@ -72,7 +72,7 @@ SCALARS = (
     "fail_safe_stroke",  # m
     "fail_safe_current",  # A, when the LVDT cannot be used
     "fail_safe_rate",  # m/s, on the way to the fail-safe stroke
-    "degraded_hold",  # s: longest time in DEGRADED before FAIL_SAFE
+    "degraded_hold",  # s: longest presence of a fault's cause in DEGRADED before FAIL_SAFE
     "recover_time",  # s: all clear for this long before RUN returns
     "demand_timeout",  # s without a good frame: stale
     "demand_reject_limit",  # refused frames in the bucket: rejected
@@ -155,7 +155,7 @@ STATE = (
     "x_dem",  # m, stroke demand, rate-limited (the end of the present 10 ms)
     "x_from",  # m, stroke demand 10 ms before
     "x_meas",  # m, last plausible stroke
-    "x_last",  # m, last raw sample
+    "x_reach",  # m, how far from x_meas the stroke can have come since that sample
     "lvdt_good",  # 1 if the last sample was plausible
     "stuck_x",  # m, where the stuck timer started
     "stuck_timer",
@@ -174,6 +174,7 @@ STATE = (
     "t_saturated",
     "t_demand_range",
     "x_servo",  # m, reference of the servo at this tick
+    "run_request",  # 1 if the last good frame asked for RUN
 )
 N_STATE = len(STATE)
 (
@@ -195,7 +196,7 @@ N_STATE = len(STATE)
     X_DEM,
     X_FROM,
     X_MEAS,
-    X_LAST,
+    X_REACH,
     LVDT_GOOD,
     STUCK_X,
     STUCK_TIMER,
@@ -214,14 +215,18 @@ N_STATE = len(STATE)
     T_SATURATED,
     T_DEMAND_RANGE,
     X_SERVO,
+    RUN_REQUEST,
 ) = range(N_STATE)
 
 TICK = 1e-3  # s, servo rate 1 kHz
 SLOW = 10  # ticks: demand, trend and schedule run every 10 ms
 SLOW_TICK = 1e-2  # s
+HALF_TICK = 0.5 * TICK  # s: timers are sums of ticks; half a tick keeps their rounding from costing a whole one
 
 # ---- rows of the stroke table -------------------------------------------------------------------------------------------------------
 ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
+
+FAR = 1.0  # m, beyond any stroke
 
 
 @njit(cache=True, error_model="numpy")
@@ -267,7 +272,7 @@ def trend_step(z, k, n_dem):
     moving = -d * z[TREND_RATE] > k[TREND_RATE_ON] and back > 0.5 * k[TREND_CHANGE]
     if moving or back > k[TREND_CHANGE]:
         z[TREND_TIMER] += SLOW_TICK
-        if z[TREND_TIMER] >= k[TREND_HOLD]:
+        if z[TREND_TIMER] >= k[TREND_HOLD] - HALF_TICK:
             z[DIRECTION] = -d
             z[TREND_TURN] = n_dem
             z[TREND_TIMER] = 0.0
@@ -344,41 +349,49 @@ def _debounce(z, timer, bad, bit, rise, heal):
     mask = int(z[FAULT_BITS])
     if mask & (1 << bit):
         z[timer] = 0.0 if bad else z[timer] - TICK
-        if z[timer] <= -heal:
+        if z[timer] <= HALF_TICK - heal:
             z[FAULT_BITS] = float(mask & ~(1 << bit))
             z[timer] = 0.0
     else:
         z[timer] = z[timer] + TICK if bad else 0.0
-        if bad and z[timer] >= rise:
+        if bad and z[timer] >= rise - HALF_TICK:
             z[FAULT_BITS] = float(mask | (1 << bit))
             z[timer] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def _condition_lvdt(z, k, x):
-    """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one."""
+    """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one.
+
+    A sample is plausible if the piston can have come there from the last plausible one at ``lvdt_rate``, however long ago that was: a
+    spike costs one sample, a gap none after it, and a lasting step is refused until it is a fault.
+    """
     in_range = k[LVDT_LOW] <= x <= k[LVDT_HIGH]  # False for NaN
-    first = z[TICKS] == 0.0
-    jump = in_range and not first and abs(x - z[X_LAST]) > k[LVDT_RATE] * TICK
-    if in_range:
-        z[X_LAST] = x
-    z[LVDT_GOOD] = 1.0 if in_range and not jump else 0.0
-    if z[LVDT_GOOD] == 1.0:
+    z[X_REACH] = min(z[X_REACH] + k[LVDT_RATE] * TICK, FAR)
+    jump = in_range and abs(x - z[X_MEAS]) > z[X_REACH]
+    if in_range and not jump:
+        z[LVDT_GOOD] = 1.0
         z[X_MEAS] = x
-    _debounce(z, T_LVDT_RANGE, not in_range, F_LVDT_RANGE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
-    # a single jump is one sample; repeated jumps are a fault, so each counts as five samples of the debounce time
+        z[X_REACH] = 0.0
+    else:
+        z[LVDT_GOOD] = 0.0
+    _debounce_leaky(z, T_LVDT_RANGE, not in_range, F_LVDT_RANGE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
+    # each jump counts as five samples of the debounce time: a lasting step of more than 2 mm (the tracking limit) is a fault
     if jump:
         z[T_LVDT_RATE] += 4.0 * TICK
     _debounce_leaky(z, T_LVDT_RATE, jump, F_LVDT_RATE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
 
-    # stuck: a current that must move the piston, and no motion, away from the end stops
+    # stuck: a current that must move the piston, and no motion, away from the end stops; then stuck until there is motion
     inside = k[STROKE_MIN] + k[STUCK_MARGIN] < z[X_MEAS] < k[STROKE_MAX] - k[STUCK_MARGIN]
-    if abs(z[I_CMD]) > k[STUCK_CURRENT] and inside and abs(z[X_MEAS] - z[STUCK_X]) < k[STUCK_MOTION]:
-        z[STUCK_TIMER] += TICK
+    stuck = z[STUCK_TIMER] >= k[STUCK_TIME] - HALF_TICK
+    asked = abs(z[I_CMD]) > k[STUCK_CURRENT] and inside
+    if (asked or stuck) and abs(z[X_MEAS] - z[STUCK_X]) < k[STUCK_MOTION]:
+        if not stuck:
+            z[STUCK_TIMER] += TICK
     else:
         z[STUCK_X] = z[X_MEAS]
         z[STUCK_TIMER] = 0.0
-    _debounce(z, T_LVDT_STUCK, z[STUCK_TIMER] >= k[STUCK_TIME], F_LVDT_STUCK, TICK, k[LVDT_HEAL])
+    _debounce(z, T_LVDT_STUCK, z[STUCK_TIMER] >= k[STUCK_TIME] - HALF_TICK, F_LVDT_STUCK, TICK, k[LVDT_HEAL])
 
 
 @njit(cache=True, error_model="numpy")
@@ -389,27 +402,28 @@ def _debounce_leaky(z, timer, bad, bit, rise, heal):
         _debounce(z, timer, bad, bit, rise, heal)
         return
     z[timer] = z[timer] + TICK if bad else max(0.0, z[timer] - 0.1 * TICK)
-    if z[timer] >= rise:
+    if z[timer] >= rise - HALF_TICK:
         z[FAULT_BITS] = float(mask | (1 << bit))
         z[timer] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def _monitor_demand(inputs, z, k):
-    """Age, refusals and range of the ECU's demand; take the values of a good frame."""
-    n_dem, n_r = inputs[IN_N_DEM], inputs[IN_N_R]
+    """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too."""
+    n_dem, n_r, request = inputs[IN_N_DEM], inputs[IN_N_R], inputs[IN_MODE_REQUEST]
     fresh = inputs[IN_FRESH] > 0.5
-    in_range = (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH]) and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH])  # False for NaN
+    in_range = (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH]) and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH]) and 0.0 <= request <= 1.0  # not NaN
     good = fresh and in_range
     rejected = inputs[IN_REJECTED]
     if not (rejected >= 0.0):
         rejected = 0.0
-    bucket = z[REJECT_BUCKET] + min(rejected, 100.0) - k[DEMAND_REJECT_LEAK] * TICK
-    z[REJECT_BUCKET] = min(max(bucket, 0.0), 2.0 * k[DEMAND_REJECT_LIMIT])
+    bucket = max(z[REJECT_BUCKET] - k[DEMAND_REJECT_LEAK] * TICK, 0.0) + rejected
+    z[REJECT_BUCKET] = min(bucket, 2.0 * k[DEMAND_REJECT_LIMIT])
     if good:
         z[DEMAND_AGE] = 0.0
         z[N_DEM] = n_dem
         z[N_R_RAW] = n_r
+        z[RUN_REQUEST] = 1.0 if request > 0.5 else 0.0
         if z[DEMAND_SEEN] == 0.0:
             z[DEMAND_SEEN] = 1.0
             z[N_R] = n_r
@@ -417,7 +431,7 @@ def _monitor_demand(inputs, z, k):
             z[TREND_TURN] = n_dem
     else:
         z[DEMAND_AGE] = min(z[DEMAND_AGE] + TICK, 1e6)
-    _debounce(z, T_STALE, z[DEMAND_AGE] > k[DEMAND_TIMEOUT], F_STALE, TICK, k[RECOVER_TIME])
+    _debounce(z, T_STALE, z[DEMAND_AGE] >= k[DEMAND_TIMEOUT] - HALF_TICK, F_STALE, TICK, k[RECOVER_TIME])
     _debounce(z, T_REJECTED, z[REJECT_BUCKET] >= k[DEMAND_REJECT_LIMIT], F_REJECTED, TICK, k[RECOVER_TIME])
     _debounce(z, T_DEMAND_RANGE, fresh and not in_range, F_DEMAND_RANGE, TICK, k[RECOVER_TIME])
 
@@ -428,20 +442,31 @@ SERVO_MASK = (1 << F_TRACKING) | (1 << F_SATURATED)
 
 
 @njit(cache=True, error_model="numpy")
-def _choose_mode(z, k, mode_request):
+def _cause_present(z, mask):
+    """Is the cause of any fault in ``mask`` there at this tick, rather than gone and the fault healing?"""
+    faults = int(z[FAULT_BITS]) & mask
+    present = False
+    for bit in range(N_FAULTS):
+        present |= faults & (1 << bit) != 0 and z[T_STALE + bit] == 0.0
+    return present
+
+
+@njit(cache=True, error_model="numpy")
+def _choose_mode(z, k):
     """Next mode. The transitions that can happen are listed in docs/controller.md; this is all of them."""
     mode = int(z[MODE])
     faults = int(z[FAULT_BITS])
     lvdt_lost = (faults & LVDT_MASK) != 0
     trouble = (faults & (DEMAND_MASK | SERVO_MASK)) != 0
-    wants_run = mode_request > 0.5
+    wants_run = z[RUN_REQUEST] == 1.0
     if mode == INIT:
         if lvdt_lost:
             mode = FAIL_SAFE
-        elif z[TICKS] * TICK >= k[INIT_TIME] and z[LVDT_GOOD] == 1.0:
+        elif z[TICKS] * TICK >= k[INIT_TIME] - HALF_TICK and z[LVDT_GOOD] == 1.0:
             mode = STANDBY
     elif lvdt_lost:
         mode = FAIL_SAFE
+        z[RECOVER_TIMER] = 0.0
     elif mode == STANDBY:
         if wants_run and z[DEMAND_SEEN] == 1.0 and not trouble:
             mode = RUN
@@ -451,14 +476,15 @@ def _choose_mode(z, k, mode_request):
         elif not wants_run:
             mode = STANDBY
     elif mode == DEGRADED:
-        z[DEGRADED_TIMER] += TICK
+        if _cause_present(z, DEMAND_MASK | SERVO_MASK):
+            z[DEGRADED_TIMER] += TICK
         if not trouble:
             mode = RUN
-        elif z[DEGRADED_TIMER] >= k[DEGRADED_HOLD]:
+        elif z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:
             mode = FAIL_SAFE
     elif mode == FAIL_SAFE:
         z[RECOVER_TIMER] = 0.0 if trouble else z[RECOVER_TIMER] + TICK
-        if z[RECOVER_TIMER] >= k[RECOVER_TIME]:
+        if z[RECOVER_TIMER] >= k[RECOVER_TIME] - HALF_TICK:
             mode = RUN if wants_run and z[DEMAND_SEEN] == 1.0 else STANDBY
     if mode != int(z[MODE]):
         z[RECOVER_TIMER] = 0.0
@@ -510,18 +536,22 @@ def tick(inputs, state, calibration):
         z[I_CMD] = 0.0
         z[INTEGRAL] = 0.0
         z[SATURATED] = 0.0
+        servo_on = False
     elif mode == FAIL_SAFE and lvdt_lost:
         limit = k[CURRENT_LIMIT]
+        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])  # bumpless: the servo starts from where the piston is
+        z[X_FROM] = z[X_DEM]
         z[I_CMD] = min(max(k[FAIL_SAFE_CURRENT], -limit), limit)
         z[INTEGRAL] = 0.0
         z[SATURATED] = 0.0
+        servo_on = False
     else:
         servo_step(z, k, x_ref, dx_ref)
-    servo_on = mode == RUN or mode == DEGRADED
+        servo_on = True
     _debounce(z, T_TRACKING, servo_on and abs(x_ref - z[X_MEAS]) > k[TRACKING_LIMIT], F_TRACKING, k[TRACKING_TIME], k[RECOVER_TIME])
     _debounce(z, T_SATURATED, servo_on and z[SATURATED] == 1.0, F_SATURATED, k[SATURATED_TIME], k[RECOVER_TIME])
     z[TICKS] += 1.0
-    _choose_mode(z, k, inputs[IN_MODE_REQUEST])
+    _choose_mode(z, k)
     # NaN cannot enter through the inputs; this guards the outputs against a calibration edited by hand
     if math.isnan(z[I_CMD]):
         z[I_CMD] = 0.0
