@@ -573,6 +573,7 @@ def heat(
         "zmax": reach or 1.0,
         "xgap": 2,
         "ygap": 2,
+        "showlegend": False,
         "colorbar": {"title": {"text": _label(unit)}, "thickness": 12, "outlinewidth": 0},
         "hovertemplate": f"%{{y}}, %{{x}}: %{{z:.3g}} {_label(unit)}<extra></extra>",
     }
@@ -857,7 +858,7 @@ _SCRIPT = """
   const template = c => ({layout: {
     font: {family: 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif', size: 13, color: c.text},
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", xaxis: axis(c), yaxis: axis(c),
-    margin: {l: 66, r: 44, t: 44, b: 50}, dragmode: "zoom",
+    margin: {l: 66, r: 44, t: 44, b: 50}, dragmode: "zoom", showlegend: true,
     legend: {orientation: "h", x: 0, xanchor: "left", y: 1, yanchor: "bottom", yref: "container"},
     hoverlabel: {bgcolor: c.panel, bordercolor: c.muted, font: {color: c.text}},
     modebar: {orientation: "v", bgcolor: "rgba(0,0,0,0)", color: c.muted, activecolor: c.text},

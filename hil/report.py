@@ -554,12 +554,12 @@ def _hysteresis_section(page: Page, result: Result, vanes: Sequence[str]) -> Non
             pictures.append((v, paths))
     if not pictures:
         return
+    compare = " If the measured (blue) and the simulated (orange) loop differ in width, height or tilt, the linkage model misses something."
     page.section(
         "Hysteresis between stroke and vane angle",
         "The joints between actuator and vane have clearance, so the vane stands elsewhere after extending than after retracting. "
-        "Left: the "
-        "angle itself. Right: the same with the mean curve taken off, so that the width of the loop and its shape can be read. If the "
-        "measured (blue) and the simulated (orange) loop differ in width, height or tilt, the linkage model misses something.",
+        "Left: the angle itself. Right: the same with the mean curve taken off, so that the width of the loop and its shape can be read."
+        + (compare if any(len(paths) > 1 for _, paths in pictures) else ""),
     )
     for v, paths in pictures:
         _loops(page, v, paths)
