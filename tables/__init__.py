@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import tomllib
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 __all__ = ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"]
 
 _HERE = Path(__file__).parent
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: neither "1.0" nor true is a number
 
 
 class InputError(ValueError):
@@ -38,7 +39,7 @@ class Quantity(Table):
     value: Finite
     unit: str
     origin: str = Field(min_length=4)
-    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    tolerance: Annotated[Finite, Field(ge=0)] = 0.0
 
 
 class Axis(Table):
@@ -96,39 +97,56 @@ def read(source: str | Path, model: type[M]) -> M:
     Raises InputError, in one line, naming file, key, value and what is allowed.
     """
     file = Path(source)
-    if not file.is_file() and path(str(source)).is_file():
-        file = path(str(source))
     try:
-        data: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+        if not file.is_file() and path(str(source)).is_file():
+            file = path(str(source))
+        data: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as e:
-        raise InputError(f"{file}: cannot be read ({e.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise InputError(f"{file}: not a TOML table ({e})".replace("\n", " ")) from None
+        raise _refusal(source, f"cannot be read ({e.strerror})") from None
+    except (ValueError, RecursionError) as e:  # TOMLDecodeError, UnicodeDecodeError, a number of thousands of digits
+        raise _refusal(file, f"not a TOML table ({e})") from None
     try:
         return model.model_validate(data)
     except ValidationError as e:
-        raise InputError(f"{file}: {_one_line(e, model)}") from None
+        raise _refusal(file, _complaint(e, model)) from None
 
 
-def _one_line(e: ValidationError, model: type[BaseModel]) -> str:
-    """First complaint of pydantic as ``key (=value): what is allowed``."""
-    err = e.errors()[0]
+def _refusal(file: str | Path, why: str) -> InputError:
+    return InputError(" ".join(f"{file}: {why}".split()))
+
+
+def _complaint(e: ValidationError, model: type[BaseModel]) -> str:
+    """What matters most of pydantic's complaints, as ``key (=value): what is allowed``.
+
+    A misspelt key is both unknown and missing: it is told as unknown, with the key that was probably meant.
+    """
+    errors = e.errors()
+    err = next((x for x in errors if x["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(p) for p in err["loc"])
-    more = "" if e.error_count() == 1 else f" (and {e.error_count() - 1} more)"
-    if err["type"] == "missing":
-        return f"key {key!r} is missing; allowed here: {_allowed(model, err['loc'][:-1])}{more}"
-    if err["type"] == "extra_forbidden":
-        return f"key {key!r} is unknown; allowed here: {_allowed(model, err['loc'][:-1])}{more}"
+    more = "" if len(errors) == 1 else f" (and {len(errors) - 1} more)"
+    if err["type"] in ("missing", "extra_forbidden"):
+        allowed = _allowed(model, err["loc"][:-1])
+        meant = difflib.get_close_matches(str(err["loc"][-1]), allowed, 1) if err["type"] == "extra_forbidden" else []
+        hint = f", probably {meant[0]!r} is meant" if meant else ""
+        kind = "missing" if err["type"] == "missing" else "unknown"
+        return f"key {key!r} is {kind}{hint}; allowed here: {', '.join(allowed)}{more}"
     message = err["msg"].removeprefix("Value error, ")
     if err["type"] == "value_error":
         return f"{key}{': ' if key else ''}{message}{more}"
-    return f"{key} (={err['input']!r}): {message}{more}"
+    if err["type"] in ("model_type", "model_attributes_type"):
+        message = f"must be a table with the keys {', '.join(_allowed(model, err['loc']))}"
+    return f"{key} (={_short(err['input'])}): {message}{more}"
 
 
-def _allowed(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _allowed(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
     """Names of the keys allowed at ``loc`` inside ``model``."""
     here: Any = model
     for step in loc:
         field = getattr(here, "model_fields", {}).get(step)
         here = field.annotation if field is not None else here
-    return ", ".join(getattr(here, "model_fields", {})) or "?"
+    return list(getattr(here, "model_fields", {}))
