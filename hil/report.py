@@ -599,7 +599,9 @@ def _middle_curve(x: Array, y: Array) -> Any:
         sides.append((float(np.mean(x[group])), float(low), float(high)))
     at, low_side, high_side = np.array(sides).T
     width = high_side - low_side
-    open_loop = width >= 0.7 * np.median(width)  # at the ends only one side is visited
+    open_loop = width >= 0.6 * np.quantile(width, 0.95)  # elsewhere, as at the ends, only one side was visited
+    if open_loop.mean() < 0.6:  # too little of both sides for a curve
+        return line
     degree = min(3, int(open_loop.sum()) - 1)
     if degree < 1:
         return line
