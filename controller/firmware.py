@@ -20,6 +20,9 @@ import math
 
 from numba import njit
 
+# Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a tick.
+compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
+
 # ---- inputs -------------------------------------------------------------------------------------------------------------------------
 INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt")
 N_INPUTS = len(INPUTS)
@@ -229,7 +232,7 @@ ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
 FAR = 1.0  # m, beyond any stroke
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def look_up(axis, row, table, v):
     """Linear interpolation of ``table[row]`` over the increasing ``table[axis]``, held constant beyond both ends."""
     last = table.shape[1] - 1
@@ -248,7 +251,7 @@ def look_up(axis, row, table, v):
     return table[row, lo] + w * (table[row, hi] - table[row, lo])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def trend_step(z, k, n_dem):
     """Is the demand rising or falling? One 10 ms step.
 
@@ -280,7 +283,7 @@ def trend_step(z, k, n_dem):
         z[TREND_TIMER] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def schedule_step(z, k, table):
     """Stroke demand from the speed: one 10 ms step.
 
@@ -300,7 +303,7 @@ def schedule_step(z, k, table):
     z[X_TARGET] = min(max(target, k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def move_demand(z, k, target, rate):
     """Let the stroke demand follow ``target`` (m) no faster than ``rate`` (m/s): one 10 ms step."""
     step = rate * SLOW_TICK
@@ -309,7 +312,7 @@ def move_demand(z, k, target, rate):
     z[X_DEM] = min(max(z[X_DEM], k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def servo_step(z, k, x_ref, dx_ref):
     """Servo-valve current: PI on the stroke error with feed-forward of the demanded speed, one tick of 1 ms.
 
@@ -340,7 +343,7 @@ def servo_step(z, k, x_ref, dx_ref):
     z[I_CMD] = i
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _debounce(z, timer, bad, bit, rise, heal):
     """Set fault ``bit`` after ``rise`` seconds of bad ticks, clear it after ``heal`` seconds of good ones.
 
@@ -359,7 +362,7 @@ def _debounce(z, timer, bad, bit, rise, heal):
             z[timer] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _condition_lvdt(z, k, x):
     """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one.
 
@@ -394,7 +397,7 @@ def _condition_lvdt(z, k, x):
     _debounce(z, T_LVDT_STUCK, z[STUCK_TIMER] >= k[STUCK_TIME] - HALF_TICK, F_LVDT_STUCK, TICK, k[LVDT_HEAL])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _debounce_leaky(z, timer, bad, bit, rise, heal):
     """Like `_debounce`, but good ticks only count the timer down: intermittent faults add up."""
     mask = int(z[FAULT_BITS])
@@ -407,7 +410,7 @@ def _debounce_leaky(z, timer, bad, bit, rise, heal):
         z[timer] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _monitor_demand(inputs, z, k):
     """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too."""
     n_dem, n_r, request = inputs[IN_N_DEM], inputs[IN_N_R], inputs[IN_MODE_REQUEST]
@@ -441,7 +444,7 @@ DEMAND_MASK = (1 << F_STALE) | (1 << F_REJECTED) | (1 << F_DEMAND_RANGE)
 SERVO_MASK = (1 << F_TRACKING) | (1 << F_SATURATED)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _cause_present(z, mask):
     """Is the cause of any fault in ``mask`` there at this tick, rather than gone and the fault healing?"""
     faults = int(z[FAULT_BITS]) & mask
@@ -451,7 +454,7 @@ def _cause_present(z, mask):
     return present
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _choose_mode(z, k):
     """Next mode. The transitions that can happen are listed in docs/controller.md; this is all of them."""
     mode = int(z[MODE])
@@ -495,7 +498,7 @@ def _choose_mode(z, k):
     z[MODE] = float(mode)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def tick(inputs, state, calibration):
     """Run the controller for one servo tick of 1 ms.
 
