@@ -50,11 +50,11 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
                     f.rmdir() if f.is_dir() else f.unlink()
                 except OSError:
                     pass  # another process is using it; it goes next time
-    numba.config.CACHE_DIR = str(_folder)
+    numba.config.CACHE_DIR = str(_folder)  # type: ignore[attr-defined]
 
 compiled = njit(cache=True, error_model="numpy")
 
 
 def is_cached() -> bool:
     """Return True if compiled code of these sources is there already (the first run takes seconds to compile)."""
-    return any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))
+    return any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))  # type: ignore[attr-defined]

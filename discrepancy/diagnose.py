@@ -1,0 +1,348 @@
+"""Which effects is a stage missing? Screening, pairs of the leaders, pruning, rivals, and what is left.
+
+A candidate must earn its place on data that it was not fitted to. Two measures, both from the held-out errors of the log's blocks:
+
+- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats itself n times is one
+  observation, not n);
+- *spreads*: the fall of the RMS error in units of the noise floor's own spread, over the whole log, or within the blocks where it acts.
+
+A gain counts when it passes both thresholds. They are set on the maximum over the library under "nothing missing" (docs/diagnosis.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from discrepancy.fit import Fit, Judge
+from discrepancy.stage import Array, Stage
+
+__all__ = ["Candidate", "Found", "StageDiagnosis", "diagnose_stage"]
+
+NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
+SPREADS = 3.0  # the definition of detectable
+BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
+LEADERS = 5  # effects tried in pairs
+MOST = 4  # effects in one stage
+TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
+RESIDUAL_SHARE = 0.1  # of the excess over the floor that a model of the right kind may leave (its equation is not nature's)
+
+
+@dataclass
+class Candidate:
+    """An effect as a candidate: its gain on held-out data when it is added alone (or in the pair named) to the nominal model."""
+
+    effect: str
+    nats: float
+    spreads: float
+    reason: str = ""  # why it cannot be seen in this log, if it cannot
+
+
+@dataclass
+class Found:
+    """An effect named as missing."""
+
+    effect: str
+    probability: float
+    parameters: dict[str, dict[str, object]]
+    rivals: list[str]
+    nats: float
+
+
+@dataclass
+class StageDiagnosis:
+    """What one stage says."""
+
+    stage: str
+    verdict: str  # missing, none, unknown
+    floor: Array
+    base: Fit
+    final: Fit
+    error_before: Array
+    error_after: Array
+    effects: list[Found]
+    recalibrated: list[dict[str, object]]
+    candidates: list[Candidate]
+    correlation: float
+    steps: list[tuple[str, float]] = field(default_factory=list)  # waterfall: what was added, whitened RMS after it
+    excess: float = 1.0  # whitened RMS after the best model
+
+
+class Search:
+    """The search on one stage: fits made once, compared by their held-out blocks."""
+
+    def __init__(self, judge: Judge, tick: Callable[[], None] | None = None):
+        """Fit the nominal model and note how correlated its errors are."""
+        self.judge = judge
+        self.stage = judge.stage
+        self.tick = tick or (lambda: None)
+        self.fits: dict[frozenset[str], Fit] = {}
+        self.base = self.of(())
+        self.starts = self._screen()
+
+    def of(self, effects: tuple[str, ...], start: Array | None = None, iterations: int = 12) -> Fit:
+        """Return the fit with ``effects``, from memory if it was made before."""
+        key = frozenset(effects)
+        if key not in self.fits:
+            begin = self.stage.neutral() if start is None else start
+            self.fits[key] = self.judge.fit(tuple(effects), begin, iterations)
+            self.tick()
+        return self.fits[key]
+
+    def _screen(self) -> dict[str, list[Array]]:
+        """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal model."""
+        stage, judge = self.stage, self.judge
+        index = stage.index()
+        thetas, owner = [], []
+        for e in stage.effects:
+            for s in e.starts:
+                theta = self.base.theta.copy()
+                theta[index[e.name]] = s
+                thetas.append(theta)
+                owner.append(e.name)
+        free = self.base.free
+        low, high = judge.bounds()
+        e0, jac = judge._linearise(self.base.theta, free, judge.scale[free], low, high)
+        flat = jac.reshape(len(free), -1)
+        a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
+        costs = []
+        for i in range(0, len(thetas), 16):
+            errors = judge.errors(np.array(thetas[i : i + 16])).reshape(len(thetas[i : i + 16]), -1)
+            for e in errors:
+                step = np.linalg.solve(a, flat @ e) if len(free) else np.empty(0)
+                costs.append(float(e @ e - (2.0 * step @ (flat @ e) - step @ a @ step if len(free) else 0.0)))
+        out: dict[str, list[Array]] = {}
+        self.reach: dict[str, float] = {}
+        for name in {o: None for o in owner}:
+            mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
+            out[name] = [thetas[i] for _, i in mine[:2]]
+            base_cost = float(np.sum(e0 * e0))
+            self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
+        return out
+
+    def single(self, name: str) -> Fit:
+        """Fit with one effect, from its best starts."""
+        key = frozenset((name,))
+        if key not in self.fits:
+            fits = [self.judge.fit((name,), s, 8) for s in self.starts[name][:2]]
+            self.fits[key] = min(fits, key=lambda f: float(f.cost.sum()))
+            self.tick()
+        return self.fits[key]
+
+    def joined(self, effects: tuple[str, ...]) -> Fit:
+        """Fit with several effects, started from the fits with one fewer."""
+        key = frozenset(effects)
+        if key in self.fits:
+            return self.fits[key]
+        if len(effects) == 1:
+            return self.single(effects[0])
+        index = self.stage.index()
+        begins = []
+        for leave in effects:
+            rest = frozenset(effects) - {leave}
+            if rest in self.fits:
+                for source in self.starts[leave][:1] + [self.single(leave).theta]:
+                    theta = self.fits[rest].theta.copy()
+                    theta[index[leave]] = source[index[leave]]
+                    begins.append(theta)
+        if not begins:
+            theta = self.single(effects[0]).theta.copy()
+            for other in effects[1:]:
+                theta[index[other]] = self.single(other).theta[index[other]]
+            begins.append(theta)
+        costs = self.judge.block_costs(self.judge.errors(np.array(begins))).sum(axis=1)
+        order = np.argsort(costs)[:2]
+        fits = [self.judge.fit(tuple(effects), begins[i], 10) for i in order]
+        self.fits[key] = min(fits, key=lambda f: float(f.cost.sum()))
+        self.tick()
+        return self.fits[key]
+
+
+def _correlation(judge: Judge, theta: Array) -> float:
+    """Variance inflation of a sum of the whitened errors: 1 + 2 sum of the autocorrelations up to the first that is not positive."""
+    e = judge.errors(theta[None])[0]
+    worst = 1.0
+    for row in e:
+        row = row - row.mean()
+        power = float(row @ row)
+        if power <= 0.0:
+            continue
+        total = 1.0
+        for lag in range(1, min(400, len(row) // 4)):
+            rho = float(row[:-lag] @ row[lag:]) / power
+            if rho <= 0.05:
+                break
+            total += 2.0 * rho * rho  # squares of errors are correlated by rho squared
+        worst = max(worst, total)
+    return worst
+
+
+def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
+    """Return (nats, spreads): what ``after`` gains over ``before`` on held-out blocks."""
+    d = before.held_out - after.held_out
+    nats = 0.5 * float(d.sum()) / correlation
+    n = max(judge.n, 1)
+    spread = np.sqrt(correlation / (2.0 * n))
+    rms = [np.sqrt(max(f.held_out.sum(), 0.0) / n) for f in (before, after)]
+    overall = (rms[0] - rms[1]) / spread
+    m = np.maximum(judge.samples, 1)
+    local = (np.sqrt(np.maximum(before.held_out, 0.0) / m) - np.sqrt(np.maximum(after.held_out, 0.0) / m)) / np.sqrt(correlation / (2.0 * m))
+    return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
+
+
+def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bool:
+    """True when ``after`` is worth its extra effect."""
+    nats, spreads = gain(judge, before, after, correlation)
+    extra = max(len(after.free) - len(before.free), 1)
+    return nats > NATS + (extra - 1) and spreads > SPREADS
+
+
+def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
+    """Search the stage's library for what is missing.
+
+    floor  RMS of each output's error when nothing is missing
+    keep   samples that count
+    tick   called after every fit, for a progress bar
+    """
+    judge = Judge(stage, floor, keep)
+    search = Search(judge, tick)
+    base = search.base
+    n = max(judge.n, 1)
+
+    def rms(fit: Fit) -> float:
+        return float(np.sqrt(fit.held_out.sum() / n))
+
+    candidates = []
+    names = [e.name for e in stage.effects]
+    singles = {name: search.single(name) for name in names}
+    leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
+    correlation = min(_correlation(judge, leader.theta), 50.0)
+    for name in names:
+        nats, spreads = gain(judge, base, singles[name], correlation)
+        reason = ""
+        if search.reach[name] < 2.0 * NATS * correlation:
+            reason = stage.effect(name).excites or "this log does not excite it"
+        candidates.append(Candidate(name, nats, spreads, reason))
+    candidates.sort(key=lambda c: -c.nats)
+
+    chosen: tuple[str, ...] = ()
+    current = base
+    steps = [("nominal", rms(base))]
+    while len(chosen) < MOST and rms(current) > 1.0:
+        options: list[Fit] = []
+        if not chosen:
+            options += list(singles.values())
+            leaders = [c.effect for c in candidates[:LEADERS]]
+            if rms(leader) > TOLERATED:
+                options += [search.joined(pair) for pair in itertools.combinations(leaders, 2)]
+        else:
+            trial = sorted(names, key=lambda m: -_nats(candidates, m))
+            options += [search.joined((*chosen, m)) for m in trial if m not in chosen]
+        ok = [f for f in options if significant(judge, current, f, correlation)]
+        if not ok:
+            break
+        # fewest effects first: a pair must be significantly better than the best single
+        ok.sort(key=lambda f: (len(f.effects), float(f.held_out.sum())))
+        best = ok[0]
+        for f in ok[1:]:
+            if len(f.effects) == len(best.effects):
+                if f.held_out.sum() < best.held_out.sum():
+                    best = f
+            elif significant(judge, best, f, correlation):
+                best = f
+        chosen, current = best.effects, best
+        steps.append((" + ".join(chosen), rms(current)))
+    # backward: drop what is not needed any more
+    pruned = True
+    while pruned and len(chosen) > 1:
+        pruned = False
+        for name in chosen:
+            rest = tuple(c for c in chosen if c != name)
+            without = search.joined(rest)
+            if not significant(judge, without, current, correlation):
+                chosen, current, pruned = rest, without, True
+                break
+
+    effects = _name(judge, search, chosen, current, candidates, correlation)
+    excess_before, excess_after = rms(base) ** 2 - 1.0, rms(current) ** 2 - 1.0
+    limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
+    leftover = rms(current) > limit
+    if leftover and excess_after > RESIDUAL_SHARE * max(excess_before, 1e-12):
+        verdict, effects = "unknown", []
+    elif chosen:
+        verdict = "missing"
+    else:
+        verdict = "none"
+    before, after = (_rms_per_output(judge, f) for f in (base, current))
+    return StageDiagnosis(
+        stage.name, verdict, judge.floor, base, current, before, after, effects, _recalibrated(stage, current), candidates, correlation,
+        steps, rms(current),
+    )  # fmt: skip
+
+
+def _nats(candidates: list[Candidate], name: str) -> float:
+    return next(c.nats for c in candidates if c.effect == name)
+
+
+def _rms_per_output(judge: Judge, fit: Fit) -> Array:
+    """RMS error of each output in its unit, scaled from fitted to held-out blocks."""
+    e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
+    counts = np.maximum(judge.valid.sum(axis=1), 1)
+    inflation = np.sqrt(max(fit.held_out.sum(), 1e-300) / max(fit.cost.sum(), 1e-300))
+    return np.sqrt(np.sum(e * e, axis=1) / counts) * inflation
+
+
+def _name(
+    judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate], correlation: float
+) -> list[Found]:
+    """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters."""
+    stage, index = judge.stage, judge.stage.index()
+    out = []
+    rng = np.random.default_rng(0)
+    blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
+    near = [c.effect for c in candidates if c.effect not in chosen][:10]
+    for name in chosen:
+        rest = tuple(c for c in chosen if c != name)
+        alternatives = {name: current}
+        for other in near:
+            alternatives[other] = search.joined((*rest, other)) if rest else search.single(other)
+        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation)]
+        score = {}
+        for m, f in alternatives.items():
+            score[m] = -0.5 * f.held_out[blocks].sum(axis=1) / correlation
+        table = np.array(list(score.values()))
+        nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
+        weight = np.exp((table - table.max(axis=0)) / max(1.0, 0.02 * abs(nats)))  # equations are not nature's: 2 % of the gain is a tie
+        share = (weight / weight.sum(axis=0)).mean(axis=1)
+        parameters: dict[str, dict[str, object]] = {}
+        for i, p in zip(range(index[name].start, index[name].stop), stage.effect(name).parameters, strict=True):
+            k = int(np.flatnonzero(current.free == i)[0])
+            parameters[p.name] = {
+                "value": float(current.theta[i]),
+                "low": float(max(current.low[k], p.low)),
+                "high": float(min(current.high[k], p.high)),
+                "unit": p.unit,
+            }
+        out.append(Found(name, float(share[0]), parameters, rivals, nats))
+    return out
+
+
+def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
+    """True when the log can tell that ``other`` explains it less well than ``best``."""
+    nats, spreads = gain(judge, other, best, correlation)
+    return nats > NATS and spreads > SPREADS
+
+
+def _recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
+    """Nominal parameters that have moved significantly within their tolerance."""
+    out = []
+    for k, c in enumerate(fit.free):
+        if c < len(stage.parameters):
+            p = stage.parameters[c]
+            low, high = float(fit.low[k]), float(fit.high[k])
+            if not low <= p.value <= high:
+                out.append({"parameter": p.name, "value": float(fit.theta[c]), "low": low, "high": high, "unit": p.unit})
+    return out

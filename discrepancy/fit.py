@@ -1,0 +1,235 @@
+"""Fit a stage's parameters to its log, and judge a fit on data that it has not seen.
+
+Errors are divided by the noise floor and, where a stage integrates, freed of one constant per window. The fit is Levenberg-Marquardt with
+bounds; all difference steps and all damping trials of an iteration are one call of the stage's ``run`` (many parameter sets side by side).
+Nominal parameters carry a prior of the width of their tolerance.
+
+The log is cut into blocks. Leaving one block out changes the least-squares solution by a step that follows from the blocks' normal
+equations, so the held-out error of every block costs no further simulation (exact for a linear model, first order otherwise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from discrepancy.stage import Array, Stage
+
+__all__ = ["Fit", "Judge"]
+
+MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
+BLOCK_S = 10.0  # s, longer than the memory of any stage here
+MAX_SETS = 48  # parameter sets in one call of run
+DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
+
+
+@dataclass
+class Fit:
+    """Parameters fitted with some effects present.
+
+    effects   names of the effects set free
+    theta     float64[all parameters]
+    free      columns of theta that were fitted
+    cost      whitened sum of squares of every block, float64[blocks], with the parameters fitted to all blocks
+    held_out  the same with the parameters fitted to the other blocks
+    low, high 90 % interval of each free parameter
+    """
+
+    effects: tuple[str, ...]
+    theta: Array
+    free: Array
+    cost: Array
+    held_out: Array
+    gradients: Array
+    normals: Array
+    prior: Array
+    low: Array
+    high: Array
+
+
+class Judge:
+    """Everything that fits of one stage share: whitening, windows, blocks, base fit."""
+
+    def __init__(self, stage: Stage, floor: Array, keep: Array | None = None):
+        """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured ones)."""
+        self.stage, self.floor = stage, np.asarray(floor, dtype=float)
+        self.valid = np.isfinite(stage.measured)
+        if keep is not None:
+            self.valid &= keep
+        self.measured = np.where(self.valid, stage.measured, 0.0)
+        t = stage.t
+        span = t[-1] - t[0]
+        if stage.window:
+            w = np.minimum(((t - t[0]) / stage.window).astype(int), max(int(span / stage.window) - 1, 0))
+        else:
+            w = None
+        blocks = int(np.clip(span / BLOCK_S, MIN_BLOCKS, 60))
+        if w is not None:
+            per = max(1, round((w[-1] + 1) / blocks))
+            block_of = w // per
+            self.window_start = np.flatnonzero(np.diff(w, prepend=-1))
+        else:
+            block_of = np.minimum(((t - t[0]) / span * blocks).astype(int), blocks - 1)
+            self.window_start = None
+        self.block_start = np.flatnonzero(np.diff(block_of, prepend=-1))
+        self.n_blocks = len(self.block_start)
+        self.samples = np.add.reduceat(self.valid.sum(axis=0), self.block_start)
+        self.n = int(self.samples.sum())
+        self.scale = self._scales()
+        self._counts = None
+        if self.window_start is not None:
+            self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
+            self._lengths = np.diff(np.append(self.window_start, len(t)))
+
+    def _scales(self) -> Array:
+        """Size of a usual change of each parameter, for difference steps and damping."""
+        s = self.stage
+        out = [p.tolerance or abs(p.value) or 1.0 for p in s.parameters]
+        for e in s.effects:
+            starts = np.array(e.starts, dtype=float)
+            for i, p in enumerate(e.parameters):
+                away = np.abs(starts[:, i] - p.value)
+                away = away[away > 0]
+                out.append(float(np.median(away)) if len(away) else abs(p.value) or 1.0)
+        return np.array(out)
+
+    def errors(self, thetas: Array) -> Array:
+        """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""
+        thetas = np.atleast_2d(thetas)
+        parts = [self._whiten(self.stage.run(thetas[i : i + MAX_SETS])) for i in range(0, len(thetas), MAX_SETS)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _whiten(self, model: Array) -> Array:
+        e = np.where(self.valid, self.measured - model, 0.0)
+        e[~np.isfinite(e)] = 0.0
+        if self.window_start is not None and self._counts is not None:
+            mean = np.add.reduceat(e, self.window_start, axis=2) / self._counts
+            e -= np.repeat(mean, self._lengths, axis=2)
+            e[:, ~self.valid] = 0.0
+        return e / self.floor[:, None]
+
+    def block_costs(self, e: Array) -> Array:
+        """Sum of squares per block: float64[sets, blocks]."""
+        return np.add.reduceat(np.einsum("soi,soi->si", e, e), self.block_start, axis=1)
+
+    def columns(self, effects: tuple[str, ...]) -> Array:
+        """Columns that a fit with these effects sets free."""
+        s = self.stage
+        free = [i for i, p in enumerate(s.parameters) if p.tolerance > 0]
+        index = s.index()
+        for name in effects:
+            sl = index[name]
+            free += list(range(sl.start, sl.stop))
+        return np.array(free, dtype=int)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest value of every column; nominal parameters stay within their tolerance."""
+        s = self.stage
+        low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [p.low for e in s.effects for p in e.parameters]
+        high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [p.high for e in s.effects for p in e.parameters]
+        return np.array(low), np.array(high)
+
+    def fit(self, effects: tuple[str, ...], start: Array, iterations: int = 12, weights: Array | None = None) -> Fit:
+        """Fit the nominal parameters and those of ``effects`` from ``start``.
+
+        weights: of every block, default 1; 0 leaves a block out
+        """
+        s = self.stage
+        free = self.columns(effects)
+        low, high = self.bounds()
+        theta = np.clip(np.array(start, dtype=float), low, high)
+        nominal = s.neutral()
+        n_nominal = len(s.parameters)
+        tolerance = np.array([p.tolerance for p in s.all_parameters()])
+        # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
+        prior = np.array([3.0 / tolerance[c] ** 2 if c < n_nominal else 0.0 for c in free])
+        scale = self.scale[free]
+        block_weights = np.ones(self.n_blocks) if weights is None else weights
+        per_sample = np.repeat(block_weights, np.diff(np.append(self.block_start, len(s.t))))
+
+        def total(cost: Array, thetas: Array) -> Array:
+            return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
+
+        damping = 1e-3
+        best: float | None = None
+        for _ in range(iterations):
+            e, jac = self._linearise(theta, free, scale, low, high)
+            here = float(total(self.block_costs(e[None]), theta[None])[0])
+            if best is not None and best - here < 0.02 * len(free) and best >= here:
+                best = here
+                break
+            best = here
+            if len(free) == 0:
+                break
+            j2 = jac.reshape(len(free), -1) * np.tile(np.sqrt(per_sample), len(s.outputs))
+            r2 = e.reshape(-1) * np.tile(np.sqrt(per_sample), len(s.outputs))
+            a = j2 @ j2.T + np.diag(prior * scale**2)
+            g = j2 @ r2 - prior * scale * (theta[free] - nominal[free])
+            trials = []
+            for factor in (0.01, 1.0, 100.0, 1e4):
+                lam = damping * factor
+                step = np.linalg.solve(a + lam * np.diag(np.maximum(np.diag(a), 1e-9)), g)
+                trial = theta.copy()
+                trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
+                trials.append((lam, trial))
+            thetas = np.array([t for _, t in trials])
+            costs = total(self.block_costs(self.errors(thetas)), thetas)
+            k = int(np.argmin(costs))
+            if not costs[k] < here:
+                break
+            damping, theta = max(trials[k][0], 1e-9), thetas[k]
+            if here - costs[k] < 0.02 * max(1, len(free)):
+                break
+        return self._finish(effects, theta, free, prior, scale, nominal, low, high)
+
+    def _linearise(self, theta: Array, free: Array, scale: Array, low: Array, high: Array) -> tuple[Array, Array]:
+        """Whitened error at ``theta`` and minus its derivative by each scaled free parameter: (outputs, samples), (free, outputs, samples)."""
+        thetas = np.repeat(theta[None], len(free) + 1, axis=0)
+        steps = np.empty(len(free))
+        for i, c in enumerate(free):
+            d = DIFFERENCE * scale[i]
+            if theta[c] + d > high[c]:
+                d = -d
+            thetas[i + 1, c] += d
+            steps[i] = d / scale[i]
+        e = self.errors(thetas)
+        jac = (e[0] - e[1:]) / steps[:, None, None] if len(free) else np.empty((0, *e[0].shape))
+        return e[0], jac
+
+    def _finish(
+        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array
+    ) -> Fit:
+        e, jac = self._linearise(theta, free, scale, low, high)
+        k = len(free)
+        cost = self.block_costs(e[None])[0]
+        gradients = np.empty((self.n_blocks, k))
+        normals = np.empty((self.n_blocks, k, k))
+        ends = np.append(self.block_start[1:], e.shape[1])
+        for b, (i, j) in enumerate(zip(self.block_start, ends, strict=True)):
+            jb, eb = jac[:, :, i:j].reshape(k, -1), e[:, i:j].reshape(-1)
+            gradients[b], normals[b] = jb @ eb, jb @ jb.T
+        # parameters at a bound do not move
+        scaled_prior = prior * scale**2
+        pinned = (theta[free] <= low[free]) | (theta[free] >= high[free])
+        held = cost.copy()
+        half = np.zeros(k)
+        move = ~pinned
+        if move.any():
+            nm, gm, pm = normals[:, move][:, :, move], gradients[:, move], scaled_prior[move]
+            # at the solution the blocks' pulls and the prior's cancel; what is left of the pull is rounding and bounds
+            pull = gm.sum(axis=0) - pm * ((theta[free] - nominal[free]) / scale)[move]
+            total = nm.sum(axis=0) + np.diag(pm)
+            without = np.empty_like(gm)
+            for b in range(self.n_blocks):
+                a = total - nm[b] + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
+                without[b] = np.linalg.solve(a, pull - gm[b])
+            held = cost - 2.0 * np.einsum("bk,bk->b", without, gm) + np.einsum("bk,bkl,bl->b", without, nm, without)
+            covariance = np.linalg.pinv(total)
+            centre = without.mean(axis=0)
+            spread = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
+            excess = max(1.0, cost.sum() / max(self.n, 1))
+            half[move] = 1.645 * np.sqrt(np.maximum(np.diag(covariance) * excess, spread)) * scale[move]
+        return Fit(
+            effects, theta, free, cost, np.maximum(held, cost * 0.5), gradients, normals, prior, theta[free] - half, theta[free] + half
+        )

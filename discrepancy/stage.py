@@ -1,0 +1,114 @@
+"""What a model is to the search: stages with inputs, outputs, parameters, and effects that can be set free. Nothing here knows vanes.
+
+A stage is one part of the machine driven by its own *logged* inputs, so that one part's error does not hide in another's, as it does in a
+closed loop. It is a function from parameters to outputs, nothing more; the search does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["Effect", "Parameter", "Stage", "StageError"]
+
+Array = np.ndarray
+
+
+class StageError(ValueError):
+    """A stage that cannot be used: one line naming the stage, the thing and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a stage or of an effect, in ``unit``.
+
+    value      nominal value of a stage's parameter, neutral value of an effect's
+    low, high  physical bounds
+    tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted
+    """
+
+    name: str
+    value: float
+    unit: str
+    low: float = -np.inf
+    high: float = np.inf
+    tolerance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A physical effect that may be missing.
+
+    parameters  what it sets free; at their (neutral) values the effect is not there
+    starts      parameter vectors from which a fit is tried; they span undetectable to gross, both signs where the sign is free
+    excites     what a log needs to show it, in words
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    starts: tuple[tuple[float, ...], ...]
+    excites: str = ""
+
+
+@dataclass
+class Stage:
+    """One part of the machine on one log.
+
+    run       function from parameter sets, float64[sets, parameters], to outputs, float64[sets, outputs, samples]. The columns are the
+              stage's parameters, then each effect's in the order of ``effects`` (`index`)
+    t         s, float64[samples]
+    measured  float64[outputs, samples]; NaN where not measured
+    window    s: within each window of this length the initial state is free, so one constant per output is taken off the error there;
+              None for stages that do not integrate
+    regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
+    floor     RMS of an output's error when nothing is missing, in its unit; NaN: to be estimated
+    """
+
+    name: str
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    effects: tuple[Effect, ...]
+    run: Callable[[Array], Array]
+    t: Array
+    measured: Array
+    window: float | None = None
+    regimes: Mapping[str, Array] = field(default_factory=dict)
+    regime_units: Mapping[str, str] = field(default_factory=dict)
+    floor: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes and names."""
+        m, n = len(self.outputs), len(self.t)
+        self.measured = np.atleast_2d(np.asarray(self.measured, dtype=float))
+        if self.measured.shape != (m, n):
+            raise StageError(f"stage {self.name!r}: measured has shape {self.measured.shape}; ({m}, {n}) is needed")
+        names = [p.name for p in self.parameters] + [e.name for e in self.effects]
+        if len(set(names)) != len(names):
+            raise StageError(f"stage {self.name!r}: two parameters or effects share a name among {', '.join(names)}")
+        for e in self.effects:
+            for s in e.starts:
+                if len(s) != len(e.parameters):
+                    raise StageError(f"stage {self.name!r}, effect {e.name!r}: a start has {len(s)} values; {len(e.parameters)} are needed")
+
+    def all_parameters(self) -> tuple[Parameter, ...]:
+        """Columns of ``run``'s argument."""
+        return self.parameters + tuple(p for e in self.effects for p in e.parameters)
+
+    def index(self) -> dict[str, slice]:
+        """Columns of each effect, by name."""
+        out, at = {}, len(self.parameters)
+        for e in self.effects:
+            out[e.name] = slice(at, at + len(e.parameters))
+            at += len(e.parameters)
+        return out
+
+    def neutral(self) -> Array:
+        """Nominal parameters, every effect absent: float64[parameters]."""
+        return np.array([p.value for p in self.all_parameters()], dtype=float)
+
+    def effect(self, name: str) -> Effect:
+        """Return the effect of that name."""
+        return next(e for e in self.effects if e.name == name)
