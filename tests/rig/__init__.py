@@ -1,0 +1,31 @@
+"""The rig: a truth simulator of engine, servo valve, actuator, linkage and sensors, independent of the product's plant. See docs/rig.md."""
+
+from .controller import AsObject, Compiled, Controller, playback, stand_in
+from .effects import CATALOGUE, EFFECTS, OUTSIDE, Effect, Hidden, draw, neutral
+from .manoeuvre import MANOEUVRES, Manoeuvre, manoeuvre, slow_ramps, small_moves, steady
+from .simulate import Run, machine, simulate, write
+
+__all__ = [
+    "CATALOGUE",
+    "EFFECTS",
+    "MANOEUVRES",
+    "OUTSIDE",
+    "AsObject",
+    "Compiled",
+    "Controller",
+    "Effect",
+    "Hidden",
+    "Manoeuvre",
+    "Run",
+    "draw",
+    "machine",
+    "manoeuvre",
+    "neutral",
+    "playback",
+    "simulate",
+    "slow_ramps",
+    "small_moves",
+    "stand_in",
+    "steady",
+    "write",
+]

@@ -1,0 +1,637 @@
+"""The machine between two servo ticks: engine, spool, two oil chambers, friction, pins, vanes, sensors. All compiled code of the rig.
+
+Equations, symbols and signs are in docs/rig.md. Units SI, speeds in %, temperatures in degC. State ``s`` is read by `S`, parameters ``p``
+by `P`. Slots and constants stand in this file with the code that uses them: numba's cache looks at one file's date only.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+
+TICK = 1e-3  # s, servo tick
+FRAME = 10  # ticks: the ECU sends every 10 ms
+LINKS = 10  # linkage steps in a tick: 0.1 ms against a contact of 0.3 ms
+PINS = 4  # pins in parallel a stage, each with its own gap
+PLAYS = 4  # Preisach elements of the torque motor's hysteresis
+PIN_OFFSET = np.array([-1.3416, -0.4472, 0.4472, 1.3416])  # zero mean, unit variance
+MOTOR_GAP = np.array([0.4, 0.8, 1.2, 1.6])  # mean 1
+X_LOW, X_HIGH, X_STEP = -1e-3, 49e-3, 1e-5  # m: the ring-angle tables run 1 mm beyond both stops in 10 um steps
+X_LAST = round((X_HIGH - X_LOW) / X_STEP)
+HALF_STROKE = 0.024  # m
+
+
+class P(IntEnum):
+    """Slots of the kernel's parameter array. ``_0`` marks the first of three, one a stage."""
+
+    # engine
+    engine_lag = 0  # s
+    acceleration = 1  # %/s
+    deceleration = 2  # %/s
+    knee = 3  # - sharpness of the limits
+    # valve
+    i_rated = 4  # A
+    spool_omega = 5  # rad/s
+    spool_zeta = 6  # -
+    # actuator
+    flow_gain = 7  # m/s at full spool and p_ref
+    p_ref = 8  # Pa
+    area = 9  # m2
+    mass = 10  # kg, pistons and linkage seen at the rod
+    bulk = 11  # Pa
+    dead_volume = 12  # m3 a chamber
+    viscous = 13  # N/(m/s)
+    stroke = 14  # m
+    stop_stiffness = 15  # N/m
+    stop_damping = 16  # N/(m/s)
+    centring = 17  # 1/s: rate at which the lands' null leakage brings the mean chamber pressure to p_s/2
+    bristle = 18  # m: LuGre deflection at breakaway
+    # sensors
+    lvdt_tau = 19  # s
+    lvdt_noise = 20  # m
+    lvdt_step = 21  # m
+    pot_noise = 22  # rad
+    pot_step = 23  # rad
+    speed_noise = 24  # %
+    # linkage
+    contact_tau = 25  # s: damping over stiffness of the pins' contact
+    spread = 26  # - spread of the four pins' gaps about their mean
+    half_gap_0 = 27  # rad at the ring
+    half_gap_1 = 28
+    half_gap_2 = 29
+    vane_ratio_0 = 30  # - Ld'/L
+    vane_ratio_1 = 31
+    vane_ratio_2 = 32
+    pot_tau_0 = 33  # s
+    pot_tau_1 = 34
+    pot_tau_2 = 35
+    pot_bias_0 = 36  # rad
+    pot_bias_1 = 37
+    pot_bias_2 = 38
+    # ---- hidden effects of the library, at their neutral values
+    can_delay = 39  # s
+    frame_hold = 40  # s
+    schedule_offset = 41  # m
+    controller_gain = 42  # -
+    null_bias = 43  # A
+    dead_band = 44  # A half width
+    valve_hysteresis = 45  # A total width
+    flow_limit = 46  # m/s
+    valve_lag = 47  # s
+    asymmetry = 48  # -
+    droop = 49  # Pa/(m/s)
+    viscosity = 50  # 1/K
+    coulomb = 51  # N
+    stiction = 52  # N above Coulomb
+    stribeck_speed = 53  # m/s
+    leakage = 54  # m/s/Pa
+    compliance = 55  # m/N
+    aero_force = 56  # N at 100 %
+    stop_shift = 57  # m
+    lvdt_bias = 58  # m
+    lvdt_gain = 59  # -
+    lvdt_nonlinearity = 60  # m
+    lvdt_lag = 61  # s
+    lvdt_thermal = 62  # m/K
+    gap_change_0 = 63  # rad, total width
+    gap_change_1 = 64
+    gap_change_2 = 65
+    ring_compliance = 66  # rad at the aerodynamic load of 100 %
+    friction_width_0 = 67  # rad, total
+    friction_width_1 = 68
+    friction_width_2 = 69
+    friction_distance = 70  # rad
+    wear_0 = 71  # rad/s
+    wear_1 = 72
+    wear_2 = 73
+    thermal_growth_0 = 74  # rad/K
+    thermal_growth_1 = 75
+    thermal_growth_2 = 76
+    eccentricity_0 = 77  # rad
+    eccentricity_1 = 78
+    eccentricity_2 = 79
+    eccentricity_phase = 80  # rad
+    pot_gain_0 = 81  # -
+    pot_gain_1 = 82
+    pot_gain_2 = 83
+    # ---- hidden effects outside the library
+    ripple_amplitude = 84  # m
+    ripple_frequency = 85  # Hz
+    vibration_amplitude = 86  # rad at resonance
+    vibration_speed = 87  # % at resonance
+    gap_thermal = 88  # rad/K
+    area_growth = 89  # - relative area added at full stroke
+    dip_depth = 90  # Pa
+    dip_period = 91  # s
+    cross_talk = 92  # -
+    silt_time = 93  # s of rest after which the spool sticks
+    silt_current = 94  # A that frees it
+    creep = 95  # - share of a move that comes late
+    creep_tau = 96  # s
+    ring_frequency = 97  # Hz
+    ring_damping = 98  # -
+    track_angle = 99  # rad where the wiper's track is worn
+    track_width = 100  # rad
+    track_error = 101  # rad
+    dither_amplitude = 102  # A
+    dither_frequency = 103  # Hz
+    rumble_amplitude = 104  # rad
+    rumble_speed = 105  # %
+    cushion = 106  # N/(m/s)^2
+    lag_slope = 107  # 1/% relative change of the engine's lag with speed
+    lvdt_lost_step = 108  # m: resolution left after lost bits
+    snag_angle = 109  # rad of the VIGV ring where it catches
+    snag_depth = 110  # rad
+    t_ref = 111  # degC
+
+
+N_P = len(P)
+
+
+class S(IntEnum):
+    """Slots of the state array. ``_0`` marks the first of several."""
+
+    n = 0  # % rotor speed
+    u = 1  # - spool
+    w = 2  # 1/s spool speed
+    i_lagged = 3  # A
+    i_valve = 4  # A after the torque motor
+    p1 = 5  # Pa, extends
+    p2 = 6  # Pa, retracts
+    p_valve = 7  # Pa supply at the valve
+    x = 8  # m
+    v = 9  # m/s
+    z = 10  # m LuGre bristle
+    work = 11  # J taken by friction
+    x_sensor = 12  # m
+    x_sensor_2 = 13  # m behind the extra lag
+    rest = 14  # s since the piston last moved
+    stuck_at = 15  # A at which the silted spool stands
+    motor_0 = 16  # A, PLAYS outputs
+    pin_0 = 20  # rad, 3 x PINS
+    ring_0 = 32  # rad
+    ring_speed_0 = 35  # rad/s
+    ring_in_0 = 38  # rad
+    bristle_0 = 41  # - linkage friction
+    creep_0 = 44  # rad
+    vane_0 = 47  # rad
+    pot_0 = 50  # rad
+    silted = 53
+    friction = 54  # N
+
+
+N_S = 55
+
+
+@njit(cache=True, error_model="numpy")
+def clip(v, low, high):
+    """Return ``v`` within [low, high]."""
+    return min(max(v, low), high)
+
+
+@njit(cache=True, error_model="numpy")
+def dead_zone(v, half):
+    """Return how far ``v`` lies outside +-half."""
+    return v - clip(v, -half, half)
+
+
+@njit(cache=True, error_model="numpy")
+def approach(tau, h):
+    """Return the share of the way a lag ``tau`` goes in ``h``."""
+    if tau <= 0.0:
+        return 1.0
+    return 1.0 - math.exp(-h / tau)
+
+
+@njit(cache=True, error_model="numpy")
+def orifice(dp):
+    """Signed square root of a pressure drop (Pa), laminar below about 0.2 MPa: sqrt(dp) for dp >> 0.2 MPa."""
+    return dp / math.sqrt(math.sqrt(dp * dp + 4e10))
+
+
+@njit(cache=True, error_model="numpy")
+def acceleration(e, p, n):
+    """Rotor acceleration (%/s) for the speed error ``e``: the wanted rate, bent smoothly into the limit."""
+    rate = e / (p[P.engine_lag] * (1.0 + p[P.lag_slope] * (n - 70.0)))
+    limit = p[P.acceleration] if rate > 0.0 else p[P.deceleration]
+    return rate / (1.0 + (abs(rate) / limit) ** p[P.knee]) ** (1.0 / p[P.knee])
+
+
+@njit(cache=True, error_model="numpy")
+def engine(s, p, n_dem):
+    """Rotor speed over one tick (Heun)."""
+    n = s[S.n]
+    a = acceleration(n_dem - n, p, n)
+    b = acceleration(n_dem - n - TICK * a, p, n)
+    s[S.n] = n + 0.5 * TICK * (a + b)
+
+
+@njit(cache=True, error_model="numpy")
+def torque_motor(s, p, i, t):
+    """Current that moves the spool: null bias, dither, magnetic hysteresis (Preisach: plays in parallel), silt after long rest."""
+    i = i + p[P.null_bias]
+    if p[P.dither_amplitude] != 0.0:
+        i += p[P.dither_amplitude] * math.sin(2.0 * math.pi * p[P.dither_frequency] * t)
+    if p[P.valve_hysteresis] > 0.0:
+        total = 0.0
+        for k in range(PLAYS):
+            half = 0.5 * p[P.valve_hysteresis] * MOTOR_GAP[k]
+            s[S.motor_0 + k] = clip(s[S.motor_0 + k], i - half, i + half)
+            total += s[S.motor_0 + k]
+        i = total / PLAYS
+    if p[P.silt_current] > 0.0:
+        if abs(s[S.v]) < 5e-4:
+            s[S.rest] += TICK
+        elif s[S.silted] == 0.0:
+            s[S.rest] = 0.0
+        if s[S.silted] == 0.0 and s[S.rest] > p[P.silt_time]:
+            s[S.silted] = 1.0
+            s[S.stuck_at] = i
+        if s[S.silted] == 1.0:
+            if abs(i - s[S.stuck_at]) > p[P.silt_current]:
+                s[S.silted] = 0.0
+                s[S.rest] = 0.0
+            else:
+                i = s[S.stuck_at]
+    s[S.i_valve] = i
+
+
+@njit(cache=True, error_model="numpy")
+def hydraulics(s, p, p_s, t_oil, n, h, steps):
+    """Spool, chambers and piston over ``steps`` steps of ``h`` (s).
+
+    Spool by Heun; pressures, then speed, then stroke (symplectic order), friction's bristle and viscous part implicitly.
+    """
+    u, w, i_lagged = s[S.u], s[S.w], s[S.i_lagged]
+    p1, p2, p_valve = s[S.p1], s[S.p2], s[S.p_valve]
+    x, v, z, work = s[S.x], s[S.v], s[S.z], s[S.work]
+    xs, xs2 = s[S.x_sensor], s[S.x_sensor_2]
+
+    i = s[S.i_valve]
+    lag_share = approach(p[P.valve_lag], h)
+    om2 = p[P.spool_omega] * p[P.spool_omega]
+    damp = 2.0 * p[P.spool_zeta] * p[P.spool_omega]
+    i_rated = p[P.i_rated]
+    overlap = p[P.dead_band] / i_rated
+    area0, mass = p[P.area], p[P.mass]
+    gain = p[P.flow_gain] * area0 / math.sqrt(0.5 * p[P.p_ref])
+    gain *= 1.0 + p[P.viscosity] * (t_oil - p[P.t_ref])
+    k_open = gain * p[P.asymmetry]
+    stroke = p[P.stroke]
+    # a hidden compliance (m/N) adds to the oil's own: V/(4 beta A^2) at mid stroke
+    v_mid = p[P.dead_volume] + area0 * 0.5 * stroke
+    own = 0.5 * v_mid / (p[P.bulk] * area0 * area0)
+    bulk = p[P.bulk] * own / (own + p[P.compliance])
+    force = p[P.aero_force] * (n * 0.01) ** 2
+    f_c, f_x = p[P.coulomb], p[P.stiction]
+    rough = f_c + f_x > 0.0
+    sigma0 = (f_c + f_x) / p[P.bristle]
+    sigma1 = 0.5 * math.sqrt(sigma0 * mass) if rough else 0.0
+    low = max(0.0, p[P.stop_shift])
+    high = stroke + min(0.0, p[P.stop_shift])
+    droop_share = approach(2e-3, h)
+    lvdt_share = approach(p[P.lvdt_tau], h)
+    lvdt_share_2 = approach(p[P.lvdt_lag], h)
+    centring = p[P.centring]
+    friction = 0.0
+
+    for _ in range(steps):
+        i_lagged += lag_share * (i - i_lagged)
+        target = i_lagged / i_rated
+        a0 = om2 * (target - u) - damp * w
+        u1, w1 = u + h * w, w + h * a0
+        a1 = om2 * (target - u1) - damp * w1
+        u, w = u + 0.5 * h * (w + w1), w + 0.5 * h * (a0 + a1)
+        if u > 1.0:
+            u, w = 1.0, min(w, 0.0)
+        elif u < -1.0:
+            u, w = -1.0, max(w, 0.0)
+
+        opening = dead_zone(u, overlap)
+        if opening >= 0.0:
+            q1 = k_open * opening * orifice(p_valve - p1)
+            q2 = k_open * opening * orifice(p2)
+        else:
+            q1 = gain * opening * orifice(p1)
+            q2 = gain * opening * orifice(p_valve - p2)
+        if p[P.flow_limit] < 1e9:
+            ratio = 0.5 * abs(q1 + q2) / (area0 * p[P.flow_limit])
+            share = (1.0 + ratio**8) ** -0.125
+            q1, q2 = q1 * share, q2 * share
+        p_valve += droop_share * (p_s - p[P.droop] * 0.5 * abs(q1 + q2) / area0 - p_valve)
+
+        area = area0
+        if p[P.area_growth] != 0.0:
+            near = clip((x - 0.030) / 0.018, 0.0, 1.0)
+            area = area0 * (1.0 + p[P.area_growth] * near * near)
+        leak = p[P.leakage] * area0 * (p1 - p2)
+        v1 = p[P.dead_volume] + area0 * clip(x, 0.0, stroke)
+        v2 = p[P.dead_volume] + area0 * clip(stroke - x, 0.0, stroke)
+        centre = centring * (0.5 * p_valve - 0.5 * (p1 + p2))
+        p1 += h * (bulk / v1 * (q1 - area * v - leak) + centre)
+        p2 += h * (bulk / v2 * (area * v - q2 + leak) + centre)
+        # no chamber falls below vapour pressure or rises above the relief valve
+        p1 = clip(p1, 0.0, 4e7)
+        p2 = clip(p2, 0.0, 4e7)
+
+        f = area * (p1 - p2) - force
+        b = p[P.viscous] + p[P.cushion] * abs(v)
+        if x > high:
+            f -= p[P.stop_stiffness] * (x - high)
+            b += p[P.stop_damping]
+        elif x < low:
+            f += p[P.stop_stiffness] * (low - x)
+            b += p[P.stop_damping]
+        if rough:
+            level = f_c + f_x * math.exp(-((v / p[P.stribeck_speed]) ** 2)) + 1e-3
+            rate = sigma0 * abs(v) / level
+            # z' = v - rate z, solved exactly over the step; its mean speed gives the bristle's damping
+            share = rate * h
+            decay = math.exp(-share)
+            gain_z = h * (1.0 - 0.5 * share) if share < 1e-6 else (1.0 - decay) / rate
+            z_new = z * decay + v * gain_z
+            friction = sigma0 * z_new + sigma1 * (z_new - z) / h
+            z = z_new
+            f -= friction
+        v_new = (v + h * f / mass) / (1.0 + h * b / mass)
+        if rough:
+            work += h * friction * 0.5 * (v + v_new)
+        v = v_new
+        x += h * v
+        xs += lvdt_share * (x - 0.5 * h * v - xs)
+        xs2 += lvdt_share_2 * (xs - xs2)
+
+    s[S.u], s[S.w], s[S.i_lagged] = u, w, i_lagged
+    s[S.p1], s[S.p2], s[S.p_valve] = p1, p2, p_valve
+    s[S.x], s[S.v], s[S.z], s[S.work] = x, v, z, work
+    s[S.x_sensor], s[S.x_sensor_2] = xs, xs2
+    s[S.friction] = friction
+
+
+@njit(cache=True, error_model="numpy")
+def linkage(s, p, ring_table, n, t_oil, t, h):
+    """Rings, vanes and potentiometers over one step ``h`` (s): kinematics, then what bends or loosens the way to the vane."""
+    place = clip((s[S.x] - X_LOW) / X_STEP, 0.0, X_LAST - 1e-6)
+    cell = int(place)
+    part = place - cell
+    load = (n * 0.01) ** 2
+    warm = t_oil - p[P.t_ref]
+    contact = approach(p[P.contact_tau], h)
+    for k in range(3):
+        ring_in = ring_table[k, cell] + part * (ring_table[k, cell + 1] - ring_table[k, cell])
+        if p[P.eccentricity_0 + k] != 0.0:
+            ring_in += p[P.eccentricity_0 + k] * math.sin(ring_in + p[P.eccentricity_phase])
+        ring_in += p[P.thermal_growth_0 + k] * warm - p[P.ring_compliance] * load
+        if k == 0 and p[P.snag_depth] != 0.0:
+            d = (ring_in - p[P.snag_angle]) / (0.5 * math.pi / 180.0)
+            ring_in += p[P.snag_depth] * d * math.exp(0.5 - 0.5 * d * d)
+
+        # lost motion: pins in parallel, each with its own gap and a stiff, damped contact
+        half = p[P.half_gap_0 + k] + 0.5 * (p[P.gap_change_0 + k] + p[P.wear_0 + k] * max(t, 0.0) + p[P.gap_thermal] * warm)
+        half = max(half, 0.0)
+        ring = 0.0
+        for j in range(PINS):
+            slot = S.pin_0 + k * PINS + j
+            s[slot] += contact * dead_zone(ring_in - s[slot], half * (1.0 + p[P.spread] * PIN_OFFSET[j]))
+            ring += s[slot]
+        ring /= PINS
+
+        # smooth friction in the joints (Dahl's bristle, normalised to +-1): it lags behind the drive
+        if p[P.friction_width_0 + k] > 0.0:
+            moved = (ring - s[S.ring_in_0 + k]) / p[P.friction_distance]
+            y = s[S.bristle_0 + k]
+            sign = 1.0 if moved >= 0.0 else -1.0
+            s[S.bristle_0 + k] = sign + (y - sign) * math.exp(-abs(moved))
+            s[S.ring_in_0 + k] = ring
+            ring -= 0.5 * p[P.friction_width_0 + k] * s[S.bristle_0 + k]
+        else:
+            s[S.ring_in_0 + k] = ring
+
+        if p[P.creep] != 0.0:
+            s[S.creep_0 + k] += approach(p[P.creep_tau], h) * (ring - s[S.creep_0 + k])
+            ring -= p[P.creep] * (ring - s[S.creep_0 + k])
+        else:
+            s[S.creep_0 + k] = ring
+
+        if p[P.ring_frequency] > 0.0:
+            omega = 2.0 * math.pi * p[P.ring_frequency]
+            a = omega * omega * (ring - s[S.ring_0 + k]) - 2.0 * p[P.ring_damping] * omega * s[S.ring_speed_0 + k]
+            s[S.ring_speed_0 + k] += h * a
+            s[S.ring_0 + k] += h * s[S.ring_speed_0 + k]
+        else:
+            s[S.ring_0 + k] = ring
+
+        vane = math.asin(clip(p[P.vane_ratio_0 + k] * math.tan(s[S.ring_0 + k]), -1.0, 1.0))
+        if p[P.vibration_amplitude] != 0.0:
+            d = (n - p[P.vibration_speed]) / 3.0
+            vane += p[P.vibration_amplitude] / (1.0 + d * d) * math.sin(2.0 * math.pi * 0.37 * n * t + k)
+        if p[P.rumble_amplitude] != 0.0:
+            d = (n - p[P.rumble_speed]) / 4.0
+            shake = math.sin(2.0 * math.pi * 1.9 * t) + math.sin(2.0 * math.pi * 3.1 * t + k)
+            vane += p[P.rumble_amplitude] * math.exp(-0.5 * d * d) * shake
+        s[S.vane_0 + k] = vane
+        s[S.pot_0 + k] += approach(p[P.pot_tau_0 + k], h) * (vane - s[S.pot_0 + k])
+
+
+@njit(cache=True, error_model="numpy")
+def advance(s, p, ring_table, i_cmd, n_dem, p_s, t_oil, t, steps):
+    """Move the machine from ``t`` to ``t`` + 1 ms under a constant current, in ``steps`` hydraulic steps (a multiple of LINKS)."""
+    torque_motor(s, p, i_cmd, t)
+    if p[P.dip_depth] != 0.0:
+        phase = (t / p[P.dip_period]) % 1.0
+        if phase < 0.15:
+            p_s -= p[P.dip_depth] * math.sin(math.pi * phase / 0.15)
+    n = s[S.n]
+    h = TICK / steps
+    each = steps // LINKS
+    for k in range(LINKS):
+        hydraulics(s, p, p_s, t_oil, n, h, each)
+        linkage(s, p, ring_table, n, t_oil, t + (k + 1) * TICK / LINKS, TICK / LINKS)
+    engine(s, p, n_dem)
+
+
+@njit(cache=True, error_model="numpy")
+def read_lvdt(s, p, t, t_oil, noise):
+    """Stroke as the LVDT gives it at time ``t`` (m); ``noise`` is a standard normal number."""
+    x = s[S.x_sensor_2]
+    y = x * p[P.lvdt_gain] + p[P.lvdt_bias] + p[P.lvdt_thermal] * (t_oil - p[P.t_ref])
+    if p[P.lvdt_nonlinearity] != 0.0:
+        y += p[P.lvdt_nonlinearity] * math.sin(math.pi * (x - HALF_STROKE) / HALF_STROKE)
+    if p[P.ripple_amplitude] != 0.0:
+        y += p[P.ripple_amplitude] * math.sin(2.0 * math.pi * p[P.ripple_frequency] * t)
+    y += p[P.lvdt_noise] * noise
+    step = max(p[P.lvdt_step], p[P.lvdt_lost_step])
+    return math.floor(y / step + 0.5) * step
+
+
+@njit(cache=True, error_model="numpy")
+def read_pot(s, p, k, noise):
+    """Vane angle of stage ``k`` as its potentiometer gives it (rad); ``noise`` is a standard normal number."""
+    angle = s[S.pot_0 + k]
+    y = angle * p[P.pot_gain_0 + k] + p[P.pot_bias_0 + k]
+    if k == 0:
+        y += p[P.cross_talk] * s[S.pot_0 + 1]
+        if p[P.track_error] != 0.0:
+            d = (angle - p[P.track_angle]) / (0.5 * p[P.track_width])
+            y += p[P.track_error] * math.exp(-(d**4))
+    y += p[P.pot_noise] * noise
+    return math.floor(y / p[P.pot_step] + 0.5) * p[P.pot_step]
+
+
+@njit(cache=True, error_model="numpy")
+def start(s, p, ring_table, x, n, p_s):
+    """Set the state to rest at stroke ``x`` (m) and speed ``n`` (%), pins in the middle of their gaps."""
+    s[:] = 0.0
+    s[S.n] = n
+    s[S.x] = s[S.x_sensor] = s[S.x_sensor_2] = x
+    s[S.p1] = s[S.p2] = 0.5 * p_s
+    s[S.p_valve] = p_s
+    cell = int(clip((x - X_LOW) / X_STEP, 0.0, X_LAST - 1.0))
+    for k in range(3):
+        ring = ring_table[k, cell]
+        for j in range(PINS):
+            s[S.pin_0 + k * PINS + j] = ring
+        s[S.ring_0 + k] = s[S.ring_in_0 + k] = s[S.creep_0 + k] = ring
+        vane = math.asin(clip(p[P.vane_ratio_0 + k] * math.tan(ring), -1.0, 1.0))
+        s[S.vane_0 + k] = s[S.pot_0 + k] = vane
+
+
+# ---- rows of the log and of the truth record -----------------------------------------------------------------------------------------
+LOG = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state")
+_ONES = ("x", "v", "u", "p1", "p2", "p_valve", "n", "i_valve", "friction", "work")
+TRUTH = (*_ONES, "ring_0", "ring_1", "ring_2", "vane_0", "vane_1", "vane_2")
+TRUTH_SLOTS = np.array([*(S[name] for name in _ONES), *(S.ring_0 + k for k in range(3)), *(S.vane_0 + k for k in range(3))])
+
+
+@njit(cache=True, error_model="numpy")
+def ecu_frame(k, p, frames, n_frames):
+    """Which ECU frame the controller has at tick ``k``: the newest that has arrived, or the one it is held at."""
+    t = k * TICK + 1e-9 - p[P.can_delay]
+    period = max(FRAME * TICK, p[P.frame_hold])
+    held = math.floor(t / period) * period
+    f = int((held + 1e-9) / (FRAME * TICK)) if held > 0.0 else 0
+    return min(max(f, 0), n_frames - 1)
+
+
+@njit(cache=True, error_model="numpy")
+def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view):
+    """Sense at tick ``k``: fill ``view`` (n_dem, n_r, x_lvdt, fresh, x_lvdt as logged) with what the controller sees."""
+    f = k // FRAME
+    if k % FRAME == 0:
+        frames[f, 0] = math.floor(n_dem[f] / 0.002 + 0.5) * 0.002
+        frames[f, 1] = math.floor((s[S.n] + p[P.speed_noise] * speed_noise[f]) / 0.002 + 0.5) * 0.002
+    seen = min(ecu_frame(k, p, frames, len(frames)), f)
+    x = read_lvdt(s, p, (k - warm) * TICK, t_oil[f], lvdt_noise[k])
+    view[0] = frames[seen, 0]
+    view[1] = frames[seen, 1]
+    # a shifted stroke table, as seen from outside the controller: the servo works towards x_dem + offset
+    view[2] = x - p[P.schedule_offset]
+    # frames go on arriving every 10 ms, whatever they hold
+    late = int(math.floor(p[P.can_delay] / TICK + 0.5))
+    view[3] = 1.0 if (k - late) % FRAME == 0 else 0.0
+    view[4] = x
+
+
+@njit(cache=True, error_model="numpy")
+def current(i, p, limit):
+    """Current that leaves the controller: its own, or changed by an error of its gain."""
+    if p[P.controller_gain] == 1.0:
+        return i
+    return clip(i * p[P.controller_gain], -limit, limit)
+
+
+@njit(cache=True, error_model="numpy")
+def write_row(row, k, warm, s, p, frames, view, x_dem, mode, i_mean, p_s, t_oil, pot_noise, log, truth):
+    """One row of the log, in border units, at the resolution of the bus."""
+    f = k // FRAME
+    log[row, 0] = (k - warm) * TICK
+    log[row, 1] = frames[f, 0]
+    log[row, 2] = frames[f, 1]
+    log[row, 3] = math.floor((x_dem + p[P.schedule_offset]) * 1e6 + 0.5) * 1e-3
+    log[row, 4] = math.floor(view[4] * 1e6 + 0.5) * 1e-3
+    log[row, 5] = math.floor(i_mean * 1e3 / 0.002 + 0.5) * 0.002
+    log[row, 6] = math.floor(p_s * 1e-3 + 0.5) * 1e-3
+    log[row, 7] = math.floor(t_oil * 100.0 + 0.5) * 0.01
+    for j in range(3):
+        log[row, 8 + j] = math.floor(read_pot(s, p, j, pot_noise[row, j]) * (180.0 / math.pi) / 0.002 + 0.5) * 0.002
+    log[row, 11] = mode
+    for j in range(len(TRUTH_SLOTS)):
+        truth[row, j] = s[TRUTH_SLOTS[j]]
+
+
+@njit(error_model="numpy")
+def run_compiled(
+    tick,
+    inputs,
+    state,
+    calibration,
+    slots,
+    onset,
+    par,
+    tables,
+    s,
+    warm,
+    limit,
+    through,
+    every,
+    steps,
+    n_dem,
+    p_s,
+    t_oil,
+    speed_noise,
+    lvdt_noise,
+    pot_noise,
+    frames,
+    log,
+    truth,
+):
+    """The whole run with a compiled controller ``tick(inputs, state, calibration)``; ``slots`` says where its signals are."""
+    view = np.zeros(5)
+    total, count, row = 0.0, 0, 0
+    segment = 0
+    n_ticks = len(lvdt_noise)
+    for k in range(n_ticks):
+        while segment + 1 < len(onset) and k >= onset[segment + 1]:
+            segment += 1
+        p = par[segment]
+        f = k // FRAME
+        before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view)
+        inputs[slots[0]] = view[0]
+        inputs[slots[1]] = view[1]
+        inputs[slots[2]] = view[2]
+        inputs[slots[3]] = view[3]
+        tick(inputs, state, calibration)
+        i = current(state[slots[4]], p, limit)
+        if k == warm:
+            total, count = 0.0, 0
+        if through:
+            total += i
+            count += 1
+        if k >= warm and (k - warm) % every == 0:
+            write_row(
+                row,
+                k,
+                warm,
+                s,
+                p,
+                frames,
+                view,
+                state[slots[5]],
+                state[slots[6]],
+                total / count if count > 0 else i,
+                p_s[f],
+                t_oil[f],
+                pot_noise,
+                log,
+                truth,
+            )
+            row += 1
+            total, count = 0.0, 0
+        if not through:
+            total += i
+            count += 1
+        advance(s, p, tables[segment], i, frames[f, 0], p_s[f], t_oil[f], (k - warm) * TICK, steps)
+    return row

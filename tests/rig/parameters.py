@@ -1,0 +1,110 @@
+"""Numbers of the rig: what each is, its nominal value, and how far a drawn specimen may stray from it. SI; speeds in %.
+
+The kernel reads them by position (`kernel.P`) from one flat array; neutral values of the hidden effects are here too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .kernel import N_P, P
+
+DEG = np.pi / 180.0
+
+
+def _nominal() -> np.ndarray:
+    p = np.zeros(N_P)
+    values = {
+        P.engine_lag: 1.2,
+        P.acceleration: 8.0,
+        P.deceleration: 10.0,
+        P.knee: 60.0,
+        P.i_rated: 0.040,
+        P.spool_omega: 2.0 * np.pi * 60.0,
+        P.spool_zeta: 0.8,
+        P.flow_gain: 0.150,
+        P.p_ref: 21e6,
+        P.area: 1.2e-3,
+        P.mass: 5.0,
+        P.bulk: 1.6e9,
+        P.dead_volume: 1e-5,
+        P.viscous: 1500.0,
+        P.stroke: 0.048,
+        P.stop_stiffness: 2e9,
+        P.stop_damping: 5e4,
+        P.centring: 3.0,
+        P.bristle: 3e-6,
+        P.lvdt_tau: 1e-3,
+        P.lvdt_noise: 5e-6,
+        P.lvdt_step: 0.050 / 65536,
+        P.pot_noise: 0.03 * DEG,
+        P.pot_step: 120.0 / 65536 * DEG,
+        P.speed_noise: 0.02,
+        P.contact_tau: 3e-4,
+        P.spread: 0.02,
+        P.pot_tau_0: 5e-3,
+        P.pot_tau_1: 5e-3,
+        P.pot_tau_2: 5e-3,
+        P.controller_gain: 1.0,
+        P.flow_limit: np.inf,
+        P.asymmetry: 1.0,
+        P.stribeck_speed: 5e-3,
+        P.lvdt_gain: 1.0,
+        P.friction_distance: 1.0 * DEG,
+        P.pot_gain_0: 1.0,
+        P.pot_gain_1: 1.0,
+        P.pot_gain_2: 1.0,
+        P.vibration_speed: 80.0,
+        P.ripple_frequency: 7.3,
+        P.dip_period: 20.0,
+        P.creep_tau: 15.0,
+        P.ring_damping: 0.1,
+        P.track_width: 1.0 * DEG,
+        P.dither_frequency: 11.0,
+        P.rumble_speed: 70.0,
+        P.t_ref: 40.0,
+    }
+    for slot, value in values.items():
+        p[slot] = value
+    return p
+
+
+NOMINAL = _nominal()
+NOMINAL.setflags(write=False)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a specimen's parameter may lie from nominal: half-width, relative to nominal or absolute."""
+
+    slot: P
+    half_width: float
+    relative: bool
+
+
+TOLERANCES = (
+    Tolerance(P.engine_lag, 0.05, True),
+    Tolerance(P.acceleration, 0.03, True),
+    Tolerance(P.deceleration, 0.03, True),
+    Tolerance(P.spool_omega, 0.15, True),
+    Tolerance(P.spool_zeta, 0.10, True),
+    Tolerance(P.flow_gain, 0.05, True),
+    Tolerance(P.half_gap_0, 0.05 / 1.6, True),  # 0.05 deg at the vane
+    Tolerance(P.half_gap_1, 0.05 / 1.1, True),
+    Tolerance(P.half_gap_2, 0.05, True),  # 0.04 deg at the vane
+    Tolerance(P.pot_bias_0, 0.1 * DEG, False),
+    Tolerance(P.pot_bias_1, 0.1 * DEG, False),
+    Tolerance(P.pot_bias_2, 0.1 * DEG, False),
+)
+
+
+def specimen(nominal: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+    """Return parameters of one machine: the nominal ones, or (with ``rng``) each drawn uniformly within its tolerance."""
+    p = nominal.copy()
+    if rng is not None:
+        for t in TOLERANCES:
+            d = rng.uniform(-t.half_width, t.half_width)
+            p[t.slot] += p[t.slot] * d if t.relative else d
+    return p
