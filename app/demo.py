@@ -1,0 +1,60 @@
+"""``make demo``: the main job from end to end, with the commands a user would type."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from app.main import main as vaneloop
+
+__all__ = ["main"]
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT = Path("demo")
+
+
+def _shared_data() -> Path | None:
+    """Folder of real logs, where there is one."""
+    for place in (os.environ.get("VANELOOP_DATA"), ROOT.parent / "shared" / "data"):
+        if place and (Path(place) / "can_honda" / "revlog.log").is_file():
+            return Path(place)
+    return None
+
+
+def _step(text: str, *argv: str, allowed: tuple[int, ...] = (0,)) -> None:
+    print(f"\n== {text}\n$ vaneloop {' '.join(argv)}", flush=True)
+    sys.argv = ["vaneloop", *argv]
+    code = vaneloop(list(argv))
+    if code not in allowed:
+        print(f"stopped: exit code {code}", file=sys.stderr)
+        sys.exit(code)
+
+
+def main() -> None:
+    """Run the demonstration; pages go to ./demo."""
+    OUT.mkdir(exist_ok=True)
+    example = os.path.relpath(ROOT / "examples" / "engine_run.blf")
+    _step(
+        "A recorded engine run (CAN log, from an independent rig) through firmware and plant",
+        "replay", example, "--report", str(OUT / "engine_run.html"),
+    )  # fmt: skip
+    data = _shared_data()
+    if data is not None:
+        folder = os.path.relpath(data / "can_honda")
+        _step(
+            "A real engine being revved (candump of a car), its speed as the demand",
+            "replay", f"{folder}/revlog.log", "--dbc", f"{folder}/honda_pilot_2017.dbc", "--map", "ENGINE_RPM=n_dem",
+            "--unit", "n_dem=rpm", "--design-rpm", "6000", "--report", str(OUT / "real_engine.html"),
+        )  # fmt: skip
+    _step(
+        "The paper's engine test, 3,000 s under one mean curve and under dual curves",
+        "engine-test", "--report", str(OUT / "engine_test.html"),
+    )  # fmt: skip
+    print("\npages to open in a browser:")
+    for page in sorted(OUT.glob("*.html")):
+        print(f"  {page}")
+
+
+if __name__ == "__main__":
+    main()
