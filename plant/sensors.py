@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from plant.compiled import compiled
 
 __all__ = ["lag_factor", "quantise"]
@@ -23,7 +25,7 @@ def lag_factor(tau, dt):
 
 @compiled
 def quantise(v, step):
-    """Return ``v`` rounded to the nearest multiple of ``step``; ``v`` itself for step 0."""
+    """Return ``v`` rounded to the nearest multiple of ``step``; ``v`` itself for step 0, NaN or infinite."""
     if step <= 0.0:
         return v
-    return math.floor(v / step + 0.5) * step
+    return np.floor(v / step + 0.5) * step  # math.floor goes through an integer, which has no NaN and no infinity

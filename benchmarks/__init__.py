@@ -1,0 +1,3 @@
+"""How fast the loop is, beside the same loop in C, python-control and pathsim: ``python -m benchmarks``."""
+
+__all__: list[str] = []
