@@ -1100,7 +1100,7 @@ def plot(result: DesignResult, path: str | Path) -> Path:
     diagram["layout"]["yaxis"] |= {"range": [-30.0, 35.0]}
     page.plot(diagram, "Loop and -1/N(A), for any gap: the crossing is the limit cycle.", half=True)
     for site, run in c["play"].items():
-        last = run.t >= run.t[-1] - (3.0 if site != "vanes" else 21.0)
+        last = run.t <= 1.5 if site == "vanes" else run.t >= run.t[-1] - 3.0
         lines = [Line("piston", run.t[last], 1e3 * (run.x[last] - MIDDLE), "model")]
         if site == "vanes":
             lines.append(Line("vanes, as stroke", run.t[last], 1e3 * (run.x_vane[last] - MIDDLE), "measured"))
