@@ -25,7 +25,7 @@ import numpy as np
 from tables import InputError
 
 __all__ = [
-    "DISORDER_S", "Frames", "LogError", "Message", "cut_signal", "e2e_crc", "encode", "load_dbc", "read_asc", "read_blf",
+    "DISORDER_S", "EXTENDED", "Frames", "LogError", "Message", "cut_signal", "e2e_crc", "encode", "load_dbc", "read_asc", "read_blf",
     "read_candump", "read_trc", "select", "write_asc", "write_blf", "write_candump", "write_trc",
 ]  # fmt: skip
 
@@ -114,126 +114,191 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
 
 
-# --- candump -----------------------------------------------------------------------------------------------------------------------------
+# --- text formats ------------------------------------------------------------------------------------------------------------------------
 
-# `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f, direction behind;
-# and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
-_CANDUMP = re.compile(
-    rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<if>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
-    rb"(?:#(?:(?P<r>R[0-9A-Fa-f]?)|#(?P<fl>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|(?P<d>(?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?)"
-    rb"|\s+\[\s?\d{1,2}\](?:(?P<rc>\s+remote request)|\s(?P<c>(?:\s[0-9A-Fa-f]{2}){0,64})))"
-    rb"(?:\s+[RTrt][xX]?)?[ \t]*\Z"
-)
+# Lines of a text log that have equal length nearly always have equal columns. So the first line of a length gives the columns (by a
+# regular expression), all lines that agree with it are parsed as one matrix, and the others take the next round. In the expressions
+# the groups s, f, n are decimal digits (s, n with the blanks that pad them), id, d, flags are hex digits (with the blanks between
+# bytes), tail is free; all else is fixed in a round.
+_DECIMAL, _HEX = ("s", "f", "n"), ("id", "d", "flags")
+_ROUNDS = 24  # per line length; lines left over are sorted into layouts one by one
+_BLOCK = 4096  # lines turned into columns at a time: 200 kB stay in the cache
+_LONGEST = 600  # bytes of a line; CAN FD with everything behind it stays below
+
 _NIBBLE = np.full(256, 255, np.uint8)
 for _i, _c in enumerate(b"0123456789ABCDEF"):
     _NIBBLE[_c] = _i
 for _i, _c in enumerate(b"abcdef"):
     _NIBBLE[_c] = 10 + _i
-_SHAPES = 64  # layouts (interface, length of identifier) tried per line length before the rest is called unreadable
-_BAD = 2000  # unreadable lines passed over one by one per line length, likewise
-_LONGEST = 260  # bytes of the longest candump line, CAN FD with direction
+_KIND = np.arange(256, dtype=np.uint8)  # a byte's kind: hex digits are one, every other byte its own
+_KIND[_NIBBLE < 16] = ord("0")
 
 
-def read_candump(path: Path) -> Frames:
-    """Frames of a `candump -l` log, line by line layout rather than line by line.
+@dataclass
+class _Lines:
+    """Lines of a text log that one layout fits: their places in the file, their bytes as columns, and the match of one of them."""
 
-    Lines of equal length nearly always have equal layout. The first line of each length gives the columns (regular
-    expression), all lines that agree with it are parsed as one matrix, the others take the next round.
-    """
-    raw = read_bytes(path)
+    start: np.ndarray
+    columns: np.ndarray
+    match: re.Match[bytes]
+
+    def number(self, group: str) -> np.ndarray:
+        """int64 of a decimal group."""
+        out = np.zeros(self.start.size, np.int64)
+        for k in range(*self.match.span(group)):
+            out = out * 10 + (self.columns[k] & np.uint8(15))  # a blank counts 0
+        return out
+
+    def seconds(self, per_unit: int) -> np.ndarray:
+        """ns of the groups s and f, in units of ``per_unit`` ns."""
+        f0, f1 = self.match.span("f")
+        whole = np.minimum(self.number("s"), 9_000_000_000_000_000_000 // per_unit - 1)  # int64 ns end in the year 2262
+        return whole * per_unit + (self.number("f") * per_unit // 10 ** (f1 - f0) if f1 > f0 else 0)
+
+    def ident(self) -> np.ndarray:
+        """uint32 of the group id."""
+        out = np.zeros(self.start.size, np.uint32)
+        for k in range(*self.match.span("id")):
+            out = (out << np.uint32(4)) | _NIBBLE[self.columns[k]]
+        return out
+
+    def data(self, most: int) -> np.ndarray:
+        """Bytes of the group d, at most ``most``: uint8[n, w]."""
+        d0, d1 = self.match.span("d")
+        places = [k for k in range(d0, d1) if self.match.string[k] not in b" \t"][: 2 * most]
+        out = np.empty((self.start.size, len(places) // 2), np.uint8)
+        for k in range(out.shape[1]):
+            out[:, k] = _NIBBLE[self.columns[places[2 * k]]] << 4 | _NIBBLE[self.columns[places[2 * k + 1]]]
+        return out
+
+
+def _fit(columns: np.ndarray, m: re.Match[bytes]) -> np.ndarray:
+    """Which lines (columns of bytes) have the layout of ``m``."""
+    line = np.frombuffer(m.string, np.uint8)
+    fits = np.ones(columns.shape[1], bool)
+    free = np.zeros(line.size, bool)
+    free[slice(*m.span("tail") if "tail" in m.re.groupindex else (0, 0))] = True
+    for group in (*_DECIMAL, *_HEX):
+        at, end = m.span(group) if group in m.re.groupindex else (0, 0)
+        padded = group in "sn"
+        for k in range(at, end):
+            if group in _HEX and line[k] in b" \t":
+                continue
+            free[k] = True
+            c = columns[k]
+            if group in _HEX:
+                fits &= _NIBBLE[c] < 16
+            elif not padded or k == end - 1:
+                fits &= c - np.uint8(48) <= 9
+            else:  # blanks stand before the digits only
+                fits &= (c - np.uint8(48) <= 9) | ((c == 32) & (columns[max(k - 1, at)] == 32))
+    for fixed in np.flatnonzero(~free):
+        fits &= columns[fixed] == line[fixed]
+    return fits
+
+
+def _match_lines(raw: bytes, layout: re.Pattern[bytes], lead: bytes) -> Iterator[_Lines | int]:
+    """Lines that ``layout`` matches, by layout; then how many lines that begin with one of ``lead`` it does not match."""
     buf = np.frombuffer(raw, np.uint8)
     end = np.flatnonzero(buf == 10)
     start = np.concatenate(([0], end + 1))
     end = np.concatenate((end, [buf.size]))
     end = end - ((end > start) & (buf[np.maximum(end - 1, 0)] == 13))
     size = end - start
-    wanted = np.flatnonzero(size > 0)
-    start, size = start[wanted], size[wanted]
-
-    parts: list[tuple[np.ndarray, ...]] = []
-    names: dict[bytes, int] = {}
-    special = 0  # remote and error frames
-    good = np.flatnonzero((buf[start] == ord("(")) & (size <= _LONGEST)) if start.size else start
-    bad = start.size - good.size
-    by_size = good[np.argsort(size[good], kind="stable")]
-    for rows in np.split(by_size, np.flatnonzero(np.diff(size[by_size])) + 1) if by_size.size else []:
+    led = np.flatnonzero(size > 0)
+    led = led[np.isin(buf[start[led]], np.frombuffer(lead, np.uint8))]
+    wanted = led[size[led] <= _LONGEST]
+    start, size = start[wanted], size[wanted].astype(np.uint16)
+    bad = led.size - wanted.size
+    order = np.argsort(size, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(size[order])) + 1) if order.size else []:
         width = int(size[rows[0]])
+        at = start[rows]
         windows = np.lib.stride_tricks.sliding_window_view(buf, width)
-        shapes = misses = 0
-        while rows.size and shapes < _SHAPES and misses < _BAD:
-            first = int(start[rows[0]])
-            m = _CANDUMP.match(raw[first : first + width])
+        columns = np.empty((width, at.size), np.uint8)
+        for k in range(0, at.size, _BLOCK):
+            columns[:, k : k + _BLOCK] = windows[at[k : k + _BLOCK]].T
+        for _ in range(_ROUNDS):
+            if not at.size:
+                break
+            m = layout.match(columns[:, 0].tobytes())
+            if m is None:  # leave out every line of its kind: 500 lines of statistics are one round
+                fits = (_KIND[columns] == _KIND[columns[:, :1]]).all(axis=0)
+                bad += int(np.count_nonzero(fits))
+            else:
+                fits = _fit(columns, m)
+                yield _Lines(at, columns, m) if fits.all() else _Lines(at[fits], columns.compress(fits, axis=1), m)
+            at, columns = at[~fits], columns.compress(~fits, axis=1)
+        kinds: dict[Any, list[int]] = {}
+        for k, line in enumerate(np.ascontiguousarray(columns.T)):
+            m = layout.match(line.tobytes())
             if m is None:
-                misses += 1
-                rows = rows[1:]
-                continue
-            shapes += 1
-            fits, ns, ident, bus, data = _parse_shape(windows[start[rows]], m, names)
-            error = (ident & 0x7FFFFFFF) >= 1 << 29  # socketcan's flag of an error frame
-            if m["r"] is not None or m["rc"] is not None:
-                error[:] = True
-            special += int(np.count_nonzero(error))
-            keep = ~error
-            parts.append((rows[fits][keep], ns[keep], ident[keep], np.full(int(keep.sum()), bus, np.int32), data[keep]))
-            rows = rows[~fits]
-        bad += misses + rows.size
+                bad += 1
+            else:
+                key = m.regs, *(m[g] for g in m.re.groupindex if g not in (*_DECIMAL, *_HEX, "tail"))
+                kinds.setdefault(key, []).append(k)
+        for some in kinds.values():
+            m = layout.match(columns[:, some[0]].tobytes())
+            if m is not None:
+                yield _Lines(at[some], np.ascontiguousarray(columns[:, some]), m)
+    yield bad
 
-    notes = []
-    if bad:
-        notes.append(f"{bad} of {wanted.size} lines are not candump lines: left out")
+
+_Part = tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]  # place in the file, ns, identifier, bus, data
+
+
+def _join(path: Path, parts: list[_Part], kind: str, example: str, notes: list[str]) -> Frames:
+    """Frames of all layouts in the order of the file."""
+    parts = [p for p in parts if p[0].size]
+    if not parts:
+        raise LogError(f"{path}: no {kind} frame in it; a line looks like: {example}")
+    order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
+    data = np.zeros((order.size, 8 if max(p[4].shape[1] for p in parts) <= 8 else 64), np.uint8)
+    row = 0
+    for p in parts:
+        data[row : row + len(p[4]), : p[4].shape[1]] = p[4]
+        row += len(p[4])
+    ns, ident = (np.concatenate([p[k] for p in parts])[order] for k in (1, 2))
+    bus = np.concatenate([np.full(len(p[4]), p[3], np.int32) for p in parts])[order]
+    length = np.concatenate([np.full(len(p[4]), p[4].shape[1], np.uint8) for p in parts])[order]
+    return _frames(str(path), ns, ident, bus, length, data[order], notes)
+
+
+# --- candump -----------------------------------------------------------------------------------------------------------------------------
+
+# `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f, direction behind;
+# and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
+_CANDUMP = re.compile(
+    rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<bus>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
+    rb"(?P<form>##(?P<flags>[0-9A-Fa-f])|#|\s+\[\s?\d{1,2}\]\s*)(?P<remote>R[0-9A-Fa-f]?|remote request)?"
+    rb"(?P<d>(?: ?[0-9A-Fa-f]{2}){0,64})(?:_[0-9A-Fa-f])?(?:\s+[RTrt][xX]?)?[ \t]*\Z"
+)
+
+
+def read_candump(path: Path) -> Frames:
+    """Frames of a `candump` log."""
+    parts: list[_Part] = []
+    buses: dict[bytes, int] = {}
+    bad = special = 0
+    raw = read_bytes(path)
+    for lines in _match_lines(raw, _CANDUMP, b"("):
+        if isinstance(lines, int):
+            bad += lines
+            continue
+        m, ident = lines.match, lines.ident()
+        extended = len(m["id"]) == 8
+        right = ident < (1 << 29 if extended else 1 << 11)  # an error frame has bit 29
+        if m["remote"] is not None:
+            right[:] = False
+        special += int(np.count_nonzero(~right))
+        if extended:
+            ident |= np.uint32(EXTENDED)
+        data = lines.data(8 if m["form"] == b"#" else 64)
+        parts.append((lines.start[right], lines.seconds(10**9)[right], ident[right], buses.setdefault(m["bus"], len(buses)), data[right]))
+    notes = [f"{bad} lines are not candump lines: left out"] if bad else []
     if special:
         notes.append(f"{special} remote or error frames: left out")
-    if not sum(p[0].size for p in parts):
-        raise LogError(f"{path}: no candump frame in it; a line looks like (1735329625.329586) can0 17C#0000000010000021")
-    order = np.argsort(np.concatenate([p[0] for p in parts]))
-    wide = 8 if max(p[4].shape[1] for p in parts) <= 8 else 64
-    data = np.zeros((order.size, wide), np.uint8)
-    length = np.zeros(order.size, np.uint8)
-    at = 0
-    for p in parts:
-        n, w = p[4].shape
-        data[at : at + n, :w] = p[4]
-        length[at : at + n] = w
-        at += n
-    ns, ident, buses = (np.concatenate([p[k] for p in parts])[order] for k in (1, 2, 3))
-    return _frames(str(path), ns, ident, buses, length[order], data[order], notes)
-
-
-def _parse_shape(
-    text: np.ndarray, m: re.Match[bytes], names: dict[bytes, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, np.ndarray]:
-    """Parse the lines (rows of ``text``) that have the columns of ``m``: which rows fit, and their ns, identifier, bus and data."""
-    line = np.frombuffer(m.string, np.uint8)
-    (s0, s1), (f0, f1), (i0, i1) = m.span("s"), m.span("f"), m.span("id")
-    d0, d1 = m.span(next((g for g in ("d", "fd", "c") if m[g] is not None), 0)) if m["r"] is None and m["rc"] is None else (0, 0)
-    digits = np.r_[s0:s1, f0:f1]
-    nibbles = np.r_[i0:i1, d0 + np.flatnonzero(line[d0:d1] != ord(" "))]
-    same = np.ones(line.size, bool)
-    same[digits] = False
-    same[nibbles] = False
-    if m["fl"] is not None:
-        same[m.start("fl")] = False
-    fits = np.ones(len(text), bool)
-    for k in np.flatnonzero(same):
-        fits &= text[:, k] == line[k]
-    number = text[:, digits] - np.uint8(48)
-    fits &= (number <= 9).all(axis=1)
-    half = _NIBBLE[text[:, nibbles]]
-    fits &= (half < 16).all(axis=1)
-    number, half = number[fits].astype(np.float64), half[fits]
-    seconds = (number[:, : s1 - s0] @ 10.0 ** np.arange(s1 - s0 - 1, -1, -1)).astype(np.int64)
-    fraction = (number[:, s1 - s0 :] @ 10.0 ** np.arange(8, 8 - (f1 - f0), -1)).astype(np.int64)
-    seconds = np.minimum(seconds, 9_000_000_000)  # int64 nanoseconds end in the year 2262
-    width = i1 - i0
-    ident = np.full(len(half), 0, np.uint32)
-    for k in range(width):
-        ident = (ident << np.uint32(4)) | half[:, k]
-    if width == 8:
-        ident |= np.uint32(EXTENDED)
-    else:
-        ident &= np.uint32(0x7FF)
-    data = (half[:, width::2] << 4) | half[:, width + 1 :: 2]
-    return fits, seconds * 1_000_000_000 + fraction, ident, names.setdefault(m["if"], len(names)), data
+    return _join(path, parts, "candump", "(1735329625.329586) can0 17C#0000000010000021", notes)
 
 
 def write_candump(path: Path, frames: Frames) -> None:
@@ -248,43 +313,42 @@ def write_candump(path: Path, frames: Frames) -> None:
     path.write_text("".join(lines), encoding="ascii")
 
 
-# --- text formats of other tools ---------------------------------------------------------------------------------------------------------
+# --- other text formats ------------------------------------------------------------------------------------------------------------------
 
-# python-can's readers end at the first line they cannot read; a log cut off in mid-line, or with a foreign event, is common.
+# python-can's readers of these end at the first line they cannot read; a log cut off in mid-line, or with a foreign event, is common.
 _ASC = re.compile(
-    rb"^[ \t]*(?P<t>\d+\.\d+)[ \t]+(?:"
-    rb"(?P<bus>\d{1,4})[ \t]+(?P<id>[0-9A-Fa-f]{1,9})(?P<x>x?)[ \t]+\w+[ \t]+d[ \t]+(?P<dlc>[0-9A-Fa-f]{1,2})"
-    rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{1,3}\b)*)"
-    rb"|CANFD[ \t]+(?P<fbus>\d{1,4})[ \t]+\w+[ \t]+(?P<fid>[0-9A-Fa-f]{1,9})(?P<fx>x?)[ \t]+(?:[^\s]*[^\s01][^\s]*[ \t]+)?"
-    rb"[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}[ \t]+(?P<n>\d{1,2})(?P<fd>(?:[ \t]+[0-9A-Fa-f]{1,3}\b)*))",
-    re.M,
+    rb"(?P<s> *\d{1,10})\.(?P<f>\d{1,9})[ \t]+(?P<fd>CANFD[ \t]+)?(?P<bus>\d{1,4})[ \t]+(?(fd)\w+[ \t]+)(?P<id>[0-9A-Fa-f]{1,8})"
+    rb"(?P<x>x?)[ \t]+(?(fd)(?:\S*[^\s01]\S*[ \t]+)?[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}|\w+[ \t]+d)[ \t]+(?P<len>[0-9A-Fa-f]{1,2})"
+    rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{2}(?![^ \t])){0,64})(?P<tail>(?:[ \t].*)?)\Z"
 )
 _ASC_TIME = re.compile(rb"^[ \t]*(\d+\.\d+)[ \t]", re.M)
+_ASC_BASE = re.compile(rb"^[ \t]*base[ \t]+(hex|dec)(?:[ \t]+timestamps[ \t]+(absolute|relative))?", re.M | re.I)
 
 
 def read_asc(path: Path) -> Frames:
-    """Frames of a Vector ASCII log, classic and CAN FD, hex or dec, times absolute or relative to the event before."""
+    """Frames of a Vector ASCII log, classic and CAN FD; times absolute or relative to the event before."""
     raw = read_bytes(path)
-    head = re.search(rb"^[ \t]*base[ \t]+(hex|dec)(?:[ \t]+timestamps[ \t]+(absolute|relative))?", raw[:100_000], re.M | re.I)
-    base = 10 if head and head[1].lower() == b"dec" else 16
-    since: dict[int, float] = {}
+    head = _ASC_BASE.search(raw[:100_000])
+    if head and head[1].lower() == b"dec":
+        raise LogError(f"{path}: has its numbers in base dec; allowed: base hex")
+    parts: list[_Part] = []
+    for lines in _match_lines(raw, _ASC, b" \t0123456789"):
+        if not isinstance(lines, int):
+            m = lines.match
+            most = min(int(m["len"]), 64) if m["fd"] and m["len"].isdigit() else min(int(m["len"], 16), 8)
+            parts.append(_text_part(lines, 10**9, bool(m["x"]), int(m["bus"]), most))
     if head and (head[2] or b"").lower() == b"relative":
         events = [(m.start(), float(m[1])) for m in _ASC_TIME.finditer(raw)]
-        since = dict(zip((e[0] for e in events), np.cumsum([e[1] for e in events]).tolist(), strict=True))
-    rows = []
-    for m in _ASC.finditer(raw):
-        fd = m["fbus"] is not None
-        ident, x, bus, text = (m["fid"], m["fx"], m["fbus"], m["fd"]) if fd else (m["id"], m["x"], m["bus"], m["d"])
-        n = int(m["n"]) if fd else min(int(m["dlc"], base), 8)
-        row = _text_frame(since.get(m.start(), float(m["t"])), int(ident, base), bool(x), int(bus), n, text.split()[:n], base)
-        if row is not None:
-            rows.append(row)
-    return _text_frames(path, rows, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07")
+        place, since = np.array([e[0] for e in events]), np.cumsum([e[1] for e in events])
+        parts = [(p[0], np.rint(since[np.searchsorted(place, p[0])] * 1e9).astype(np.int64), *p[2:]) for p in parts]
+    return _join(path, parts, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07", [])
 
 
-_TRC_LINE = re.compile(rb"^[ \t]*\d+\)?[ \t]+(\d[^\r\n]*)", re.M)
 _TRC_COLUMNS = {b"1.0": "OILD", b"1.1": "OdILD", b"1.2": "OBdILD", b"1.3": "OBdIRLD", b"2.0": "OTIdlD", b"2.1": "OTBIdRLD"}
-_TRC_DATA = {"T": (b"DT", b"FD", b"FB", b"FE", b"BI"), "d": (b"Rx", b"Tx")}
+_TRC_WORD = {
+    "O": rb"(?P<s> *\d{1,12})(?:\.(?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
+    "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ \t]+RTR)", "l": rb"(?P<len>\d{1,2})",
+}  # fmt: skip
 
 
 def read_trc(path: Path) -> Frames:
@@ -292,53 +356,34 @@ def read_trc(path: Path) -> Frames:
     raw = read_bytes(path)
     version = re.search(rb"^;\$FILEVERSION=(\d\.\d)", raw[:100_000], re.M)
     if version and version[1] not in _TRC_COLUMNS:
-        raise LogError(f"{path}: TRC version {version[1].decode()} is not known; allowed: 1.0 to 1.3, 2.0, 2.1")
-    columns = _TRC_COLUMNS[version[1] if version else b"1.0"]
+        raise LogError(f"{path}: TRC version {version[1].decode()} is not known; allowed: {b', '.join(_TRC_COLUMNS).decode()}")
     stated = re.search(rb"^;\$COLUMNS=N,([A-Za-z,]+)", raw[:100_000], re.M)
-    if stated:
-        columns = stated[1].decode().replace(",", "")
-    place = {c: i for i, c in enumerate(columns)}
-    n_at = place.get("l", place.get("L", -1))
-    if n_at < 0 or not {"O", "I", "D"} <= set(place) or place["D"] != len(columns) - 1:
-        raise LogError(f"{path}: TRC columns {columns} are not understood; needed: O, I, L or l, and D last")
-    rows = []
-    for m in _TRC_LINE.finditer(raw):
-        words = m[1].split()
-        if len(words) < len(columns) - 1 or any(words[place[c]] not in _TRC_DATA[c] for c in "Td" if c in place):
-            continue
-        try:
-            ident, n, bus = words[place["I"]], int(words[n_at]), int(words[place["B"]]) if "B" in place else 1
-            if "l" not in place and n > 8:
-                n = (12, 16, 20, 24, 32, 48, 64)[min(n, 15) - 9]
-            row = _text_frame(float(words[place["O"]]) / 1000, int(ident, 16), len(ident) > 4, bus, n, words[place["D"] :][:n], 16)
-        except ValueError:
-            continue
-        if row is not None:
-            rows.append(row)
-    return _text_frames(path, rows, "TRC", "1)  10.0  Rx  00A0  8  00 01 02 03 04 05 06 07")
+    columns = stated[1].decode().replace(",", "") if stated else _TRC_COLUMNS[version[1] if version else b"1.0"]
+    given = set(columns)
+    if not given <= {*_TRC_WORD, "D"} or len(given) < len(columns) or not {"O", "I", "D"} <= given or columns[-1] != "D":
+        raise LogError(f"{path}: TRC columns {columns} are not understood; allowed: {', '.join(_TRC_WORD)}, and D last")
+    if ("L" in given) == ("l" in given):
+        raise LogError(f"{path}: TRC columns {columns} must have one of L and l")
+    words = b"".join((rb"[ \t]" if c == "O" else rb"[ \t]+") + _TRC_WORD[c] for c in columns[:-1])
+    bytes_ = rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{2}(?![^ \t])){0,64})(?P<tail>(?:[ \t].*)?)\Z"
+    layout = re.compile(rb"(?P<n> *\d{1,10})\)?" + words + bytes_)
+    parts = []
+    for lines in _match_lines(raw, layout, b" \t0123456789"):
+        if not isinstance(lines, int):
+            m, n = lines.match, int(lines.match["len"])
+            most = n if "l" in columns or n <= 8 else (12, 16, 20, 24, 32, 48, 64)[min(n, 15) - 9]
+            bus = int(m["bus"]) if "B" in columns else 1
+            parts.append(_text_part(lines, 10**6, len(m["id"]) > 4, bus, min(most, 64)))
+    return _join(path, parts, "TRC", "1)  10.0  Rx  00A0  8  00 01 02 03 04 05 06 07", [])
 
 
-_Row = tuple[float, int, int, int, bytes]
-
-
-def _text_frame(t: float, ident: int, extended: bool, bus: int, n: int, words: list[bytes], base: int) -> _Row | None:
-    """One frame of a text log; None where its numbers cannot be a frame's."""
-    try:
-        data = bytes(int(w, base) for w in words)
-    except ValueError:
-        return None
-    if not t < 1e12 or ident >> (29 if extended else 11) or n > 64 or bus >> 16:
-        return None
-    return t, ident | (EXTENDED if extended else 0), bus, len(data), data
-
-
-def _text_frames(path: Path, rows: list[_Row], kind: str, example: str) -> Frames:
-    if not rows:
-        raise LogError(f"{path}: no {kind} frame in it; a line looks like: {example}")
-    t, ident, bus, length, data = zip(*rows, strict=True)
-    wide = 8 if max(length) <= 8 else 64
-    block = np.frombuffer(b"".join(d.ljust(wide, b"\0") for d in data), np.uint8).reshape(-1, wide)
-    return _frames(str(path), np.array(t), np.array(ident, np.uint32), np.array(bus, np.int32), np.array(length, np.uint8), block, [])
+def _text_part(lines: _Lines, per_unit: int, extended: bool, bus: int, most: int) -> _Part:
+    """Frames of one layout; an identifier that is too long for its kind is no frame's."""
+    ident = lines.ident()
+    right = ident < (1 << 29 if extended else 1 << 11)
+    if extended:
+        ident |= np.uint32(EXTENDED)
+    return lines.start[right], lines.seconds(per_unit)[right], ident[right], bus, lines.data(most)[right]
 
 
 # --- BLF ---------------------------------------------------------------------------------------------------------------------------------
@@ -684,7 +729,8 @@ def cut_signal(frames: Frames, rows: np.ndarray, message: Message, signal: Any) 
         bits = raw.astype(np.uint64) & np.uint64((1 << signal.length) - 1)
         n = signal.length
         there = bits >> np.uint64(n - 8) < 0xFE if n >= 8 else bits < (1 << n) - 1 if n >= 4 else there
-    values = raw.astype(np.float64) * float(signal.scale) + float(signal.offset)
+    with np.errstate(all="ignore"):  # an IEEE signal may hold anything; the reader leaves out what is not finite
+        values = raw.astype(np.float64) * float(signal.scale) + float(signal.offset)
     return rows[there], values[there], int(np.count_nonzero(~there))
 
 
@@ -698,7 +744,7 @@ def encode(message: Message, values: dict[str, np.ndarray], n: int) -> np.ndarra
         if signal.is_float or signal.length > 52:
             if column is None:
                 continue
-            raise LogError(f"{signal.name}: its {signal.length} bits in {message.layout.name} cannot be written; allowed: integers, 52 bits")
+            raise LogError(f"{signal.name}: its {signal.length} bits in {message.layout.name} cannot be written; allowed: 52-bit integers")
         low, high = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
         none = message.missing.get(signal.name, 0)
         if column is None:

@@ -37,7 +37,7 @@ UNITS = {
 _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
 _MOST_FRAMES = 20_000_000  # of one message; 55 h at 10 ms
-_HOLD = 5  # frame periods a value is repeated on the bus before its channel counts as silent
+_HOLD = 3  # frame periods a value is repeated on the bus before its channel counts as silent
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,8 @@ class Bus:
                     self.names[key] = (key, s.name)
                     self._of[key] = m, s
                 else:
-                    self._silent[s.name] = self._silent[key] = f"{m.layout.name} (0x{m.ident & 0x1FFFFFFF:X})"
+                    why = f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no such frame"
+                    self._silent[s.name] = self._silent[key] = why
 
     def has(self) -> str:
         if self.names:
@@ -120,8 +121,7 @@ class Bus:
         return f"; {self.dbc.name} has no message for the log's {ident.size} identifiers ({most}): --dbc F"
 
     def absent(self, name: str) -> str:
-        where = self._silent.get(name)
-        return f"{self.dbc.name} has it in {where}, but the log has no such frame" if where else ""
+        return self._silent.get(name, "")
 
     def series(self, key: str) -> Series:
         m, signal = self._of[key]
@@ -129,7 +129,9 @@ class Bus:
             self._rows[m.ident], notes = canlog.select(self.frames, m)
             self.notes += notes
         rows, values, missing = canlog.cut_signal(self.frames, self._rows[m.ident], m, signal)
-        if missing:
+        if missing and not rows.size:
+            self._silent[key] = self._silent[str(signal.name)] = f"all {missing} frames say not available"
+        elif missing:
             self.notes.append(f"{key}: {missing} frames say not available: left out")
         return Series(self.frames.t[rows], values, str(signal.unit or ""))
 
@@ -226,39 +228,61 @@ def _open_csv(path: Path, options: _Options) -> Source:
         raise LogError(f"{path}: column {again!r} is there more than once")
     comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
 
-    def load(key: str) -> np.ndarray:
-        return _csv_column(path, rest, headers, headers.index(key), separator, comma, first)
+    time = _time_column(path, headers, options.mapping)
+    known = {*UNITS, *options.mapping, time}
+    table = _Csv(path, rest, headers, [h for h in headers if h in known or _split_unit(h)[0] in known], separator, comma, first)
+    return Table([h for h in headers if h], table.column, first, time)
 
-    return Table([h for h in headers if h], load, first, _time_column(path, headers, options.mapping))
 
+class _Csv:
+    """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
 
-def _csv_column(path: Path, rest: bytes, headers: list[str], index: int, separator: str, comma: bool, first: int) -> np.ndarray:
-    """One column as numbers; where a cell is none, once more as text to take blanks off or to name the first bad one."""
-    import polars as pl
+    def __init__(self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int):
+        self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
+        self.separator, self.comma, self.first = separator, comma, first
+        self.ready: dict[str, np.ndarray] | None = None
 
-    def read(kind: Any) -> Any:
-        schema = {f"c{i}": kind if i == index else pl.String for i in range(len(headers))}
-        return pl.read_csv(
-            io.BytesIO(rest), has_header=False, separator=separator, schema=schema, columns=[index], truncate_ragged_lines=True,
-            decimal_comma=comma and kind != pl.String, null_values=["", *_NO_SAMPLE],
-        )[f"c{index}"]  # fmt: skip
+    def column(self, header: str) -> np.ndarray:
+        import polars as pl
 
-    if not rest.strip():
-        return np.empty(0)
-    try:
-        return _numbers(read(pl.Float64))
-    except pl.exceptions.PolarsError:
-        pass
-    try:
-        text = read(pl.String).str.strip_chars()
-    except pl.exceptions.PolarsError as e:
-        raise LogError(f"{path}: column {headers[index]!r}: {str(e)[:160]}") from None
-    text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
-    number = (text.str.replace(",", ".", literal=True) if comma else text).cast(pl.Float64, strict=False)
-    bad = (number.is_null() & text.is_not_null()).arg_true()
-    if bad.len():
-        raise LogError(f"{path}: column {headers[index]!r}, row {bad[0] + first}: {text[bad[0]][:40]!r} is not a number")
-    return _numbers(number)
+        if not self.rows.strip():
+            return np.empty(0)
+        if self.ready is None:
+            try:
+                frame = self._read(self.wanted, pl.Float64)
+                self.ready = {h: _numbers(frame[h]) for h in self.wanted}
+            except pl.exceptions.PolarsError:
+                self.ready = {}  # a cell that is no number: column by column
+        if header not in self.ready:
+            self.ready[header] = self._numbers(header)
+        return self.ready[header]
+
+    def _read(self, columns: list[str], kind: Any) -> Any:
+        """The columns of ``columns`` as ``kind``."""
+        import polars as pl
+
+        places = [f"c{self.headers.index(h)}" for h in columns]  # names of our own: the file's may be empty
+        head = self.separator.join(f"c{i}" for i in range(len(self.headers))).encode() + b"\n"
+        frame = pl.read_csv(
+            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0, schema_overrides=dict.fromkeys(places, kind),
+            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String, null_values=["", *_NO_SAMPLE],
+        )  # fmt: skip
+        return frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
+
+    def _numbers(self, header: str) -> np.ndarray:
+        """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is named."""
+        import polars as pl
+
+        try:
+            text = self._read([header], pl.String)[header].str.strip_chars()
+        except pl.exceptions.PolarsError as e:
+            raise LogError(f"{self.path}: column {header!r}: {str(e)[:160]}") from None
+        text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
+        number = (text.str.replace(",", ".", literal=True) if self.comma else text).cast(pl.Float64, strict=False)
+        bad = (number.is_null() & text.is_not_null()).arg_true()
+        if bad.len():
+            raise LogError(f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number")
+        return _numbers(number)
 
 
 def _numbers(column: Any) -> np.ndarray:
@@ -385,7 +409,11 @@ def _encode(channels: dict[str, Channel], dbc: Path, path: Path) -> canlog.Frame
         t, values = t[sent], {n: v[sent] for n, v in values.items()}
         if "mode_request" in m.missing:
             values["mode_request"] = np.ones(t.size)
-        parts.append((t - start, np.full(t.size, m.ident, np.uint32), canlog.encode(m, values, t.size)))
+        try:
+            data = canlog.encode(m, values, t.size)
+        except LogError as e:
+            raise LogError(f"{path}: {e}") from None
+        parts.append((t - start, np.full(t.size, m.ident, np.uint32), data))
     if left:
         raise LogError(f"{path}: {dbc.name} has no signal for {', '.join(sorted(left))}")
     t = np.concatenate([p[0] for p in parts])
@@ -510,9 +538,10 @@ _SPEED = ("n_dem", "n_r")
 _ALIASES = {
     "%": "percent", "pct": "percent", "per cent": "percent", "1": "", "ratio": "",
     "°": "degree", "deg": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC",
-    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
-    "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second", "hz": "turn/second", "khz": "kiloturn/second",
-    "sec": "second", "s": "second", "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
+    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm", "r/min": "rpm",
+    "rev/min": "rpm", "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second", "hz": "turn/second",
+    "khz": "kiloturn/second", "sec": "second", "s": "second",
+    "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
 }  # fmt: skip
 
 
@@ -667,10 +696,11 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
     if t.size:
         last = np.append(np.diff(t) > 0, True)
         if not last.all():
-            notes.append(f"{signal} ({key}): {int(np.count_nonzero(~last))} samples share their time with the next: the last is kept")
+            notes.append(f"{signal} ({key}): {int(np.count_nonzero(~last))} of {t.size} samples have the time of the next: left out")
             t, values = t[last], values[last]
     if not t.size:
-        notes.append(f"{signal} ({key}): no sample that can be used")
+        if s.t.size:
+            notes.append(f"{signal} ({key}): no sample that can be used")
         return None
     return Channel(np.ascontiguousarray(t, np.float64), np.ascontiguousarray(values, np.float64))
 

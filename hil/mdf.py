@@ -81,8 +81,9 @@ def _child(request: bytes, seconds: float) -> bytes:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], input=request, capture_output=True, timeout=seconds, env=environment, check=False
-        )
+            [sys.executable, "-c", code], input=request, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            timeout=seconds, env=environment, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return b""
     return done.stdout if done.returncode == 0 else b""
@@ -113,7 +114,7 @@ def answer(request: bytes, out: BinaryIO) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     arrays: dict[str, np.ndarray] = {}
     try:
-        with asammdf.MDF(path, **{"process_bus_logging": False}) as mdf:
+        with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
             reply = _read(mdf, asked["wanted"], arrays)
     except Exception as e:  # the library meets a damaged file with any exception there is
         reply = {"error": f"{type(e).__name__}: {' '.join(str(e).split())}"[:160]}

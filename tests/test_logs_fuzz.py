@@ -1,0 +1,193 @@
+"""No bytes whatever take the reader down: a log is read with its invariants kept, or refused in one line."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import hil.mdf
+import tables
+from hil import canlog, logs
+from hil.logs import LogError, read_log, write_log
+from tests.test_logs import check, run
+
+DBC = tables.path("vgv.dbc")
+QUICK = {".csv": 250, ".parquet": 250, ".log": 400, ".asc": 400, ".blf": 400, ".trc": 400, ".mf4": 150}
+MAPS: list[dict[str, str]] = [{}, {}, {"n_r": "n_dem"}]
+
+
+def mutations(raw: bytes, rng: random.Random) -> bytes:
+    """The file as a broken disk, a cut transfer, or another program might leave it."""
+    kind = rng.random()
+    if kind < 0.1:
+        return rng.randbytes(rng.choice([1, 3, 17, 200, 3000]))
+    if kind < 0.15:
+        return raw[: rng.choice([4, 8, 12, 64, 144, 168, 200])] + rng.randbytes(300)
+    if kind < 0.35:
+        return raw[: rng.randrange(1, len(raw))]
+    out = bytearray(raw)
+    # headers of binary formats stand at either end: most damage goes there
+    span = rng.choice([200, 2000, len(out), -400, -4000])
+    for _ in range(rng.choice([1, 1, 2, 3, 8, 40])):
+        at = rng.randrange(min(span, len(out))) if span > 0 else rng.randrange(max(0, len(out) + span), len(out))
+        how = rng.random()
+        if how < 0.35:
+            out[at] = rng.randrange(256)
+        elif how < 0.5:
+            out[at] ^= 1 << rng.randrange(8)
+        elif how < 0.75:
+            at &= ~7
+            number = rng.choice([0, 1, 8, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1, 1 << 40, rng.randrange(len(out)) & ~7, rng.randrange(1 << 16)])
+            out[at : at + 8] = number.to_bytes(8, "little")
+        elif how < 0.85:
+            out[at : at + rng.randrange(1, 60)] = b""
+        elif how < 0.95:
+            out[at:at] = out[at : at + rng.randrange(1, 300)]
+        else:
+            out[at : at + 4] = rng.choice([b"nan,", b",,,,", b"\n\n\n\n", b"1e99", b"-inf", b'"', b"\0\0\0\0", b"#", b"(", b"\xff\xfe\xfd", "٣".encode()])
+        if not out:
+            return b"\0"
+    return bytes(out)
+
+
+def campaign(folder: Path, suffix: str, seeds: range, dbc: Path | None = None) -> None:
+    """Read mutated logs of one format."""
+    write_log(folder / f"good{suffix}", run(120), dbc=dbc)
+    raw = (folder / f"good{suffix}").read_bytes()
+    file = folder / f"bad{suffix}"
+    for seed in seeds:
+        rng = random.Random(seed)
+        file.write_bytes(mutations(raw, rng))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                check(read_log(file, mapping=rng.choice(MAPS), dbc=dbc, design_rpm=rng.choice([None, 38000.0]), require=rng.choice([(), ("n_dem",)])))
+        except LogError as e:
+            assert "\n" not in str(e) and str(file) in str(e), f"seed {seed}: {e}"
+        except BaseException as e:
+            raise AssertionError(f"seed {seed} of {suffix}: {type(e).__name__}: {e}") from e
+
+
+@pytest.fixture(scope="module")
+def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
+    """In place of a fresh interpreter a file: one that has imported asammdf and forks for each file."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    code = (
+        "import os, sys, signal\nimport asammdf\nfrom hil.mdf import answer\n"
+        "for line in sys.stdin.buffer:\n"
+        "    name, _, request = line.partition(b' ')\n"
+        "    pid = os.fork()\n"
+        "    if pid == 0:\n"
+        "        signal.alarm(20)\n"
+        "        with open(name, 'wb') as out: answer(request, out)\n"
+        "        os._exit(0)\n"
+        "    status = os.waitpid(pid, 0)[1]\n"
+        "    sys.stdout.write(f'{status}\\n'); sys.stdout.flush()\n"
+    )
+    root = str(Path(__file__).parents[1])
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=root, env={**os.environ, "PYTHONPATH": root}
+    )
+    assert process.stdin is not None and process.stdout is not None
+    stdin, stdout = process.stdin, process.stdout
+    reply = Path(os.environ.get("TMPDIR", "/tmp")) / f"vaneloop-fuzz-{process.pid}"
+
+    def child(request: bytes, seconds: float) -> bytes:
+        stdin.write(str(reply).encode() + b" " + request)
+        stdin.flush()
+        status = int(stdout.readline())
+        return reply.read_bytes() if status == 0 else b""
+
+    yield child
+    stdin.close()
+    process.wait(30)
+    reply.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("suffix", list(logs._FORMATS))
+def test_no_damage_takes_the_reader_down(
+    tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    campaign(tmp_path, suffix, range(QUICK[suffix]))
+
+
+def test_no_damage_takes_the_reader_of_bus_mdf_down(
+    tmp_path: Path, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    campaign(tmp_path, ".mf4", range(1000, 1000 + QUICK[".mf4"]), DBC)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", list(logs._FORMATS))
+def test_long_campaign(tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
+
+
+def test_a_damaged_mdf_ends_the_child_and_not_the_reader(tmp_path: Path) -> None:
+    """Without any stand-in: the reader's own child on files that end it by a fault, and on one that it reads."""
+    write_log(tmp_path / "a.mf4", run(50))
+    raw = (tmp_path / "a.mf4").read_bytes()
+    for seed in (3, 5):
+        out = bytearray(raw)
+        rng = random.Random(seed)
+        for _ in range(30):
+            at = rng.randrange(200, len(out)) & ~7
+            out[at : at + 8] = rng.randrange(1 << 62).to_bytes(8, "little")
+        (tmp_path / "b.mf4").write_bytes(out)
+        try:
+            check(read_log(tmp_path / "b.mf4"))
+        except LogError as e:
+            assert "\n" not in str(e)
+    check(read_log(tmp_path / "a.mf4"))
+
+
+def test_a_child_that_never_answers_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_log(tmp_path / "a.mf4", run(50))
+    monkeypatch.setattr(hil.mdf, "_TIME", (0.01, 1e12))
+    with pytest.raises(LogError, match="damaged"):
+        read_log(tmp_path / "a.mf4")
+
+
+def test_no_damage_to_a_database_takes_the_reader_down(tmp_path: Path) -> None:
+    write_log(tmp_path / "a.log", run(60))
+    raw, bad = DBC.read_bytes(), tmp_path / "bad.dbc"
+    raw = b"\n".join(line for line in raw.splitlines() if not line.startswith(b"CM_"))
+    for seed in range(60):
+        bad.write_bytes(mutations(raw, random.Random(seed)))
+        try:
+            check(read_log(tmp_path / "a.log", dbc=bad))
+        except LogError as e:
+            assert "\n" not in str(e)
+    canlog._load_dbc.cache_clear()
+
+
+def test_a_suffix_that_lies_is_refused(tmp_path: Path) -> None:
+    good = {}
+    for suffix in logs._FORMATS:
+        write_log(tmp_path / f"a{suffix}", run(60))
+        good[suffix] = (tmp_path / f"a{suffix}").read_bytes()
+    for suffix in logs._FORMATS:
+        for other, raw in good.items():
+            if other != suffix:
+                (tmp_path / f"b{suffix}").write_bytes(raw)
+                with pytest.raises(LogError):
+                    read_log(tmp_path / f"b{suffix}")
+    (tmp_path / "folder.csv").mkdir()
+    for name in ("folder.csv", "none.log", "a", "a.txt"):
+        with pytest.raises(LogError):
+            read_log(tmp_path / name)
+    for suffix in logs._FORMATS:
+        (tmp_path / f"c{suffix}").write_bytes(b"")
+        with pytest.raises(LogError, match="empty"):
+            read_log(tmp_path / f"c{suffix}")
