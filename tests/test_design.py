@@ -252,18 +252,18 @@ def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: d.Des
 
 
 def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -> None:
-    result, code = d.command(report=tmp_path / "design.html")
+    result, code = d.evaluate(report=tmp_path / "design.html")
     assert code == 0 and result.ok
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["nominal"]["gain_margin_db"] > 8.0
     assert (tmp_path / "design.html").stat().st_size > 100_000
     assert any("gain margin" in line for line in d.summary(result))
-    result, code = d.command(kp=60.0)
+    result, code = d.evaluate(kp=60.0)
     assert code == 1 and not result.ok
     json.dumps(result.to_dict(), allow_nan=False)
 
 
 def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
-    result, code = d.command(kp=200.0, report=tmp_path / "unstable.html")
+    result, code = d.evaluate(kp=200.0, report=tmp_path / "unstable.html")
     assert code == 1 and "stable" in result.checks[0].name
     json.dumps(result.to_dict(), allow_nan=False)
     assert d.summary(result)
@@ -271,7 +271,7 @@ def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
 
 @pytest.mark.parametrize("gap_mm", [0.0, 0.3])
 def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
-    result, code = d.command(backlash_inside=gap_mm)
+    result, code = d.evaluate(backlash_inside=gap_mm)
     assert result.play[0].gap == pytest.approx(gap_mm)
     assert code == (0 if gap_mm == 0.0 else 1)  # 0.3 mm hunts with 0.16 mm, beyond 0.05 mm
     assert (result.play[0].predicted_amplitude is None) == (gap_mm == 0.0)
@@ -280,7 +280,7 @@ def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
 @pytest.mark.parametrize("bad", [{"kp": -1.0}, {"kp": math.nan}, {"ki": math.inf}, {"kff": -0.1}, {"backlash_inside": math.nan}])
 def test_a_gain_out_of_range_is_named(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
-        d.command(**bad)
+        d.evaluate(**bad)
 
 
 # ---------------------------------------------------------------- trend filter
