@@ -21,7 +21,7 @@ import math
 from numba import njit
 
 # Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a tick.
-compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
+compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  # type: ignore[call-overload]
 
 # ---- inputs -------------------------------------------------------------------------------------------------------------------------
 INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt")
@@ -511,13 +511,9 @@ def tick(inputs, state, calibration):
     z, k = state, calibration.k
     _condition_lvdt(z, k, inputs[IN_X_LVDT])
     _monitor_demand(inputs, z, k)
-    if z[TICKS] == 0.0:
-        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])
-        z[X_FROM] = z[X_DEM]
-
+    mode = int(z[MODE])
     phase = int(z[TICKS]) % SLOW
     if phase == 0:
-        mode = int(z[MODE])
         if z[DEMAND_SEEN] == 1.0:
             z[N_R] += (z[N_R_RAW] - z[N_R]) * SLOW_TICK / (k[SPEED_FILTER] + SLOW_TICK)
             trend_step(z, k, z[N_DEM])
@@ -529,28 +525,21 @@ def tick(inputs, state, calibration):
         else:
             z[X_FROM] = z[X_DEM]
 
+    servo_on = mode != INIT and not (mode == FAIL_SAFE and (int(z[FAULT_BITS]) & LVDT_MASK) != 0)
+    if not servo_on:
+        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])  # bumpless: the servo starts from where the piston is
+        z[X_FROM] = z[X_DEM]
     # the servo's reference runs straight through the 10 ms from the last demand to the new one
     dx_ref = (z[X_DEM] - z[X_FROM]) / SLOW_TICK
     x_ref = z[X_FROM] + dx_ref * TICK * (phase + 1)
     z[X_SERVO] = x_ref
-    mode = int(z[MODE])
-    lvdt_lost = (int(z[FAULT_BITS]) & LVDT_MASK) != 0
-    if mode == INIT:
-        z[I_CMD] = 0.0
-        z[INTEGRAL] = 0.0
-        z[SATURATED] = 0.0
-        servo_on = False
-    elif mode == FAIL_SAFE and lvdt_lost:
-        limit = k[CURRENT_LIMIT]
-        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])  # bumpless: the servo starts from where the piston is
-        z[X_FROM] = z[X_DEM]
-        z[I_CMD] = min(max(k[FAIL_SAFE_CURRENT], -limit), limit)
-        z[INTEGRAL] = 0.0
-        z[SATURATED] = 0.0
-        servo_on = False
-    else:
+    if servo_on:
         servo_step(z, k, x_ref, dx_ref)
-        servo_on = True
+    else:
+        limit = k[CURRENT_LIMIT]
+        z[I_CMD] = 0.0 if mode == INIT else min(max(k[FAIL_SAFE_CURRENT], -limit), limit)
+        z[INTEGRAL] = 0.0
+        z[SATURATED] = 0.0
     _debounce(z, T_TRACKING, servo_on and abs(x_ref - z[X_MEAS]) > k[TRACKING_LIMIT], F_TRACKING, k[TRACKING_TIME], k[RECOVER_TIME])
     _debounce(z, T_SATURATED, servo_on and z[SATURATED] == 1.0, F_SATURATED, k[SATURATED_TIME], k[RECOVER_TIME])
     z[TICKS] += 1.0
