@@ -80,7 +80,9 @@ def engine_test(
     signals = [
         error_figures(name, "linkage", "deg", "schedule", run.t, run.columns[name], values, speed, noise) for name, values in target.items()
     ]
-    return ReplayResult(f"engine test, {strategy}", run.simulated_s, run.wall_s, run.state_hash, signals, run.t, dict(run.columns), target, {})
+    return ReplayResult(
+        f"engine test, {strategy}", run.simulated_s, run.wall_s, run.state_hash, signals, run.t, dict(run.columns), target, {}
+    )
 
 
 DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and falls, 1.6 deg of hysteresis
@@ -95,7 +97,9 @@ exit codes: 0 the dual curves stay at or below the paper's figures, 1 they do no
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the shipped engine_test.toml)")
+    parser.add_argument(
+        "--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the shipped engine_test.toml)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
     parser.add_argument("--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)")
     cli.add_output_options(parser)
@@ -121,7 +125,9 @@ def command(args: argparse.Namespace) -> int:
     rows: list[list[str]] = []
     for strategy, r in results.items():
         for s in r.signals:
-            rows.append([f"{strategy}: {s.signal}", *("-" if (v := getattr(s, k)) is None else f"{v:.3f}" for k in STATISTICS), f"{s.samples:,}"])
+            rows.append(
+                [f"{strategy}: {s.signal}", *("-" if (v := getattr(s, k)) is None else f"{v:.3f}" for k in STATISTICS), f"{s.samples:,}"]
+            )
     rows.append(["paper, dual: vigv", "-", *(f"{PAPER_TABLE_5[k]:.2f}" for k in STATISTICS[1:]), "over 30,000"])
     dual = results["dual"]
     title = f"engine test: {dual.simulated_s:,.0f} s under each strategy, {dual.wall_s:.1f} s of computing; error of the vane angles, deg"

@@ -111,12 +111,16 @@ class Search:
         costs = []
         for i in range(0, len(thetas), 16):
             errors = judge.errors(np.array(thetas[i : i + 16])).reshape(len(thetas[i : i + 16]), -1)
-            for e in errors:
-                step = np.linalg.solve(a, flat @ e) if len(free) else np.empty(0)
-                costs.append(float(e @ e - (2.0 * step @ (flat @ e) - step @ a @ step if len(free) else 0.0)))
+            for r in errors:
+                fall = 0.0
+                if len(free):
+                    pull = flat @ r
+                    step = np.linalg.solve(a, pull)
+                    fall = float(2.0 * step @ pull - step @ a @ step)
+                costs.append(float(r @ r) - fall)
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
-        for name in {o: None for o in owner}:
+        for name in dict.fromkeys(owner):
             mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
             out[name] = [thetas[i] for _, i in mine[:2]]
             base_cost = float(np.sum(e0 * e0))
@@ -189,7 +193,9 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
     rms = [np.sqrt(max(f.held_out.sum(), 0.0) / n) for f in (before, after)]
     overall = (rms[0] - rms[1]) / spread
     m = np.maximum(judge.samples, 1)
-    local = (np.sqrt(np.maximum(before.held_out, 0.0) / m) - np.sqrt(np.maximum(after.held_out, 0.0) / m)) / np.sqrt(correlation / (2.0 * m))
+    local = (np.sqrt(np.maximum(before.held_out, 0.0) / m) - np.sqrt(np.maximum(after.held_out, 0.0) / m)) / np.sqrt(
+        correlation / (2.0 * m)
+    )
     return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
 
 

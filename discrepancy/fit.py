@@ -68,7 +68,7 @@ class Judge:
         if w is not None:
             per = max(1, round((w[-1] + 1) / blocks))
             block_of = w // per
-            self.window_start = np.flatnonzero(np.diff(w, prepend=-1))
+            self.window_start: Array | None = np.flatnonzero(np.diff(w, prepend=-1))
         else:
             block_of = np.minimum(((t - t[0]) / span * blocks).astype(int), blocks - 1)
             self.window_start = None
@@ -77,7 +77,7 @@ class Judge:
         self.samples = np.add.reduceat(self.valid.sum(axis=0), self.block_start)
         self.n = int(self.samples.sum())
         self.scale = self._scales()
-        self._counts = None
+        self._counts: Array | None = None
         if self.window_start is not None:
             self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
             self._lengths = np.diff(np.append(self.window_start, len(t)))

@@ -12,7 +12,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-__all__ = ["Parser", "add_log_options", "add_output_options", "pairs", "print_table", "progress_bar", "read_log_of", "run", "say", "write_json"]
+__all__ = [
+    "Parser",
+    "add_log_options",
+    "add_output_options",
+    "pairs",
+    "print_table",
+    "progress_bar",
+    "read_log_of",
+    "run",
+    "say",
+    "write_json",
+]
 
 
 class Parser(argparse.ArgumentParser):
@@ -32,7 +43,9 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="LOG", help="candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
     group = parser.add_argument_group("reading the log (docs/logs.md)")
     group.add_argument("--dbc", metavar="F", help="database of a CAN log (default: the product's own vgv.dbc)")
-    group.add_argument("--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem")
+    group.add_argument(
+        "--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem"
+    )
     group.add_argument("--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm")
     group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
 
@@ -90,10 +103,14 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     say(args, title)
     table = Table(box=box.SIMPLE_HEAD)
     for i, c in enumerate(columns):
-        table.add_column(c, justify="left" if i == 0 or not any(ch.isdigit() for ch in "".join(r[i] for r in rows)) else "right", overflow="fold")
+        table.add_column(
+            c, justify="left" if i == 0 or not any(ch.isdigit() for ch in "".join(r[i] for r in rows)) else "right", overflow="fold"
+        )
     for r in rows:
         table.add_row(*r)
-    console = Console(file=sys.stderr if args.json == "-" else sys.stdout, soft_wrap=False, width=None if sys.stdout.isatty() else 150, markup=False)
+    console = Console(
+        file=sys.stderr if args.json == "-" else sys.stdout, soft_wrap=False, width=None if sys.stdout.isatty() else 150, markup=False
+    )
     console.print(table)
 
 

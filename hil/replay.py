@@ -102,9 +102,7 @@ def replay(
     start = float(log.channels["x_dem"].values[0]) * 1e-3 if "x_dem" in log.channels else None
     outputs = [log.channels[s] for s in STAGE if s in log.channels]
     fine = min((float(np.median(np.diff(c.t))) for c in outputs if len(c.t) > 1), default=1e-2) < 5e-3
-    run = lockstep(
-        stimulus, calibration=cal, plant=machine, angles=angles, stroke_demand=start, every=1 if fine else 10, progress=progress
-    )
+    run = lockstep(stimulus, calibration=cal, plant=machine, angles=angles, stroke_demand=start, every=1 if fine else 10, progress=progress)
 
     t, model = run.t, {name: run.columns[name] for name in UNITS}
     model["n_r"] = run.columns["n_engine"]
@@ -194,7 +192,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of replay and of compare."""
     cli.add_log_options(parser)
     group = parser.add_argument_group("the model and the judgement")
-    group.add_argument("--strategy", metavar="S", help="stroke curves of the controller: single (one mean curve) or dual (one per direction)")
+    group.add_argument(
+        "--strategy", metavar="S", help="stroke curves of the controller: single (one mean curve) or dual (one per direction)"
+    )
     group.add_argument(
         "--tolerance",
         metavar="signal=value",

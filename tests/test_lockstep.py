@@ -24,7 +24,12 @@ print(lockstep(Stimulus.of(n), seed=5).state_hash)
 
 def hash_in_another_process(seconds: float, **env: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", SHORT.format(seconds=seconds)], cwd=ROOT, env={**os.environ, **env}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", SHORT.format(seconds=seconds)],
+        cwd=ROOT,
+        env={**os.environ, **env},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return done.stdout.strip()
 
@@ -66,7 +71,9 @@ def test_logging_faster_changes_no_state() -> None:
     slow, fast = lockstep(Stimulus.of(n), every=10), lockstep(Stimulus.of(n), every=1)
     assert slow.state_hash == fast.state_hash
     assert np.array_equal(slow.columns["x_lvdt"], fast.columns["x_lvdt"][::10])
-    assert np.allclose(slow.columns["i_cmd"][1:], fast.columns["i_cmd"][1:].reshape(-1)[: 10 * (len(slow.t) - 1)].reshape(-1, 10).mean(axis=1))
+    assert np.allclose(
+        slow.columns["i_cmd"][1:], fast.columns["i_cmd"][1:].reshape(-1)[: 10 * (len(slow.t) - 1)].reshape(-1, 10).mean(axis=1)
+    )
 
 
 def test_stroke_follows_its_demand_and_vanes_their_schedule() -> None:

@@ -1,0 +1,452 @@
+"""The vane chain as stages: the only module of the search that knows what a vane is.
+
+| stage    | driven by (logged)            | explains (logged)            | scored                                            |
+|----------|-------------------------------|------------------------------|---------------------------------------------------|
+| demand   | n_dem, n_r                    | x_dem                        | the firmware's own trend, tables and rate limits  |
+| servo    | x_dem, x_lvdt                 | i_cmd                        | windows, integral free                            |
+| engine   | n_dem                         | n_r                          | free run                                          |
+| actuator | i_cmd, n_r, p_s, t_oil        | x_lvdt                       | windows, stroke free                              |
+| linkage  | x_lvdt, n_r, t_oil            | vigv, vgv1, vgv2, jointly    | free run, play a state                            |
+
+All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are measured on the errors
+of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it causes is measured and added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from controller import Calibration, load_calibration, new_state
+from controller import firmware as fw
+from discrepancy.stage import Array, Effect, Parameter, Stage
+from hil.figures import noise_floor
+from hil.logs import Log, LogError
+from plant import Plant, build_plant, chain
+from plant.compiled import compiled
+from plant.effects import EFFECTS, ROW
+from plant.linkage import STAGES
+from plant.parameters import NAMES, derive, nominal
+
+__all__ = ["STAGE_ORDER", "Chain", "build_chain"]
+
+STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
+RASTER = 1e-2  # s
+WINDOW = 1.0  # s
+SUBSTEPS = 5  # of the actuator between two samples of 10 ms
+SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
+FREE = {  # nominal parameters that a stage refits within their tolerance
+    "demand": (),
+    "servo": (),
+    "engine": ("engine.lag", "engine.acceleration", "engine.deceleration"),
+    "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping"),
+    "linkage": tuple(f"linkage.{s}_play" for s in STAGES) + tuple(f"sensors.{s}_bias" for s in STAGES),
+}
+LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
+
+
+@dataclass
+class Chain:
+    """The stages of one log.
+
+    stages        the stages that can be judged
+    not_observed  stage -> what the log lacks
+    columns       channel -> values on the common raster ``t`` (border units), for plots
+    """
+
+    t: Array
+    stages: list[Stage]
+    not_observed: dict[str, str]
+    columns: dict[str, Array]
+    plant: Plant
+    calibration: Calibration
+    notes: list[str] = field(default_factory=list)
+
+    def stage(self, name: str) -> Stage:
+        """Return a stage by name."""
+        return next(s for s in self.stages if s.name == name)
+
+
+def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration | None = None, present: tuple[str, ...] = ()) -> Chain:
+    """Put ``log`` on one raster and make every stage that its channels allow.
+
+    present  effects that the model already has: they are part of ``plant`` and not tried again
+    """
+    machine, cal = plant or build_plant(), calibration or load_calibration()
+    t, columns, fresh, notes = _raster(log)
+    if len(t) < 500:
+        raise LogError(
+            f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to search for missing physics"
+        )
+    dt = float(t[1] - t[0])
+    run = fresh & (t >= SETTLE)
+    if "state" in columns:
+        run &= np.round(columns["state"]) == fw.RUN
+    run &= _no_gap_in_window(t, fresh)
+    supply = machine.table.supply
+    filled = {"p_s": supply.pressure.value, "t_oil": supply.temperature.value}
+    have = dict(columns)
+    for name, value in filled.items():
+        if name not in have:
+            have[name] = np.full(len(t), value)
+            notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
+    regimes, units = _regimes(t, columns)
+    makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
+        "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
+        "servo": (("x_dem", "x_lvdt"), ("i_cmd",), _servo),
+        "engine": (("n_dem",), ("n_r",), _engine),
+        "actuator": (("i_cmd",), ("x_lvdt",), _actuator),
+        "linkage": (("x_lvdt",), STAGES, _linkage),
+    }
+    stages, absent = [], {}
+    for name in STAGE_ORDER:
+        needs, gives, make = makers[name]
+        missing = [c for c in needs if c not in columns]
+        outputs = tuple(c for c in gives if c in columns)
+        if missing or not outputs:
+            absent[name] = "no " + ", ".join(missing or gives)
+            continue
+        if name in ("servo", "demand") and dt > 2.5 * RASTER:
+            absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
+            continue
+        stage = make(t, have, machine, cal, outputs, run, present)
+        stage.regimes, stage.regime_units = regimes, units
+        if np.isfinite(stage.measured).sum() < 300:
+            absent[name] = "fewer than 300 samples in mode RUN without gaps"
+            continue
+        stage.floor = _floor(stage, dt)
+        stages.append(stage)
+    return Chain(t, stages, absent, columns, machine, cal, notes)
+
+
+# ---- raster -------------------------------------------------------------------------------------------------------------------------
+
+
+def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
+    """All channels on one uniform raster; which samples are near measured ones; notes."""
+    channels = log.channels
+    steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
+    if not steps:
+        raise LogError(f"{log.path}: no channel has more than 10 samples")
+    dt = max(RASTER, round(float(np.median(steps)) / RASTER) * RASTER)
+    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
+    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    reference = max((c for c in channels.values()), key=lambda c: len(c.t))
+    own = float(np.median(np.diff(reference.t)))
+    phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
+    t = np.arange(max(1, int((end - start) / dt + 1e-6) + 1)) * dt
+    fresh = np.ones(len(t), dtype=bool)
+    columns = {}
+    for name, c in channels.items():
+        if len(c.t) < 2:
+            columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
+            continue
+        when = t + start + phase
+        step = float(np.median(np.diff(c.t)))
+        uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
+        if name == "i_cmd" and step < 0.6 * dt:
+            total = np.concatenate([[0.0], np.cumsum(c.values)])
+            edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
+            count = np.maximum(np.diff(edge), 1)
+            columns[name] = np.diff(total[edge]) / count
+        elif uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state"):
+            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands hold their value
+            i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
+            columns[name] = c.values[i]
+        else:
+            columns[name] = np.interp(when, c.t, c.values)
+        i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
+        fresh &= np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1])) < max(3.0 * step, 2.0 * dt)
+    return t, columns, fresh, list(log.notes)
+
+
+def _no_gap_in_window(t: Array, fresh: Array) -> Array:
+    w = (t / WINDOW).astype(int)
+    bad = np.unique(w[~fresh])
+    return ~np.isin(w, bad)
+
+
+def _regimes(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Conditions under which a stage may fail."""
+    out: dict[str, Array] = {"time": t}
+    units = {"time": "s"}
+    dt = t[1] - t[0]
+    if "x_lvdt" in columns:
+        x = columns["x_lvdt"]
+        k = max(3, int(round(0.1 / dt)))
+        smooth = np.convolve(np.pad(x, k, mode="edge"), np.ones(2 * k + 1) / (2 * k + 1), mode="valid")
+        v = np.gradient(smooth, dt)
+        out |= {"stroke": x, "stroke speed": v, "direction": np.sign(np.where(np.abs(v) > 0.2, v, 0.0))}
+        units |= {"stroke": "mm", "stroke speed": "mm/s", "direction": ""}
+        turns = np.zeros(len(t))
+        last, sign = smooth[0], 0.0
+        for i in range(1, len(t)):
+            if abs(v[i]) > 0.2 and np.sign(v[i]) != sign:
+                sign, last = float(np.sign(v[i])), smooth[i]
+            turns[i] = abs(smooth[i] - last)
+        out["distance since reversal"], units["distance since reversal"] = turns, "mm"
+    for name, label, unit in (("n_r", "rotor speed", "%"), ("t_oil", "oil temperature", "degC"), ("p_s", "supply pressure", "MPa")):
+        if name in columns:
+            out[label], units[label] = columns[name], unit
+    if "i_cmd" in columns:
+        out["current"], units["current"] = columns["i_cmd"], "mA"
+    return out, units
+
+
+def _floor(stage: Stage, dt: float) -> Array:
+    """Noise floor of every output: noise of the nominal model's error, and the error of a slow raster."""
+    model = stage.run(stage.neutral()[None])[0]
+    out = []
+    for k in range(len(stage.outputs)):
+        e = np.where(np.isfinite(stage.measured[k]), stage.measured[k] - model[k], np.nan)
+        out.append(max(noise_floor(stage.t, e), LEAST_FLOOR[stage.name]))
+    return np.array(out)
+
+
+# ---- parameters and effects ---------------------------------------------------------------------------------------------------------
+
+
+def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
+    """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors to SI."""
+    known = {n.name: n for n in nominal(machine.table, machine.geometry)}
+    parameters, rows, si = [], [], []
+    for name in FREE[stage]:
+        n = known[name]
+        value = float(machine.p[NAMES.index(name), 0]) / n.si
+        if name.endswith("_play"):
+            # the play is known at the vane and used at the ring
+            factor = machine.p[NAMES.index(name), 0] / (n.value * n.si)
+            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance))
+            si.append(n.si * factor)
+        else:
+            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance))
+            si.append(n.si)
+        rows.append(NAMES.index(name))
+    effects = []
+    for e in EFFECTS.values():
+        if stage not in e.stages or e.name in present:
+            continue
+        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high) for p in e.parameters)
+        effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
+        rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
+        si += [p.si for p in e.parameters]
+    return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
+
+
+SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
+FIXED_START = {"speed": 5.0, "distance": 0.3}  # of second parameters
+FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
+
+
+def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ...]:
+    """Sizes from which a fit of the effect starts: small to gross, both signs where the bounds allow."""
+    if name == "valve_flow_saturation":
+        return tuple((v,) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0))
+    if name in ("can_delay", "frame_hold"):
+        return tuple((v,) for v in np.arange(0.01, 0.51, 0.01) if name != "frame_hold" or v > 0.015)
+    if name == "trend_threshold_error":
+        return tuple((v,) for v in (0.2, 0.4, 0.6, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 8.0))
+    if name == "end_stop_shift":
+        return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
+    second = [FIXED_START.get(p.name, p.value) for p in ps]
+    mains = [i for i, p in enumerate(ps) if p.name not in ("speed", "distance", "phase")]
+    out = []
+    for size in SIZES if ps[mains[0]].value == 0.0 else range(len(FACTORS)):
+        for sign in (1.0, -1.0):
+            start = list(second)
+            ok = True
+            for i in mains:
+                p = ps[i]
+                if p.value == 0.0:
+                    v = sign * size * (p.high if sign > 0 else -p.low)
+                else:
+                    v = p.value * FACTORS[int(size)]
+                    ok &= sign > 0
+                ok &= p.low <= v <= p.high and v != p.value
+                start[i] = v
+            if ok:
+                phases = (0.0, 90.0, 180.0, 270.0) if any(p.name == "phase" for p in ps) else (None,)
+                for phase in phases:
+                    out.append(tuple(phase if p.name == "phase" and phase is not None else start[i] for i, p in enumerate(ps)))
+    return tuple(out)
+
+
+def _lanes(machine: Plant, thetas: Array, rows: Array, si: Array) -> Array:
+    """The plant's parameter array with one lane per parameter set."""
+    p = np.repeat(machine.p, len(thetas), axis=1)
+    p[rows] = (thetas * si).T
+    return p
+
+
+# ---- stages -------------------------------------------------------------------------------------------------------------------------
+
+
+def _engine(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    parameters, effects, rows, si = _declared("engine", machine, present)
+    dt = float(t[1] - t[0])
+    inner = max(1, int(round(dt / 2e-3)))
+    n_dem = (
+        np.repeat(c["n_dem"], inner) if dt < 1.5 * RASTER else np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), c["n_dem"])
+    )
+    n_dem = np.ascontiguousarray(n_dem)
+
+    def simulate(thetas: Array) -> Array:
+        p = _lanes(machine, thetas, rows, si)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        s[chain.N_R] = np.median(c["n_r"][:5])
+        out = np.empty((len(n_dem), len(thetas)))
+        chain.engine_run(n_dem, dt / inner, p, s, out)
+        return out[::inner].T[:, None, :]
+
+    return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])
+
+
+def _actuator(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    parameters, effects, rows, si = _declared("actuator", machine, present)
+    dt = float(t[1] - t[0])
+    substeps = SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
+    i = np.ascontiguousarray(c["i_cmd"] * 1e-3)
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
+    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+
+    def simulate(thetas: Array) -> Array:
+        p = _lanes(machine, thetas, rows, si)
+        derive(p, dt / substeps, dt)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        s[chain.X] = s[chain.X_LVDT] = x[0]
+        out = np.empty((len(t), len(thetas)))
+        chain.actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
+        return out.T[:, None, :] * 1e3
+
+    return Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
+
+
+def _linkage(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    parameters, effects, rows, si = _declared("linkage", machine, present)
+    dt = float(t[1] - t[0])
+    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    t_oil = np.ascontiguousarray(c["t_oil"])
+    which = [STAGES.index(o) for o in outputs]
+    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in STAGES]
+
+    def simulate(thetas: Array) -> Array:
+        p = _lanes(machine, thetas, rows, si)
+        derive(p, dt, dt)
+        start = machine.start(stroke=x[0], n_r=n_r[0])
+        machine.place_rings(start, tuple(first))
+        s = np.repeat(start, len(thetas), axis=1)
+        out = np.empty((len(t), 3, len(thetas)))
+        chain.linkage_run(x, n_r, t_oil, t, dt, p, s, out)
+        return np.rad2deg(out[:, which].transpose(2, 1, 0))
+
+    measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
+    return Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
+
+
+def _servo(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    parameters, effects, _, _ = _declared("servo", machine, present)
+    x_dem, x = c["x_dem"], c["x_lvdt"]
+    kp, ki, kff, limit = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF, fw.CURRENT_LIMIT))  # A/m = mA/mm
+    # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
+    before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
+    before[0], two[:2] = x_dem[0], x_dem[0]
+    ramp = sum(two + (before - two) * f / 10.0 for f in range(2, 11)) + before + (x_dem - before) / 10.0
+    x_before = np.roll(x, 1)
+    x_before[0] = x[0]
+    stroke = sum(x_before + (x - x_before) * f / 10.0 for f in range(1, 11))
+    error = (ramp - stroke) / 10.0
+    rate = (9.0 * (before - two) + (x_dem - before)) / 10.0 / RASTER
+    integral = np.cumsum(error) * RASTER
+    integral -= 0.5 * error * RASTER
+
+    def simulate(thetas: Array) -> Array:
+        factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
+        i = factor * (kp * error + ki * integral + kff * rate)[None]
+        return i[:, None, :]
+
+    near = np.abs(c["i_cmd"]) < 0.9e3 * limit
+    return Stage("servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW)
+
+
+@compiled
+def _demand_run(t, n_dem, n_r, delay, hold, phase, k, table, z, out):
+    """The firmware's 10 ms part on logged frames: x_dem (m) of every frame."""
+    n = len(t)
+    dt = t[1] - t[0]
+    for i in range(n):
+        at = t[i]
+        if hold > 0.0:
+            at = np.floor((at - phase) / hold + 1e-9) * hold + phase
+        at = (at - delay) / dt
+        j = min(max(int(np.floor(at + 1e-9)), 0), n - 1)
+        w = min(max(at - j, 0.0), 1.0)
+        if w < 1e-6 or j == n - 1:
+            a, b = n_dem[j], n_r[j]
+        else:
+            a = n_dem[j] + w * (n_dem[j + 1] - n_dem[j])
+            b = n_r[j] + w * (n_r[j + 1] - n_r[j])
+        if i == 0:
+            z[fw.TREND_N] = a
+            z[fw.TREND_TURN] = a
+            z[fw.N_R] = b
+        z[fw.N_DEM] = a
+        z[fw.N_R] += (b - z[fw.N_R]) * fw.SLOW_TICK / (k[fw.SPEED_FILTER] + fw.SLOW_TICK)
+        fw.trend_step(z, k, a)
+        fw.schedule_step(z, k, table)
+        if i == 0:
+            z[fw.X_DEM] = z[fw.X_TARGET]
+        fw.move_demand(z, k, z[fw.X_TARGET], k[fw.STROKE_RATE])
+        out[i] = z[fw.X_DEM]
+
+
+def _demand(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    _, effects, _, _ = _declared("demand", machine, present)
+    n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
+    starting = [float(np.interp(n_r[0], cal.table[0], cal.table[r])) * 1e3 for r in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)]
+    rising = abs(starting[0] - c["x_dem"][0]) <= abs(starting[1] - c["x_dem"][0])
+    at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
+
+    def value(theta: Array, name: str, neutral: float) -> float:
+        return float(theta[at[name]]) if name in at else neutral
+
+    def simulate(thetas: Array) -> Array:
+        out = np.empty((len(thetas), 1, len(t)))
+        for i, theta in enumerate(thetas):
+            k, table = cal.k.copy(), cal.table.copy()
+            factor = value(theta, "trend_threshold_error", 1.0)
+            k[fw.TREND_RATE_ON] *= factor
+            k[fw.TREND_CHANGE] *= factor
+            table[1:] += value(theta, "schedule_error", 0.0) * 1e-3
+            z = new_state()
+            z[fw.DEMAND_SEEN] = 1.0
+            z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if rising else (-1.0, 0.0)
+            hold = value(theta, "frame_hold", 0.0)
+            phase = float(theta[at["frame_hold"] + 1]) * hold if hold > 0.0 else 0.0
+            _demand_run(t, n_dem, n_r, value(theta, "can_delay", 0.0), hold, phase, k, table, z, out[i, 0])
+        return out * 1e3
+
+    # the hold's clock is not the log's: where it stands is a nuisance that is fitted with it
+    held = []
+    for e in effects:
+        if e.name == "frame_hold":
+            phase = Parameter("phase", 0.0, "-", 0.0, 1.0)
+            starts = tuple((s[0], k * RASTER / s[0]) for s in e.starts for k in range(max(1, round(s[0] / RASTER))))
+            e = Effect(e.name, (*e.parameters, phase), starts, e.excites)
+        held.append(e)
+    effects = tuple(held)
+    at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
+    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, np.where(run, c["x_dem"], np.nan)[None])
