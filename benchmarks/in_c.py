@@ -11,12 +11,22 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ours import COLUMNS, Setup
+from plant import parameters as par
+from plant.linkage import N_GEOMETRY
+from plant.parameters import N_NOMINAL
 
 __all__ = ["BITWISE", "FAST", "CLoop", "build"]
 
 FAST = ("-O3", "-march=native")
 BITWISE = (*FAST, "-ffp-contract=off")  # no fused multiply-add: every operation rounds, as in the compiled Python
 
+# the product's parameters in the order of loop.c's `Parameters`
+_PARAMETERS = [
+    *(par.LAG, par.ACCELERATION, par.DECELERATION, par.RATED_CURRENT, par.BANDWIDTH, par.DAMPING, par.FLOW_GAIN, par.AREA, par.STROKE),
+    *(par.P_REF, par.LVDT_LAG, par.POT_LAG, *range(par.PLAY, par.PLAY + 3), *range(par.POT_BIAS, par.POT_BIAS + 3)),
+    *range(par.GEOMETRY, par.GEOMETRY + N_GEOMETRY),
+    *(par.LVDT_STEP, par.VALVE_A11, par.VALVE_A12, par.VALVE_A21, par.VALVE_A22, par.LVDT_FACTOR, par.POT_FACTOR),
+]
 _Doubles = ctypes.POINTER(ctypes.c_double)
 
 
@@ -55,7 +65,7 @@ class CLoop:
         self._c = build(flags, gcc)
         s = self._setup = setup
         # kept: the C side reads the table where it is
-        self._arrays = [np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[:, 0], s.sigma)]
+        self._arrays = [np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[:N_NOMINAL, 0], s.sigma)]
         k, table, p, sigma = self._arrays
         expected = [len(k), len(p), s.stimulus.rows.shape[1], len(sigma)]
         found = [self._c.loop_layout(i) for i in range(4)]

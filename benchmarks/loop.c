@@ -332,10 +332,6 @@ static void choose_mode(Controller *c, const Calibration *k) {
 static void controller_tick(Controller *c, const Calibration *k, const StrokeTable *t, const Inputs *in) {
     condition_lvdt(c, k, in->x_lvdt);
     monitor_demand(c, k, in);
-    if (c->ticks == 0) {
-        c->x_dem = clip(c->x_meas, k->stroke_min, k->stroke_max);
-        c->x_from = c->x_dem;
-    }
     int phase = c->ticks % SLOW;
     if (phase == 0) {
         if (c->demand_seen) {
@@ -350,23 +346,20 @@ static void controller_tick(Controller *c, const Calibration *k, const StrokeTab
         else
             c->x_from = c->x_dem;
     }
+    bool servo_on = c->mode != INIT && !(c->mode == FAIL_SAFE && (c->faults & LVDT_LOST));
+    if (!servo_on) {
+        c->x_dem = clip(c->x_meas, k->stroke_min, k->stroke_max);
+        c->x_from = c->x_dem;
+    }
     double dx_ref = (c->x_dem - c->x_from) / SLOW_TICK;
     double x_ref = c->x_from + dx_ref * TICK * (phase + 1);
     c->x_servo = x_ref;
-    bool servo_on = false;
-    if (c->mode == INIT) {
-        c->i_cmd = 0.0;
-        c->integral = 0.0;
-        c->saturated = false;
-    } else if (c->mode == FAIL_SAFE && (c->faults & LVDT_LOST)) {
-        c->x_dem = clip(c->x_meas, k->stroke_min, k->stroke_max);
-        c->x_from = c->x_dem;
-        c->i_cmd = clip(k->fail_safe_current, -k->current_limit, k->current_limit);
-        c->integral = 0.0;
-        c->saturated = false;
-    } else {
+    if (servo_on) {
         servo_step(c, k, x_ref, dx_ref);
-        servo_on = true;
+    } else {
+        c->i_cmd = c->mode == INIT ? 0.0 : clip(k->fail_safe_current, -k->current_limit, k->current_limit);
+        c->integral = 0.0;
+        c->saturated = false;
     }
     debounce(c, TRACKING, servo_on && fabs(x_ref - c->x_meas) > k->tracking_limit, k->tracking_time, k->recover_time);
     debounce(c, CURRENT_SATURATED, servo_on && c->saturated, k->saturated_time, k->recover_time);

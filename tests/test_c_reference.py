@@ -63,8 +63,8 @@ def test_faults_are_the_same_bits_as_in_c(gcc: str, spiked: bool) -> None:
     assert {MODES[int(m)] for m in ours[:, COLUMNS.index("state")]} >= {"STANDBY", "RUN", "DEGRADED", "FAIL_SAFE"}
 
 
-def test_every_tick_is_the_same_bits_as_in_c(gcc: str) -> None:
-    setup = Setup(troubled(25.0), noisy=True, every=1)
+def test_every_tick_from_switching_on_is_the_same_bits_as_in_c(gcc: str) -> None:
+    setup = Setup(troubled(25.0), noisy=True, every=1, warm_up=0)
     assert_same_bits(*both(setup, gcc, sensor_noise(setup.ticks, spiked=True)))
 
 

@@ -1,0 +1,256 @@
+"""The measurements behind ``python -m benchmarks``: each gives rows of what, ours, peer, ratio, target.
+
+This machine may be busy and its clock may change: opponents run in turn, and the fastest run of each counts (the median where whole
+processes are started). Loops are timed in processor time, processes on the wall clock.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from benchmarks.ours import COLUMNS, OurLoop, Setup, profile
+from hil.lockstep import Stimulus, lockstep
+
+__all__ = ["MEASUREMENTS", "Row", "machine"]
+
+ROOT = Path(__file__).resolve().parent.parent
+LONG = 300.0  # s simulated where only compiled loops run
+ROUNDS = 15
+REPLAYED = 3000.0  # s
+# largest difference to a peer that integrates the same equations with another method: one count of the LVDT is 0.00076 mm
+TOLERANCE = {"n_engine": 0.005, "x_dem": 2e-6, "x_lvdt": 2e-6, **dict.fromkeys(("vigv", "vgv1", "vgv2"), np.deg2rad(2e-3))}  # %, m, rad
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table. ``ratio`` is what the ``target`` is about; ``held`` None = no target, for information."""
+
+    what: str
+    ours: str
+    peer: str = ""
+    ratio: float | None = None
+    target: str = ""
+    held: bool | None = None
+    note: str = ""
+
+
+def machine() -> dict[str, str]:
+    """Return what the figures depend on."""
+    cpu = "unknown"
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    found = {"cpu": f"{cpu}, {os.cpu_count()} cores", "system": platform.platform(), "python": platform.python_version()}
+    for package in ("numpy", "numba", "control", "pathsim"):
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    try:
+        found["gcc"] = subprocess.run(["gcc", "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        found["gcc"] = "not installed"
+    found["load"] = f"{os.getloadavg()[0]:.1f}"
+    return found
+
+
+class Loop(Protocol):
+    """A loop that is ready at t = 0."""
+
+    def advance(self, out: np.ndarray) -> None:
+        """Run the whole stimulus."""
+
+
+def cpu_time(loop: Loop, out: np.ndarray) -> float:
+    """Processor time of one run, s, without what comes before t = 0."""
+    started = time.process_time()
+    loop.advance(out)
+    return time.process_time() - started
+
+
+def _speed(simulated: float, seconds: float) -> str:
+    rate = simulated / seconds
+    return f"{rate:,.0f} s/s" if rate >= 100 else f"{rate:.2g} s/s"
+
+
+def _rows(setup: Setup) -> np.ndarray:
+    return np.zeros((-(-setup.ticks // setup.every), len(COLUMNS)))
+
+
+# ---- compiled loops -----------------------------------------------------------------------------------------------------------------
+
+
+def against_c() -> Iterator[Row]:
+    """The loop against the same loop in C."""
+    from benchmarks.in_c import BITWISE, FAST, CLoop
+
+    setup = Setup(Stimulus.of(profile(LONG)))
+    out, c_out = _rows(setup), _rows(setup)
+    best = dict.fromkeys(("ours", "fast", "bitwise"), float("inf"))
+    for _ in range(ROUNDS):
+        best["ours"] = min(best["ours"], cpu_time(OurLoop(setup), out))
+        best["fast"] = min(best["fast"], cpu_time(CLoop(setup, FAST), c_out))
+        best["bitwise"] = min(best["bitwise"], cpu_time(CLoop(setup, BITWISE), c_out))
+    same = bool((out.view(np.int64) == c_out.view(np.int64)).all())
+    ours = _speed(LONG, best["ours"])
+    ratio = best["ours"] / best["fast"]
+    yield Row("loop, C -O3 -march=native", ours, _speed(LONG, best["fast"]), ratio, "<= 1.3", ratio <= 1.3)
+    bits = "every logged signal the same bits" if same else "THE SIGNALS DIFFER"
+    yield Row("same, -ffp-contract=off", ours, _speed(LONG, best["bitwise"]), best["ours"] / best["bitwise"], "same bits", same, bits)
+    for hashed, what, note in (
+        (False, "hil.lockstep, no hash", "wall clock"),
+        (True, "hil.lockstep, every tick hashed", "wall clock; the hash takes as long as the loop, beside it where a core is free"),
+    ):
+        wall = min(lockstep(setup.stimulus, hashed=hashed).wall_s for _ in range(5))
+        yield Row(what, _speed(LONG, wall), note=note)
+
+
+def interpreted() -> Iterator[Row]:
+    """The same source without compilation, and whether it gives the same bits."""
+    code = (
+        "from benchmarks.ours import profile; from hil.lockstep import Stimulus, lockstep;"
+        "r = lockstep(Stimulus.of(profile(2.5)[200:]), seed=1, duration=0.5); print(r.wall_s, r.state_hash)"
+    )
+    answers = []
+    for disabled in ("0", "1"):
+        env = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
+        answers.append(_wall([sys.executable, "-c", code], env)[1].split())
+    same = answers[0][1] == answers[1][1]
+    speed = _speed(0.5, float(answers[1][0]))
+    yield Row("loop without compilation", speed, target="same hash", held=same, note="NUMBA_DISABLE_JIT=1, 500 noisy ticks")
+
+
+# ---- other simulators ---------------------------------------------------------------------------------------------------------------
+
+
+Peer = Callable[[Setup], np.ndarray]
+
+
+def _against(name: str, run: Peer, signals: tuple[str, ...], seconds: float, least: float | None, repeat: int) -> Row:
+    """Time a peer on a rise and a fall, check that it simulates the same system, and compare with the product on the very same run."""
+    half = int(seconds * 50)
+    ramp = np.linspace(60.0, 60.0 + 3.0 * seconds, half)
+    setup = Setup(Stimulus.of(np.concatenate([ramp, ramp[::-1]])))
+    out = _rows(setup)
+    ours = min(cpu_time(OurLoop(setup), out) for _ in range(ROUNDS))
+    run(Setup(Stimulus.of(ramp[:10])))  # its first call imports and compiles
+    theirs, best = np.empty(0), float("inf")
+    for _ in range(repeat):
+        started = time.process_time()
+        theirs = run(setup)
+        best = min(best, time.process_time() - started)
+    n = min(len(theirs), len(out))
+    errors = {s: float(np.abs(theirs[:n, i] - out[:n, COLUMNS.index(s)]).max()) for i, s in enumerate(signals)}
+    outside = [s for s in signals if not errors[s] <= TOLERANCE[s]]
+    ratio = best / ours
+    vane = np.rad2deg(max(errors[s] for s in ("vigv", "vgv1", "vgv2")))
+    note = f"within {errors['x_lvdt'] * 1e3:.2g} mm, {vane:.2g} deg of ours over {2 * half / 100:g} s"
+    if outside:
+        note = f"NOT THE SAME SYSTEM: {', '.join(outside)} outside the tolerance; {note}"
+    held = None if least is None else bool(ratio >= least and not outside)
+    return Row(name, _speed(half / 50, ours), _speed(half / 50, best), ratio, "" if least is None else f">= {least:,.0f}", held, note)
+
+
+def against_control() -> Iterator[Row]:
+    """The loop in python-control."""
+    from benchmarks import in_control
+
+    yield _against("loop in python-control", in_control.run, in_control.SIGNALS, 6.0, 200.0, 5)
+
+
+def against_pathsim() -> Iterator[Row]:
+    """The loop in pathsim, at the product's plant step and at one ten times as long."""
+    from benchmarks import in_pathsim
+
+    for name, step, solver, least in (
+        ("loop in pathsim, plant step 0.1 ms as ours", 1e-4, "EUF", 1000.0),
+        ("same, its default solver", 1e-4, "SSPRK22", 1000.0),
+        ("same, plant step 1 ms", 1e-3, "SSPRK22", None),
+    ):
+        yield _against(name, partial(in_pathsim.run, step=step, solver=solver), in_pathsim.SIGNALS, 4.0, least, 3)
+
+
+# ---- commands -----------------------------------------------------------------------------------------------------------------------
+
+
+def _vaneloop() -> list[str]:
+    script = Path(sys.executable).with_name("vaneloop")
+    return [str(script)] if script.exists() else [sys.executable, "-m", "app.main"]
+
+
+def _wall(command: list[str], env: dict[str, str] | None = None) -> tuple[float, str]:
+    started = time.perf_counter()
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+    wall = time.perf_counter() - started
+    if done.returncode not in (0, 1):
+        raise RuntimeError(f"{' '.join(command)}: {done.stderr.strip()[-200:]}")
+    return wall, done.stdout + done.stderr
+
+
+def command_start() -> Iterator[Row]:
+    """``vaneloop --help`` against an interpreter that does nothing."""
+    bare, help_ = [], []
+    for _ in range(41):
+        bare.append(_wall([sys.executable, "-c", "pass"])[0])
+        help_.append(_wall([*_vaneloop(), "--help"])[0])
+    a, b = statistics.median(help_[1:]), statistics.median(bare[1:])
+    yield Row("vaneloop --help, python -c pass", f"{a * 1e3:.0f} ms", f"{b * 1e3:.0f} ms", a / b, "<= 5", a / b <= 5.0)
+
+
+def _write_run(path: Path, seconds: float) -> None:
+    from hil.logs import UNITS, Channel, write_log
+
+    run = lockstep(Stimulus.of(profile(seconds)), seed=1, hashed=False)
+    write_log(path, {name: Channel(run.t, v) for name, v in run.columns.items() if name in UNITS})
+
+
+def first_run() -> Iterator[Row]:
+    """The first run on a new machine, compilation included."""
+    with tempfile.TemporaryDirectory() as folder:
+        log, cache = Path(folder, "short.csv"), Path(folder, "cache")
+        _write_run(log, 2.0)
+        wall, said = _wall([*_vaneloop(), "replay", str(log)], {**os.environ, "NUMBA_CACHE_DIR": str(cache)})
+        told = "compiling" in said
+        again, _ = _wall([*_vaneloop(), "replay", str(log)], {**os.environ, "NUMBA_CACHE_DIR": str(cache)})
+    note = f"{'says' if told else 'DOES NOT SAY'} that it compiles; the second run takes {again:.1f} s"
+    yield Row("first replay, nothing compiled yet", f"{wall:.1f} s", target="< 30 s, told", held=wall < 30.0 and told, note=note)
+
+
+def long_replay() -> Iterator[Row]:
+    """A whole ``vaneloop replay`` of a long log, start to end."""
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix, what in (("parquet", "Parquet"), ("log", "candump")):
+            log, answer = Path(folder, f"long.{suffix}"), Path(folder, "answer.json")
+            _write_run(log, REPLAYED)
+            wall = min(_wall([*_vaneloop(), "replay", str(log), "--json", str(answer)])[0] for _ in range(2))
+            result = json.loads(answer.read_text(encoding="utf-8"))
+            note = f"{result['simulated_s']:,.0f} s, {log.stat().st_size / 2**20:.0f} MiB; the loop itself {result['wall_s']:.1f} s"
+            yield Row(f"vaneloop replay of a long {what} log", f"{wall:.1f} s", note=note)
+
+
+MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "the loop in C": against_c,
+    "the loop in python-control": against_control,
+    "the loop in pathsim": against_pathsim,
+    "the interpreted loop": interpreted,
+    "start of the command": command_start,
+    "first run": first_run,
+    "replay of a long log": long_replay,
+}
