@@ -157,7 +157,10 @@ class Table:
     def series(self, key: str) -> Series:
         if self._t is None:
             self._t = self._load(self._time)
-        return Series(self._t, self._load(key), _split_unit(key)[1], _split_unit(self._time)[1], "row", self._first)
+        values = self._load(key)
+        if values.size != self._t.size:
+            raise LogError(f"column {key!r} has {values.size} rows, the time column {self._time!r} has {self._t.size}")
+        return Series(self._t, values, _split_unit(key)[1], _split_unit(self._time)[1], "row", self._first)
 
 
 def _split_unit(header: str) -> tuple[str, str]:
@@ -303,30 +306,43 @@ def _is_absent(values: np.ndarray) -> np.ndarray:
 
 
 def _open_parquet(path: Path, options: _Options) -> Source:
-    """Parquet with numeric columns; null = no sample there."""
-    import polars as pl
+    """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a damaged page."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    raw = canlog.read_bytes(path)
-    if len(raw) < 12 or raw[:4] != b"PAR1" or raw[-4:] != b"PAR1":
-        raise LogError(f"{path}: is not a whole Parquet file (it must begin and end with PAR1)")
+    canlog.check_file(path)
+    damage = pa.ArrowException, OSError, ValueError, OverflowError, MemoryError
     try:
-        schema = dict(pl.read_parquet_schema(io.BytesIO(raw)))
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as e:
+        file = pq.ParquetFile(path)
+        schema = file.schema_arrow
+    except damage as e:
         raise LogError(f"{path}: is not a Parquet file ({str(e)[:160]})") from None
+    if again := next((n for k, n in enumerate(schema.names) if n in schema.names[:k]), None):
+        raise LogError(f"{path}: column {again!r} is there more than once")
 
     def load(key: str) -> np.ndarray:
-        kind = schema[key]
-        if not (kind.is_numeric() or kind.is_temporal() or kind == pl.Boolean) or kind == pl.Time:
+        kind = schema.field(key).type
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        scale = 1.0
+        if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+            scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind) or pa.types.is_boolean(kind)):
             raise LogError(f"{path}: column {key!r} holds {kind}, not numbers")
         try:
-            column = pl.read_parquet(io.BytesIO(raw), columns=[key])[key]
-            if kind.is_temporal():
-                column = column.cast(pl.Duration("ns") if kind == pl.Duration else pl.Datetime("ns")).to_physical().cast(pl.Float64) / 1e9
-            return _numbers(column.cast(pl.Float64))
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as e:
+            column = file.read(columns=[key], use_threads=False).column(key).combine_chunks().cast(kind)
+            column.validate(full=True)
+            if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+                column = column.cast(pa.int64())
+            if pa.types.is_boolean(kind):
+                column = column.cast(pa.int8())
+            values = column.cast(pa.float64(), safe=False).fill_null(np.nan).to_numpy(zero_copy_only=False)
+            values = np.array(values * scale if scale != 1.0 else values, np.float64)
+            values[column.is_null().to_numpy(zero_copy_only=False)] = _ABSENT
+            return values
+        except damage as e:
             raise LogError(f"{path}: column {key!r} cannot be read ({str(e)[:160]})") from None
 
-    return Table(list(schema), load, 1, _time_column(path, list(schema), options.mapping))
+    return Table(list(schema.names), load, 1, _time_column(path, list(schema.names), options.mapping))
 
 
 def _raster(channels: dict[str, Channel]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -747,8 +763,9 @@ def read_log(
             raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
         if taken is not None:
             key, s = taken
-            t = unit.convert("t", "t", s.t, s.t_unit)
-            values = unit.convert(signal, key, s.values, s.unit)
+            with np.errstate(all="ignore"):  # what overflows is not finite and left out below
+                t = unit.convert("t", "t", s.t, s.t_unit)
+                values = unit.convert(signal, key, s.values, s.unit)
             if values is not s.values:
                 values = np.where(_is_absent(s.values), _ABSENT, values)
             channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import zlib
@@ -141,7 +142,9 @@ def test_dbc_names_modes_and_faults(db: Any) -> None:
 def test_dbc_round_trip_loses_at_most_half_a_resolution(db: Any, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for m in db.messages:
-        sent = {s.name: rng.uniform(s.minimum, s.maximum) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1)) for s in m.signals}
+        sent = {
+            s.name: rng.uniform(s.minimum, s.maximum) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1)) for s in m.signals
+        }
         got = m.decode(m.encode(sent), decode_choices=False)
         assert all(abs(got[s.name] - sent[s.name]) <= s.scale * 0.5000001 for s in m.signals)
 
@@ -151,7 +154,11 @@ def test_frames_are_those_of_cantools_and_the_e2e_library(db: Any, seed: int) ->
     rng = np.random.default_rng(seed)
     for message in canlog.load_dbc(DBC)[0]:
         m, n = message.layout, 33
-        values = {s.name: np.round(rng.uniform(s.minimum, s.maximum, n) / s.scale) * s.scale for s in m.signals if s.name not in ("crc", "counter")}
+        values = {
+            s.name: np.round(rng.uniform(s.minimum, s.maximum, n) / s.scale) * s.scale
+            for s in m.signals
+            if s.name not in ("crc", "counter")
+        }
         ours = canlog.encode(message, values, n)
         theirs = bytearray(8)
         for k in range(n):
@@ -263,7 +270,9 @@ def test_any_samples_survive_a_table(tmp_path: Path, points: list[tuple[float, f
     assert np.array_equal(log.channels["n_dem"].t, t) and np.array_equal(log.channels["n_dem"].values, values)
 
 
-@pytest.mark.parametrize(("suffix", "writer"), [(".log", "CanutilsLogWriter"), (".asc", "ASCWriter"), (".blf", "BLFWriter"), (".trc", "TRCWriter")])
+@pytest.mark.parametrize(
+    ("suffix", "writer"), [(".log", "CanutilsLogWriter"), (".asc", "ASCWriter"), (".blf", "BLFWriter"), (".trc", "TRCWriter")]
+)
 def test_frames_are_those_that_python_can_reads(tmp_path: Path, suffix: str, writer: str) -> None:
     import can
 
@@ -403,7 +412,8 @@ def test_a_cut_log_is_read_as_far_as_it_goes(tmp_path: Path, suffix: str) -> Non
 def test_asc_times_relative_to_the_event_before_add_up(tmp_path: Path) -> None:
     text = "date Fri Jan 1 10:00:00.000 am 2021\nbase hex  timestamps relative\ninternal events logged\n"
     for _ in range(5):
-        text += "   0.004000 1  Statistic: D 1 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n   0.006000 1  123             Rx   d 2 01 02  Length = 1 ID = 291\n"
+        text += "   0.004000 1  Statistic: D 1 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
+        text += "   0.006000 1  123             Rx   d 2 01 02  Length = 1 ID = 291\n"
     (tmp_path / "a.asc").write_text(text)
     np.testing.assert_allclose(canlog.read_asc(tmp_path / "a.asc").t, np.arange(5) * 0.01, atol=1e-9)
 
@@ -512,10 +522,11 @@ def test_an_mdf_name_may_carry_its_group(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("signal", "unit", "value", "expected"),
     [
-        ("n_dem", "rpm", 19000.0, 50.0), ("n_dem", "Hz", 38000 / 60, 100.0), ("n_dem", "1/min", 3800.0, 10.0), ("n_dem", "kHz", 0.038 / 0.06, 100.0),
-        ("n_dem", "rad/s", 38000 / 60 * 2 * np.pi, 100.0), ("n_dem", "deg/s", 38000 * 6, 100.0), ("n_dem", "ratio", 0.5, 50.0), ("n_dem", "%", 7.0, 7.0),
-        ("x_dem", "m", 0.02, 20.0), ("x_dem", "inch", 1.0, 25.4), ("i_cmd", "A", 0.01, 10.0), ("p_s", "bar", 210.0, 21.0), ("p_s", "psi", 3000.0, 20.6842719),
-        ("t_oil", "K", 300.0, 26.85), ("t_oil", "°C", 20.0, 20.0), ("t_oil", "degF", 212.0, 100.0), ("vigv", "rad", 1.0, 57.29577951), ("vigv", "°", 3.0, 3.0),
+        ("n_dem", "rpm", 19000.0, 50.0), ("n_dem", "Hz", 38000 / 60, 100.0), ("n_dem", "1/min", 3800.0, 10.0),
+        ("n_dem", "kHz", 0.038 / 0.06, 100.0), ("n_dem", "rad/s", 38000 / 60 * 2 * np.pi, 100.0), ("n_dem", "deg/s", 38000 * 6, 100.0),
+        ("n_dem", "ratio", 0.5, 50.0), ("n_dem", "%", 7.0, 7.0), ("x_dem", "m", 0.02, 20.0), ("x_dem", "inch", 1.0, 25.4),
+        ("i_cmd", "A", 0.01, 10.0), ("p_s", "bar", 210.0, 21.0), ("p_s", "psi", 3000.0, 20.6842719), ("t_oil", "K", 300.0, 26.85),
+        ("t_oil", "°C", 20.0, 20.0), ("t_oil", "degF", 212.0, 100.0), ("vigv", "rad", 1.0, 57.29577951), ("vigv", "°", 3.0, 3.0),
     ],
 )  # fmt: skip
 def test_units_are_converted(tmp_path: Path, signal: str, unit: str, value: float, expected: float) -> None:
@@ -551,10 +562,8 @@ def test_a_unit_that_nobody_knows_is_taken_for_the_signals_own_with_a_note(tmp_p
 
 @pytest.mark.parametrize("unit", ["9**9**9**9", "mm^99999", "(" * 40, "mm mm", "%%", "1e999", "m^-", "_", "+", "°°", "\\", "mm/0"])
 def test_no_unit_text_of_a_file_does_harm(tmp_path: Path, unit: str) -> None:
-    try:
+    with contextlib.suppress(LogError):
         check(read_log(csv(tmp_path, f"t,n_dem,p_s [{unit}]\n0,1,5\n1,2,6\n")))
-    except LogError:
-        pass
 
 
 def test_time_may_be_in_another_unit_or_count_from_1970(tmp_path: Path) -> None:
@@ -619,8 +628,11 @@ def test_a_word_among_numbers_is_named_by_its_row(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "t;n_dem\n0;1,5\n0,5;2,5\n", "t\tn_dem\n0\t1.5\n0.5\t2.5\n", '"t","n_dem"\n"0","1.5"\n"0.5","2.5"\n', "t,n_dem\r\n0,1.5\r\n0.5,2.5\r\n",
-        " t , n_dem \n 0 , 1.5 \n 0.5, 2.5\n", "\ufefft,n_dem\n0,1.5\n0.5,2.5", "t,n_dem,note\n0,1.5,a\n0.5,2.5,b,c\n", "note,t,n_dem\n\u00e4,0,1.5\n-,0.5,2.5\n",
+        "t;n_dem\n0;1,5\n0,5;2,5\n",
+        "t\tn_dem\n0\t1.5\n0.5\t2.5\n", '"t","n_dem"\n"0","1.5"\n"0.5","2.5"\n',
+        "t,n_dem\r\n0,1.5\r\n0.5,2.5\r\n",
+        " t , n_dem \n 0 , 1.5 \n 0.5, 2.5\n", "\ufefft,n_dem\n0,1.5\n0.5,2.5",
+        "t,n_dem,note\n0,1.5,a\n0.5,2.5,b,c\n", "note,t,n_dem\n\u00e4,0,1.5\n-,0.5,2.5\n",
         "t,n_dem,x_dem\n0,1.5\n0.5,2.5,\n", "t,n_dem\n0,+1.5\n5e-1,25e-1\n",
     ],
 )  # fmt: skip
@@ -653,7 +665,9 @@ BA_ "VFrameFormat" BO_ {0x8CF004FE} 3;
 
 
 def test_j1939_frames_are_matched_by_their_parameter_group(tmp_path: Path) -> None:
-    (tmp_path / "j.dbc").write_text(MUX.split("BO_")[0] + f'BO_ {0x8CF004FE} EEC1: 8 A\n SG_ n_dem : 24|16@1+ (0.125,0) [0|8031.875] "rpm" A\n' + J1939)
+    (tmp_path / "j.dbc").write_text(
+        MUX.split("BO_")[0] + f'BO_ {0x8CF004FE} EEC1: 8 A\n SG_ n_dem : 24|16@1+ (0.125,0) [0|8031.875] "rpm" A\n' + J1939
+    )
     speeds = [800, 801, 0xFFFF, 803]
     lines = [f"(1.{k:06d}) can0 0CF00400#000000{(8 * n & 0xFFFF).to_bytes(2, 'little').hex().upper()}000000" for k, n in enumerate(speeds)]
     lines += ["(1.100000) can0 18F00417#0000000000000000"]
@@ -677,6 +691,9 @@ def test_a_car_being_revved_is_read_from_candump() -> None:
         assert np.median(np.diff(log.channels["n_dem"].t)) == pytest.approx(0.01, abs=2e-4)
         assert any("VAL_" in n for n in log.notes)
     assert set(log.channels) == {"n_dem"}
+    line = refused(folder / "revlog.log", mapping={"ENGINE_RPM": "n_dem"}, dbc=options["dbc"])
+    assert "in rpm" in line and "--design-rpm" in line  # the DBC says rpm
+    assert "--dbc" in refused(folder / "revlog.log", mapping={"ENGINE_RPM": "n_dem"})
 
 
 def test_an_idling_truck_is_read_from_an_mdf_bus_log() -> None:
@@ -715,8 +732,9 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     t = np.array([0.0, 1.0])
     good = Channel(t, t)
     for name, channels in {
-        "a.txt": {"n_dem": good}, "b.csv": {}, "c.csv": {"speed": good}, "d.csv": {"n_dem": Channel(t[::-1], t)}, "e.csv": {"n_dem": Channel(t, t[:1])},
-        "f.csv": {"n_dem": Channel(t, np.array([0, np.nan]))}, "g.log": {"n_dem": Channel(t, np.array([0, 200.0]))}, "none/h.csv": {"n_dem": good},
+        "a.txt": {"n_dem": good}, "b.csv": {}, "c.csv": {"speed": good}, "d.csv": {"n_dem": Channel(t[::-1], t)},
+        "e.csv": {"n_dem": Channel(t, t[:1])}, "f.csv": {"n_dem": Channel(t, np.array([0, np.nan]))},
+        "g.log": {"n_dem": Channel(t, np.array([0, 200.0]))}, "none/h.csv": {"n_dem": good},
         "i.log": {"n_dem": Channel(np.array([0, 1e9]), t)},
     }.items():  # fmt: skip
         with pytest.raises(LogError, match=re.escape(str(tmp_path / name))):

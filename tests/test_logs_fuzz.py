@@ -44,14 +44,18 @@ def mutations(raw: bytes, rng: random.Random) -> bytes:
             out[at] ^= 1 << rng.randrange(8)
         elif how < 0.75:
             at &= ~7
-            number = rng.choice([0, 1, 8, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1, 1 << 40, rng.randrange(len(out)) & ~7, rng.randrange(1 << 16)])
+            number = rng.choice(
+                [0, 1, 8, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1, 1 << 40, rng.randrange(len(out)) & ~7, rng.randrange(1 << 16)]
+            )
             out[at : at + 8] = number.to_bytes(8, "little")
         elif how < 0.85:
             out[at : at + rng.randrange(1, 60)] = b""
         elif how < 0.95:
             out[at:at] = out[at : at + rng.randrange(1, 300)]
         else:
-            out[at : at + 4] = rng.choice([b"nan,", b",,,,", b"\n\n\n\n", b"1e99", b"-inf", b'"', b"\0\0\0\0", b"#", b"(", b"\xff\xfe\xfd", "٣".encode()])
+            out[at : at + 4] = rng.choice(
+                [b"nan,", b",,,,", b"\n\n\n\n", b"1e99", b"-inf", b'"', b"\0\0\0\0", b"#", b"(", b"\xff\xfe\xfd", "٣".encode()]
+            )
         if not out:
             return b"\0"
     return bytes(out)
@@ -68,7 +72,15 @@ def campaign(folder: Path, suffix: str, seeds: range, dbc: Path | None = None) -
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
-                check(read_log(file, mapping=rng.choice(MAPS), dbc=dbc, design_rpm=rng.choice([None, 38000.0]), require=rng.choice([(), ("n_dem",)])))
+                check(
+                    read_log(
+                        file,
+                        mapping=rng.choice(MAPS),
+                        dbc=dbc,
+                        design_rpm=rng.choice([None, 38000.0]),
+                        require=rng.choice([(), ("n_dem",)]),
+                    )
+                )
         except LogError as e:
             assert "\n" not in str(e) and str(file) in str(e), f"seed {seed}: {e}"
         except BaseException as e:
@@ -86,6 +98,7 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
         "    name, _, request = line.partition(b' ')\n"
         "    pid = os.fork()\n"
         "    if pid == 0:\n"
+        "        os.dup2(2, 1)\n"
         "        signal.alarm(20)\n"
         "        with open(name, 'wb') as out: answer(request, out)\n"
         "        os._exit(0)\n"
@@ -94,7 +107,12 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
     )
     root = str(Path(__file__).parents[1])
     process = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=root, env={**os.environ, "PYTHONPATH": root}
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": root},
     )
     assert process.stdin is not None and process.stdout is not None
     stdin, stdout = process.stdin, process.stdout
