@@ -255,7 +255,7 @@ static void monitor_demand(Controller *c, const Calibration *k, const Inputs *in
     double rejected = in->rejected >= 0.0 ? in->rejected : 0.0;
     double bucket = c->reject_bucket - k->demand_reject_leak * TICK;
     bucket = (bucket > 0.0 ? bucket : 0.0) + rejected;
-    double full = 2.0 * k->demand_reject_limit;
+    double full = k->demand_reject_limit;
     c->reject_bucket = bucket < full ? bucket : full;
     if (in->fresh && in_range) {
         c->demand_age = 0.0;

@@ -421,7 +421,7 @@ def _monitor_demand(inputs, z, k):
     if not (rejected >= 0.0):
         rejected = 0.0
     bucket = max(z[REJECT_BUCKET] - k[DEMAND_REJECT_LEAK] * TICK, 0.0) + rejected
-    z[REJECT_BUCKET] = min(bucket, 2.0 * k[DEMAND_REJECT_LIMIT])
+    z[REJECT_BUCKET] = min(bucket, k[DEMAND_REJECT_LIMIT])
     if good:
         z[DEMAND_AGE] = 0.0
         z[N_DEM] = n_dem

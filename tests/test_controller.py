@@ -648,6 +648,19 @@ def test_the_bucket_of_refused_frames_overflows_at_its_limit_and_forgives_one_in
     assert rig.first_fault(fw.F_REJECTED) - start < 1000
 
 
+@pytest.mark.parametrize("refused", [6, 20, 52])
+def test_a_burst_of_refused_frames_never_fails_safe_once_good_ones_return(refused):
+    rig = Rig().running(95.0)
+    start = rig.now
+    rows = silent(refused * fw.SLOW, start)
+    rows[:: fw.SLOW, fw.IN_REJECTED] = 1.0
+    rig.play(rows)
+    rig.healthy(2000, 95.0)
+    assert set(rig.log[start:, fw.MODE]) == {RUN, DEGRADED}
+    assert rig.first_fault(fw.F_REJECTED) == start + 5 * fw.SLOW  # 0.1 is forgiven between two frames: the sixth overflows
+    assert rig.first_mode(RUN, since=rig.now - 2000) == rig.now - 2000 + ticks("recover_time") - 1
+
+
 def test_one_frame_out_of_range_degrades_for_recover_time_and_no_longer():
     rig = Rig().running()
     start = rig.now
