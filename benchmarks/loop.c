@@ -80,7 +80,7 @@ typedef struct {
     unsigned faults;
     bool demand_seen, lvdt_good, saturated, run_request;
     double n_dem, n_r_raw, n_r, demand_age, reject_bucket;
-    double trend_n, trend_rate, trend_turn, trend_timer, direction, blend;
+    double trend_n, trend_rate, trend_turn, trend_last, trend_timer, direction, blend;
     double x_target, x_dem, x_from, x_meas, x_reach, x_servo;
     double stuck_x, stuck_timer, integral, i_cmd, recover_timer, degraded_timer;
     double timer[FAULTS];
@@ -131,14 +131,18 @@ static void trend_step(Controller *c, const Calibration *k) {
     c->trend_n = predicted + k->trend_alpha * r;
     c->trend_rate = c->trend_rate + k->trend_beta * r / SLOW_TICK;
     double d = c->direction;
-    if (d * (n_dem - c->trend_turn) > 0.0) c->trend_turn = n_dem;
+    double last = c->trend_last;
+    bool ahead = d * (n_dem - last) > 0.0;
+    double reached = ahead ? last : n_dem;
+    if (d * (reached - c->trend_turn) > 0.0) c->trend_turn = reached;
+    c->trend_last = n_dem;
     double back = d * (c->trend_turn - n_dem);
     bool moving = -d * c->trend_rate > k->trend_rate_on && back > 0.5 * k->trend_change;
     if (moving || back > k->trend_change) {
         c->trend_timer += SLOW_TICK;
         if (c->trend_timer >= k->trend_hold - HALF_TICK) {
             c->direction = -d;
-            c->trend_turn = n_dem;
+            c->trend_turn = ahead ? n_dem : last;
             c->trend_timer = 0.0;
         }
     } else {
@@ -267,6 +271,7 @@ static void monitor_demand(Controller *c, const Calibration *k, const Inputs *in
             c->n_r = in->n_r;
             c->trend_n = in->n_dem;
             c->trend_turn = in->n_dem;
+            c->trend_last = in->n_dem;
         }
     } else if (c->demand_age < 1e6) {
         c->demand_age += TICK;

@@ -150,7 +150,7 @@ STATE = (
     "demand_seen",
     "trend_n",  # %, filtered demand
     "trend_rate",  # %/s
-    "trend_turn",  # %, farthest demand along the present direction
+    "trend_turn",  # %, farthest demand along the present direction, of two steps in a row
     "trend_timer",  # s for which a turn has been due
     "direction",  # +1 demand rises (extension curve), -1 falls (retraction curve)
     "blend",  # 0 retraction curve .. 1 extension curve
@@ -178,6 +178,7 @@ STATE = (
     "t_demand_range",
     "x_servo",  # m, reference of the servo at this tick
     "run_request",  # 1 if the last good frame asked for RUN
+    "trend_last",  # %, demand of the 10 ms step before
 )
 N_STATE = len(STATE)
 (
@@ -219,6 +220,7 @@ N_STATE = len(STATE)
     T_DEMAND_RANGE,
     X_SERVO,
     RUN_REQUEST,
+    TREND_LAST,
 ) = range(N_STATE)
 
 TICK = 1e-3  # s, servo rate 1 kHz
@@ -262,22 +264,26 @@ def trend_step(z, k, n_dem):
     ``back`` is how far the demand has come back from its farthest point along the present direction. The direction turns once the demand
     has been moving against it (rate beyond ``trend_rate_on``) and is back by half of ``trend_change``, or has crept back by the whole of
     it, and this has stood without a gap for ``trend_hold``. The turning point is taken from the demand itself: the filter overshoots after
-    a slam and would turn falsely at its end.
+    a slam and would turn falsely at its end. It takes two steps in a row to move it, so that one wrong demand moves nothing.
     """
     predicted = z[TREND_N] + z[TREND_RATE] * SLOW_TICK
     r = n_dem - predicted
     z[TREND_N] = predicted + k[TREND_ALPHA] * r
     z[TREND_RATE] = z[TREND_RATE] + k[TREND_BETA] * r / SLOW_TICK
     d = z[DIRECTION]
-    if d * (n_dem - z[TREND_TURN]) > 0.0:
-        z[TREND_TURN] = n_dem
+    last = z[TREND_LAST]
+    ahead = d * (n_dem - last) > 0.0
+    reached = last if ahead else n_dem
+    if d * (reached - z[TREND_TURN]) > 0.0:
+        z[TREND_TURN] = reached
+    z[TREND_LAST] = n_dem
     back = d * (z[TREND_TURN] - n_dem)
     moving = -d * z[TREND_RATE] > k[TREND_RATE_ON] and back > 0.5 * k[TREND_CHANGE]
     if moving or back > k[TREND_CHANGE]:
         z[TREND_TIMER] += SLOW_TICK
         if z[TREND_TIMER] >= k[TREND_HOLD] - HALF_TICK:
             z[DIRECTION] = -d
-            z[TREND_TURN] = n_dem
+            z[TREND_TURN] = n_dem if ahead else last
             z[TREND_TIMER] = 0.0
     else:
         z[TREND_TIMER] = 0.0
@@ -432,6 +438,7 @@ def _monitor_demand(inputs, z, k):
             z[N_R] = n_r
             z[TREND_N] = n_dem
             z[TREND_TURN] = n_dem
+            z[TREND_LAST] = n_dem
     else:
         z[DEMAND_AGE] = min(z[DEMAND_AGE] + TICK, 1e6)
     _debounce(z, T_STALE, z[DEMAND_AGE] >= k[DEMAND_TIMEOUT] - HALF_TICK, F_STALE, TICK, k[RECOVER_TIME])
