@@ -63,7 +63,7 @@ def open_loop(currents: np.ndarray, hidden=(), *, x0: float = 24e-3, test: Manoe
 
 
 @lru_cache
-def closed_loop(hidden: tuple[tuple[str, tuple], ...] = (), seed: int = 1, seconds: float = 60.0):
+def closed_loop(hidden: tuple[tuple[str, tuple], ...] = (), seed: int = 1, seconds: float = 40.0):
     """Engine test with the rig's own controller at 1000 Hz; ``hidden`` as hashable (name, parameter items)."""
     effects = [Hidden(name, dict(items)) for name, items in hidden]
     return simulate(manoeuvre(seed, seconds), controller(), effects, seed=seed, rate=1000)
@@ -251,7 +251,7 @@ def test_a_clean_log_is_clean_at_the_noise_floor(seed):
     actuator = reference.actuator_residual(run, window=1.0)
     assert actuator.std() < 1.02 * 0.005  # mm
     linkage = reference.linkage_residual(run)
-    assert np.sqrt((linkage**2).mean(axis=0)).max() < 1.08 * 0.03  # deg; the LVDT's noise shakes the reference's own play
+    assert np.sqrt((linkage**2).mean(axis=0)).max() < 1.03 * 0.03  # deg
     assert np.std(reference.engine_residual(run)) < 1.02 * 0.02  # %
 
 
@@ -291,6 +291,7 @@ FAINT = {
     "piston_stiction": 2.0,
     "area_growth": 1.5,
     "supply_dips": 1.5,
+    "vane_vibration": 2.0,
 }
 
 

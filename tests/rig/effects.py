@@ -28,6 +28,7 @@ class Parameter:
     meaning: str
     per_stage: bool = False
     offset: P | None = None  # slot of the nominal value that is added to the size
+    at_vane: bool = False  # the size is meant at the vane, the slot at the ring: over the lever's ratio
 
 
 @dataclass(frozen=True)
@@ -159,17 +160,19 @@ EFFECTS = _table(
          "drift per kelvin of oil above 40 degC", (2e-8, 2e-7, 3e-6, 1e-5, 4e-5), signed=True),
     # linkage
     _one("linkage_backlash", "linkage", "linkage", "width", P.gap_change_0, "rad", 0.0,
-         "total play of the ring beyond nominal", (1e-5, 1e-4, 6e-4, 1.5e-3, 4e-3), stages=True),
+         "total play at the vane beyond nominal", (5e-5, 5e-4, 3e-3, 8e-3, 2e-2), stages=True, at_vane=True),
     _one("linkage_compliance", "linkage", "linkage", "compliance", P.ring_compliance, "rad", 0.0,
          "ring angle lost at the load of 100 %", (1e-6, 1e-5, 3e-4, 1e-3, 4e-3)),
     _one("linkage_friction", "linkage", "linkage", "width", P.friction_width_0, "rad", 0.0,
-         "total width of a smooth loop of the ring", (1e-5, 1e-4, 5e-4, 1.5e-3, 4e-3),
-         stages=True, more={"distance": Parameter(P.friction_distance, "rad", 1.0 * DEG, "turn after which the loop has closed to 1/e")},
+         "total width of a smooth loop at the vane", (5e-5, 5e-4, 3e-3, 8e-3, 2e-2),
+         stages=True, at_vane=True,
+         more={"distance": Parameter(P.friction_distance, "rad", DEG, "turn of the ring after which the loop has closed to 1/e")},
          others={"distance": 0.2 * DEG}),
     _one("linkage_wear", "linkage", "linkage", "rate", P.wear_0, "rad/s", 0.0,
-         "growth of the ring's total play", (1e-8, 1e-7, 3e-6, 1e-5, 3e-5), stages=True),
+         "growth of the total play at the vane", (5e-8, 5e-7, 1.5e-5, 5e-5, 1.5e-4), stages=True, at_vane=True),
     _one("thermal_growth", "linkage", "linkage", "coefficient", P.thermal_growth_0, "rad/K", 0.0,
-         "ring angle per kelvin of oil above 40 degC", (2e-8, 2e-7, 8e-6, 3e-5, 1e-4), signed=True, stages=True),
+         "vane angle per kelvin of oil above 40 degC", (1e-7, 1e-6, 4e-5, 1.5e-4, 5e-4),
+         signed=True, stages=True, at_vane=True),
     _one("crank_length_error", "linkage", "linkage", "error", None, "m", 0.0,
          "lower arm longer than in the table", (2e-6, 2e-5, 5e-4, 1.5e-3, 4e-3), signed=True, stages=True),
     _one("link_length_error", "linkage", "linkage", "error", None, "m", 0.0,
@@ -289,5 +292,5 @@ def apply(hidden: Hidden, p: np.ndarray, geometry: Geometry) -> tuple[np.ndarray
             continue
         for k in stages if parameter.per_stage else (0,):
             base = p[parameter.offset + k] if parameter.offset is not None else 0.0
-            p[parameter.slot + k] = base + value
+            p[parameter.slot + k] = base + (value / p[P.vane_ratio_0 + k] if parameter.at_vane else value)
     return p, geometry

@@ -279,7 +279,7 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
     area0, mass = p[P.area], p[P.mass]
     gain = p[P.flow_gain] * area0 / math.sqrt(0.5 * p[P.p_ref])
     gain *= 1.0 + p[P.viscosity] * (t_oil - p[P.t_ref])
-    k_open = gain * p[P.asymmetry]
+    k_in, k_out = gain / math.sqrt(p[P.asymmetry]), gain * math.sqrt(p[P.asymmetry])
     stroke = p[P.stroke]
     # a hidden compliance (m/N) adds to the oil's own: V/(4 beta A^2) at mid stroke
     v_mid = p[P.dead_volume] + area0 * 0.5 * stroke
@@ -312,14 +312,14 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
 
         opening = dead_zone(u, overlap)
         if opening >= 0.0:
-            q1 = k_open * opening * orifice(p_valve - p1)
-            q2 = k_open * opening * orifice(p2)
+            q1 = k_out * opening * orifice(p_valve - p1)
+            q2 = k_out * opening * orifice(p2)
         else:
-            q1 = gain * opening * orifice(p1)
-            q2 = gain * opening * orifice(p_valve - p2)
+            q1 = k_in * opening * orifice(p1)
+            q2 = k_in * opening * orifice(p_valve - p2)
         if p[P.flow_limit] < 1e9:
             ratio = 0.5 * abs(q1 + q2) / (area0 * p[P.flow_limit])
-            share = (1.0 + ratio**8) ** -0.125
+            share = (1.0 + ratio**20) ** -0.05
             q1, q2 = q1 * share, q2 * share
         p_valve += droop_share * (p_s - p[P.droop] * 0.5 * abs(q1 + q2) / area0 - p_valve)
 
@@ -507,13 +507,13 @@ TRUTH_SLOTS = np.array([*(S[name] for name in _ONES), *(S.ring_0 + k for k in ra
 
 
 @njit(cache=True, error_model="numpy")
-def ecu_frame(k, p, frames, n_frames):
-    """Which ECU frame the controller has at tick ``k``: the newest that has arrived, or the one it is held at."""
-    t = k * TICK + 1e-9 - p[P.can_delay]
+def ecu_frame(k, warm, p):
+    """Which ECU frame the controller has at tick ``k``: the newest that has arrived, or the one whose content is held (from t = 0 on)."""
+    t = (k - warm) * TICK - p[P.can_delay]
     period = max(FRAME * TICK, p[P.frame_hold])
-    held = math.floor(t / period) * period
-    f = int((held + 1e-9) / (FRAME * TICK)) if held > 0.0 else 0
-    return min(max(f, 0), n_frames - 1)
+    held = math.floor((t + 1e-6) / period) * period
+    f = int(math.floor((held + 1e-6) / (FRAME * TICK))) + warm // FRAME
+    return max(f, 0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -523,7 +523,7 @@ def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, vi
     if k % FRAME == 0:
         frames[f, 0] = math.floor(n_dem[f] / 0.002 + 0.5) * 0.002
         frames[f, 1] = math.floor((s[S.n] + p[P.speed_noise] * speed_noise[f]) / 0.002 + 0.5) * 0.002
-    seen = min(ecu_frame(k, p, frames, len(frames)), f)
+    seen = min(ecu_frame(k, warm, p), f)
     x = read_lvdt(s, p, (k - warm) * TICK, t_oil[f], lvdt_noise[k])
     view[0] = frames[seen, 0]
     view[1] = frames[seen, 1]

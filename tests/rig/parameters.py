@@ -29,7 +29,7 @@ def _nominal() -> np.ndarray:
         P.area: 1.2e-3,
         P.mass: 5.0,
         P.bulk: 1.6e9,
-        P.dead_volume: 1e-5,
+        P.dead_volume: 3e-6,
         P.viscous: 1500.0,
         P.stroke: 0.048,
         P.stop_stiffness: 2e9,

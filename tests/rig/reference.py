@@ -90,10 +90,12 @@ def by_window(d: np.ndarray, window: float, rate: int = 1000) -> np.ndarray:
 def linkage_residual(run: Run) -> np.ndarray:
     """Measured minus nominal angles (deg), float64[rows, 3]: kinematics of the logged stroke, ideal play, sensor lag.
 
-    Each play starts on the side of its gap (or in between) that fits the first second best.
+    The stroke is a centred mean over 21 ms: the noise of single samples would push an ideal play along by its extremes. Each play starts
+    where in its gap it fits the first second best.
     """
     tables = ring_tables(load())
-    place = np.clip((run.log["x_lvdt"] * 1e-3 - X_LOW) / X_STEP, 0, tables.shape[1] - 1)
+    smooth = np.convolve(np.pad(run.log["x_lvdt"], 10, mode="edge"), np.full(21, 1.0 / 21.0), mode="valid")
+    place = np.clip((smooth * 1e-3 - X_LOW) / X_STEP, 0, tables.shape[1] - 1)
     out = []
     for k, name in enumerate(("vigv", "vgv1", "vgv2")):
         drive = np.interp(place, np.arange(tables.shape[1]), tables[k])
@@ -122,16 +124,17 @@ def controller_residual(run: Run, controller: Compiled) -> tuple[np.ndarray, np.
     """Logged minus replayed stroke demand (mm) and current (mA): the unchanged controller fed with the logged frames and strokes.
 
     The current's slow part is the controller's own integral and drifts in open loop. The log does not say in which state the controller
-    starts; the first seconds are left out.
+    starts (the record does say from where it came); the first seconds are left out.
     """
     log = run.log
     inputs, state = controller.inputs.copy(), controller.state.copy()
     x_dem, i_cmd = np.empty(len(log["t"])), np.empty(len(log["t"]))
-    for k in range(-2000, len(x_dem)):
+    for k in range(-1500, len(x_dem)):
         row = max(k, 0)
-        inputs[controller.n_dem] = log["n_dem"][row]
+        inputs[controller.n_dem] = run.record["came_from"] if k < -1000 else log["n_dem"][row]
         inputs[controller.n_r] = log["n_r"][row]
-        inputs[controller.x_lvdt] = log["x_lvdt"][row] * 1e-3
+        # before the log the stroke follows its demand, so that no monitor takes it for stuck
+        inputs[controller.x_lvdt] = state[controller.x_dem] if -1500 < k < 0 else log["x_lvdt"][row] * 1e-3
         inputs[controller.fresh] = 1.0 if k % 10 == 0 else 0.0
         controller.tick(inputs, state, controller.calibration)
         if k >= 0:

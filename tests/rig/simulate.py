@@ -74,7 +74,7 @@ def simulate(
     noise: bool = True,
     jitter: float = 2e-4,
     substeps: int = 50,
-    run_up: float = 5.0,
+    run_up: float = 8.0,
     x0: float | None = None,
     mean_through: bool = True,
     parameters: np.ndarray | None = None,
@@ -89,7 +89,8 @@ def simulate(
     noise         False: sensors and speed without noise (converters still quantise)
     jitter        s: the logger's clock is late by up to this much, uniformly
     substeps      hydraulic steps a tick, a multiple of 10
-    run_up        s at the first demand before the log starts, for the controller to reach its running mode
+    run_up        s before the log starts, for the controller to reach its running mode: a second 3 % above or below the first demand,
+                  then at it. Which, is the seed's: logs start on either stroke table and with the pins on either side
     x0            m, stroke at the start of the run-up; None: where the schedule wants it
     mean_through  i_cmd is the mean of the ticks since the last row, the one at the row included (as a frame sent after the tick); False: of
                   the ticks before the row, which is the current that acted between the two rows
@@ -102,7 +103,9 @@ def simulate(
     if not 0.0 <= jitter < 1.0 / rate:
         raise ValueError(f"jitter (={jitter:g} s) must be in [0, {1.0 / rate:g})")
     geometry = load()
-    streams = {name: np.random.default_rng([seed, k]) for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter"), start=10)}
+    streams = {
+        name: np.random.default_rng([seed, k]) for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
+    }
     p = specimen(machine(geometry), streams["specimen"] if randomised else None) if parameters is None else parameters.copy()
 
     # segments between onsets, each with its parameters and ring tables
@@ -122,7 +125,9 @@ def simulate(
     onset = np.array([0 if at == 0.0 else warm + round(at / TICK) for at in onsets])
 
     ahead = warm // FRAME
-    n_dem = np.concatenate([np.full(ahead, test.n_dem[0]), test.n_dem])
+    came_from = _came_from(test, streams["start"])
+    before = np.where(np.arange(ahead) < 100, came_from, test.n_dem[0])
+    n_dem = np.concatenate([before, test.n_dem])
     p_s = np.concatenate([np.full(ahead, test.p_s[0]), test.p_s])
     t_oil = np.concatenate([np.full(ahead, test.t_oil[0]), test.t_oil])
     n_frames = len(n_dem)
@@ -167,6 +172,7 @@ def simulate(
         "seed": seed,
         "rate_hz": rate,
         "jitter_s": jitter,
+        "came_from": came_from,
         "hidden": [
             {
                 "effect": h.name,
@@ -181,6 +187,13 @@ def simulate(
         "specimen": {slot.name: float(p[slot]) for slot in P if p[slot] != machine(geometry)[slot]},
     }
     return Run(out, true, p, tuple(hidden), record)
+
+
+def _came_from(test: Manoeuvre, rng: np.random.Generator) -> float:
+    """Speed demand (%) from which the first demand is approached."""
+    first = float(test.n_dem[0])
+    step = 3.0 if rng.random() < 0.5 else -3.0
+    return first + step if 40.0 <= first + step <= 100.0 else first - step
 
 
 def _scheduled_stroke(table: np.ndarray, p: np.ndarray, n: float) -> float:
