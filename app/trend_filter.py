@@ -150,7 +150,7 @@ def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Ar
     z, k = np.zeros(fw.N_STATE), np.zeros(fw.N_SCALARS)
     k[[fw.TREND_ALPHA, fw.TREND_BETA]] = design.alpha, design.beta
     k[[fw.TREND_RATE_ON, fw.TREND_CHANGE, fw.TREND_HOLD]] = design.rate_on, design.change, design.hold
-    z[fw.TREND_N] = z[fw.TREND_TURN] = y[0]
+    z[fw.TREND_N] = z[fw.TREND_TURN] = z[fw.TREND_LAST] = y[0]
     z[fw.DIRECTION] = 1.0
     out = np.empty((3, y.size))
     for i, v in enumerate(y):
@@ -164,23 +164,24 @@ def direction(n_dem: ArrayLike, design: TrendDesign) -> Array:
 
     ::
 
-        turn = farthest demand along the direction d,   back = d (turn - n_dem)
+        turn = farthest demand along the direction d that two samples in a row reached,   back = d (turn - n_dem)
         against: (-d r > rate_on and back > change/2) or back > change
         d turns once `against` has stood for `hold` without a gap
     """
     y = np.asarray(n_dem, dtype=float)
-    n, r, d, turn, stands = y[0], 0.0, 1.0, y[0], 0
+    n, r, d, turn, last, stands = y[0], 0.0, 1.0, y[0], y[0], 0
     needed = math.ceil(design.hold / STEP - 1e-9)
     out = np.empty(y.size)
     for i, v in enumerate(y):
         e = v - (n + STEP * r)
         n, r = n + STEP * r + design.alpha * e, r + design.beta * e / STEP
-        turn = max(turn, v) if d > 0.0 else min(turn, v)
+        low, high, last = min(v, last), max(v, last), v
+        turn = max(turn, low) if d > 0.0 else min(turn, high)
         back = d * (turn - v)
         against = (-d * r > design.rate_on and back > 0.5 * design.change) or back > design.change
         stands = stands + 1 if against else 0
         if stands >= max(needed, 1):
-            d, turn, stands = -d, v, 0
+            d, turn, stands = -d, high if d > 0.0 else low, 0
         out[i] = d
     return out
 
