@@ -229,7 +229,7 @@ def test_halving_the_step_changes_nothing_that_matters(hidden, limit):
 
 
 def test_stick_slip_converges_in_its_statistics():
-    """Each hop is F / k = 15 um long; when it comes depends on the last digit, so single hops do not converge, but work and size do."""
+    """Each hop is F / k, some 12 um long; when it comes depends on the last digit, so single hops do not converge, but work and size do."""
     t = np.arange(6000) * 1e-3
     currents = 0.006 * np.sin(2 * np.pi * 0.6 * t)
     work, size = [], []
