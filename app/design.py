@@ -1121,8 +1121,8 @@ def plot(result: DesignResult, path: str | Path) -> Path:
 
 # ---------------------------------------------------------------- command line
 
-DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp, and the limit cycles that
-play inside the loop would cause, predicted by describing function and held against the time simulation.
+DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp, and the limit
+cycles that play inside the loop would cause, predicted by describing function and held against the time simulation.
 
 examples:
   vaneloop design --report design.html

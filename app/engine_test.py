@@ -85,8 +85,8 @@ def engine_test(
     )
 
 
-DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and falls, 1.6 deg of hysteresis
-in the VIGV's linkage, under one mean stroke curve and under the dual curves, beside the figures of the paper's Table 5.
+DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and falls, 1.6 deg of
+hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual curves, beside the figures of the paper's Table 5.
 
 examples:
   vaneloop engine-test --report engine_test.html

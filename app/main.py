@@ -12,8 +12,11 @@ __all__ = ["COMMANDS", "main", "run"]
 # command -> (module with add_options, command and DESCRIPTION; one line of help)
 COMMANDS = {
     "replay": ("hil.replay", "run a logged engine run through firmware and plant; errors in figures and pictures"),
-    "compare": ("hil.replay", "the same, under the name that the search for missing physics uses"),
+    "compare": ("app.compare", "the model against a log: the whole loop, and each stage on its own logged inputs"),
+    "locate": ("app.locate", "which stage fails, under which conditions, since when"),
+    "diagnose": ("app.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
     "engine-test": ("app.engine_test", "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures"),
+    "hidden-effect": ("app.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
 }
 

@@ -8,8 +8,8 @@
 | actuator | i_cmd, n_r, p_s, t_oil        | x_lvdt                       | windows, stroke free                              |
 | linkage  | x_lvdt, n_r, t_oil            | vigv, vgv1, vgv2, jointly    | free run, play a state                            |
 
-All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are measured on the errors
-of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it causes is measured and added.
+All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are measured on the
+errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it causes is measured and added.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from plant.compiled import compiled
 from plant.effects import EFFECTS, ROW
 from plant.linkage import STAGES
 from plant.parameters import NAMES, derive, nominal
+from plant.stages import actuator_run, engine_run, linkage_run
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
@@ -218,23 +219,45 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
         if name.endswith("_play"):
             # the play is known at the vane and used at the ring
             factor = machine.p[NAMES.index(name), 0] / (n.value * n.si)
-            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance))
+            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, _vane(name)))
             si.append(n.si * factor)
         else:
-            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance))
+            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, _vane(name)))
             si.append(n.si)
         rows.append(NAMES.index(name))
     effects = []
     for e in EFFECTS.values():
         if stage not in e.stages or e.name in present:
             continue
-        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high) for p in e.parameters)
-        effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
+        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high, 0.0, _vane(p.name)) for p in e.parameters)
+        effects.append(Effect(e.name, ps, _starts(e.name, ps), NEEDS.get(e.name, "")))
         rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
         si += [p.si for p in e.parameters]
     return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
 
 
+def _vane(name: str) -> str | None:
+    """The vane stage that a parameter belongs to."""
+    return next((v for v in STAGES if v in name), None)
+
+
+NEEDS = {  # what a log must hold for an effect to show
+    "aero_load": "stroke under load at speeds that differ",
+    "end_stop_shift": "strokes that reach the end stops",
+    "internal_leakage": "a load on the piston (aero_load or friction)",
+    "oil_compressibility": "a load on the piston that changes",
+    "oil_viscosity": "oil temperature that changes while the stroke moves",
+    "supply_pressure_droop": "fast strokes, above 30 mm/s",
+    "valve_flow_saturation": "strokes faster than the flow at which the valve saturates",
+    "valve_lag": "currents that change within some milliseconds",
+    "lvdt_lag": "strokes that change speed within some milliseconds",
+    "lvdt_thermal_drift": "oil temperature that changes",
+    "thermal_growth": "oil temperature that changes",
+    "linkage_wear": "a log of some hours, or fast wear",
+    "linkage_compliance": "rotor speeds that differ",
+    "trend_threshold_error": "reversals of the demand",
+    "acceleration_limit_error": "demands that rise faster than the engine accelerates",
+}
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3}  # of second parameters
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
@@ -288,18 +311,18 @@ def _engine(
 ) -> Stage:
     parameters, effects, rows, si = _declared("engine", machine, present)
     dt = float(t[1] - t[0])
-    inner = max(1, int(round(dt / 2e-3)))
-    n_dem = (
-        np.repeat(c["n_dem"], inner) if dt < 1.5 * RASTER else np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), c["n_dem"])
-    )
-    n_dem = np.ascontiguousarray(n_dem)
+    n_dem = np.ascontiguousarray(c["n_dem"])
+    inner = 1
+    if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
+        inner = int(round(dt / RASTER))
+        n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
 
     def simulate(thetas: Array) -> Array:
         p = _lanes(machine, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[chain.N_R] = np.median(c["n_r"][:5])
         out = np.empty((len(n_dem), len(thetas)))
-        chain.engine_run(n_dem, dt / inner, p, s, out)
+        engine_run(n_dem, dt / inner, p, s, out)
         return out[::inner].T[:, None, :]
 
     return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])
@@ -322,7 +345,7 @@ def _actuator(
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[chain.X] = s[chain.X_LVDT] = x[0]
         out = np.empty((len(t), len(thetas)))
-        chain.actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
+        actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
         return out.T[:, None, :] * 1e3
 
     return Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
@@ -346,7 +369,7 @@ def _linkage(
         machine.place_rings(start, tuple(first))
         s = np.repeat(start, len(thetas), axis=1)
         out = np.empty((len(t), 3, len(thetas)))
-        chain.linkage_run(x, n_r, t_oil, t, dt, p, s, out)
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
@@ -400,6 +423,7 @@ def _demand_run(t, n_dem, n_r, delay, hold, phase, k, table, z, out):
         if i == 0:
             z[fw.TREND_N] = a
             z[fw.TREND_TURN] = a
+            z[fw.TREND_LAST] = a
             z[fw.N_R] = b
         z[fw.N_DEM] = a
         z[fw.N_R] += (b - z[fw.N_R]) * fw.SLOW_TICK / (k[fw.SPEED_FILTER] + fw.SLOW_TICK)

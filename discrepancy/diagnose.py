@@ -2,8 +2,8 @@
 
 A candidate must earn its place on data that it was not fitted to. Two measures, both from the held-out errors of the log's blocks:
 
-- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats itself n times is one
-  observation, not n);
+- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats itself n times is
+  one observation, not n);
 - *spreads*: the fall of the RMS error in units of the noise floor's own spread, over the whole log, or within the blocks where it acts.
 
 A gain counts when it passes both thresholds. They are set on the maximum over the library under "nothing missing" (docs/diagnosis.md).
@@ -57,6 +57,8 @@ class StageDiagnosis:
     """What one stage says."""
 
     stage: str
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
     verdict: str  # missing, none, unknown
     floor: Array
     base: Fit
@@ -106,7 +108,7 @@ class Search:
         free = self.base.free
         low, high = judge.bounds()
         e0, jac = judge._linearise(self.base.theta, free, judge.scale[free], low, high)
-        flat = jac.reshape(len(free), -1)
+        flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
         costs = []
         for i in range(0, len(thetas), 16):
@@ -131,8 +133,11 @@ class Search:
         """Fit with one effect, from its best starts."""
         key = frozenset((name,))
         if key not in self.fits:
-            fits = [self.judge.fit((name,), s, 8) for s in self.starts[name][:2]]
-            self.fits[key] = min(fits, key=lambda f: float(f.cost.sum()))
+            fits = [self.judge.fit((name,), s, 3) for s in self.starts[name][:2]]
+            best = min(fits, key=lambda f: float(f.cost.sum()))
+            if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
+                best = self.judge.fit((name,), best.theta, 8)
+            self.fits[key] = best
             self.tick()
         return self.fits[key]
 
@@ -284,9 +289,22 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
         verdict = "none"
     before, after = (_rms_per_output(judge, f) for f in (base, current))
     return StageDiagnosis(
-        stage.name, verdict, judge.floor, base, current, before, after, effects, _recalibrated(stage, current), candidates, correlation,
-        steps, rms(current),
-    )  # fmt: skip
+        stage=stage.name,
+        outputs=stage.outputs,
+        units=stage.units,
+        verdict=verdict,
+        floor=judge.floor,
+        base=base,
+        final=current,
+        error_before=before,
+        error_after=after,
+        effects=effects,
+        recalibrated=_recalibrated(stage, current),
+        candidates=candidates,
+        correlation=correlation,
+        steps=steps,
+        excess=rms(current),
+    )
 
 
 def _nats(candidates: list[Candidate], name: str) -> float:

@@ -156,18 +156,18 @@ class Judge:
         for _ in range(iterations):
             e, jac = self._linearise(theta, free, scale, low, high)
             here = float(total(self.block_costs(e[None]), theta[None])[0])
-            if best is not None and best - here < 0.02 * len(free) and best >= here:
+            if best is not None and best - here < 0.2 * len(free) and best >= here:
                 best = here
                 break
             best = here
             if len(free) == 0:
                 break
-            j2 = jac.reshape(len(free), -1) * np.tile(np.sqrt(per_sample), len(s.outputs))
+            j2 = jac.reshape(len(free), e.size) * np.tile(np.sqrt(per_sample), len(s.outputs))
             r2 = e.reshape(-1) * np.tile(np.sqrt(per_sample), len(s.outputs))
             a = j2 @ j2.T + np.diag(prior * scale**2)
             g = j2 @ r2 - prior * scale * (theta[free] - nominal[free])
             trials = []
-            for factor in (0.01, 1.0, 100.0, 1e4):
+            for factor in (0.01, 1.0, 300.0):
                 lam = damping * factor
                 step = np.linalg.solve(a + lam * np.diag(np.maximum(np.diag(a), 1e-9)), g)
                 trial = theta.copy()
@@ -179,22 +179,37 @@ class Judge:
             if not costs[k] < here:
                 break
             damping, theta = max(trials[k][0], 1e-9), thetas[k]
-            if here - costs[k] < 0.02 * max(1, len(free)):
+            if here - costs[k] < 0.2 * max(1, len(free)):
                 break
         return self._finish(effects, theta, free, prior, scale, nominal, low, high)
 
     def _linearise(self, theta: Array, free: Array, scale: Array, low: Array, high: Array) -> tuple[Array, Array]:
-        """Whitened error at ``theta`` and minus its derivative by each scaled free parameter: (outputs, samples), (free, outputs, samples)."""
-        thetas = np.repeat(theta[None], len(free) + 1, axis=0)
+        """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs, samples)."""
+        names = self.stage.outputs
+        owner = [names.index(p.output) if p.output in names else None for p in self.stage.all_parameters()]
+        row, groups = np.zeros(len(free), dtype=int), []
+        for i, c in enumerate(free):  # parameters that move different outputs share a simulation
+            for g, taken in enumerate(groups):
+                if owner[c] is not None and None not in taken and owner[c] not in taken:
+                    taken.append(owner[c])
+                    row[i] = g
+                    break
+            else:
+                groups.append([owner[c]])
+                row[i] = len(groups) - 1
+        thetas = np.repeat(theta[None], len(groups) + 1, axis=0)
         steps = np.empty(len(free))
         for i, c in enumerate(free):
             d = DIFFERENCE * scale[i]
             if theta[c] + d > high[c]:
                 d = -d
-            thetas[i + 1, c] += d
+            thetas[row[i] + 1, c] += d
             steps[i] = d / scale[i]
         e = self.errors(thetas)
-        jac = (e[0] - e[1:]) / steps[:, None, None] if len(free) else np.empty((0, *e[0].shape))
+        jac = np.zeros((len(free), *e[0].shape))
+        for i, c in enumerate(free):
+            only = slice(None) if owner[c] is None else owner[c]
+            jac[i, only] = (e[0, only] - e[row[i] + 1, only]) / steps[i]
         return e[0], jac
 
     def _finish(
@@ -207,7 +222,7 @@ class Judge:
         normals = np.empty((self.n_blocks, k, k))
         ends = np.append(self.block_start[1:], e.shape[1])
         for b, (i, j) in enumerate(zip(self.block_start, ends, strict=True)):
-            jb, eb = jac[:, :, i:j].reshape(k, -1), e[:, i:j].reshape(-1)
+            jb, eb = jac[:, :, i:j].reshape(k, e[:, i:j].size), e[:, i:j].reshape(-1)
             gradients[b], normals[b] = jb @ eb, jb @ jb.T
         # parameters at a bound do not move
         scaled_prior = prior * scale**2

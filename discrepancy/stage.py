@@ -27,6 +27,7 @@ class Parameter:
     value      nominal value of a stage's parameter, neutral value of an effect's
     low, high  physical bounds
     tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted
+    output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
     """
 
     name: str
@@ -35,6 +36,7 @@ class Parameter:
     low: float = -np.inf
     high: float = np.inf
     tolerance: float = 0.0
+    output: str | None = None
 
 
 @dataclass(frozen=True)

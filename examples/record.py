@@ -1,7 +1,7 @@
 """Record the shipped example logs: the firmware drives the independent rig of tests/rig, and the bus or the rig's logger writes.
 
-``python -m examples.record`` from a checkout makes them anew. The machine behind them is not the plant model of this project: other equations,
-randomised parameters, noisy and quantised sensors.
+``python -m examples.record`` from a checkout makes them anew. The machine behind them is not the plant model of this project: other
+equations, randomised parameters, noisy and quantised sensors.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def write_json(args: argparse.Namespace, data: dict[str, Any]) -> None:
     """Write ``data`` where ``--json`` says; NaN and infinity become null."""
     if not args.json:
         return
-    text = json.dumps(_plain(data), indent=2, allow_nan=False)
+    text = json.dumps(plain(data), indent=2, allow_nan=False)
     if args.json == "-":
         print(text, flush=True)
         return
@@ -132,17 +132,18 @@ def write_json(args: argparse.Namespace, data: dict[str, Any]) -> None:
         raise InputError(f"{args.json}: cannot be written ({e.strerror})") from None
 
 
-def _plain(v: Any) -> Any:
+def plain(v: Any) -> Any:
+    """Turn numpy values into what JSON knows; NaN and infinity become None."""
     if isinstance(v, dict):
-        return {str(k): _plain(x) for k, x in v.items()}
+        return {str(k): plain(x) for k, x in v.items()}
     if isinstance(v, list | tuple):
-        return [_plain(x) for x in v]
+        return [plain(x) for x in v]
     if isinstance(v, str | bool | int | type(None)):
         return v
     if hasattr(v, "item") and getattr(v, "ndim", 1) == 0:
-        return _plain(v.item())
+        return plain(v.item())
     if hasattr(v, "tolist"):
-        return _plain(v.tolist())
+        return plain(v.tolist())
     f = float(v)
     return f if f - f == 0.0 else None
 

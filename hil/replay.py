@@ -1,7 +1,7 @@
 """Replay a logged engine run through the controller's firmware and the plant, and say where they agree with it.
 
-``python -m hil.replay LOG`` and ``vaneloop replay LOG`` are the same command. What the firmware gets is what the log's ECU sent: ``n_dem`` and,
-where logged, ``n_r``; otherwise the plant's engine supplies the speed. Supply pressure and oil temperature are taken from the log too.
+``python -m hil.replay LOG`` and ``vaneloop replay LOG`` are the same command. What the firmware gets is what the log's ECU sent: ``n_dem``
+and, where logged, ``n_r``; otherwise the plant's engine supplies the speed. Supply pressure and oil temperature are taken from the log too.
 Everything behind is simulated in closed loop and held against what the log measured; vane angles also against the schedule's target at the
 measured speed, as in the paper's Table 5.
 """
@@ -207,8 +207,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)")
 
 
-def command(args: argparse.Namespace) -> int:
-    """Run replay from parsed options; return the exit code."""
+def command(args: argparse.Namespace, extra: dict[str, Any] | None = None) -> int:
+    """Run replay from parsed options; ``extra`` goes into the JSON too. Return the exit code."""
     from pathlib import Path
 
     from hil.logs import Channel, write_log
@@ -236,7 +236,7 @@ def command(args: argparse.Namespace) -> int:
         cli.say(args, f"note: {note}")
     for line in exceeded:
         cli.say(args, f"differs: {line}")
-    cli.write_json(args, {**replay_json(result), "exceeded": exceeded})
+    cli.write_json(args, {**replay_json(result), "exceeded": exceeded, **(extra or {})})
     if args.report:
         from hil.report import replay_report
 

@@ -16,7 +16,8 @@ from tests.conftest import ROOT
 
 
 def vaneloop(*args: str | Path, module: str = "app.main", cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", module, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
+    command = [sys.executable, "-m", module, *map(str, args)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
 def refused(done: subprocess.CompletedProcess[str]) -> str:

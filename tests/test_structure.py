@@ -38,7 +38,7 @@ EXPORTS: dict[str, list[str]] = {
     "discrepancy": [],
     "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
     "plant": ["Geometry", "Plant", "Schedules", "build_plant", "load_geometry", "load_schedules"],
-    "plant.effects": [],
+    "plant.effects": ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"],
     "tables": ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"],
 }
 
@@ -74,6 +74,8 @@ def may_import(file: str, name: str) -> bool:
         return False
     if top not in OURS:
         return True
+    if file == "app/hidden_effect.py" and top == "tests":
+        return True  # the blind benchmark hides effects with the rig, and says so where there is no checkout
     if home == "tests/rig":
         return name in ("tests", "tests.rig") or name.startswith("tests.rig.")
     if file in BORDER_OF_DISCREPANCY:

@@ -1,0 +1,230 @@
+"""``vaneloop hidden-effect``: the blind benchmark. The rig hides an effect, the diagnosis sees the log only, and every answer is counted.
+
+The rig (``tests/rig``) is an independent simulator with other equations; it is part of a checkout, not of the installed package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from hil import cli
+
+__all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
+
+DESCRIPTION = """Blind benchmark of the diagnosis: logs with fresh seeds are drawn (25 % clean, 25 % with an effect that the library does
+not have, 20 % with two effects, the rest with one, from undetectable to gross), written, and diagnosed knowing only the log.
+
+examples:
+  vaneloop hidden-effect --logs 40 --out out/blind.parquet
+  vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
+
+exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
+
+KINDS = ("clean", "outside", "pair", "single")
+SHARES = (0.25, 0.25, 0.20, 0.30)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--logs", type=int, default=40, metavar="N", help="number of logs (default 40)")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
+    parser.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of each log (default 300 s)")
+    parser.add_argument("--rate", type=int, default=100, choices=(10, 100, 1000), help="rows a second (default 100)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
+    parser.add_argument(
+        "--out", metavar="F.parquet", default="out/hidden_effect.parquet", help="results, a row a log; an existing file is continued"
+    )
+    cli.add_output_options(parser)
+
+
+def _rig() -> Any:
+    import importlib
+
+    from tables import InputError
+
+    try:
+        return importlib.import_module("tests.rig"), importlib.import_module("tests.firmware_on_rig")
+    except ImportError:
+        raise InputError("hidden-effect needs the independent rig in tests/rig: run it from a checkout of the repository") from None
+
+
+def draw_case(seed: int, index: int) -> dict[str, Any]:
+    """Draw what is hidden in log ``index`` of the series ``seed``: kind and effects, nothing simulated yet."""
+    import numpy as np
+
+    rig, _ = _rig()
+    rng = np.random.default_rng([seed, index])
+    kind = str(rng.choice(KINDS, p=SHARES))
+    hidden = []
+    if kind == "single":
+        hidden = [rig.draw(str(rng.choice(list(rig.EFFECTS))), int(rng.integers(0, 5)), rng)]
+    elif kind == "outside":
+        hidden = [rig.draw(str(rng.choice(list(rig.OUTSIDE))), int(rng.integers(1, 5)), rng)]
+    elif kind == "pair":
+        two = rng.choice(list(rig.EFFECTS), size=2, replace=False)
+        hidden = [rig.draw(str(name), int(rng.integers(2, 5)), rng) for name in two]
+    return {"index": index, "kind": kind, "hidden": hidden, "machine_seed": int(rng.integers(1, 2**31))}
+
+
+def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, Any]:
+    """Simulate, write, diagnose and score one log; a flat record."""
+    import numpy as np
+
+    from discrepancy.adapter import build_chain
+    from discrepancy.fit import Judge
+    from discrepancy.workflow import diagnose, diagnosis_json
+    from hil.logs import Channel, read_log, write_log
+
+    rig, on_rig = _rig()
+    case = draw_case(seed, index)
+    test = rig.manoeuvre(case["machine_seed"], duration)
+
+    def stages_of(hidden: list[Any]) -> Any:
+        run = rig.simulate(test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "log.parquet"
+            write_log(path, {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
+            return build_chain(read_log(path, require=()))
+
+    chain = stages_of(case["hidden"])
+    started = time.perf_counter()
+    d = diagnose(chain.stages, chain.not_observed, workers=1)
+    elapsed = time.perf_counter() - started
+    answer = diagnosis_json(d, f"case {index}")
+    truth = [h.name for h in case["hidden"]]
+    # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3 spreads of the floor
+    detectable = []
+    if truth:
+        clean = stages_of([])
+        for h in case["hidden"]:
+            alone = chain if len(truth) == 1 else stages_of([h])
+            best = 0.0
+            for with_it in alone.stages:
+                without = next((s for s in clean.stages if s.name == with_it.name), None)
+                if without is None or without.floor is None:
+                    continue
+                figures = []
+                for s in (with_it, without):
+                    judge = Judge(s, without.floor)
+                    figures.append(float(np.sqrt(judge.fit((), s.neutral()).held_out.sum() / judge.n)))
+                best = max(best, (figures[0] - figures[1]) * np.sqrt(2.0 * judge.n))
+            detectable.append(bool(best > 3.0))
+    named = [e["effect"] for e in answer["effects"]]
+    rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
+    ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
+    return {
+        "seed": seed, "index": index, "kind": case["kind"], "truth": truth, "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
+        "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
+        "probabilities": [e["probability"] for e in answer["effects"]],
+        "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
+        "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed, "answer": json.dumps(cli.plain(answer)),
+    }  # fmt: skip
+
+
+def _hit(effect: str, row: dict[str, Any]) -> bool:
+    rivals = json.loads(row["rivals"])
+    return any(effect == n or effect in rivals[n] for n in row["named"])
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Count: shares with 90 % binomial (Wilson) intervals, and every miss."""
+    from statsmodels.stats.proportion import proportion_confint
+
+    def share(hits: list[bool]) -> dict[str, Any]:
+        n, k = len(hits), sum(hits)
+        low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
+        return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
+
+    single = [r for r in rows if r["kind"] == "single" and r["detectable"][0]]
+    alone = [r for r in single if r["verdict"] == "missing" and len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]]
+    pairs = [r for r in rows if r["kind"] == "pair" and all(r["detectable"])]
+    outside = [r for r in rows if r["kind"] == "outside"]
+    found = [r for r in single if _hit(r["truth"][0], r) and r["after_over_floor"] is not None]
+    return {
+        "logs": len(rows),
+        "detectable single named or among rivals": share([_hit(r["truth"][0], r) for r in single]),
+        "single named verdict right": share([r["named"][0] == r["truth"][0] for r in alone]),
+        "single named verdict given": share([r in alone for r in single]),
+        "clean logs with a false alarm": share([r["verdict"] != "none" for r in rows if r["kind"] == "clean"]),
+        "clean logs with an effect named": share([bool(r["named"]) for r in rows if r["kind"] == "clean"]),
+        "both effects of a detectable pair": share([all(_hit(e, r) for e in r["truth"]) for r in pairs]),
+        "outside the library: unknown, or none where undetectable": share(
+            [("unknown" in (r["verdict"], *(["unknown"] if r["unknown_stages"] else [])) and not r["named"])
+             or (r["verdict"] == "none" and not r["detectable"][0]) for r in outside]
+        ),
+        "error after within 1.1 noise floors": share([r["after_over_floor"] <= 1.1 for r in found]),
+        "median seconds": sorted(r["elapsed_s"] for r in rows)[len(rows) // 2] if rows else None,
+    }  # fmt: skip
+
+
+def misses(rows: list[dict[str, Any]]) -> list[str]:
+    """Every answer that is not what it should be, a line each."""
+    out = []
+    for r in rows:
+        what = f"#{r['index']} {r['kind']}: hidden {', '.join(r['truth']) or 'nothing'} {r['sizes']}, detectable {r['detectable']}"
+        said = f"said {r['verdict']} {r['named']} rivals {r['rivals']} unknown {r['unknown_stages']}"
+        wrong = (
+            (r["kind"] == "clean" and r["verdict"] != "none")
+            or (r["kind"] in ("single", "pair") and any(d and not _hit(e, r) for e, d in zip(r["truth"], r["detectable"], strict=True)))
+            or (r["kind"] == "outside" and (r["named"] or (r["verdict"] == "none" and r["detectable"][0])))
+        )
+        if wrong:
+            out.append(f"{what}; {said}")
+    return out
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    import secrets
+
+    import polars as pl
+
+    from hil.lockstep import warm_up
+    from tables import InputError
+
+    _rig()
+    if not 1 <= args.logs <= 100_000 or not 1 <= args.workers <= 64 or not 30.0 <= args.duration <= 1e5:
+        raise InputError("--logs must be in [1, 100000], --workers in [1, 64], --duration in [30, 100000]")
+    path = Path(args.out)
+    rows: list[dict[str, Any]] = []
+    if path.exists():
+        try:
+            rows = pl.read_parquet(path).to_dicts()
+        except Exception as e:
+            raise InputError(f"{path}: not a result of hidden-effect ({type(e).__name__})") from None
+    seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
+    rows = [r for r in rows if r["seed"] == seed]
+    cli.say(args, f"seed {seed}; {len(rows)} logs done before")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    warm_up(lambda text: cli.say(args, text))
+    done = {r["index"] for r in rows}
+    todo = [i for i in range(args.logs) if i not in done]
+    with (
+        cli.progress_bar(args, f"{args.logs} logs") as progress,
+        ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        jobs = [pool.submit(judge_case, seed, i, args.duration, args.rate) for i in todo]
+        for job in as_completed(jobs):
+            rows.append(job.result())
+            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
+            if progress:
+                progress(len(rows) / args.logs)
+    rows.sort(key=lambda r: r["index"])
+    s = summary(rows)
+    table = [
+        [k, f"{v['hits']} of {v['of']}", "-" if v["share"] is None else f"{v['share']:.3f}", f"{v['low']:.3f} to {v['high']:.3f}"]
+        for k, v in s.items()
+        if isinstance(v, dict)
+    ]
+    cli.print_table(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", ["what", "count", "share", "90 % interval"], table)
+    for line in misses(rows):
+        cli.say(args, "miss " + line)
+    cli.write_json(args, {"schema": 1, "seed": seed, "summary": s, "misses": misses(rows)})
+    return 0

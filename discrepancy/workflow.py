@@ -1,0 +1,169 @@
+"""Compare, diagnose and extend over all stages of a model, and the JSON of it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from discrepancy.fit import Fit, Judge
+from discrepancy.locate import Shape, shape
+from discrepancy.stage import Array, Stage
+
+__all__ = ["Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "fit_effects"]
+
+
+class StageError(ValueError):
+    """An effect or stage that was asked for and is not there."""
+
+
+@dataclass(frozen=True)
+class StageFigures:
+    """Error of one output of a stage driven by its own logged inputs."""
+
+    stage: str
+    signal: str
+    unit: str
+    rms: float
+    noise_floor: float
+    samples: int
+
+
+@dataclass
+class Diagnosis:
+    """What all stages say together."""
+
+    verdict: str
+    stages: list[StageDiagnosis]
+    shapes: dict[str, list[Shape]]
+    not_observed: dict[str, str]
+    elapsed_s: float
+    notes: list[str] = field(default_factory=list)
+
+
+def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
+    """Error of every stage with its nominal parameters (nothing refitted), driven by its own logged inputs."""
+    out = []
+    for stage in stages:
+        judge = Judge(stage, floor_of(stage))
+        e = judge.errors(stage.neutral()[None])[0]
+        for k, signal in enumerate(stage.outputs):
+            n = int(judge.valid[k].sum())
+            rms = float(np.sqrt(np.sum(e[k] ** 2) / max(n, 1)) * judge.floor[k])
+            out.append(StageFigures(stage.name, signal, stage.units[k], rms, float(judge.floor[k]), n))
+    return out
+
+
+def floor_of(stage: Stage) -> Array:
+    """The stage's noise floor, which whoever made the stage must have given."""
+    if stage.floor is None or not np.all(np.isfinite(stage.floor)):
+        raise StageError(f"stage {stage.name!r}: no noise floor")
+    return stage.floor
+
+
+_WORK: list[Stage] = []
+
+
+def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
+    stage = _WORK[i]
+    d = diagnose_stage(stage, floor_of(stage))
+    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" else []
+
+
+def diagnose(
+    stages: Sequence[Stage], not_observed: dict[str, str] | None = None, progress: Callable[[float], None] | None = None, workers: int = 2
+) -> Diagnosis:
+    """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can fork."""
+    started = time.perf_counter()
+    _WORK[:] = list(stages)
+    # the longest first
+    order = sorted(range(len(_WORK)), key=lambda i: -len(_WORK[i].effects) * len(_WORK[i].outputs))
+    done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
+    if workers > 1 and len(_WORK) > 1 and hasattr(os, "fork"):
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
+            jobs = {i: pool.submit(_one, i) for i in order}
+            for n, i in enumerate(order):
+                done[i] = jobs[i].result()
+                if progress:
+                    progress((n + 1) / len(order))
+    else:
+        for n, i in enumerate(order):
+            done[i] = _one(i)
+            if progress:
+                progress((n + 1) / len(order))
+    results = [done[i][0] for i in range(len(_WORK))]
+    shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
+    verdicts = {d.verdict for d in results}
+    verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
+    return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def fit_effects(stage: Stage, effects: tuple[str, ...]) -> tuple[Judge, Fit, Fit]:
+    """Fit a stage with exactly these effects: (judge, fit without, fit with). Raises StageError for an effect it does not have."""
+    from discrepancy.diagnose import Search
+
+    for e in effects:
+        if all(e != x.name for x in stage.effects):
+            raise StageError(f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}")
+    judge = Judge(stage, floor_of(stage))
+    search = Search(judge)
+    joined: tuple[str, ...] = ()
+    for e in effects:
+        joined = (*joined, e)
+        search.joined(joined)
+    return judge, search.base, search.joined(tuple(effects))
+
+
+def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
+    """Return the diagnosis as the JSON of the command."""
+    stages, effects, recalibrated, unknown, unobservable = [], [], [], [], []
+    for s in d.stages:
+        for k in range(len(s.floor)):
+            stages.append(
+                {
+                    "stage": s.stage,
+                    "verdict": s.verdict,
+                    "signal": s.outputs[k],
+                    "unit": s.units[k],
+                    "error_before": float(s.error_before[k]),
+                    "error_after": float(s.error_after[k]),
+                    "noise_floor": float(s.floor[k]),
+                }
+            )
+        for f in s.effects:
+            effects.append(
+                {"effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals}
+            )
+        recalibrated += s.recalibrated
+        if s.verdict == "unknown":
+            text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
+            leaning = [c.effect for c in s.candidates if c.nats > 12.0][:3]
+            unknown.append({"stage": s.stage, "shape": text, "nearest_effects": leaning})
+        unobservable += [{"effect": c.effect, "stage": s.stage, "needs": c.reason} for c in s.candidates if c.reason]
+    for name, why in d.not_observed.items():
+        stages.append(
+            {
+                "stage": name, "verdict": "not_observed", "signal": None, "unit": None, "error_before": None, "error_after": None,
+                "noise_floor": None, "reason": why,
+            }
+        )  # fmt: skip
+    effects.sort(key=lambda e: -float(e["probability"]))
+    return {
+        "schema": 1,
+        "log": log,
+        "verdict": d.verdict,
+        "stages": stages,
+        "effects": effects,
+        "recalibrated": recalibrated,
+        "unknown": unknown,
+        "not_observable": unobservable,
+        "notes": d.notes,
+        "elapsed_s": d.elapsed_s,
+    }
