@@ -7,6 +7,7 @@ inside the machine's block), and blocks that call the product's own compiled fun
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from benchmarks.ours import OurLoop, Setup
 from controller import tick
@@ -16,6 +17,20 @@ from plant import chain
 __all__ = ["SIGNALS", "run"]
 
 SIGNALS = ("n_engine", "x_dem", "x_lvdt", "vigv", "vgv1", "vgv2")
+
+
+@njit(cache=True)
+def machine_step(s, p, i_cmd, n_dem, p_s, t_oil):
+    """Engine, valve, actuator, LVDT, linkage and potentiometers: one tick."""
+    chain.rotor_step(s, p, 0, n_dem)
+    chain.drive_step(s, p, 0, i_cmd, n_dem, p_s, t_oil)
+    chain.vane_step(s, p, 0, n_dem, t_oil)
+
+
+@njit(cache=True)
+def lvdt_sample(s, p):
+    """Sample of the LVDT, m."""
+    return chain.sample_lvdt(s, p, 0, 0.0)
 
 
 def run(setup: Setup) -> np.ndarray:
@@ -39,14 +54,11 @@ def run(setup: Setup) -> np.ndarray:
     def machine_update(t, s, u, params):
         i_cmd, n_dem = u
         s = s.reshape(-1, 1).copy()
-        chain.rotor_step(s, p, 0, n_dem)
-        chain.drive_step(s, p, 0, i_cmd, n_dem, p_s, t_oil)
-        chain.vane_step(s, p, 0, n_dem, t_oil)
+        machine_step(s, p, i_cmd, n_dem, p_s, t_oil)
         return s[:, 0]
 
     def machine_output(t, s, u, params):
-        lvdt = chain.sample_lvdt(s.reshape(-1, 1), p, 0, 0.0)
-        return np.array([s[chain.N_R], lvdt, s[chain.POT], s[chain.POT + 1], s[chain.POT + 2]])
+        return np.array([s[chain.N_R], lvdt_sample(s.reshape(-1, 1), p), s[chain.POT], s[chain.POT + 1], s[chain.POT + 2]])
 
     firmware = control.NonlinearIOSystem(
         lambda t, z, u, params: ticked(z, u),

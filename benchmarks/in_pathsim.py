@@ -33,6 +33,13 @@ def drive(x, u, rated, w, damping, gain, lvdt_lag):
     return np.array([x[1], w * w * (u[0] / rated - x[0]) - 2.0 * damping * w * x[1], gain * x[0], (x[2] - x[3]) / lvdt_lag])
 
 
+@njit(cache=True)
+def vanes_step(s, p, stroke):
+    """Linkage and potentiometers: one tick at ``stroke`` (m)."""
+    s[chain.X, 0] = stroke
+    chain.vane_step(s, p, 0, 0.0, 0.0)
+
+
 def run(setup: Setup, step: float, solver: str) -> np.ndarray:
     """Simulate the setup from the state after its warm-up; return `SIGNALS` in SI, a row every 10 ms.
 
@@ -61,8 +68,7 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
 
     def linkage(x):
         if ticks[0] > 1:  # the state at t = 0 is given
-            linkage_state[chain.X, 0] = x
-            chain.vane_step(linkage_state, p, 0, 0.0, 0.0)
+            vanes_step(linkage_state, p, x)
         return tuple(linkage_state[chain.POT : chain.POT + 3, 0])
 
     source = Source(lambda t: n_dem[min(int(t * 100.0 + 1e-6), len(n_dem) - 1)])
