@@ -13,7 +13,6 @@ import numpy as np
 from benchmarks.ours import COLUMNS, Setup
 from plant import parameters as par
 from plant.linkage import N_GEOMETRY
-from plant.parameters import N_NOMINAL
 
 __all__ = ["BITWISE", "FAST", "CLoop", "build"]
 
@@ -65,7 +64,7 @@ class CLoop:
         self._c = build(flags, gcc)
         s = self._setup = setup
         # kept: the C side reads the table where it is
-        self._arrays = [np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[:N_NOMINAL, 0], s.sigma)]
+        self._arrays = [np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[_PARAMETERS, 0], s.sigma)]
         k, table, p, sigma = self._arrays
         expected = [len(k), len(p), s.stimulus.rows.shape[1], len(sigma)]
         found = [self._c.loop_layout(i) for i in range(4)]
