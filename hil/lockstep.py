@@ -12,6 +12,7 @@ Time is an integer number of ticks; no clock is read. The same stimulus, tables 
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -32,15 +33,21 @@ from controller.firmware import (
     IN_N_R,
     IN_REJECTED,
     IN_X_LVDT,
+    KFF,
+    KI,
+    KP,
     MODE,
     N_INPUTS,
     SLOW,
+    TREND_CHANGE,
+    TREND_RATE_ON,
     X_DEM,
 )
 from plant import Plant, build_plant, chain
 from plant.compiled import compiled
+from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 
-__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
+__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "flashed", "lockstep", "warm_up"]
 
 FRAME = 1e-2  # s, period of the ECU's frame
 CHUNK = 10_000  # ticks between two calls of the progress function
@@ -110,6 +117,8 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
     keep = snapshots.shape[0] > 0
     n_z, n_s = z.shape[0], s.shape[0]
     last_frame = stimulus.shape[0] - 1
+    stale = p[chain.CAN_DELAY, 0] > 0.0 or p[chain.FRAME_HOLD, 0] > 0.0
+    sent_n_dem, sent_n_r = inputs[IN_N_DEM], inputs[IN_N_R]
     for i in range(ticks):
         k = k0 + i
         m = i if noisy else 0
@@ -119,6 +128,15 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
             n_r = stimulus[frame, S_N_R]
             if n_r != n_r:  # not logged: the plant's engine
                 n_r = s[chain.N_R, 0] + sigma[4] * noise[m, 4]
+                if stale:
+                    stimulus[frame, S_N_R] = n_r  # for the frame in which it arrives
+            sent_n_dem, sent_n_r = n_dem, n_r
+            if stale:
+                content = can_delay.step(k * chain.TICK, p[chain.CAN_DELAY, 0])
+                content = frame_hold.step(content, p[chain.FRAME_HOLD, 0])
+                old = min(max(int(math.floor(content / FRAME + 1e-6)), 0), frame)
+                n_dem = stimulus[old, S_N_DEM]
+                n_r = stimulus[old, S_N_R]
             inputs[IN_N_DEM] = n_dem
             inputs[IN_N_R] = n_r
             inputs[IN_FRESH] = stimulus[frame, S_FRESH]
@@ -128,15 +146,15 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
             inputs[IN_FRESH] = 0.0
             inputs[IN_REJECTED] = 0.0
         p_s, t_oil = stimulus[frame, S_P_S], stimulus[frame, S_T_OIL]
-        inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[m, 0])
+        inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[m, 0], t_oil)
         tick(inputs, z, calibration)
         mean[0] += z[I_CMD]
         mean[1] += 1.0
         if k % every == 0 and out.shape[0] > 0:
             r = i // every
             out[r, 0] = k * 1e-3
-            out[r, 1] = inputs[IN_N_DEM]
-            out[r, 2] = inputs[IN_N_R]
+            out[r, 1] = sent_n_dem
+            out[r, 2] = sent_n_r
             out[r, 3] = z[X_DEM]
             out[r, 4] = inputs[IN_X_LVDT]
             out[r, 5] = mean[0] / mean[1]
@@ -154,9 +172,9 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
                 snapshots[i, q] = z[q]
             for q in range(n_s):
                 snapshots[i, n_z + q] = s[q, 0]
-        chain.rotor_step(s, p, 0, inputs[IN_N_DEM])
-        chain.drive_step(s, p, 0, z[I_CMD], inputs[IN_N_R], p_s, t_oil)
-        chain.vane_step(s, p, 0, inputs[IN_N_R], t_oil)
+        chain.rotor_step(s, p, 0, sent_n_dem, chain.TICK)
+        chain.drive_step(s, p, 0, z[I_CMD], sent_n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
+        chain.vane_step(s, p, 0, sent_n_r, t_oil, (k + 1) * chain.TICK)
 
 
 @lru_cache(maxsize=1)
@@ -186,8 +204,8 @@ def lockstep(
     duration       s, default the stimulus's length
     progress       called with the fraction done
     """
-    cal = calibration or load_calibration()
     machine = plant or _nominal()
+    cal = flashed(calibration or load_calibration(), machine)
     if CHUNK % every:
         raise ValueError(f"every (={every}) must divide {CHUNK}")
     ticks = int(round((duration if duration is not None else len(stimulus.rows) * FRAME) * 1000))
@@ -195,16 +213,18 @@ def lockstep(
     n0 = stimulus.rows[0, S_N_R] if np.isfinite(stimulus.rows[0, S_N_R]) else stimulus.rows[0, S_N_DEM]
     z, inputs, mean = new_state(), np.zeros(N_INPUTS), np.zeros(2)
     z[DIRECTION], z[BLEND] = _starting_curve(cal, n0, stroke_demand)
-    s = machine.start(stroke=float(np.interp(n0, cal.table[0], cal.table[3])), n_r=stimulus.rows[0, S_N_DEM])
+    stroke, t_oil = float(np.interp(n0, cal.table[0], cal.table[3])), float(stimulus.rows[0, S_T_OIL])
+    s = machine.start(stroke=stroke, n_r=stimulus.rows[0, S_N_DEM], t_oil=t_oil)
     sigma = machine.sigma if seed is not None else np.zeros(5)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
     silent = np.zeros((1, 5))
     no_out, no_snapshots = np.empty((0, len(COLUMNS))), np.empty((0, 0))
-    advance(-WARM_UP, WARM_UP, stimulus.rows[:1], silent, sigma, inputs, z, cal, s, p, mean, 10, no_out, no_snapshots)
+    advance(-WARM_UP, WARM_UP, stimulus.rows[:1].copy(), silent, sigma, inputs, z, cal, s, p, mean, 10, no_out, no_snapshots)
     mean[:] = 0.0
     if angles is not None:
-        machine.place_rings(s, angles)
+        machine.place_rings(s, angles, n0, t_oil)
 
+    rows = stimulus.rows.copy()  # a late frame keeps the speed with which it was sent
     out = np.empty((-(-ticks // every), len(COLUMNS)))
     buffers = [np.empty((CHUNK if hashed else 0, len(z) + len(s))) for _ in range(2)]
     digest = hashlib.sha256()
@@ -215,7 +235,7 @@ def lockstep(
             n = min(CHUNK, ticks - k0)
             noise = silent if seed is None else generator.standard_normal((n, 5))
             snap = buffers[c % 2][:n]
-            advance(k0, n, stimulus.rows, noise, sigma, inputs, z, cal, s, p, mean, every, out[k0 // every :], snap)
+            advance(k0, n, rows, noise, sigma, inputs, z, cal, s, p, mean, every, out[k0 // every :], snap)
             if pending is not None:
                 pending.result()
             if hashed:
@@ -225,6 +245,18 @@ def lockstep(
     wall = time.perf_counter() - started
     columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
     return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(z[FAULT_BITS]))
+
+
+def flashed(calibration: Calibration, plant: Plant) -> Calibration:
+    """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
+    p = plant.p[:, 0]
+    k, table = calibration.k.copy(), calibration.table.copy()
+    table[1:] = schedule_error.step(table[1:], p[chain.SCHEDULE_ERROR])
+    for row in (TREND_RATE_ON, TREND_CHANGE):
+        k[row] = trend_threshold_error.step(k[row], p[chain.TREND_THRESHOLD_ERROR])
+    for row in (KP, KI, KFF):
+        k[row] = controller_gain_error.step(k[row], p[chain.CONTROLLER_GAIN_ERROR])
+    return Calibration(k, table)
 
 
 def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numba
 from numba import njit
 
-__all__ = ["cache_folder", "compiled", "is_cached"]
+__all__ = ["cache_folder", "compiled", "in_place", "inlined", "is_cached"]
 
 _PACKAGES = ("controller", "plant", "hil", "discrepancy")
 
@@ -30,7 +30,11 @@ def _digest() -> str:
 
 def cache_folder() -> Path:
     """Return the folder for compiled code: in the package where that can be written, else in the user's cache."""
-    places = [Path(__file__).parent / "__pycache__", Path.home() / ".cache" / "vaneloop", Path(tempfile.gettempdir()) / f"vaneloop-{os.getuid()}"]
+    places = [
+        Path(__file__).parent / "__pycache__",
+        Path.home() / ".cache" / "vaneloop",
+        Path(tempfile.gettempdir()) / f"vaneloop-{os.getuid()}",
+    ]
     for place in places:
         try:
             place.mkdir(parents=True, exist_ok=True)
@@ -53,6 +57,11 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_folder)  # type: ignore[attr-defined]
 
 compiled = njit(cache=True, error_model="numpy")
+# The same for functions that work in place on their caller's arrays and allocate nothing: without counting references to those arrays,
+# which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes an array does not compile under it.
+in_place = njit(cache=True, error_model="numpy", _nrt=False)
+# For loop bodies of many scalars: a call would pass them on the stack.
+inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 
 
 def is_cached() -> bool:

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from plant import chain
+from plant.effect import T_REF
+from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain
 from plant.geometry import Geometry, Schedules, load_schedules
-from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE, ring_angle_of_vane, ring_angles, vane_angle
+from plant.linkage import G_L, G_LDP, G_LE, G_LX0, G_X1, G_Y1, N_CRANK, N_PER_STAGE, crank, ring_angle_of_vane, vane_angle
 from plant.parameters import GEOMETRY, PLAY, POT_BIAS, PlantTable, derive, load_plant
 
 __all__ = ["Plant", "build_plant"]
@@ -30,24 +32,40 @@ class Plant:
     p: np.ndarray
     sigma: np.ndarray
 
-    def start(self, stroke: float, n_r: float) -> np.ndarray:
-        """Return a state at rest at ``stroke`` (m) and speed ``n_r`` (%), every ring in the middle of its play."""
+    def start(self, stroke: float, n_r: float, t_oil: float = T_REF) -> np.ndarray:
+        """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of its play."""
+        p = self.p[:, 0]
         s = np.zeros((chain.N_STATE, 1))
         s[chain.N_R, 0] = n_r
-        s[chain.X, 0] = s[chain.X_LVDT, 0] = stroke
-        for k, ring in enumerate(ring_angles(stroke, self.p[GEOMETRY:, 0])):
-            s[chain.RING + k, 0] = ring
-            s[chain.POT + k, 0] = vane_angle(ring, *self._lever(k)) + self.p[POT_BIAS + k, 0]
+        s[chain.X, 0] = s[chain.X_LVDT, 0] = s[chain.READING, 0] = stroke
+        load = aero_load.step(n_r, p[chain.AERO_LOAD])
+        s[chain.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[chain.OIL_COMPRESSIBILITY :][:2])
+        s[chain.CURRENT, 0] = s[chain.LAGGED, 0] = p[chain.VALVE_NULL_BIAS]
+        for k, ring in enumerate(self._rings(stroke, n_r, t_oil)):
+            s[chain.RING + k, 0] = s[chain.DRIVEN + k, 0] = ring
+            s[chain.POT + k, 0] = self._reading(ring, k)
         return s
 
-    def place_rings(self, s: np.ndarray, angles: tuple[float, ...]) -> None:
+    def place_rings(self, s: np.ndarray, angles: tuple[float, ...], n_r: float = 0.0, t_oil: float = T_REF) -> None:
         """Set each ring, as far as its play allows, to where the vane angle is the given one (rad; NaN = leave it)."""
-        for k, drive in enumerate(ring_angles(s[chain.X, 0], self.p[GEOMETRY:, 0])):
+        p = self.p[:, 0]
+        for k, drive in enumerate(self._rings(s[chain.X, 0], n_r, t_oil)):
             if np.isfinite(angles[k]):
-                half = 0.5 * self.p[PLAY + k, 0]
-                ring = ring_angle_of_vane(angles[k] - self.p[POT_BIAS + k, 0], *self._lever(k))
-                s[chain.RING + k, 0] = min(max(ring, drive - half), drive + half)
-                s[chain.POT + k, 0] = vane_angle(s[chain.RING + k, 0], *self._lever(k)) + self.p[POT_BIAS + k, 0]
+                ldp, lever = self._lever(k)
+                half = 0.5 * linkage_backlash.step(p[PLAY + k], p[chain.LINKAGE_BACKLASH + k], lever / ldp)
+                vane = (angles[k] - p[POT_BIAS + k] - p[chain.POT_BIAS_ERROR + k]) / p[chain.POT_GAIN + k]
+                ring = min(max(ring_angle_of_vane(vane, ldp, lever), drive - half), drive + half)
+                s[chain.RING + k, 0] = s[chain.DRIVEN + k, 0] = ring
+                s[chain.POT + k, 0] = self._reading(ring, k)
+
+    def _rings(self, stroke: float, n_r: float, t_oil: float) -> list[float]:
+        g = self.p[GEOMETRY:, 0]
+        c, d = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
+        return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(3)]
+
+    def _reading(self, ring: float, k: int) -> float:
+        vane = pot_gain.step(vane_angle(ring, *self._lever(k)), self.p[chain.POT_GAIN + k, 0])
+        return vane + pot_bias.step(self.p[POT_BIAS + k, 0], self.p[chain.POT_BIAS_ERROR + k, 0])
 
     def _lever(self, k: int) -> tuple[float, float]:
         o = GEOMETRY + N_CRANK + k * N_PER_STAGE

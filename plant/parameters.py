@@ -9,60 +9,86 @@ from typing import Annotated
 
 import numpy as np
 
+from plant.effects import DERIVED, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
 from plant.geometry import Geometry, load_geometry
+from plant.layout import (
+    ACCELERATION,
+    AREA,
+    BANDWIDTH,
+    DAMPING,
+    DECELERATION,
+    FLOW_GAIN,
+    GEOMETRY,
+    LAG,
+    LVDT_FACTOR,
+    LVDT_LAG,
+    LVDT_STEP,
+    N_NOMINAL,
+    NAMES,
+    P_REF,
+    PLAY,
+    POT_BIAS,
+    POT_FACTOR,
+    POT_LAG,
+    RATED_CURRENT,
+    STROKE,
+    VALVE_A11,
+    VALVE_A12,
+    VALVE_A21,
+    VALVE_A22,
+)
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from tables import Bound, Bounded, Quantity, Table, read
 
-__all__ = ["NAMES", "Nominal", "PlantTable", "derive", "load_plant", "nominal"]
+__all__ = [
+    "ACCELERATION",
+    "AREA",
+    "BANDWIDTH",
+    "DAMPING",
+    "DECELERATION",
+    "DRIVE_EFFECTS",
+    "DRIVE_LOADED",
+    "FLOW_GAIN",
+    "GEOMETRY",
+    "LAG",
+    "LVDT_FACTOR",
+    "LVDT_LAG",
+    "LVDT_SHARE",
+    "LVDT_STEP",
+    "NAMES",
+    "N_NOMINAL",
+    "N_PARAMETERS",
+    "PLAY",
+    "POT_BIAS",
+    "POT_FACTOR",
+    "POT_LAG",
+    "POT_SHARE",
+    "P_REF",
+    "RATED_CURRENT",
+    "STROKE",
+    "VALVE_A11",
+    "VALVE_A12",
+    "VALVE_A21",
+    "VALVE_A22",
+    "VALVE_SHARE",
+    "VANE_EFFECTS",
+    "Nominal",
+    "PlantTable",
+    "derive",
+    "load_plant",
+    "nominal",
+]
 
-# Rows of the parameter array p[row, lane]. Named rows first: they are what an engineer can recalibrate.
-NAMES = (
-    "engine.lag",
-    "engine.acceleration",
-    "engine.deceleration",
-    "valve.rated_current",
-    "valve.bandwidth",
-    "valve.damping",
-    "actuator.flow_gain",
-    "actuator.area",
-    "actuator.stroke",
-    "supply.pressure",
-    "sensors.lvdt_lag",
-    "sensors.pot_lag",
-    "linkage.vigv_play",
-    "linkage.vgv1_play",
-    "linkage.vgv2_play",
-    "sensors.vigv_bias",
-    "sensors.vgv1_bias",
-    "sensors.vgv2_bias",
-)
-(
-    LAG,
-    ACCELERATION,
-    DECELERATION,
-    RATED_CURRENT,
-    BANDWIDTH,
-    DAMPING,
-    FLOW_GAIN,
-    AREA,
-    STROKE,
-    P_REF,
-    LVDT_LAG,
-    POT_LAG,
-    PLAY,  # three rows: total width at the ring, rad
-    _,
-    _,
-    POT_BIAS,  # three rows, rad
-    _,
-    _,
-) = range(len(NAMES))
-GEOMETRY = len(NAMES)  # N_GEOMETRY rows, see plant.linkage
-# rows worked out from the others by `derive`
-(LVDT_STEP, VALVE_A11, VALVE_A12, VALVE_A21, VALVE_A22, LVDT_FACTOR, POT_FACTOR, N_PARAMETERS) = range(
-    GEOMETRY + N_GEOMETRY, GEOMETRY + N_GEOMETRY + 8
-)
+# rows of p that `derive` works out from the effects' parameters
+DRIVE_EFFECTS = DERIVED  # 0 where every effect from valve to LVDT is neutral: the chain takes its short way
+DRIVE_LOADED = DERIVED + 1  # 0 where neither a load nor the oil's pressure changes the motion
+VANE_EFFECTS = DERIVED + 2  # as the first, from linkage to potentiometers
+VALVE_SHARE = DERIVED + 3  # valve_lag and lvdt_lag: share of the way in one plant step
+LVDT_SHARE = DERIVED + 4
+POT_SHARE = DERIVED + 5  # three rows: the potentiometers' share in one tick, pot_lag included
+
 _SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "deg": math.pi / 180.0}
 
 
@@ -146,12 +172,24 @@ def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
     return out
 
 
+_NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])[:, None]
+_DRIVE_ROWS = rows_at("valve", "supply", "actuator", "lvdt")
+_LOAD_ROWS = [r for r in rows_at("supply", "actuator") if r not in (ROW["oil_viscosity"], ROW["end_stop_shift"])]
+_VANE_ROWS = rows_at("linkage", "pot")
+
+
 def derive(p: np.ndarray, dt: float, tick: float) -> None:
     """Work out the rows that follow from others: the valve's and the sensors' exact steps over ``dt`` and ``tick`` (s)."""
     for j in range(p.shape[1]):
         p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
         p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
         p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
+        p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)
+        p[LVDT_SHARE, j] = lag_factor(p[ROW["lvdt_lag"], j], dt)
+        for k in range(3):
+            p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[ROW["pot_lag"] + k, j]), tick)
+    for flag, rows in ((DRIVE_EFFECTS, _DRIVE_ROWS), (DRIVE_LOADED, _LOAD_ROWS), (VANE_EFFECTS, _VANE_ROWS)):
+        p[flag] = np.any(p[rows] != _NEUTRAL[rows], axis=0)
 
 
 def load_plant(source: str | Path = "plant.toml", geometry: str | Path = "geometry.toml") -> tuple[PlantTable, Geometry, np.ndarray]:
@@ -170,5 +208,6 @@ def load_plant(source: str | Path = "plant.toml", geometry: str | Path = "geomet
     for k in range(len(STAGES)):
         o = N_CRANK + k * N_PER_STAGE
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
+    p[N_NOMINAL:DERIVED, 0] = NEUTRAL
     p[LVDT_STEP, 0] = table.sensors.lvdt_range.value * 1e-3 / 2.0 ** table.sensors.lvdt_bits.value
     return table, geo, p

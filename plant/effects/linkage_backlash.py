@@ -1,0 +1,36 @@
+"""Play other than nominal: worn or tight pins between crank, link, ring and lever.
+
+Equation::
+
+    w = max(w_nominal + width L / Ld', 0)
+
+Symbols: w total play at the ring (rad), width total play at the vane beyond nominal (rad), L / Ld' ratio of the lever
+at mid-stroke.
+Limits: all clearance of a stage as one play, between link and ring.
+In a log: at each reversal the vane stands until the stroke has crossed the play; up and down strokes differ by the
+width, the same at every stroke.
+Source: play operator, see plant/play.py; Kim & Ki 2020, Figure 13, for the nominal width.
+"""
+
+from __future__ import annotations
+
+from plant.compiled import compiled
+from plant.effect import Effect, per_vane_stage
+
+__all__ = ["EFFECT", "step"]
+
+EFFECT = Effect(
+    "linkage_backlash",
+    "linkage",
+    ("linkage",),
+    per_vane_stage("deg", 0.0, (-1.6, -1.1, -0.8), 5.0, "total play at the vane beyond nominal"),
+    (),
+    "a stage has more or less play than nominal",
+    "reversals of the stroke",
+)
+
+
+@compiled
+def step(play, width, ratio):
+    """Return the total play (rad at the ring) for a ``width`` (rad at the vane) beyond the nominal ``play``; ``ratio`` ring per vane."""
+    return max(play + width * ratio, 0.0)

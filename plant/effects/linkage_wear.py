@@ -1,0 +1,36 @@
+"""Play that grows: pins wear out during the run.
+
+Equation::
+
+    w(t) = w + rate L / Ld' t
+
+Symbols: w total play at the ring (rad), rate growth at the vane (rad/s, declared in deg/h), t time from the start of
+the log (s).
+Limits: steady growth; real wear is fast at first and follows load and number of reversals.
+In a log: the hysteresis of a stage widens from the beginning to the end of the log, symmetrically; nothing at its
+start.
+Source: Archard's law at constant conditions, J. Appl. Phys. 24 (1953) 981.
+"""
+
+from __future__ import annotations
+
+from plant.compiled import compiled
+from plant.effect import Effect, per_vane_stage
+
+__all__ = ["EFFECT", "step"]
+
+EFFECT = Effect(
+    "linkage_wear",
+    "linkage",
+    ("linkage",),
+    per_vane_stage("deg/h", 0.0, 0.0, 200.0, "growth of the total play at the vane"),
+    (),
+    "a stage's play grows with time",
+    "reversals throughout a log of some minutes",
+)
+
+
+@compiled
+def step(play, rate, ratio, t):
+    """Return the total play (rad at the ring) at time ``t`` (s) with a growth of ``rate`` (rad/s at the vane); ``ratio`` ring per vane."""
+    return play + rate * ratio * max(t, 0.0)

@@ -1,0 +1,35 @@
+"""A stem potentiometer behind a slower filter than the table says.
+
+Equation::
+
+    (tau + lag) dy/dt = vane - y
+
+Symbols: vane angle (rad), y reading (rad), tau nominal lag (s), lag beyond it (s).
+Limits: first order.
+In a log: one stage's reading trails while the vanes move, in proportion to their speed, with the same sign as the
+motion; dwells are right. A play also trails, but by an angle that does not depend on speed.
+Source: first-order lag, Ogata, Modern Control Engineering (2010), section 5.
+"""
+
+from __future__ import annotations
+
+from plant.compiled import compiled
+from plant.effect import Effect, per_vane_stage
+
+__all__ = ["EFFECT", "step"]
+
+EFFECT = Effect(
+    "pot_lag",
+    "pot",
+    ("linkage",),
+    per_vane_stage("s", 0.0, -0.005, 0.5, "lag beyond nominal"),
+    (),
+    "a vane-angle reading is late",
+    "fast motion",
+)
+
+
+@compiled
+def step(nominal, lag):
+    """Return the potentiometer's lag (s)."""
+    return nominal + lag
