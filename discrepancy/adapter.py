@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from controller import Calibration, load_calibration, new_state
 from controller import firmware as fw
@@ -42,7 +43,7 @@ FREE = {  # nominal parameters that a stage refits within their tolerance
     "demand": (),
     "servo": (),
     "engine": ("engine.lag", "engine.acceleration", "engine.deceleration"),
-    "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping"),
+    "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping", "sensors.lvdt_lag"),
     "linkage": tuple(f"linkage.{s}_play" for s in STAGES) + tuple(f"sensors.{s}_bias" for s in STAGES),
 }
 LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
@@ -203,7 +204,8 @@ def _floor(stage: Stage, dt: float) -> Array:
     for k in range(len(stage.outputs)):
         e = np.where(np.isfinite(stage.measured[k]), stage.measured[k] - model[k], np.nan)
         out.append(max(noise_floor(stage.t, e), LEAST_FLOOR[stage.name]))
-    return np.array(out)
+    floor = np.array(out)
+    return floor if stage.raster_error is None else np.hypot(floor, stage.raster_error)
 
 
 # ---- parameters and effects ---------------------------------------------------------------------------------------------------------
@@ -270,7 +272,7 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
     if name in ("can_delay", "frame_hold"):
         return tuple((v,) for v in np.arange(0.01, 0.51, 0.01) if name != "frame_hold" or v > 0.015)
     if name == "trend_threshold_error":
-        return tuple((v,) for v in (0.2, 0.4, 0.6, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 8.0))
+        return tuple((float(v),) for v in np.geomspace(0.1, 12.0, 121))
     if name == "end_stop_shift":
         return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
     second = [FIXED_START.get(p.name, p.value) for p in ps]
@@ -372,6 +374,11 @@ def _linkage(
         linkage_run(x, n_r, t_oil, t, dt, p, s, out)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
+    # until the stroke has crossed the play twice over, nobody knows where in it the rings started
+    reach = np.maximum.accumulate(c["x_lvdt"]) - np.minimum.accumulate(c["x_lvdt"])
+    known = reach > 3.0
+    if known.any():
+        run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
     return Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
 
@@ -386,9 +393,10 @@ def _servo(
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
     before[0], two[:2] = x_dem[0], x_dem[0]
     ramp = sum(two + (before - two) * f / 10.0 for f in range(2, 11)) + before + (x_dem - before) / 10.0
-    x_before = np.roll(x, 1)
-    x_before[0] = x[0]
-    stroke = sum(x_before + (x - x_before) * f / 10.0 for f in range(1, 11))
+    curve = CubicSpline(t, x)
+    ticks = t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None]
+    stroke = curve(np.maximum(ticks, t[0])).sum(axis=1)
+    straight = np.interp(np.maximum(ticks, t[0]).ravel(), t, x).reshape(ticks.shape).sum(axis=1)
     error = (ramp - stroke) / 10.0
     rate = (9.0 * (before - two) + (x_dem - before)) / 10.0 / RASTER
     integral = np.cumsum(error) * RASTER
@@ -400,7 +408,12 @@ def _servo(
         return i[:, None, :]
 
     near = np.abs(c["i_cmd"]) < 0.9e3 * limit
-    return Stage("servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW)
+    stage = Stage(
+        "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
+    )
+    # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
+    stage.raster_error = np.array([float(np.std(kp * (stroke - straight) / 10.0))])
+    return stage
 
 
 @compiled

@@ -28,6 +28,7 @@ BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 LEADERS = 5  # effects tried in pairs
 MOST = 4  # effects in one stage
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
+LEAST_SHARE = 0.15  # of the excess over the floor that a further effect must explain: less is one effect patching another's equation
 RESIDUAL_SHARE = 0.1  # of the excess over the floor that a model of the right kind may leave (its equation is not nature's)
 
 
@@ -207,6 +208,9 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
 def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bool:
     """True when ``after`` is worth its extra effect."""
     nats, spreads = gain(judge, before, after, correlation)
+    excess = before.held_out.sum() - judge.n
+    if before.held_out.sum() - after.held_out.sum() < LEAST_SHARE * excess:
+        return False
     extra = max(len(after.free) - len(before.free), 1)
     return nats > NATS + (extra - 1) and spreads > SPREADS
 

@@ -65,6 +65,7 @@ class Stage:
     window    s: within each window of this length the initial state is free, so one constant per output is taken off the error there;
               None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
+    raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
     floor     RMS of an output's error when nothing is missing, in its unit; NaN: to be estimated
     """
 
@@ -79,6 +80,7 @@ class Stage:
     window: float | None = None
     regimes: Mapping[str, Array] = field(default_factory=dict)
     regime_units: Mapping[str, str] = field(default_factory=dict)
+    raster_error: Array | None = None
     floor: Array | None = None
 
     def __post_init__(self) -> None:
