@@ -118,7 +118,9 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
             continue
-        stage.floor = _floor(stage, dt)
+        least = LEAST_FLOOR[name]
+        stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
+        stage.floor = _floor(stage)
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, cal, notes)
 
@@ -197,15 +199,12 @@ def _regimes(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dic
     return out, units
 
 
-def _floor(stage: Stage, dt: float) -> Array:
-    """Noise floor of every output: noise of the nominal model's error, and the error of a slow raster."""
+def _floor(stage: Stage) -> Array:
+    """Noise floor of every output: the noise in the nominal model's error, and what the raster hides."""
     model = stage.run(stage.neutral()[None])[0]
-    out = []
-    for k in range(len(stage.outputs)):
-        e = np.where(np.isfinite(stage.measured[k]), stage.measured[k] - model[k], np.nan)
-        out.append(max(noise_floor(stage.t, e), LEAST_FLOOR[stage.name]))
-    floor = np.array(out)
-    return floor if stage.raster_error is None else np.hypot(floor, stage.raster_error)
+    assert stage.noise is not None
+    noise = [stage.noise(stage.t, np.where(np.isfinite(y), y - m, np.nan)) for y, m in zip(stage.measured, model, strict=True)]
+    return np.array(noise) if stage.raster_error is None else np.hypot(noise, stage.raster_error)
 
 
 # ---- parameters and effects ---------------------------------------------------------------------------------------------------------

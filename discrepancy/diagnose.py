@@ -216,6 +216,26 @@ def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bo
 
 
 def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
+    """Search the stage's library for what is missing; see `_diagnose`.
+
+    The floor is measured again on the errors of the best model and the search repeated where it was too high: a gross effect makes the
+    nominal model's error move so fast that it passes for noise.
+    """
+    d = _diagnose(stage, floor, keep, tick)
+    for _ in range(2):
+        if stage.noise is None:
+            break
+        error = stage.measured - stage.run(d.final.theta[None])[0]
+        lower = np.array([stage.noise(stage.t, e) for e in error])
+        if stage.raster_error is not None:
+            lower = np.hypot(lower, stage.raster_error)
+        if not np.any(lower < 0.9 * d.floor):
+            break
+        d = _diagnose(stage, np.minimum(lower, d.floor), keep, tick)
+    return d
+
+
+def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
     """Search the stage's library for what is missing.
 
     floor  RMS of each output's error when nothing is missing
@@ -232,7 +252,9 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
 
     candidates = []
     names = [e.name for e in stage.effects]
-    singles = {name: search.single(name) for name in names}
+    # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the screening
+    quiet = rms(base) <= 1.0
+    singles = {name: base if quiet else search.single(name) for name in names}
     leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
     correlation = min(_correlation(judge, leader.theta), 50.0)
     for name in names:

@@ -66,7 +66,9 @@ class Stage:
               None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
-    floor     RMS of an output's error when nothing is missing, in its unit; NaN: to be estimated
+    floor     RMS of an output's error when nothing is missing, in its unit
+    noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
+              known, whose errors hold less of the machine's motion
     """
 
     name: str
@@ -82,6 +84,7 @@ class Stage:
     regime_units: Mapping[str, str] = field(default_factory=dict)
     raster_error: Array | None = None
     floor: Array | None = None
+    noise: Callable[[Array, Array], float] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and names."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from numba import njit
 
 __all__ = ["cache_folder", "compiled", "in_place", "inlined", "is_cached"]
 
+KEPT = 6
 _PACKAGES = ("controller", "plant", "hil", "discrepancy")
 
 
@@ -47,13 +49,10 @@ def cache_folder() -> Path:
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
     _folder = cache_folder()
-    for old in _folder.parent.glob("compiled-*"):
+    # code of other sources goes, but for the latest: a run that was started before an edit may still be using it
+    for old in sorted(_folder.parent.glob("compiled-*"), key=lambda f: -f.stat().st_mtime if f.exists() else 0.0)[KEPT:]:
         if old != _folder:
-            for f in [*old.rglob("*.nb?"), *sorted(old.rglob("*"), reverse=True), old]:
-                try:
-                    f.rmdir() if f.is_dir() else f.unlink()
-                except OSError:
-                    pass  # another process is using it; it goes next time
+            shutil.rmtree(old, ignore_errors=True)
     numba.config.CACHE_DIR = str(_folder)  # type: ignore[attr-defined]
 
 compiled = njit(cache=True, error_model="numpy")

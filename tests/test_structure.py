@@ -35,9 +35,9 @@ CLOCKS_AND_BUSES = {"asyncio", "can", "cantools", "datetime", "sched", "selector
 EXPORTS: dict[str, list[str]] = {
     "app": [],
     "controller": ["Calibration", "FAULTS", "INPUTS", "MODES", "SCALARS", "STATE", "STRATEGIES", "load_calibration", "new_state", "tick"],
-    "discrepancy": [],
+    "discrepancy": ["Effect", "Parameter", "Stage", "StageError"],
     "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
-    "plant": ["Geometry", "Plant", "Schedules", "build_plant", "load_geometry", "load_schedules"],
+    "plant": ["Geometry", "Model", "Plant", "Schedules", "build_plant", "load_geometry", "load_model", "load_schedules", "write_model"],
     "plant.effects": ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"],
     "tables": ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"],
 }
