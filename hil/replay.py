@@ -195,6 +195,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--strategy", metavar="S", help="stroke curves of the controller: single (one mean curve) or dual (one per direction)"
     )
+    group.add_argument("--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine")
     group.add_argument(
         "--tolerance",
         metavar="signal=value",
@@ -219,12 +220,17 @@ def command(args: argparse.Namespace, extra: dict[str, Any] | None = None) -> in
         from controller import load_calibration
 
         load_calibration(strategy=args.strategy)  # refuse a wrong name before reading a long log
+    machine = None
+    if args.model is not None:
+        from plant import build_plant, load_model
+
+        machine = build_plant(model=load_model(args.model))
     log = cli.read_log_of(args)
     from hil.lockstep import warm_up
 
     warm_up(lambda text: cli.say(args, text))
     with cli.progress_bar(args, f"replaying {Path(args.log).name}") as progress:
-        result = replay(log, strategy=args.strategy, progress=progress)
+        result = replay(log, strategy=args.strategy, plant=machine, progress=progress)
     exceeded = _exceeded(result, limits)
     rows = [
         [s.signal, s.stage, s.reference, *(_figure(getattr(s, k)) for k in (*STATISTICS, "noise_floor")), s.unit, f"{s.samples:,}"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import G_L, G_LDP, G_LE, G_LX0, G_X1, G_Y1, N_CRANK, N_PER_STAGE, crank, ring_angle_of_vane, vane_angle
 from plant.parameters import GEOMETRY, PLAY, POT_BIAS, PlantTable, derive, load_plant
+
+if TYPE_CHECKING:
+    from plant.model import Model
 
 __all__ = ["Plant", "build_plant"]
 
@@ -51,7 +55,7 @@ class Plant:
         p = self.p[:, 0]
         for k, drive in enumerate(self._rings(s[chain.X, 0], n_r, t_oil)):
             if np.isfinite(angles[k]):
-                ldp, lever = self._lever(k)
+                ldp, lever = self.lever(k)
                 half = 0.5 * linkage_backlash.step(p[PLAY + k], p[chain.LINKAGE_BACKLASH + k], lever / ldp)
                 vane = (angles[k] - p[POT_BIAS + k] - p[chain.POT_BIAS_ERROR + k]) / p[chain.POT_GAIN + k]
                 ring = min(max(ring_angle_of_vane(vane, ldp, lever), drive - half), drive + half)
@@ -64,21 +68,26 @@ class Plant:
         return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(3)]
 
     def _reading(self, ring: float, k: int) -> float:
-        vane = pot_gain.step(vane_angle(ring, *self._lever(k)), self.p[chain.POT_GAIN + k, 0])
+        vane = pot_gain.step(vane_angle(ring, *self.lever(k)), self.p[chain.POT_GAIN + k, 0])
         return vane + pot_bias.step(self.p[POT_BIAS + k, 0], self.p[chain.POT_BIAS_ERROR + k, 0])
 
-    def _lever(self, k: int) -> tuple[float, float]:
+    def lever(self, k: int) -> tuple[float, float]:
+        """Return Ld' and L (m) of stage ``k``: their ratio turns a small angle of the ring into one of the vane."""
         o = GEOMETRY + N_CRANK + k * N_PER_STAGE
         return float(self.p[o + G_LDP, 0]), float(self.p[o + G_L, 0])
 
 
 def build_plant(
-    source: str | Path = "plant.toml", geometry: str | Path = "geometry.toml", schedules: str | Path = "schedules.toml"
+    source: str | Path = "plant.toml",
+    geometry: str | Path = "geometry.toml",
+    schedules: str | Path = "schedules.toml",
+    model: Model | None = None,
 ) -> Plant:
-    """Read the plant's tables and return the machine they describe. Raises InputError for a table that cannot be used."""
+    """Read the plant's tables and return the machine they describe, with what ``model`` adds. InputError for what cannot be used."""
     table, geo, p = load_plant(source, geometry)
     derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
     deg = np.pi / 180.0
     sensors = table.sensors
     sigma = np.array([sensors.lvdt_noise.value * 1e-3, *[sensors.pot_noise.value * deg] * 3, sensors.speed_noise.value])
-    return Plant(table, geo, load_schedules(schedules), p, sigma)
+    plant = Plant(table, geo, load_schedules(schedules), p, sigma)
+    return model.plant(plant) if model is not None else plant

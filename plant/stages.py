@@ -54,6 +54,7 @@ from plant.chain import (
     VALVE_FLOW_SATURATION,
     VALVE_GAIN_ASYMMETRY,
     VALVE_HYSTERESIS,
+    VALVE_LAG,
     VALVE_NULL_BIAS,
     X_LVDT,
     X,
@@ -128,24 +129,31 @@ def engine_run(n_dem, dt, p, s, out):
     _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
 
 
-def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, window=0):
+def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, window=0, behind=chain.TICK):
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
-    i_cmd[k]          mean current (A) from sample k - 1 to k, as VGV_SERVO carries it
+    i_cmd[k]          mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it
+    behind            s: how much later than logged the current acts; that of the tick at sample k drives the next millisecond
     n_r, p_s, t_oil   %, Pa, degC; their mean over the step is used
     x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT saw it, so that
                       a small error of speed does not carry it away; without them it starts from ``s`` and runs free
+
+    The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where the share of a
+    constant input, 1 - exp(-h / tau), would be early by h / 2.
     """
     if window and x_lvdt is None:
         raise ValueError(f"window (={window}) needs x_lvdt")
     x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
     if window:
         _rest(p, s, i_cmd[0], n_r[0])
+    h = dt / substeps
+    for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
+        p[share] = h / (h + np.maximum(p[tau], 0.0))
     wide = _in_blocks(p.shape[1], W, FEW)
     if wide:
-        _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x, window, wide)
+        _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x, window, wide)
     if wide < p.shape[1]:
-        _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x, window, wide)
+        _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x, window, wide)
 
 
 def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
@@ -217,14 +225,23 @@ def _between(a, k):
     return 0.5 * (a[k - 1] + a[k])
 
 
+@inlined
+def _current(i_cmd, k, m, h, behind):
+    """Mean current in step m of length ``h`` after sample k - 1, where the logged means act ``behind`` later."""
+    old = min(max(behind / h - m, 0.0), 1.0)
+    return i_cmd[k] if old == 0.0 else old * i_cmd[k - 1] + (1.0 - old) * i_cmd[k]
+
+
 @_plain
-def _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt, window, first):
+def _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_lvdt, window, first):
     """The lanes from ``first`` on, one after the other."""
     for j in range(first, p.shape[1]):
-        effects = p[DRIVE_EFFECTS, j] != 0.0
+        effects, h = p[DRIVE_EFFECTS, j] != 0.0, dt / substeps
         for k in range(len(i_cmd)):
             if k > 0:
-                chain.drive_step(s, p, j, i_cmd[k], _between(n_r, k), _between(p_s, k), _between(t_oil, k), dt, substeps)
+                speed, supply, warm = _between(n_r, k), _between(p_s, k), _between(t_oil, k)
+                for m in range(substeps):
+                    chain.drive_step(s, p, j, _current(i_cmd, k, m, h, behind), speed, supply, warm, h, 1)
             if not effects:
                 s[READING, j] = s[X_LVDT, j]
             if window > 0 and k % window == 0:
@@ -247,7 +264,7 @@ def _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt, win
 
 
 @_plain
-def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt, window, lanes):
+def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_lvdt, window, lanes):
     """The first ``lanes`` lanes, eight at a time."""
     h = dt / substeps
     b = np.empty((_N_ROWS, W))
@@ -282,11 +299,11 @@ def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt, wi
                     b[_ROOT, j] = speed_factor(supply, 0.0, p[P_REF, q])
                     b[_LOAD, j] = aero_load.step(speed, p[AERO_LOAD, q])
                 if loaded:
-                    for _ in range(substeps):
-                        _block_substep(b, i_cmd[k], supply, h, True)
+                    for m in range(substeps):
+                        _block_substep(b, _current(i_cmd, k, m, h, behind), supply, h, True)
                 else:
-                    for _ in range(substeps):
-                        _block_substep(b, i_cmd[k], supply, h, False)
+                    for m in range(substeps):
+                        _block_substep(b, _current(i_cmd, k, m, h, behind), supply, h, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
                     x = true_stroke(x_lvdt[k], p, j0 + j, t_oil[k])
@@ -359,7 +376,7 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first):
 
 
 # rows of a block's scratch array: of the lane, then of each stage
-(_LX0, _X1, _Y1, _LE, _BEND, _PHASE, _DISTANCE, _LATE, _C, _D, _N_LANE) = range(11)
+(_LX0, _X1, _Y1, _LE, _BEND, _PHASE, _DISTANCE, _LATE, _STROKE, _C, _D, _N_LANE) = range(12)
 (_RING, _BRISTLE, _DRIVEN, _POT, _BEFORE, _THETA, _AX, _AY, _LB, _LC, _LD, _RATIO, _PLAY, _WEAR, _FRICTION, _AMPLITUDE, _WARM) = range(17)
 (_LEVER, _GAIN, _OFFSET, _E, _B, _N_STAGE) = range(17, 23)
 
@@ -397,9 +414,9 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
         for m in range(len(x_lvdt)):
             for j in range(WIDE):
                 q = j0 + min(j, last - 1)
-                b[_C, j] = true_stroke(x_lvdt[m] + b[_LATE, j] * speed[m], p, q, t_oil[m])
+                b[_STROKE, j] = true_stroke(x_lvdt[m] + b[_LATE, j] * speed[m], p, q, t_oil[m])
             for j in range(WIDE):
-                b[_C, j], b[_D, j] = _crank(b[_C, j], b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j])
+                b[_C, j], b[_D, j] = _crank(b[_STROKE, j], b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j])
             for k in range(3):
                 for j in range(WIDE):
                     w[k, _THETA, j] = _ring(b[_C, j], b[_D, j], w[k, _AX, j], w[k, _AY, j], w[k, _LB, j], w[k, _LC, j], w[k, _LD, j])
@@ -430,6 +447,7 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
                     out[m, k, j0 + j] = w[k, _POT, j]
         for j in range(last):
             q = j0 + j
+            s[X, q] = b[_STROKE, j]
             for k in range(3):
                 s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q] = w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j]
                 s[POT + k, q] = w[k, _POT, j]

@@ -130,7 +130,7 @@ def test_hysteresis_at_the_vane_is_the_published_width(machine, stage, width) ->
         ring = s[chain.RING + k, 0]
         from plant.linkage import vane_angle
 
-        angle[i] = np.rad2deg(vane_angle(ring, *machine._lever(k)))
+        angle[i] = np.rad2deg(vane_angle(ring, *machine.lever(k)))
     up, down = angle[:2000], angle[2000:][::-1]
     middle = slice(200, 1800)
     assert np.mean(down[middle] - up[middle]) == pytest.approx(width, rel=0.03)

@@ -5,7 +5,7 @@ Equation::
     level = force + excess S(v),   S(v) = (1 + (v/speed)^2 / 8)^-8
 
 Symbols: level greatest friction force (N), force Coulomb's (N), excess above it at rest (N), v speed of the oil
-(m/s), speed Stribeck speed (m/s). S is within 0.03 of the usual exp(-(v/speed)^2) and needs no transcendental
+(m/s), speed Stribeck speed (m/s). S is within 0.035 of the usual exp(-(v/speed)^2) and needs no transcendental
 function.
 Limits: the piston is massless and v is the oil's speed: no stick-slip oscillation comes out, only the lost motion and
 the force.

@@ -1,0 +1,66 @@
+"""The page on the library of effects, made from the effects' own docstrings and declarations.
+
+``python -m plant.effects_page > docs/effects.md`` writes it anew; a test says when that is due.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+
+from plant.effect import Effect, Parameter
+from plant.effects import EFFECTS
+
+__all__ = ["page"]
+
+HEAD = """# Effects
+
+Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral values the machine
+is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop diagnose` looks for them in a log.
+
+This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders (docs/architecture.md);
+inside the code everything is SI.
+
+| effect | site | shows in | what | parameters |
+|---|---|---|---|---|
+"""
+
+
+def page() -> str:
+    """Return the page, Markdown."""
+    sites = dict.fromkeys(("demand", "engine", "valve", "supply", "actuator", "lvdt", "linkage", "pot"))
+    effects = [e for site in sites for e in EFFECTS.values() if e.site == site]
+    rows = [
+        f"| [`{e.name}`](#{e.name}) | {e.site} | {', '.join(e.stages)} | {e.summary} | "
+        + ", ".join(f"`{p.name}` {p.unit}" for p in e.parameters)
+        + " |\n"
+        for e in effects
+    ]
+    return HEAD + "".join(rows) + "".join(_section(e) for e in effects)
+
+
+def _section(e: Effect) -> str:
+    doc = importlib.import_module(f"plant.effects.{e.name}").__doc__ or ""
+    what, rest = doc.strip().split("\n\n", 1)
+    parts = re.split(r"^(Symbols|Limits|In a log|Source): ", rest, flags=re.MULTILINE)
+    equation = re.sub(r"::\n\n", ":\n\n", parts[0]).strip()
+    words = {label: _sentence(text) for label, text in zip(parts[1::2], parts[2::2], strict=True)}
+    table = "| parameter | unit | neutral | from | to | meaning |\n|---|---|---|---|---|---|\n" + "".join(map(_row, e.parameters))
+    symbols = parts[parts.index("Symbols") + 1].strip()
+    return (
+        f"\n## {e.name}\n\n{what}\n\n{equation}\n\nSymbols: {symbols}\n\n{table}\n**In a log.** {words['In a log']}\n\n"
+        f"**What excites it.** {_sentence(e.excites)}.\n\n**Limits.** {words['Limits']}\n\n**Source.** {words['Source']}\n"
+    )
+
+
+def _sentence(text: str) -> str:
+    words = " ".join(text.split())
+    return words[0].upper() + words[1:]
+
+
+def _row(p: Parameter) -> str:
+    return f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} | {p.high:g} | {p.meaning} |\n"
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,144 @@
+"""A model file: the nominal machine with some parameters recalibrated and some effects added. TOML, taken by every command as ``--model``.
+
+::
+
+    [meta]                                  # free text; `extend` keeps its history here
+    history = ["extend run.csv --effect valve_dead_band"]
+
+    [parameters]                            # in the unit of plant.toml; widths of the play at the vane, as in geometry.toml
+    "actuator.flow_gain" = 0.147
+
+    [effects.valve_dead_band]               # in the units of docs/effects.md; what is not named stays neutral
+    half_width = 1.2
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from plant import chain
+from plant.effects import EFFECTS, ROW
+from plant.geometry import Stage
+from plant.layout import NAMES, PLAY
+from plant.linkage import STAGES
+from plant.machine import Plant, build_plant
+from plant.parameters import PlantTable, derive, nominal
+from tables import Bound, Finite, InputError, Table, read
+
+__all__ = ["Model", "load_model", "write_model"]
+
+FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
+
+
+class Model(Table):
+    """What a machine has beyond its tables.
+
+    parameters  name of a nominal parameter (`plant.layout.NAMES`) -> value in its table's unit
+    effects     name of an effect -> its parameters, in their declared units
+    meta        free text and lists of it
+    """
+
+    parameters: dict[str, Finite] = Field(default_factory=dict)
+    effects: dict[str, dict[str, Finite]] = Field(default_factory=dict)
+    meta: dict[str, str | bool | int | float | list[str]] = Field(default_factory=dict)
+
+    def check(self, plant: Plant, source: str | Path = "model") -> None:
+        """Refuse what is not in the library or out of bounds: InputError in one line, naming ``source``."""
+        known = {n.name: n for n in nominal(plant.table, plant.geometry)}
+        for name, value in self.parameters.items():
+            if name not in known:
+                raise InputError(f"{source}: parameters: {name!r} is unknown{_meant(name, known)}; allowed: {', '.join(known)}")
+            n, bound = known[name], _bound(name)
+            low, high = bound.low, bound.high
+            if n.tolerance > 0.0:
+                low, high = max(low, n.value - FAR * n.tolerance), min(high, n.value + FAR * n.tolerance)
+            _within(value, low, high, n.unit, f"{source}: parameters: {name}")
+        for effect, values in self.effects.items():
+            if effect not in EFFECTS:
+                raise InputError(f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them")
+            allowed = [p.name for p in EFFECTS[effect].parameters]
+            for key, value in values.items():
+                if key not in allowed:
+                    raise InputError(f"{source}: effects.{effect}: {key!r} is unknown{_meant(key, allowed)}; allowed: {', '.join(allowed)}")
+                p = EFFECTS[effect][key]
+                _within(value, p.low, p.high, p.unit, f"{source}: effects.{effect}.{key}")
+
+    def plant(self, base: Plant | None = None) -> Plant:
+        """Return the machine: ``base`` (default: the shipped tables) with this model's parameters and effects.
+
+        Raises InputError for what `check` refuses.
+        """
+        machine = base or build_plant()
+        self.check(machine)
+        p = machine.p.copy()
+        known = {n.name: n for n in nominal(machine.table, machine.geometry)}
+        for name, value in self.parameters.items():
+            row = NAMES.index(name)
+            p[row] = value * known[name].si
+            if PLAY <= row < PLAY + len(STAGES):  # declared at the vane, used at the ring
+                ldp, lever = machine.lever(row - PLAY)
+                p[row] *= lever / ldp
+        for effect, values in self.effects.items():
+            for i, parameter in enumerate(EFFECTS[effect].parameters):
+                p[ROW[effect] + i] = values.get(parameter.name, parameter.neutral) * parameter.si
+        derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+        return replace(machine, p=p)
+
+
+def load_model(path: str | Path, plant: Plant | None = None) -> Model:
+    """Read a model file; ``plant`` (default: the shipped tables) gives the nominal values that its parameters must be near to.
+
+    Raises InputError in one line: file, key, value, what is allowed.
+    """
+    model = read(path, Model)
+    model.check(plant or build_plant(), path)
+    return model
+
+
+def write_model(path: str | Path, model: Model) -> None:
+    """Write a model file that `load_model` reads as the same model. Raises InputError where it cannot be written."""
+    lines = []
+    if model.meta:
+        lines += ["[meta]", *(f"{_key(k)} = {json.dumps(v, ensure_ascii=False)}" for k, v in model.meta.items()), ""]
+    if model.parameters:
+        lines += ["[parameters]", *(f"{_key(k)} = {float(v)!r}" for k, v in model.parameters.items()), ""]
+    for effect, values in model.effects.items():
+        units = {p.name: p.unit for p in EFFECTS[effect].parameters} if effect in EFFECTS else {}
+        lines += [f"[effects.{_key(effect)}]", *(f"{_key(k)} = {float(v)!r}  # {units.get(k, '?')}" for k, v in values.items()), ""]
+    try:
+        Path(path).write_text("\n".join(lines), encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror})") from None
+
+
+def _key(name: str) -> str:
+    return name if name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name) else json.dumps(name, ensure_ascii=False)
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f", probably {close[0]!r} is meant" if close else ""
+
+
+def _within(value: float, low: float, high: float, unit: str, what: str) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise InputError(f"{what} (={value:g} {unit}) must be in [{low:g}, {high:g}]")
+
+
+def _bound(name: str) -> Bound:
+    """Physical bounds of a nominal parameter, in its table's unit."""
+    section, key = name.split(".")
+    if section == "linkage":
+        fields: Any = Stage.model_fields["hysteresis"]
+    else:
+        table: Any = PlantTable.model_fields[section].annotation
+        fields = table.model_fields["pot_bias" if key.endswith("_bias") else key]
+    return next(m for m in fields.metadata if isinstance(m, Bound))

@@ -1,0 +1,839 @@
+"""Every effect: neutral is an exact identity, it shows where it says and nowhere else, and its physics is right."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from controller import firmware as fw
+from controller import load_calibration, new_state
+from hil.lockstep import Stimulus, flashed, lockstep
+from plant import Model, build_plant, chain, load_model, write_model
+from plant import effects as library
+from plant.effect import DEG, STAGES
+from plant.effects import (
+    EFFECTS,
+    ROW,
+    can_delay,
+    controller_gain_error,
+    crank_length_error,
+    end_stop_shift,
+    frame_hold,
+    internal_leakage,
+    link_length_error,
+    linkage_backlash,
+    linkage_compliance,
+    linkage_friction,
+    linkage_wear,
+    lvdt_bias,
+    lvdt_gain,
+    lvdt_lag,
+    lvdt_nonlinearity,
+    lvdt_thermal_drift,
+    oil_compressibility,
+    oil_viscosity,
+    piston_friction,
+    piston_stiction,
+    pot_bias,
+    pot_gain,
+    pot_lag,
+    ring_eccentricity,
+    rotor_lag_error,
+    schedule_error,
+    supply_pressure_droop,
+    thermal_growth,
+    trend_threshold_error,
+    valve_dead_band,
+    valve_flow_saturation,
+    valve_gain_asymmetry,
+    valve_hysteresis,
+    valve_lag,
+    valve_null_bias,
+)
+from plant.effects import acceleration_limit_error as acceleration_error
+from plant.effects import aero_load as aero
+from plant.effects_page import page
+from plant.geometry import vane_angles
+from plant.layout import GEOMETRY, N_NOMINAL
+from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
+from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
+from plant.series import arctangent, tangent
+from plant.stages import SOME, W, actuator_run, engine_run, linkage_run
+from tables import InputError
+from tests.conftest import ROOT
+
+NAMES = tuple(EFFECTS)
+# the library that docs and other people's tools count on
+PROMISED = {
+    *("can_delay", "frame_hold", "schedule_error", "trend_threshold_error", "controller_gain_error"),
+    *("rotor_lag_error", "acceleration_limit_error"),
+    *("valve_null_bias", "valve_dead_band", "valve_hysteresis", "valve_flow_saturation", "valve_lag", "valve_gain_asymmetry"),
+    *("supply_pressure_droop", "oil_viscosity"),
+    *("piston_friction", "piston_stiction", "internal_leakage", "oil_compressibility", "aero_load", "end_stop_shift"),
+    *("lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag", "lvdt_thermal_drift"),
+    *("linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "thermal_growth"),
+    *("crank_length_error", "link_length_error", "ring_eccentricity"),
+    *("pot_bias", "pot_gain", "pot_lag"),
+}
+
+# a plain size of each effect, in declared units; per-stage ones on VGV1
+SIZES: dict[str, dict[str, float]] = {
+    "can_delay": {"delay": 0.1},
+    "frame_hold": {"period": 0.1},
+    "schedule_error": {"offset": 0.5},
+    "trend_threshold_error": {"factor": 4.0},
+    "controller_gain_error": {"factor": 1.3},
+    "rotor_lag_error": {"lag": 0.4},
+    "acceleration_limit_error": {"limit": -2.0},
+    "valve_null_bias": {"bias": 1.0},
+    "valve_dead_band": {"half_width": 1.2},
+    "valve_hysteresis": {"width": 1.5},
+    "valve_flow_saturation": {"limit": 40.0},
+    "valve_lag": {"time_constant": 0.01},
+    "valve_gain_asymmetry": {"ratio": 1.2},
+    "supply_pressure_droop": {"droop": 40.0},
+    "oil_viscosity": {"coefficient": -0.004},
+    "piston_friction": {"force": 2000.0},
+    "piston_stiction": {"excess": 2000.0, "speed": 4.0},
+    "internal_leakage": {"coefficient": 1.0},
+    "oil_compressibility": {"compliance": 0.1},
+    "aero_load": {"force": 4000.0},
+    "end_stop_shift": {"shift": 4.0},
+    "lvdt_bias": {"bias": 0.4},
+    "lvdt_gain": {"factor": 1.03},
+    "lvdt_nonlinearity": {"amplitude": 0.3},
+    "lvdt_lag": {"time_constant": 0.01},
+    "lvdt_thermal_drift": {"coefficient": 0.01},
+    "linkage_backlash": {"vgv1": 0.5},
+    "linkage_compliance": {"compliance": 0.1},
+    "linkage_friction": {"vgv1": 0.5},
+    "linkage_wear": {"vgv1": 50.0},
+    "thermal_growth": {"vgv1": 0.02},
+    "crank_length_error": {"vgv1": 1.0},
+    "link_length_error": {"vgv1": 0.5},
+    "ring_eccentricity": {"vgv1": 0.2, "phase": 60.0},
+    "pot_bias": {"vgv1": 0.5},
+    "pot_gain": {"vgv1": 1.03},
+    "pot_lag": {"vgv1": 0.05},
+}
+
+number = st.floats(-50.0, 50.0, allow_subnormal=False)
+positive = st.floats(1e-3, 50.0)
+
+
+def si(name: str, key: str, value: float) -> float:
+    return value * EFFECTS[name][key].si
+
+
+def machine_with(base=None, **sizes):
+    """The nominal machine (or ``base``) with effects, {name: {parameter: value in its unit}}."""
+    return Model(effects=sizes).plant(base)
+
+
+def drive(machine, current, ticks, *, n_r=100.0, p_s=21e6, t_oil=40.0, stroke=0.024):
+    s = machine.start(stroke=stroke, n_r=n_r, t_oil=t_oil)
+    out = np.empty((ticks, chain.N_STATE))
+    for k in range(ticks):
+        chain.drive_step(s, machine.p, 0, current if np.isscalar(current) else current[k], n_r, p_s, t_oil)
+        out[k] = s[:, 0]
+    return out
+
+
+def speed(machine, current, **conditions):
+    """Steady speed (m/s) of the piston under a constant current (A)."""
+    out = drive(machine, current, 200, **conditions)[:, chain.X]
+    return (out[-1] - out[-101]) / 0.1
+
+
+# ---- the registry -------------------------------------------------------------------------------------------------------------------
+
+
+def test_library_holds_the_promised_names() -> None:
+    assert set(NAMES) == PROMISED == set(SIZES)
+
+
+def test_rows_follow_the_nominal_ones_without_gaps() -> None:
+    rows = [ROW[e.name] + i for e in EFFECTS.values() for i in range(len(e.parameters))]
+    assert rows == list(range(N_NOMINAL, library.DERIVED))
+    assert len(library.STATE) == library.N_STATE == len(set(library.STATE))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_docstring_has_its_sections(name: str) -> None:
+    doc = sys.modules[f"plant.effects.{name}"].__doc__
+    for section in ("Equation", "Symbols:", "Limits:", "In a log:", "Source:"):
+        assert section in doc, f"plant/effects/{name}.py: the docstring lacks {section!r}"
+
+
+def test_page_on_effects_is_current() -> None:
+    assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page(), "run: python -m plant.effects_page > docs/effects.md"
+
+
+# ---- neutral is an identity ---------------------------------------------------------------------------------------------------------
+
+# effect -> (result of its step at neutral, what it must be), for any numbers a, b and any positive c
+IDENTITIES = {
+    "can_delay": lambda n, a, b, c: (can_delay.step(a, *n), a),
+    "frame_hold": lambda n, a, b, c: (frame_hold.step(a, *n), a),
+    "schedule_error": lambda n, a, b, c: (schedule_error.step(a, *n), a),
+    "trend_threshold_error": lambda n, a, b, c: (trend_threshold_error.step(a, *n), a),
+    "controller_gain_error": lambda n, a, b, c: (controller_gain_error.step(a, *n), a),
+    "rotor_lag_error": lambda n, a, b, c: (rotor_lag_error.step(c + 0.01, *n), c + 0.01),
+    "acceleration_limit_error": lambda n, a, b, c: (acceleration_error.step(c + 0.01, *n), c + 0.01),
+    "valve_null_bias": lambda n, a, b, c: (valve_null_bias.step(a, *n), a),
+    "valve_dead_band": lambda n, a, b, c: (valve_dead_band.step(a, *n), a),
+    "valve_hysteresis": lambda n, a, b, c: (valve_hysteresis.step(b, a, *n), a),
+    "valve_flow_saturation": lambda n, a, b, c: (valve_flow_saturation.step(a, *n), a),
+    "valve_lag": lambda n, a, b, c: (valve_lag.step(b, a, 1.0), a),
+    "valve_gain_asymmetry": lambda n, a, b, c: (valve_gain_asymmetry.step(a, *n), (a, a)),
+    "supply_pressure_droop": lambda n, a, b, c: (supply_pressure_droop.step(a, b, *n), a),
+    "oil_viscosity": lambda n, a, b, c: (oil_viscosity.step(a, b, *n), a),
+    "piston_friction": lambda n, a, b, c: (piston_friction.step(0.0, a, *n, c), 0.0),
+    "piston_stiction": lambda n, a, b, c: (piston_stiction.step(a, b, *n), a),
+    "internal_leakage": lambda n, a, b, c: (internal_leakage.step(a, b, *n), a),
+    "oil_compressibility": lambda n, a, b, c: (oil_compressibility.step(0.0, a, *n), 0.0),
+    "aero_load": lambda n, a, b, c: (aero.step(a, *n), 0.0),
+    "end_stop_shift": lambda n, a, b, c: (end_stop_shift.step(c, *n), (0.0, c)),
+    "lvdt_bias": lambda n, a, b, c: (lvdt_bias.step(a, *n), a),
+    "lvdt_gain": lambda n, a, b, c: (lvdt_gain.step(a, *n), a),
+    "lvdt_nonlinearity": lambda n, a, b, c: (lvdt_nonlinearity.step(a, c, *n), a),
+    "lvdt_lag": lambda n, a, b, c: (lvdt_lag.step(b, a, 1.0), a),
+    "lvdt_thermal_drift": lambda n, a, b, c: (lvdt_thermal_drift.step(a, b, *n), a),
+    "linkage_backlash": lambda n, a, b, c: (linkage_backlash.step(c, n[0], abs(a)), c),
+    "linkage_compliance": lambda n, a, b, c: (linkage_compliance.step(a, b, *n), a),
+    "linkage_friction": lambda n, a, b, c: (linkage_friction.loop(a, b, n[0], c), a),
+    "linkage_wear": lambda n, a, b, c: (linkage_wear.step(c, n[0], abs(a), b), c),
+    "thermal_growth": lambda n, a, b, c: (thermal_growth.step(a, b, n[0], c), a),
+    "crank_length_error": lambda n, a, b, c: (crank_length_error.step(c, n[0]), c),
+    "link_length_error": lambda n, a, b, c: (link_length_error.step(c, n[0]), c),
+    "ring_eccentricity": lambda n, a, b, c: (ring_eccentricity.step(a, n[0], n[3]), a),
+    "pot_bias": lambda n, a, b, c: (pot_bias.step(a, n[0]), a),
+    "pot_gain": lambda n, a, b, c: (pot_gain.step(a, n[0]), a),
+    "pot_lag": lambda n, a, b, c: (pot_lag.step(c, n[0]), c),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=40)
+@given(a=number, b=number, c=positive)
+def test_neutral_effect_is_an_exact_identity(name: str, a: float, b: float, c: float) -> None:
+    neutral = [p.neutral * p.si for p in EFFECTS[name].parameters]
+    if name == "valve_flow_saturation":
+        a *= 1e3  # any speed at all
+    result, expected = IDENTITIES[name](neutral, a, b, c)
+    assert result == expected
+
+
+@settings(max_examples=30)
+@given(st.lists(st.floats(-0.045, 0.045), min_size=5, max_size=40), st.floats(0.0, 0.048), st.floats(5e6, 25e6), st.floats(-40.0, 120.0))
+def test_neutral_chain_with_every_effect_in_it_is_the_nominal_chain_bit_by_bit(currents, stroke, p_s, t_oil) -> None:
+    machine = build_plant()
+    assert not machine.p[[DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS], 0].any()
+    long_way = machine.p.copy()
+    long_way[[DRIVE_EFFECTS, VANE_EFFECTS]] = 1.0
+    loaded = long_way.copy()
+    loaded[DRIVE_LOADED] = 1.0
+    runs = []
+    for p in (machine.p, long_way, loaded):
+        s, samples = machine.start(stroke, 60.0), []
+        for k, i in enumerate(currents):
+            chain.rotor_step(s, p, 0, 80.0)
+            chain.drive_step(s, p, 0, i, 70.0, p_s, t_oil)
+            chain.vane_step(s, p, 0, 70.0, t_oil, k * 1e-3)
+            samples.append(chain.sample_lvdt(s, p, 0, 0.0, t_oil))
+        runs.append(np.concatenate([s[: chain.RING + 6, 0], samples]))
+    assert np.array_equal(runs[0], runs[1])
+    # with the load's equations in it, one product is rounded differently
+    assert np.allclose(runs[0], runs[2], rtol=1e-12, atol=1e-15)
+
+
+# ---- where an effect shows: stages driven by the same log ---------------------------------------------------------------------------
+
+T = np.arange(0.0, 40.0, 0.01)
+SAMPLES = len(T)
+
+
+@lru_cache(maxsize=1)
+def log() -> dict[str, np.ndarray]:
+    """Inputs that excite every effect: both stops, slams, slow motion, reversals, dwells, warming oil."""
+    n_dem = np.interp(T, [0, 3, 10, 12, 18, 20, 22, 22.6, 25, 32, 36, 40], [60, 60, 95, 95, 70, 70, 74, 73.4, 98, 98, 62, 62])
+    n_r = lockstep(Stimulus.of(n_dem)).columns["n_engine"]
+    x = 24.0 + 20.0 * np.sin(0.5 * T) + 4.5 * np.sin(2.3 * T)
+    i = 4.0 * np.sin(2.0 * np.pi * T / 7.0) + 2.0 * np.sin(9.0 * T) + np.where((T > 20) & (T < 20.6), 40.0, 0.0)
+    i += np.where((T > 30) & (T < 30.6), -40.0, 0.0)
+    return {
+        "n_dem": n_dem,
+        "n_r": n_r,
+        "x_lvdt": 1e-3 * np.clip(x, 0.5, 47.5),
+        "i_cmd": 1e-3 * i,
+        "p_s": np.full(len(T), 21e6),
+        "t_oil": 30.0 + T,
+        "x_dem": 1e-3 * np.interp(T, [0, 5, 20, 40], [10, 10, 40, 15]),
+    }
+
+
+def lanes_of(sets, base):
+    """Parameters with one lane per set of effects, on top of ``base``."""
+    p = np.concatenate([machine_with(base, **effects).p for effects in sets], axis=1)
+    return p, np.repeat(base.start(0.024, 60.0), len(sets), axis=1)
+
+
+def actuator_lanes(sets, base, n=SAMPLES):
+    p, s = lanes_of(sets, base)
+    derive(p, 2e-3, 1e-2)
+    out, c = np.empty((n, len(sets))), {k: v[:n] for k, v in log().items()}
+    actuator_run(c["i_cmd"], c["n_r"], c["p_s"], c["t_oil"], 1e-2, 5, p, s, out, c["x_lvdt"], 500)
+    return out, s
+
+
+def linkage_lanes(sets, base, n=SAMPLES):
+    p, s = lanes_of(sets, base)
+    out, c = np.empty((n, 3, len(sets))), {k: v[:n] for k, v in log().items()}
+    linkage_run(c["x_lvdt"], c["n_r"], c["t_oil"], T[:n], 1e-2, p, s, out)
+    return out, s
+
+
+def engine_lanes(sets, base):
+    p, s = lanes_of(sets, base)
+    out = np.empty((len(T), len(sets)))
+    engine_run(log()["n_dem"], 1e-2, p, s, out)
+    return out
+
+
+def demand_of(machine):
+    """x_dem (m) of the firmware's 10 ms part with the logged frames, as the bus brings them."""
+    cal, z, c = flashed(load_calibration(), machine), new_state(), log()
+    z[fw.TREND_N] = z[fw.TREND_TURN] = c["n_dem"][0]
+    out = np.empty(len(T))
+    for k, t in enumerate(T):
+        content = frame_hold.step(can_delay.step(t, machine.p[ROW["can_delay"], 0]), machine.p[ROW["frame_hold"], 0])
+        j = max(int(np.floor(content / 0.01 + 1e-6)), 0)
+        z[fw.N_DEM], z[fw.N_R] = c["n_dem"][j], c["n_r"][j]
+        fw.trend_step(z, cal.k, z[fw.N_DEM])
+        fw.schedule_step(z, cal.k, cal.table)
+        if k == 0:
+            z[fw.X_DEM] = z[fw.X_TARGET]
+        fw.move_demand(z, cal.k, z[fw.X_TARGET], cal.k[fw.STROKE_RATE])
+        out[k] = z[fw.X_DEM]
+    return out
+
+
+def servo_of(machine):
+    """i_cmd (A) of the firmware's servo on a logged demand and a stroke 0.1 mm behind it."""
+    cal, z, c = flashed(load_calibration(), machine), new_state(), log()
+    out = np.empty(len(T))
+    for k, x in enumerate(c["x_dem"]):
+        z[fw.X_MEAS] = x - 1e-4
+        fw.servo_step(z, cal.k, x, 0.001)
+        out[k] = z[fw.I_CMD]
+    return out
+
+
+@pytest.fixture(scope="module")
+def stage_outputs():
+    """{effect: {stage: output}} of every effect alone, None for the machine without it. A load is on the piston in all of them."""
+    base = machine_with(aero_load={"force": 2000.0})
+    sets = [{}, *({name: SIZES[name]} for name in NAMES)]
+    wide = {"actuator": actuator_lanes(sets, base)[0], "linkage": linkage_lanes(sets, base)[0], "engine": engine_lanes(sets, base)}
+    out = {}
+    for j, effects in enumerate(sets):
+        machine = machine_with(base, **effects)
+        alone = {"demand": demand_of(machine), "servo": servo_of(machine)}
+        out[next(iter(effects), None)] = alone | {k: v[..., j] for k, v in wide.items()}
+    return out
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_effect_shows_in_every_stage_it_declares_and_in_no_other(name: str, stage_outputs) -> None:
+    with_it, without = stage_outputs[name], stage_outputs[None]
+    # blocks of lanes and single ones differ by rounding
+    changed = {stage for stage in STAGES if np.max(np.abs(with_it[stage] - without[stage])) > 1e-12}
+    assert changed == set(EFFECTS[name].stages)
+    assert all(np.isfinite(v).all() for v in with_it.values())
+
+
+def test_any_parameters_within_their_bounds_keep_every_stage_finite() -> None:
+    base = machine_with(aero_load={"force": 2000.0})
+    sets = [{e.name: {p.name: v}} for e in EFFECTS.values() for p in e.parameters for v in (p.low, p.high)]
+    everything_low = {e.name: {p.name: p.low for p in e.parameters} for e in EFFECTS.values()}
+    everything_high = {e.name: {p.name: p.high for p in e.parameters} for e in EFFECTS.values()}
+    sets += [everything_low, everything_high]
+    x, s = actuator_lanes(sets, base)
+    vanes, _ = linkage_lanes(sets, base)
+    assert np.isfinite(x).all() and np.isfinite(s).all() and np.isfinite(vanes).all() and np.isfinite(engine_lanes(sets, base)).all()
+    assert np.all((s[chain.X] >= 0.0) & (s[chain.X] <= 0.048))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_effect_changes_the_closed_loop_and_keeps_it_finite(name: str) -> None:
+    load = {} if name == "aero_load" else {"aero_load": {"force": 2000.0}}
+    stimulus = Stimulus.of(log()["n_dem"], t_oil=log()["t_oil"])
+    machines = (machine_with(**load, **effects) for effects in ({name: SIZES[name]}, {}))
+    run, without = (lockstep(stimulus, plant=machine, hashed=False).columns for machine in machines)
+    assert all(np.isfinite(v).all() for v in run.values())
+    if name == "end_stop_shift":  # this run stays 4 mm off the stops
+        return
+    assert any(not np.array_equal(run[c], without[c]) for c in run)
+
+
+def everything_on():
+    """The machine with every effect at a fiftieth of its range."""
+
+    def small(p):
+        return p.neutral + 0.02 * ((p.high - p.neutral) or (p.low - p.neutral))
+
+    return machine_with(**{e.name: {p.name: small(p) for p in e.parameters} for e in EFFECTS.values()})
+
+
+@pytest.mark.parametrize("lanes", [2, W, W + 2, SOME + 3, 40])
+def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
+    base = everything_on()
+    singles = [{}, {"valve_null_bias": {"bias": -0.5}}, {"piston_friction": {"force": 900.0}}, {"linkage_backlash": {"vigv": 0.4}}]
+    sets = [singles[j % 4] for j in range(lanes)]
+    x, s = actuator_lanes(sets, base, 600)
+    vanes, _ = linkage_lanes(sets, base, 600)
+    for j in range(min(lanes, 4)):
+        alone, state = actuator_lanes([sets[j]], base, 600)
+        assert np.array_equal(alone[:, 0], x[:, j]) and np.array_equal(state[:, 0], s[:, j])
+        assert np.allclose(linkage_lanes([sets[j]], base, 600)[0][:, :, 0], vanes[:, :, j], rtol=0.0, atol=1e-14)
+
+
+def test_series_are_the_c_librarys_to_the_last_places() -> None:
+    t = np.concatenate([np.linspace(-3.0, 3.0, 2001), np.geomspace(1e-9, 1e9, 500)])
+    assert np.allclose([arctangent(v, 1.0) for v in t], np.arctan(t), rtol=5e-16, atol=0.0)
+    assert arctangent(1.0, 0.0) == pytest.approx(np.pi / 2) and arctangent(-2.0, 0.0) == pytest.approx(-np.pi / 2)
+    a = np.linspace(-0.785, 0.785, 2001)
+    assert np.allclose([tangent(v) for v in a], np.tan(a), rtol=5e-16, atol=1e-300)
+
+
+def test_stages_alone_reproduce_the_closed_loop_that_made_the_log() -> None:
+    c = lockstep(Stimulus.of(log()["n_dem"])).columns
+    machine, n = build_plant(), len(T)
+    x, n_r, t_oil = c["x_lvdt"] * 1e-3, c["n_r"], c["t_oil"]
+    p, s, out = machine.p.copy(), machine.start(x[0], n_r[0]), np.empty((n, 1))
+    derive(p, 2e-3, 1e-2)
+    actuator_run(c["i_cmd"] * 1e-3, n_r, c["p_s"] * 1e6, t_oil, 1e-2, 5, p, s, out, x, 100)
+    error = (out[:, 0] - x).reshape(-1, 100)
+    error -= error.mean(axis=1, keepdims=True)
+    assert np.sqrt(np.mean(error**2)) < 0.7e-6  # one count of the LVDT is 0.76 um
+    s, vanes = machine.start(x[0], n_r[0]), np.empty((n, 3, 1))
+    machine.place_rings(s, tuple(np.deg2rad(c[k][0]) for k in ("vigv", "vgv1", "vgv2")))
+    linkage_run(x, n_r, t_oil, T, 1e-2, machine.p, s, vanes)
+    for k, stage in enumerate(("vigv", "vgv1", "vgv2")):
+        assert np.sqrt(np.mean((np.rad2deg(vanes[300:, k, 0]) - c[stage][300:]) ** 2)) < 0.006  # a fifth of the potentiometer's noise
+    s, speeds = machine.start(x[0], c["n_engine"][0]), np.empty((n, 1))
+    engine_run(c["n_dem"], 1e-2, machine.p, s, speeds)
+    assert np.max(np.abs(speeds[:, 0] - c["n_engine"])) < 0.01
+
+
+SHORT = """
+import numpy as np
+from hil.lockstep import Stimulus, lockstep
+from tests.test_effects import everything_on
+print(lockstep(Stimulus.of(np.linspace(60.0, 63.0, 30)), seed=5, plant=everything_on()).state_hash)
+"""
+
+
+def test_every_effect_on_gives_the_same_bits_without_compiling() -> None:
+    run = partial(subprocess.run, [sys.executable, "-c", SHORT], cwd=ROOT, capture_output=True, text=True, check=True)
+    found = [run(env={**os.environ, **env}).stdout for env in ({"NUMBA_DISABLE_JIT": "1"}, {})]
+    assert found[0] == found[1] and len(found[0].strip()) == 64
+
+
+# ---- physics: demand and engine -----------------------------------------------------------------------------------------------------
+
+
+def test_can_delay_shifts_the_demand_by_itself() -> None:
+    n = np.interp(T, [0, 3, 10, 12, 18, 40], [60, 60, 95, 95, 70, 70])
+    late, prompt = (lockstep(Stimulus.of(n, n), plant=machine_with(**e)).columns for e in ({"can_delay": {"delay": 0.15}}, {}))
+    assert np.allclose(late["x_dem"][15:], prompt["x_dem"][:-15], atol=1e-9)
+    assert np.array_equal(late["n_dem"], prompt["n_dem"])  # the log holds what the ECU sent
+    assert np.array_equal(late["n_engine"], prompt["n_engine"])
+
+
+@given(st.floats(0.0, 100.0), st.floats(0.011, 1.0))
+def test_held_frame_is_never_older_than_its_period(t, period) -> None:
+    content = frame_hold.step(t, period)
+    assert -2e-6 <= t - content < period
+    assert content / period == pytest.approx(round(content / period), abs=1e-6)
+
+
+def test_schedule_error_moves_the_demand_by_its_offset_at_any_speed() -> None:
+    n = np.interp(T, [0, 40], [60, 95])
+    shifted, plain = machine_with(schedule_error={"offset": -0.7}), build_plant()
+    run, without = (lockstep(Stimulus.of(n), plant=machine).columns["x_dem"] for machine in (shifted, plain))
+    assert np.allclose(run - without, -0.7, atol=1e-9)
+
+
+def test_twice_the_trend_threshold_needs_twice_the_way_back() -> None:
+    n = np.concatenate([np.linspace(60, 70, 500), 70 - 0.02 * np.arange(20), np.full(100, 69.6)])
+    for factor, direction in ((1.0, -1.0), (2.0, 1.0)):
+        cal = flashed(load_calibration(), machine_with(trend_threshold_error={"factor": factor}))
+        z = new_state()
+        z[fw.TREND_N] = z[fw.TREND_TURN] = n[0]
+        for v in n:
+            fw.trend_step(z, cal.k, v)
+        assert z[fw.DIRECTION] == direction
+
+
+def test_controller_gain_error_scales_the_current() -> None:
+    weak, plain = servo_of(machine_with(controller_gain_error={"factor": 0.8})), servo_of(build_plant())
+    linear = plain < 0.039  # the integral winds up to the limit later
+    assert linear.sum() > 1000 and np.allclose(weak[linear], 0.8 * plain[linear], rtol=1e-12)
+
+
+def test_rotor_trails_a_ramp_by_the_rate_times_the_lag() -> None:
+    p, s = lanes_of([{"rotor_lag_error": {"lag": 0.5}}], build_plant())
+    out = np.empty((4000, 1))
+    ramp = 50.0 + 1.0 * T
+    s[chain.N_R] = 50.0
+    engine_run(ramp, 1e-2, p, s, out)
+    # the demand of a sample holds until the next: half a sample later on average
+    assert ramp[-1] - out[-1, 0] == pytest.approx(1.7 * 1.0, abs=0.011)
+
+
+def test_acceleration_limit_error_moves_the_slope_of_a_slam_up_only() -> None:
+    machine = machine_with(acceleration_limit_error={"limit": -3.0})
+    for target, slope in ((100.0, 5.0), (40.0, -10.0)):
+        s = machine.start(0.02, 70.0)
+        for _ in range(1000):
+            chain.rotor_step(s, machine.p, 0, target)
+        assert s[chain.N_R, 0] - 70.0 == pytest.approx(slope, rel=1e-9)
+
+
+# ---- physics: valve and supply ------------------------------------------------------------------------------------------------------
+
+
+def test_one_milliampere_of_null_bias_creeps_by_a_fortieth_of_rated_speed() -> None:
+    assert speed(machine_with(valve_null_bias={"bias": 1.0}), 0.0) == pytest.approx(0.150 / 40.0, rel=1e-9)
+
+
+def test_dead_band_lets_its_own_current_pass_nothing() -> None:
+    machine = machine_with(valve_dead_band={"half_width": 1.2})
+    for i in (-1.2e-3, 0.5e-3, 1.2e-3):
+        assert speed(machine, i) == pytest.approx(0.0, abs=1e-12)
+    assert speed(machine, 3.2e-3) == pytest.approx(speed(build_plant(), 2e-3), rel=1e-9)
+    assert speed(machine, -3.2e-3) == pytest.approx(-speed(build_plant(), 2e-3), rel=1e-9)
+
+
+def test_valve_hysteresis_loses_its_width_at_a_reversal() -> None:
+    y, width = 0.0, 2e-3
+    for i in np.linspace(0.0, 10e-3, 50):
+        y = valve_hysteresis.step(y, i, width)
+    assert y == pytest.approx(9e-3)
+    assert valve_hysteresis.step(y, 8.1e-3, width) == y
+    assert valve_hysteresis.step(y, 7e-3, width) == pytest.approx(8e-3)
+
+
+def test_flow_saturation_limits_the_speed_and_leaves_slower_motion_alone() -> None:
+    machine = machine_with(valve_flow_saturation={"limit": 100.0})
+    assert speed(machine, 0.040, stroke=0.002) == pytest.approx(0.100, rel=1e-9)
+    assert np.array_equal(drive(machine, 0.020, 50)[:, chain.X], drive(build_plant(), 0.020, 50)[:, chain.X])
+
+
+def test_valve_lag_reaches_63_per_cent_after_its_time_constant() -> None:
+    machine = machine_with(valve_lag={"time_constant": 20.0e-3})
+    out = drive(machine, 0.010, 20)
+    assert out[-1, chain.LAGGED] == pytest.approx(0.010 * (1.0 - np.exp(-1.0)), rel=1e-9)
+
+
+def test_gain_asymmetry_keeps_the_geometric_mean() -> None:
+    machine = machine_with(valve_gain_asymmetry={"ratio": 1.21})
+    up, down = speed(machine, 0.004), -speed(machine, -0.004)
+    assert up / down == pytest.approx(1.21, rel=1e-9)
+    assert np.sqrt(up * down) == pytest.approx(0.015, rel=1e-9)
+
+
+def test_droop_at_full_spool_solves_the_orifice_with_a_resistance_in_series() -> None:
+    machine = machine_with(supply_pressure_droop={"droop": 60.0})
+    v = brentq(lambda v: v - 0.150 * np.sqrt((21e6 - 60e6 * v) / 21e6), 0.0, 0.15)
+    assert speed(machine, 0.040, stroke=0.002) == pytest.approx(v, rel=1e-9)
+    assert supply_pressure_droop.step(0.0, -1e6, 6e7) == 0.0
+
+
+def test_oil_viscosity_changes_the_speed_in_proportion_to_the_temperature() -> None:
+    machine = machine_with(oil_viscosity={"coefficient": -0.003})
+    assert speed(machine, 0.004, t_oil=70.0) / speed(machine, 0.004, t_oil=40.0) == pytest.approx(1.0 - 0.09, rel=1e-9)
+
+
+# ---- physics: actuator --------------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(-1e-4, 1e-4), min_size=1, max_size=60), st.floats(10.0, 1e4), st.floats(1e7, 1e9))
+def test_piston_friction_never_adds_energy(travels, level, stiffness) -> None:
+    z = taken = 0.0
+    for travel in travels:
+        after = piston_friction.step(z, travel, level, stiffness)
+        moved = travel - (after - z) / stiffness
+        # friction on the moving piston; the spring of the oil in series stores z^2 / 2k and gives it back
+        taken += after * moved
+        z = after
+        assert abs(z) <= level
+        assert taken >= -1e-9 * level
+
+
+def test_friction_costs_speed_both_ways_and_motion_at_reversals() -> None:
+    force = 2000.0
+    machine = machine_with(piston_friction={"force": force})
+    slower = 0.015 * np.sqrt(1.0 - force / 1.2e-3 / 21e6)
+    assert speed(machine, 0.004) == pytest.approx(slower, rel=1e-9)
+    assert speed(machine, -0.004) == pytest.approx(-slower, rel=1e-9)
+    pushed = 0.0
+    z = force
+    stiffness = 1.0 / oil_compressibility.NOMINAL
+    while z > -force:  # the piston stands while the oil turns the force round
+        z, pushed = piston_friction.step(z, -1e-7, force, stiffness), pushed + 1e-7
+    assert pushed == pytest.approx(2.0 * force / stiffness, abs=2e-7)
+
+
+def test_stiction_is_a_stribeck_curve() -> None:
+    v = np.linspace(0.0, 0.05, 500)
+    level = np.array([piston_stiction.step(500.0, x, 300.0, 0.005) for x in v])
+    assert level[0] == 800.0 and np.all(np.diff(level) < 0.0) and level[-1] < 500.01
+    assert np.max(np.abs((level - 500.0) / 300.0 - np.exp(-((v / 0.005) ** 2)))) < 0.035
+    assert piston_stiction.step(500.0, -0.003, 300.0, 0.005) == piston_stiction.step(500.0, 0.003, 300.0, 0.005)
+
+
+def test_leakage_lets_a_loaded_piston_creep() -> None:
+    machine = machine_with(internal_leakage={"coefficient": 1.5}, aero_load={"force": 3000.0})
+    assert speed(machine, 0.0) == pytest.approx(-1.5e-9 * 3000.0 / 1.2e-3, rel=1e-9)
+
+
+def test_nominal_oil_is_as_stiff_as_the_textbook_says() -> None:
+    bulk, area, stroke = 1.6e9, 1.2e-3, 0.048  # Merritt: least stiffness 4 B A^2 / V, V both chambers
+    assert pytest.approx(4.0 * bulk * area**2 / (area * stroke), rel=1e-12) == 1.0 / oil_compressibility.NOMINAL
+
+
+def test_compressible_oil_gives_way_to_a_growing_load() -> None:
+    machine = machine_with(oil_compressibility={"compliance": 0.05}, aero_load={"force": 4000.0})
+    s = machine.start(0.024, 50.0)
+    for n in np.linspace(50.0, 100.0, 200):
+        chain.drive_step(s, machine.p, 0, 0.0, n, 21e6, 40.0)
+    grown = 4000.0 * (1.0 - 0.25)
+    assert s[chain.X, 0] - 0.024 == pytest.approx(-(0.05e-6 + oil_compressibility.NOMINAL) * grown, rel=1e-9)
+
+
+def test_air_load_slows_extension_and_helps_retraction() -> None:
+    machine = machine_with(aero_load={"force": 6000.0})
+    for n_r in (50.0, 100.0):
+        share = 6000.0 * (n_r / 100.0) ** 2 / 1.2e-3 / 21e6
+        assert speed(machine, 0.004, n_r=n_r) == pytest.approx(0.015 * np.sqrt(1.0 - share), rel=1e-9)
+        assert speed(machine, -0.004, n_r=n_r) == pytest.approx(-0.015 * np.sqrt(1.0 + share), rel=1e-9)
+
+
+def test_shifted_stops_hold_the_piston() -> None:
+    for shift, ends in ((3.0, (0.003, 0.048)), (-5.0, (0.0, 0.043))):
+        machine = machine_with(end_stop_shift={"shift": shift})
+        assert drive(machine, -0.020, 500)[-1, chain.X] == ends[0]
+        assert drive(machine, 0.020, 500)[-1, chain.X] == pytest.approx(ends[1], abs=1e-15)
+
+
+# ---- physics: LVDT ------------------------------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.0, 0.048), st.floats(-5, 5), st.floats(0.8, 1.25), st.floats(-3, 3), st.floats(-0.2, 0.2), st.floats(0.0, 100.0))
+def test_true_stroke_undoes_every_effect_of_the_lvdt(x, bias, factor, amplitude, drift, t_oil) -> None:
+    p = np.zeros((library.N_PARAMETERS, 1))
+    p[chain.STROKE] = 0.048
+    p[ROW["lvdt_bias"]], p[ROW["lvdt_gain"]] = bias * 1e-3, factor
+    p[ROW["lvdt_nonlinearity"]], p[ROW["lvdt_thermal_drift"]] = amplitude * 1e-3, drift * 1e-3
+    assert chain.true_stroke(chain.measured_stroke(x, p, 0, t_oil), p, 0, t_oil) == pytest.approx(x, abs=2e-10)
+
+
+def test_lvdt_effects_add_up_as_on_a_data_sheet() -> None:
+    machine = machine_with(lvdt_bias={"bias": 0.2}, lvdt_gain={"factor": 1.01}, lvdt_thermal_drift={"coefficient": 0.002})
+    assert chain.measured_stroke(0.020, machine.p, 0, 60.0) == pytest.approx(0.0202 + 0.0002 + 0.00004, abs=1e-15)
+
+
+def test_lvdt_nonlinearity_is_nil_at_the_ends_and_in_the_middle() -> None:
+    wave = [lvdt_nonlinearity.step(q * 0.048, 0.048, 1e-4) - q * 0.048 for q in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    assert wave == pytest.approx([0.0, -1e-4, 0.0, 1e-4, 0.0], abs=1e-15)
+
+
+def test_lvdt_lag_trails_a_moving_piston_by_its_time_constant() -> None:
+    machine = machine_with(lvdt_lag={"time_constant": 0.02})
+    out = drive(machine, 0.004, 300, stroke=0.002)
+    behind_first, behind_both = out[-1, chain.X_LVDT] - out[-1, chain.READING], out[-1, chain.X] - out[-1, chain.READING]
+    assert behind_first == pytest.approx(0.015 * 0.02, rel=5e-3)
+    assert behind_both == pytest.approx(0.015 * 0.021, rel=5e-3)
+
+
+def test_slow_raster_keeps_the_delay_of_the_lvdt() -> None:
+    n, i = 200, np.full(200, 0.004)
+    same = np.full(n, 40.0)
+    for lag, delay in ((0.0, 1e-3), (0.03, 31e-3)):
+        p, s = lanes_of([{"lvdt_lag": {"time_constant": lag}}], build_plant())
+        derive(p, 2e-3, 1e-2)
+        out = np.empty((n, 1))
+        s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 0.002
+        actuator_run(i, same, np.full(n, 21e6), same, 1e-2, 5, p, s, out)
+        assert s[chain.X, 0] - out[-1, 0] == pytest.approx(0.015 * delay, rel=1e-3)
+
+
+# ---- physics: linkage ---------------------------------------------------------------------------------------------------------------
+
+
+def loop_of(machine, k, *, t=0.0, turns=(1e-3, 47e-3)):
+    """Angles (deg) behind the play of stage ``k`` while the stroke goes up and down, on the same strokes."""
+    strokes = np.concatenate([np.linspace(*turns, 2000), np.linspace(*turns[::-1], 2000)])
+    s = machine.start(turns[0], 60.0)
+    g = machine.p[GEOMETRY:, 0]
+    out = np.empty(len(strokes))
+    for i, x in enumerate(np.concatenate([strokes, strokes])):  # the second round counts
+        c, d = chain.crank(x, *g[:4])
+        out[i % 4000] = np.rad2deg(chain.stem_angle(s, machine.p, 0, k, c, d, 60.0, 40.0, t))
+    return out[:2000], out[2000:][::-1]
+
+
+def width_of(machine, k, **conditions):
+    up, down = loop_of(machine, k, **conditions)
+    return float(np.mean((down - up)[300:1700]))
+
+
+def test_backlash_widens_the_loop_at_the_vane() -> None:
+    for extra, width in ((0.5, 1.6), (-0.6, 0.5), (-1.1, 0.0)):
+        assert width_of(machine_with(linkage_backlash={"vgv1": extra}), 1) == pytest.approx(width, rel=0.03, abs=1e-9)
+
+
+def test_wear_widens_the_loop_with_time() -> None:
+    machine = machine_with(linkage_wear={"vgv2": 0.6})
+    nominal = width_of(machine, 2)
+    assert nominal == pytest.approx(0.8, rel=0.03)
+    assert width_of(machine, 2, t=1800.0) - nominal == pytest.approx(0.3, rel=0.03)
+
+
+def test_compliance_loses_angle_with_the_square_of_speed() -> None:
+    c = si("linkage_compliance", "compliance", 0.2)
+    assert linkage_compliance.step(0.1, 100.0, c) == pytest.approx(0.1 - 0.2 * DEG)
+    lost = [0.1 - linkage_compliance.step(0.1, n, c) for n in (50.0, 100.0)]
+    assert lost[1] / lost[0] == pytest.approx(4.0)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(1e-6, 0.1), st.integers(2, 9), st.sampled_from([-1.0, 1.0]))
+def test_linkage_friction_counts_travel_not_time(y, travel, parts, sign) -> None:
+    whole, pieces = linkage_friction.step(y, sign * travel, 3e-3), y
+    for _ in range(parts):
+        pieces = linkage_friction.step(pieces, sign * travel / parts, 3e-3)
+    assert pieces == pytest.approx(whole, abs=1e-12) and -1.0 <= whole <= 1.0
+
+
+def test_linkage_friction_closes_to_1_over_e_over_its_distance() -> None:
+    assert 1.0 - linkage_friction.step(-1.0, 2e-3, 2e-3) == pytest.approx(2.0 * np.exp(-1.0))
+    machine = machine_with(linkage_friction={"vigv": 0.7, "distance": 0.2})
+    assert width_of(machine, 0) == pytest.approx(1.6 + 0.7, rel=0.03)
+
+
+@given(st.lists(st.floats(-0.01, 0.01), min_size=2, max_size=40))
+def test_linkage_friction_takes_energy_on_every_closed_path(steps) -> None:
+    path = [*steps, -sum(steps)]
+    y, work = 0.0, 0.0
+    for _ in range(30):  # until the loop repeats
+        work = 0.0
+        for a in path:
+            before, y = y, linkage_friction.step(y, a, 2e-3)
+            # the bristle's force over an exact exponential: integral of y = s a - d (y - before), s = sign(a)
+            work += abs(a) - 2e-3 * (y - before) * np.sign(a) if a else 0.0
+    assert work >= -1e-12
+
+
+def test_thermal_growth_turns_the_vane_by_its_coefficient() -> None:
+    machine, k = machine_with(thermal_growth={"vgv2": 0.02}), 2
+    g = machine.p[GEOMETRY:, 0]
+    c, d = chain.crank(0.024, *g[:4])
+    angles = []
+    for t_oil in (40.0, 65.0):
+        s = machine.start(0.024, 60.0, t_oil)
+        angles.append(np.rad2deg(chain.stem_angle(s, machine.p, 0, k, c, d, 60.0, t_oil, 0.0)))
+    assert angles[1] - angles[0] == pytest.approx(0.02 * 25.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "row", "size"), [("crank_length_error", G_LB, 1.5), ("link_length_error", G_LC, -0.8)])
+def test_length_errors_are_those_of_the_linkages_equations(name, row, size) -> None:
+    machine = machine_with(**{name: {"vgv1": size}})
+    g = build_plant().p[GEOMETRY:, 0].copy()
+    g[N_CRANK + N_PER_STAGE + row] += size * 1e-3
+    for x in (0.005, 0.024, 0.043):
+        s = machine.start(x, 60.0)
+        assert s[chain.POT : chain.POT + 3, 0] == pytest.approx(vane_angles(x, g)[0], abs=1e-12)
+
+
+def test_one_millimetre_of_link_is_the_published_offset() -> None:
+    angles = [machine_with(link_length_error={"vigv": e}).start(0.024, 60.0)[chain.POT, 0] for e in (0.0, 1.0)]
+    assert np.rad2deg(angles[1] - angles[0]) == pytest.approx(-1.6, abs=0.1)
+
+
+def test_eccentricity_adds_a_sine_of_the_rings_own_angle() -> None:
+    assert ring_eccentricity.step(0.1, 0.003, 0.4) == pytest.approx(0.1 + 0.003 * np.sin(0.5))
+
+
+def test_potentiometer_reads_gain_times_angle_plus_bias() -> None:
+    plain = build_plant().start(0.010, 60.0)[chain.POT : chain.POT + 3, 0]
+    machine = machine_with(pot_bias={"vgv1": 0.4}, pot_gain={"vigv": 1.02, "vgv1": 0.98})
+    expected = [1.02 * plain[0], 0.98 * plain[1] + 0.4 * DEG, plain[2]]
+    assert machine.start(0.010, 60.0)[chain.POT : chain.POT + 3, 0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_potentiometer_lag_trails_moving_vanes() -> None:
+    x = 1e-3 * (5.0 + 8.0 * T[:400])
+    same = np.full(400, 60.0)
+    out = {}
+    for lag in (0.0, 0.04):
+        p, s = lanes_of([{"pot_lag": {"vigv": lag}}], build_plant())
+        out[lag] = np.empty((400, 3, 1))
+        linkage_run(x, same, np.full(400, 40.0), T[:400], 1e-2, p, s, out[lag])
+    late, prompt = out[0.04][:, 0, 0], out[0.0][:, 0, 0]
+    assert np.array_equal(out[0.04][:, 1], out[0.0][:, 1])
+    assert np.interp(T[300] - 0.04, T[:400], prompt) == pytest.approx(late[300], abs=2e-5)
+
+
+# ---- model files --------------------------------------------------------------------------------------------------------------------
+
+
+def test_model_file_comes_back_as_it_was_written(tmp_path) -> None:
+    model = Model(
+        parameters={"actuator.flow_gain": 0.147, "linkage.vigv_play": 1.7},
+        effects={"valve_dead_band": {"half_width": 1.25}, "pot_lag": {"vigv": 0.01, "vgv2": 1e-3}, "aero_load": {}},
+        meta={"note": 'a "quoted" word', "history": ["one", "two"]},
+    )
+    write_model(tmp_path / "m.toml", model)
+    assert load_model(tmp_path / "m.toml") == model
+
+
+def test_model_fills_the_plants_rows_in_si() -> None:
+    plain = build_plant()
+    model = Model(parameters={"linkage.vigv_play": 1.7, "actuator.flow_gain": 0.147}, effects={"lvdt_bias": {"bias": 0.3}})
+    machine = build_plant(model=model)
+    assert machine.p[ROW["lvdt_bias"], 0] == pytest.approx(3e-4)
+    assert machine.p[chain.PLAY, 0] / plain.p[chain.PLAY, 0] == pytest.approx(1.7 / 1.6)
+    assert machine.p[chain.FLOW_GAIN, 0] == 0.147
+    assert np.array_equal(Model().plant().p, plain.p)
+    assert replace(machine, p=plain.p).table is machine.table
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[effects.valve_deadband]\nx = 1.0", "probably 'valve_dead_band' is meant"),
+        ("[effects.valve_dead_band]\nhalfwidth = 1.0", "probably 'half_width' is meant; allowed: half_width"),
+        ("[effects.valve_dead_band]\nhalf_width = nan", "finite"),
+        ("[effects.valve_dead_band]\nhalf_width = 99", "(=99 mA) must be in [0, 20]"),
+        ('[parameters]\n"actuator.flow_gian" = 0.1', "probably 'actuator.flow_gain' is meant"),
+        ('[parameters]\n"actuator.flow_gain" = 0.3', "(=0.3 m/s) must be in [0.12, 0.18]"),
+        ('[parameters]\n"actuator.stroke" = -3.0', "must be in [1, 1000]"),
+        ("[effect]\nx = 1", "probably 'effects' is meant"),
+    ],
+)
+def test_model_file_that_cannot_be_used_is_refused_in_one_line(tmp_path, text, words) -> None:
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(InputError) as e:
+        load_model(tmp_path / "m.toml")
+    assert words in str(e.value) and "m.toml" in str(e.value) and "\n" not in str(e.value)
