@@ -7,7 +7,7 @@ from typing import Any
 
 from hil import cli
 
-__all__ = ["add_model_option", "chain_of", "machine_of"]
+__all__ = ["add_model_option", "chain_of"]
 
 
 def add_model_option(parser: argparse.ArgumentParser) -> None:
@@ -15,36 +15,21 @@ def add_model_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects (written by vaneloop extend)")
 
 
-def machine_of(args: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Return (model or None, plant, calibration) that ``--model`` describes."""
-    from plant.model import load_model
-
-    from controller import load_calibration
-    from plant import build_plant
-
-    if not args.model:
-        return None, build_plant(), load_calibration()
-    model = load_model(args.model)
-    from hil.lockstep import calibration_of
-
-    return model, model.plant(), calibration_of(load_calibration(), model)
-
-
-def chain_of(args: argparse.Namespace) -> Any:
-    """Read the log that ``args`` name and put it into stages."""
+def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
+    """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``) describes."""
     from discrepancy.adapter import build_chain
     from hil.lockstep import warm_up
+    from hil.logs import LogError
+    from plant import build_plant, load_model
 
-    model, plant, calibration = machine_of(args)
+    if model is None and args.model:
+        model = load_model(args.model)
     log = cli.read_log_of(args, require=())
     warm_up(lambda text: cli.say(args, text))
-    present = tuple(model.effects) if model is not None else ()
-    chain = build_chain(log, plant, calibration, present)
+    chain = build_chain(log, build_plant(model=model), present=tuple(model.effects) if model is not None else ())
     for note in chain.notes:
         cli.say(args, f"note: {note}")
     if not chain.stages:
-        from hil.logs import LogError
-
         why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
         raise LogError(f"{args.log}: no stage can be judged ({why})")
     return chain

@@ -120,7 +120,8 @@ def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, A
     rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
     ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
     return {
-        "seed": seed, "index": index, "kind": case["kind"], "truth": truth, "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
+        "seed": seed, "index": index, "kind": case["kind"], "truth": truth,
+        "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
         "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],

@@ -11,8 +11,8 @@ from hil import cli
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Find where the model fails: stage, direction of motion, speed, distance since reversal, stroke, rotor speed, oil
-temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first. Significance is corrected for the number of
-conditions looked at.
+temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first. Significance is corrected for the number
+of conditions looked at.
 
 examples:
   vaneloop locate run.csv --report locate.html

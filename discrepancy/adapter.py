@@ -22,8 +22,9 @@ from scipy.interpolate import CubicSpline
 
 from controller import Calibration, load_calibration, new_state
 from controller import firmware as fw
-from discrepancy.stage import Array, Effect, Parameter, Stage
+from discrepancy.stage import Array, Effect, Parameter, Stage, noise_of
 from hil.figures import noise_floor
+from hil.lockstep import flashed
 from hil.logs import Log, LogError
 from plant import Plant, build_plant, chain
 from plant.compiled import compiled
@@ -76,7 +77,8 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
 
     present  effects that the model already has: they are part of ``plant`` and not tried again
     """
-    machine, cal = plant or build_plant(), calibration or load_calibration()
+    machine = plant or build_plant()
+    cal = flashed(calibration or load_calibration(), machine)
     t, columns, fresh, notes = _raster(log)
     if len(t) < 500:
         raise LogError(
@@ -120,7 +122,7 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             continue
         least = LEAST_FLOOR[name]
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
-        stage.floor = _floor(stage)
+        stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, cal, notes)
 
@@ -197,14 +199,6 @@ def _regimes(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dic
     if "i_cmd" in columns:
         out["current"], units["current"] = columns["i_cmd"], "mA"
     return out, units
-
-
-def _floor(stage: Stage) -> Array:
-    """Noise floor of every output: the noise in the nominal model's error, and what the raster hides."""
-    model = stage.run(stage.neutral()[None])[0]
-    assert stage.noise is not None
-    noise = [stage.noise(stage.t, np.where(np.isfinite(y), y - m, np.nan)) for y, m in zip(stage.measured, model, strict=True)]
-    return np.array(noise) if stage.raster_error is None else np.hypot(noise, stage.raster_error)
 
 
 # ---- parameters and effects ---------------------------------------------------------------------------------------------------------
@@ -340,7 +334,7 @@ def _actuator(
     p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
     x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
 
-    def simulate(thetas: Array) -> Array:
+    def simulate(thetas: Array, substeps: int = substeps) -> Array:
         p = _lanes(machine, thetas, rows, si)
         derive(p, dt / substeps, dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
@@ -349,7 +343,9 @@ def _actuator(
         actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
         return out.T[:, None, :] * 1e3
 
-    return Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
+    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
+    stage.finer = lambda thetas: simulate(thetas, 4 * substeps)
+    return stage
 
 
 def _linkage(
@@ -470,9 +466,11 @@ def _demand(
             z = new_state()
             z[fw.DEMAND_SEEN] = 1.0
             z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if rising else (-1.0, 0.0)
-            hold = value(theta, "frame_hold", 0.0)
-            phase = float(theta[at["frame_hold"] + 1]) * hold if hold > 0.0 else 0.0
-            _demand_run(t, n_dem, n_r, value(theta, "can_delay", 0.0), hold, phase, k, table, z, out[i, 0])
+            hold = value(theta, "frame_hold", float(machine.p[ROW["frame_hold"], 0]))
+            phase = float(theta[at["frame_hold"] + 1]) * hold if hold > 0.0 and "frame_hold" in at else 0.0
+            _demand_run(
+                t, n_dem, n_r, value(theta, "can_delay", float(machine.p[ROW["can_delay"], 0])), hold, phase, k, table, z, out[i, 0]
+            )
         return out * 1e3
 
     # the hold's clock is not the log's: where it stands is a nuisance that is fitted with it

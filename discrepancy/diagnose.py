@@ -18,15 +18,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from discrepancy.fit import Fit, Judge
-from discrepancy.stage import Array, Stage
+from discrepancy.stage import Array, Stage, noise_of
 
-__all__ = ["Candidate", "Found", "StageDiagnosis", "diagnose_stage"]
+__all__ = ["Candidate", "Found", "Search", "StageDiagnosis", "diagnose_stage", "found_of", "recalibrated", "rms_per_output"]
 
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 LEADERS = 5  # effects tried in pairs
 MOST = 4  # effects in one stage
+FLOOR_KNOWN = 0.02  # relative error of a noise floor that was estimated from the log
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
 LEAST_SHARE = 0.15  # of the excess over the floor that a further effect must explain: less is one effect patching another's equation
 RESIDUAL_SHARE = 0.1  # of the excess over the floor that a model of the right kind may leave (its equation is not nature's)
@@ -205,6 +206,14 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
     return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
 
 
+def _above_floor(judge: Judge, fit: Fit, correlation: float) -> bool:
+    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the floor's spread."""
+    n, m = max(judge.n, 1), np.maximum(judge.samples, 1)
+    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(SPREADS * np.sqrt(correlation / (2.0 * n)), FLOOR_KNOWN)
+    blocks = np.sqrt(np.maximum(fit.held_out, 0.0) / m) > 1.0 + FLOOR_KNOWN + BLOCK_SPREADS * np.sqrt(correlation / (2.0 * m))
+    return bool(whole or np.any(blocks & (m > 0.2 * m.max())))
+
+
 def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bool:
     """True when ``after`` is worth its extra effect."""
     nats, spreads = gain(judge, before, after, correlation)
@@ -225,10 +234,7 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
     for _ in range(2):
         if stage.noise is None:
             break
-        error = stage.measured - stage.run(d.final.theta[None])[0]
-        lower = np.array([stage.noise(stage.t, e) for e in error])
-        if stage.raster_error is not None:
-            lower = np.hypot(lower, stage.raster_error)
+        lower = noise_of(stage, d.final.theta)
         if not np.any(lower < 0.9 * d.floor):
             break
         d = _diagnose(stage, np.minimum(lower, d.floor), keep, tick)
@@ -253,7 +259,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
     candidates = []
     names = [e.name for e in stage.effects]
     # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the screening
-    quiet = rms(base) <= 1.0
+    quiet = not _above_floor(judge, base, 1.0)
     singles = {name: base if quiet else search.single(name) for name in names}
     leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
     correlation = min(_correlation(judge, leader.theta), 50.0)
@@ -268,7 +274,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
     chosen: tuple[str, ...] = ()
     current = base
     steps = [("nominal", rms(base))]
-    while len(chosen) < MOST and rms(current) > 1.0:
+    while len(chosen) < MOST and _above_floor(judge, current, correlation):
         options: list[Fit] = []
         if not chosen:
             options += list(singles.values())
@@ -313,7 +319,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
         verdict = "missing"
     else:
         verdict = "none"
-    before, after = (_rms_per_output(judge, f) for f in (base, current))
+    before, after = (rms_per_output(judge, f) for f in (base, current))
     return StageDiagnosis(
         stage=stage.name,
         outputs=stage.outputs,
@@ -325,7 +331,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
         error_before=before,
         error_after=after,
         effects=effects,
-        recalibrated=_recalibrated(stage, current),
+        recalibrated=recalibrated(stage, current),
         candidates=candidates,
         correlation=correlation,
         steps=steps,
@@ -337,7 +343,7 @@ def _nats(candidates: list[Candidate], name: str) -> float:
     return next(c.nats for c in candidates if c.effect == name)
 
 
-def _rms_per_output(judge: Judge, fit: Fit) -> Array:
+def rms_per_output(judge: Judge, fit: Fit) -> Array:
     """RMS error of each output in its unit, scaled from fitted to held-out blocks."""
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
     counts = np.maximum(judge.valid.sum(axis=1), 1)
@@ -349,7 +355,7 @@ def _name(
     judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate], correlation: float
 ) -> list[Found]:
     """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters."""
-    stage, index = judge.stage, judge.stage.index()
+    stage = judge.stage
     out = []
     rng = np.random.default_rng(0)
     blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
@@ -367,17 +373,24 @@ def _name(
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
         weight = np.exp((table - table.max(axis=0)) / max(1.0, 0.02 * abs(nats)))  # equations are not nature's: 2 % of the gain is a tie
         share = (weight / weight.sum(axis=0)).mean(axis=1)
-        parameters: dict[str, dict[str, object]] = {}
-        for i, p in zip(range(index[name].start, index[name].stop), stage.effect(name).parameters, strict=True):
-            k = int(np.flatnonzero(current.free == i)[0])
-            parameters[p.name] = {
-                "value": float(current.theta[i]),
-                "low": float(max(current.low[k], p.low)),
-                "high": float(min(current.high[k], p.high)),
-                "unit": p.unit,
-            }
-        out.append(Found(name, float(share[0]), parameters, rivals, nats))
+        out.append(Found(name, float(share[0]), _parameters(stage, current, name), rivals, nats))
     return out
+
+
+def _parameters(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object]]:
+    """Fitted parameters of an effect with their 90 % intervals."""
+    columns = stage.index()[name]
+    out: dict[str, dict[str, object]] = {}
+    for i, p in zip(range(columns.start, columns.stop), stage.effect(name).parameters, strict=True):
+        k = int(np.flatnonzero(fit.free == i)[0])
+        low, high = float(max(fit.low[k], p.low)), float(min(fit.high[k], p.high))
+        out[p.name] = {"value": float(fit.theta[i]), "low": low, "high": high, "unit": p.unit}
+    return out
+
+
+def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
+    """Effects of a fit that was asked for: no rivals looked for, probability 1 by decree."""
+    return [Found(name, 1.0, _parameters(judge.stage, fit, name), [], 0.0) for name in effects]
 
 
 def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
@@ -386,7 +399,7 @@ def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
     return nats > NATS and spreads > SPREADS
 
 
-def _recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
+def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
     """Nominal parameters that have moved significantly within their tolerance."""
     out = []
     for k, c in enumerate(fit.free):

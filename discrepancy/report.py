@@ -76,7 +76,7 @@ def diagnosis_report(
         k = int(np.argmax(s.error_before / s.floor))
         page.tile(
             f"{s.stage}: {s.outputs[k]}", f"{number(s.error_before[k])} to {number(s.error_after[k])}", s.units[k],
-            f"noise floor {number(s.floor[k])}; {s.verdict}", {"missing": "bad", "none": "good", "unknown": "bad"}[s.verdict],
+            f"noise floor {number(s.floor[k])}; {s.verdict}", "good" if s.verdict == "none" else "bad",
         )  # fmt: skip
     page.section(
         "What each stage says",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["Effect", "Parameter", "Stage", "StageError"]
+__all__ = ["Effect", "Parameter", "Stage", "StageError", "noise_of"]
 
 Array = np.ndarray
 
@@ -67,6 +67,7 @@ class Stage:
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
     floor     RMS of an output's error when nothing is missing, in its unit
+    finer     ``run`` with a finer step of its own, for stages that have one: their difference is the numerical error
     noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
               known, whose errors hold less of the machine's motion
     """
@@ -85,6 +86,7 @@ class Stage:
     raster_error: Array | None = None
     floor: Array | None = None
     noise: Callable[[Array, Array], float] | None = None
+    finer: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and names."""
@@ -119,3 +121,23 @@ class Stage:
     def effect(self, name: str) -> Effect:
         """Return the effect of that name."""
         return next(e for e in self.effects if e.name == name)
+
+
+def noise_of(stage: Stage, theta: Array) -> Array:
+    """Noise floor of every output: the noise in the error with parameters ``theta``, and what the raster hides.
+
+    Where windows have a free constant the model may jump from one to the next; the jumps are closed first, so that they are not noise.
+    """
+    assert stage.noise is not None
+    out = []
+    for error in stage.measured - stage.run(theta[None])[0]:
+        if stage.window:
+            w = ((stage.t - stage.t[0]) / stage.window + 1e-9).astype(int)
+            first = np.flatnonzero(np.diff(w, prepend=-1))[1:]
+            step = np.zeros(len(error))
+            step[first] = error[first] - error[first - 1]
+            if len(error) > 2:  # keep what the neighbours say the step would have been without a jump
+                step[first] -= 0.5 * (error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first])
+            error = error - np.cumsum(np.where(np.isfinite(step), step, 0.0))
+        out.append(stage.noise(stage.t, error))
+    return np.array(out) if stage.raster_error is None else np.hypot(out, stage.raster_error)

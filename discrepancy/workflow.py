@@ -12,16 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from discrepancy.diagnose import Search, StageDiagnosis, diagnose_stage, found_of, recalibrated, rms_per_output
 from discrepancy.fit import Fit, Judge
 from discrepancy.locate import Shape, shape
-from discrepancy.stage import Array, Stage
+from discrepancy.stage import Array, Stage, StageError, noise_of
 
-__all__ = ["Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "fit_effects"]
-
-
-class StageError(ValueError):
-    """An effect or stage that was asked for and is not there."""
+__all__ = ["Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage"]
 
 
 @dataclass(frozen=True)
@@ -105,20 +101,44 @@ def diagnose(
     return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
 
 
-def fit_effects(stage: Stage, effects: tuple[str, ...]) -> tuple[Judge, Fit, Fit]:
-    """Fit a stage with exactly these effects: (judge, fit without, fit with). Raises StageError for an effect it does not have."""
-    from discrepancy.diagnose import Search
+def extend_stage(stage: Stage, effects: tuple[str, ...]) -> StageDiagnosis:
+    """Fit a stage with exactly these effects, one added after the other.
 
+    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step. Errors are held-out.
+    Raises StageError for an effect that the stage does not have.
+    """
     for e in effects:
         if all(e != x.name for x in stage.effects):
             raise StageError(f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}")
-    judge = Judge(stage, floor_of(stage))
-    search = Search(judge)
-    joined: tuple[str, ...] = ()
-    for e in effects:
-        joined = (*joined, e)
-        search.joined(joined)
-    return judge, search.base, search.joined(tuple(effects))
+    floor = floor_of(stage)
+    for _ in range(3):
+        judge = Judge(stage, floor)
+        search = Search(judge)
+        fits = [search.base, *(search.joined(effects[: k + 1]) for k in range(len(effects)))]
+        final = fits[-1]
+        if stage.noise is None:
+            break
+        lower = noise_of(stage, final.theta)
+        if not np.any(lower < 0.9 * floor):
+            break
+        floor = np.minimum(lower, floor)  # the nominal model's error held motion that passed for noise
+
+    def rms(fit: Fit) -> float:
+        return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1)))
+
+    names = ["nominal", *(f"+ {e}" for e in effects)]
+    steps = list(zip(names, map(rms, fits), strict=True))
+    if stage.finer is not None:
+        d = judge.errors(final.theta[None]) - judge._whiten(stage.finer(final.theta[None]))
+        numerical = float(np.sqrt(np.sum(d * d) / max(judge.n, 1)))
+        steps.append(("without numerical error", float(np.sqrt(max(rms(final) ** 2 - numerical**2, 0.0)))))
+    found = found_of(judge, final, effects)
+    before, after = (rms_per_output(judge, f) for f in (search.base, final))
+    return StageDiagnosis(
+        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if effects else "none", floor=judge.floor,
+        base=search.base, final=final, error_before=before, error_after=after, effects=found, recalibrated=recalibrated(stage, final),
+        candidates=[], correlation=1.0, steps=steps, excess=rms(final),
+    )  # fmt: skip
 
 
 def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
@@ -154,7 +174,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
                 "noise_floor": None, "reason": why,
             }
         )  # fmt: skip
-    effects.sort(key=lambda e: -float(e["probability"]))
+    effects.sort(key=lambda e: -float(str(e["probability"])))
     return {
         "schema": 1,
         "log": log,

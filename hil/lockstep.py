@@ -239,7 +239,7 @@ def lockstep(
             if pending is not None:
                 pending.result()
             if hashed:
-                pending = pool.submit(digest.update, snap)
+                pending = pool.submit(digest.update, memoryview(snap))  # type: ignore[arg-type]
             if progress is not None:
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started

@@ -58,9 +58,9 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
 compiled = njit(cache=True, error_model="numpy")
 # The same for functions that work in place on their caller's arrays and allocate nothing: without counting references to those arrays,
 # which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes an array does not compile under it.
-in_place = njit(cache=True, error_model="numpy", _nrt=False)
+in_place = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 # For loop bodies of many scalars: a call would pass them on the stack.
-inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
 
 
 def is_cached() -> bool:

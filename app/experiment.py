@@ -1,0 +1,185 @@
+"""``vaneloop experiment``: which demand profile would best tell the remaining rivals apart?"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from app.common import add_model_option, chain_of
+from hil import cli
+
+__all__ = ["DESCRIPTION", "PROFILES", "add_options", "command", "divergence", "recommend"]
+
+DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot tell apart is simulated with
+its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the other's run. The profile under which
+even the best refit stays farthest from the truth separates them best.
+
+examples:
+  vaneloop experiment run.csv --out next_demand.csv --report experiment.html
+
+exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profile separates them, 2 bad input"""
+
+SEPARATED = 12.0  # nats per rival that decide (as in the diagnosis)
+
+
+def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:
+    t, n = np.array(points).T
+    return np.interp(np.arange(0.0, t[-1], 0.01), t, n)
+
+
+def _sine(middle: float, size: float, low_hz: float, high_hz: float, seconds: float) -> np.ndarray:
+    from scipy.signal import chirp
+
+    t = np.arange(0.0, seconds, 0.01)
+    return middle + size * chirp(t, low_hz, seconds, high_hz, phi=-90)
+
+
+def _bank() -> dict[str, np.ndarray]:
+    stairs: list[tuple[float, float]] = [(0, 60)]
+    for k, n in enumerate([65, 70, 75, 80, 85, 90, 95, 99, 95, 90, 85, 80, 75, 70, 65, 60]):
+        stairs += [(4 + 7 * k, stairs[-1][1]), (5 + 7 * k, n)]
+    slams: list[tuple[float, float]] = [(0, 55)]
+    for k in range(4):
+        slams += [(5 + 30 * k, 55), (5.2 + 30 * k, 98), (20 + 30 * k, 98), (20.2 + 30 * k, 55), (35 + 30 * k, 55)]
+    small: list[tuple[float, float]] = [(0, 80)]
+    for k in range(24):
+        small += [(2 + 4 * k, 80), (2.2 + 4 * k, 80 + (1.5 if k % 2 else -1.5) * (1 + k / 8)), (4 + 4 * k, 80)]
+    return {
+        "slow ramp up and down over the whole range": _piecewise([(0, 45), (3, 45), (60, 100), (63, 100), (120, 45)]),
+        "fast ramps over the whole range": _piecewise(
+            [(0, 50), (3, 50), (11, 99), (14, 99), (22, 50), (25, 50), (33, 99), (41, 50), (60, 50)]
+        ),
+        "slams between 55 and 98 %": _piecewise(slams),
+        "stairs of 5 % with dwells": _piecewise(stairs),
+        "small reversals about 80 %": _piecewise(small),
+        "swept sine, 2 % about 82 %, 0.05 to 1.5 Hz": _sine(82.0, 2.0, 0.05, 1.5, 100.0),
+        "swept sine, 6 % about 80 %, 0.02 to 0.5 Hz": _sine(80.0, 6.0, 0.02, 0.5, 100.0),
+        "dwells at 50, 80 and 99 %": _piecewise([(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99)]),
+    }
+
+
+PROFILES = _bank()
+
+
+def divergence(profile: np.ndarray, truth: dict[str, dict[str, float]], stage: str, rival: str, named: str, seed: int = 1) -> float:
+    """Nats by which the effect ``named`` explains a simulated run better than ``rival`` does, both refitted, on this profile.
+
+    truth: effects of the simulated machine with their parameters (border units)
+    """
+    from discrepancy.adapter import build_chain
+    from discrepancy.diagnose import Search
+    from discrepancy.fit import Judge
+    from discrepancy.workflow import floor_of
+    from hil.lockstep import Stimulus, lockstep
+    from hil.logs import Channel, Log
+    from plant import Model, build_plant
+
+    t = np.arange(len(profile)) * 1e-2
+    warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
+    run = lockstep(Stimulus.of(profile, t_oil=warm), plant=build_plant(model=Model(effects=truth)), seed=seed, hashed=False)
+    log = Log("simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")})
+    chain = build_chain(log)
+    if all(s.name != stage for s in chain.stages):
+        return 0.0
+    s = chain.stage(stage)
+    s.effects = tuple(e for e in s.effects if e.name in (rival, named))
+    # only the two effects are needed: fewer columns, the same run
+    full, keep = chain.stage(stage).run, _columns(build_chain(log).stage(stage), (rival, named))
+    neutral = build_chain(log).stage(stage).neutral()
+
+    def reduced(thetas: np.ndarray) -> np.ndarray:
+        wide = np.repeat(neutral[None], len(thetas), axis=0)
+        wide[:, keep] = thetas
+        return full(wide)
+
+    s.run = reduced
+    search = Search(Judge(s, floor_of(s)))
+    return 0.5 * float(search.single(rival).held_out.sum() - search.single(named).held_out.sum())
+
+
+def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
+    index = stage.index()
+    out = list(range(len(stage.parameters)))
+    for e in stage.effects:
+        if e.name in effects:
+            out += list(range(index[e.name].start, index[e.name].stop))
+    return out
+
+
+def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
+    """Return the best profile for the rivals in a diagnosis, or None when there is nothing to separate.
+
+    ``score`` is the smallest divergence over all pairs, in nats.
+    """
+    from plant.effects import EFFECTS
+
+    pairs = [(s.stage, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
+    if not pairs:
+        return None
+    table: list[dict[str, Any]] = []
+    jobs = list(itertools.product(PROFILES.items(), pairs))
+    scores: dict[str, list[float]] = {name: [] for name in PROFILES}
+    for i, ((name, profile), (stage, f, rival)) in enumerate(jobs):
+        known = [p.name for p in EFFECTS[f.effect].parameters]
+        truth = {f.effect: {k: float(v["value"]) for k, v in f.parameters.items() if k in known}}
+        scores[name].append(divergence(profile, truth, stage, rival, f.effect))
+        if progress:
+            progress((i + 1) / len(jobs))
+    for name, s in scores.items():
+        table.append({"profile": name, "nats": min(s), "by_pair": [[f.effect, r, v] for (_, f, r), v in zip(pairs, s, strict=True)]})
+    table.sort(key=lambda r: -r["nats"])
+    best = table[0]
+    profile = PROFILES[best["profile"]]
+    separated = best["nats"] > SEPARATED
+    names = ", ".join(f"{f.effect} from {r}" for _, f, r in pairs)
+    text = f"To tell {names}: {best['profile']}, {len(profile) / 100:.0f} s; expected gain {best['nats']:.0f} nats for the closest pair."
+    if not separated:
+        text = f"No profile of the bank separates {names}: they differ by {best['nats']:.1f} nats at best, {SEPARATED:g} are needed."
+    return {
+        "text": text, "profile": best["profile"], "score": best["nats"], "separates": separated, "t": np.arange(len(profile)) * 0.01,
+        "n_dem": profile, "table": table,
+    }  # fmt: skip
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    cli.add_log_options(parser)
+    add_model_option(parser)
+    parser.add_argument("--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem)")
+    cli.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from discrepancy.workflow import diagnose
+    from hil.logs import Channel, write_log
+
+    chain = chain_of(args)
+    with cli.progress_bar(args, "searching the library of effects") as progress:
+        d = diagnose(chain.stages, chain.not_observed, progress)
+    with cli.progress_bar(args, "trying profiles") as progress:
+        e = recommend(d, progress)
+    if e is None:
+        cli.say(args, "nothing to separate: the log leaves no rivals")
+        cli.write_json(args, {"schema": 1, "log": args.log, "recommended": None, "profiles": []})
+    else:
+        rows = [[r["profile"], f"{r['nats']:.1f}"] for r in e["table"]]
+        cli.print_table(args, "divergence of the closest pair of rivals after refit", ["profile", "nats"], rows)
+        cli.say(args, e["text"])
+        best = {"profile": e["profile"], "nats": e["score"], "separates": e["separates"], "text": e["text"]}
+        cli.write_json(args, {"schema": 1, "log": args.log, "recommended": best, "profiles": e["table"]})
+        if args.out:
+            write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
+            cli.say(args, f"profile: {args.out}")
+    if args.report:
+        from discrepancy.report import diagnosis_report
+
+        words = " ".join(["vaneloop experiment", *sys.argv[2:]])
+        cli.say(args, f"page: {diagnosis_report(d, chain, args.report, words, args.log, e)}")
+    return 1 if e is not None and not e["separates"] else 0
