@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -51,6 +52,19 @@ def main() -> None:
         "The paper's engine test, 3,000 s under one mean curve and under dual curves",
         "engine-test", "--report", str(OUT / "engine_test.html"),
     )  # fmt: skip
+    hidden = os.path.relpath(ROOT / "examples" / "hidden_effect.parquet")
+    model = str(OUT / "extended.toml")
+    _step("Another log does not fit: by how much, stage by stage?", "compare", hidden, allowed=(0, 1))
+    _step("Where does it fail?", "locate", hidden, allowed=(0, 1))
+    _step("What is missing?", "diagnose", hidden, "--report", str(OUT / "diagnosis.html"), "--json", str(OUT / "diagnosis.json"), allowed=(0, 1))
+    found = [e["effect"] for e in json.loads((OUT / "diagnosis.json").read_text())["effects"]]
+    if found:
+        effects = [a for e in found for a in ("--effect", e)]
+        _step(
+            "Add it, and watch the error fall on data that was not fitted",
+            "extend", hidden, *effects, "--out", model, "--report", str(OUT / "extended.html"), allowed=(0, 1),
+        )  # fmt: skip
+        _step("The extended model against the log", "compare", hidden, "--model", model, allowed=(0, 1))
     print("\npages to open in a browser:")
     for page in sorted(OUT.glob("*.html")):
         print(f"  {page}")

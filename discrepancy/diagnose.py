@@ -26,6 +26,7 @@ NATS = 12.0  # gain that the best of a library of useless effects reaches in few
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 LEADERS = 5  # effects tried in pairs
+FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
 FLOOR_KNOWN = 0.02  # relative error of a noise floor that was estimated from the log
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
@@ -84,6 +85,7 @@ class Search:
         self.stage = judge.stage
         self.tick = tick or (lambda: None)
         self.fits: dict[frozenset[str], Fit] = {}
+        self.finished: set[frozenset[str]] = set()
         self.base = self.of(())
         self.starts = self._screen()
 
@@ -143,33 +145,40 @@ class Search:
             self.tick()
         return self.fits[key]
 
-    def joined(self, effects: tuple[str, ...]) -> Fit:
-        """Fit with several effects, started from the fits with one fewer."""
-        key = frozenset(effects)
-        if key in self.fits:
-            return self.fits[key]
+    def joined(self, effects: tuple[str, ...], finished: bool = True) -> Fit:
+        """Fit with several effects, started from the fits with one fewer; ``finished`` False: a few iterations, enough to rank it."""
         if len(effects) == 1:
             return self.single(effects[0])
-        index = self.stage.index()
-        begins = []
-        for leave in effects:
-            rest = frozenset(effects) - {leave}
-            if rest in self.fits:
-                for source in self.starts[leave][:1] + [self.single(leave).theta]:
-                    theta = self.fits[rest].theta.copy()
-                    theta[index[leave]] = source[index[leave]]
-                    begins.append(theta)
-        if not begins:
-            theta = self.single(effects[0]).theta.copy()
-            for other in effects[1:]:
-                theta[index[other]] = self.single(other).theta[index[other]]
-            begins.append(theta)
-        costs = self.judge.block_costs(self.judge.errors(np.array(begins))).sum(axis=1)
-        order = np.argsort(costs)[:2]
-        fits = [self.judge.fit(tuple(effects), begins[i], 10) for i in order]
-        self.fits[key] = min(fits, key=lambda f: float(f.cost.sum()))
-        self.tick()
+        key = frozenset(effects)
+        if key not in self.fits:
+            index = self.stage.index()
+            begins = []
+            for leave in effects:
+                rest = frozenset(effects) - {leave}
+                if rest in self.fits:
+                    for source in (self.starts[leave][0], self.single(leave).theta):
+                        theta = self.fits[rest].theta.copy()
+                        theta[index[leave]] = source[index[leave]]
+                        begins.append(theta)
+            if not begins:
+                theta = self.single(effects[0]).theta.copy()
+                for other in effects[1:]:
+                    theta[index[other]] = self.single(other).theta[index[other]]
+                begins.append(theta)
+            costs = self.judge.block_costs(self.judge.errors(np.array(begins))).sum(axis=1)
+            self.fits[key] = self.judge.fit(tuple(effects), begins[int(np.argmin(costs))], 3)
+            self.tick()
+        if finished and key not in self.finished:
+            self.fits[key] = self.judge.fit(tuple(effects), self.fits[key].theta, 8)
+            self.finished.add(key)
+            self.tick()
         return self.fits[key]
+
+    def best_of(self, sets: list[tuple[str, ...]]) -> list[Fit]:
+        """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
+        quick = sorted((self.joined(s, finished=False) for s in sets), key=lambda f: float(f.held_out.sum()))
+        out = [self.joined(f.effects) for f in quick[:FINISHED]] + quick[FINISHED:]
+        return sorted(out, key=lambda f: float(f.held_out.sum()))
 
 
 def _correlation(judge: Judge, theta: Array) -> float:
@@ -280,10 +289,9 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
             options += list(singles.values())
             leaders = [c.effect for c in candidates[:LEADERS]]
             if rms(leader) > TOLERATED:
-                options += [search.joined(pair) for pair in itertools.combinations(leaders, 2)]
+                options += search.best_of(list(itertools.combinations(leaders, 2)))
         else:
-            trial = sorted(names, key=lambda m: -_nats(candidates, m))
-            options += [search.joined((*chosen, m)) for m in trial if m not in chosen]
+            options += search.best_of([(*chosen, m) for m in names if m not in chosen])
         ok = [f for f in options if significant(judge, current, f, correlation)]
         if not ok:
             break
@@ -339,10 +347,6 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
     )
 
 
-def _nats(candidates: list[Candidate], name: str) -> float:
-    return next(c.nats for c in candidates if c.effect == name)
-
-
 def rms_per_output(judge: Judge, fit: Fit) -> Array:
     """RMS error of each output in its unit, scaled from fitted to held-out blocks."""
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
@@ -363,8 +367,8 @@ def _name(
     for name in chosen:
         rest = tuple(c for c in chosen if c != name)
         alternatives = {name: current}
-        for other in near:
-            alternatives[other] = search.joined((*rest, other)) if rest else search.single(other)
+        for f in search.best_of([(*rest, other) for other in near]):
+            alternatives[next(e for e in f.effects if e not in rest)] = f
         rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation)]
         score = {}
         for m, f in alternatives.items():

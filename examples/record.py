@@ -12,10 +12,10 @@ import numpy as np
 
 from hil.logs import Channel, write_log
 from tests.firmware_on_rig import firmware
-from tests.rig import Manoeuvre, simulate
+from tests.rig import Hidden, Manoeuvre, manoeuvre, simulate
 
 HERE = Path(__file__).parent
-__all__ = ["engine_run", "main"]
+__all__ = ["engine_run", "hidden_run", "main"]
 
 
 def engine_run() -> Manoeuvre:
@@ -32,8 +32,19 @@ def channels(log: dict[str, np.ndarray]) -> dict[str, Channel]:
     return {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}
 
 
+RESOLUTION = {"x_dem": 3, "x_lvdt": 3, "i_cmd": 3, "n_dem": 3, "n_r": 3, "p_s": 3, "t_oil": 1, "vigv": 3, "vgv1": 3, "vgv2": 3, "state": 0}
+
+
+def hidden_run() -> dict[str, np.ndarray]:
+    """200 s at 100 Hz of a machine whose valve has a dead band, and whose piston carries an aerodynamic load."""
+    hidden = [Hidden("valve_dead_band", {"half_width": 0.8e-3}), Hidden("aero_load", {"force": 3500.0})]
+    log = simulate(manoeuvre(4, 200.0), firmware(), hidden, seed=4, rate=100, jitter=0.0).log
+    return {k: np.round(v, RESOLUTION.get(k, 6)) for k, v in log.items()}
+
+
 def main() -> None:
     """Write the logs beside this file."""
+    write_log(HERE / "hidden_effect.parquet", channels(hidden_run()))
     run = simulate(engine_run(), firmware(), seed=20, rate=100, jitter=0.0)
     write_log(HERE / "engine_run.blf", channels(run.log))
 
