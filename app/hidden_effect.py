@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -49,6 +50,9 @@ def _rig() -> Any:
 
     from tables import InputError
 
+    root = str(Path(__file__).resolve().parent.parent)  # the checkout, where this is one
+    if root not in sys.path:
+        sys.path.append(root)
     try:
         return importlib.import_module("tests.rig"), importlib.import_module("tests.firmware_on_rig")
     except ImportError:
