@@ -56,7 +56,8 @@ def main() -> None:
     model = str(OUT / "extended.toml")
     _step("Another log does not fit: by how much, stage by stage?", "compare", hidden, allowed=(0, 1))
     _step("Where does it fail?", "locate", hidden, allowed=(0, 1))
-    _step("What is missing?", "diagnose", hidden, "--report", str(OUT / "diagnosis.html"), "--json", str(OUT / "diagnosis.json"), allowed=(0, 1))
+    page, answer = str(OUT / "diagnosis.html"), str(OUT / "diagnosis.json")
+    _step("What is missing?", "diagnose", hidden, "--report", page, "--json", answer, allowed=(0, 1))
     found = [e["effect"] for e in json.loads((OUT / "diagnosis.json").read_text())["effects"]]
     if found:
         effects = [a for e in found for a in ("--effect", e)]

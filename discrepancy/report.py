@@ -162,9 +162,9 @@ def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]],
     panels = []
     for k, output in enumerate(stage.outputs):
         y = np.where(judge.valid[k], stage.measured[k], np.nan)
-        panels.append(Panel(f"{output} [{stage.units[k]}]", [Line("measured", stage.t, y, "measured")], height=180))
+        panels.append(Panel(f"{output} [{stage.units[k]}]", [Line("measured", stage.t, y, "measured")], height=1.0))
         lines = [Line(name, stage.t, np.where(judge.valid[k], e[i, k], np.nan), role, 1.0) for i, (name, _, role) in enumerate(models)]
-        panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=180))
+        panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=1.0))
     page.plot(overlay(panels), caption + ". The grey band is three noise floors to each side.")
 
 
