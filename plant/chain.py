@@ -161,7 +161,7 @@ POT_LAG_ERROR = ROW["pot_lag"]  # used through POT_SHARE
 POT_BIAS_ERROR = ROW["pot_bias"]
 
 # ---- and in s
-CURRENT = STATE_ROW["valve_hysteresis"]  # A, behind the valve's hysteresis
+CURRENT = STATE_ROW["valve_hysteresis"]  # four of A: the valve's memory
 LAGGED = STATE_ROW["valve_lag"]  # A, behind the valve's lag
 FRICTION = STATE_ROW["piston_friction"]  # N
 GIVE = STATE_ROW["oil_compressibility"]  # m
@@ -222,7 +222,7 @@ def drive_substep(
         v = opening * (gain * math.sqrt(max(0.0, (p_s - against) * per_p_ref)))
         v = supply_pressure_droop.step(v, p_s - against, droop)
         v = valve_flow_saturation.step(v, limit)
-        v = internal_leakage.step(v, p_load, leakage)
+        v = internal_leakage.step(v, p_load, drag * per_area, leakage)
         travel = 0.5 * (v_before + v) * dt
         level = piston_stiction.step(force, v, excess, stribeck)
         z_before, give_before = z, give
@@ -242,7 +242,9 @@ def drive_substep(
 def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
     """`drive_step` with every effect: what changes within the step is in `drive_substep`."""
     i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
-    i = valve_hysteresis.step(s[CURRENT, j], i, p[VALVE_HYSTERESIS, j])
+    y1, y2, y3, y4 = s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j]
+    y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j])
+    i = valve_hysteresis.mean(y1, y2, y3, y4)
     gain = oil_viscosity.step(p[FLOW_GAIN, j], t_oil, p[OIL_VISCOSITY, j])
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
     load = aero_load.step(n_r, p[AERO_LOAD, j])
@@ -263,7 +265,8 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
             p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0,
         )  # fmt: skip
     s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
-    s[CURRENT, j], s[LAGGED, j], s[FRICTION, j], s[GIVE, j], s[READING, j] = i, lagged, z, give, reading
+    s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
+    s[LAGGED, j], s[FRICTION, j], s[GIVE, j], s[READING, j] = lagged, z, give, reading
 
 
 @in_place

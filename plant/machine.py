@@ -44,7 +44,7 @@ class Plant:
         s[chain.X, 0] = s[chain.X_LVDT, 0] = s[chain.READING, 0] = stroke
         load = aero_load.step(n_r, p[chain.AERO_LOAD])
         s[chain.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[chain.OIL_COMPRESSIBILITY :][:2])
-        s[chain.CURRENT, 0] = s[chain.LAGGED, 0] = p[chain.VALVE_NULL_BIAS]
+        s[chain.CURRENT : chain.CURRENT + 4, 0] = s[chain.LAGGED, 0] = p[chain.VALVE_NULL_BIAS]
         for k, ring in enumerate(self._rings(stroke, n_r, t_oil)):
             s[chain.RING + k, 0] = s[chain.DRIVEN + k, 0] = ring
             s[chain.POT + k, 0] = self._reading(ring, k)

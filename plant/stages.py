@@ -116,9 +116,9 @@ from plant.series import arctangent, tangent
 __all__ = ["actuator_run", "engine_run", "linkage_run"]
 
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
-FEW = 3  # so few lanes or fewer are quicker one by one
+FEW = 2  # so few lanes or fewer are quicker one by one
 WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would be unrolled instead of vectorised
-SOME = 8  # so few lanes or fewer are quicker one by one there
+SOME = 5  # so few lanes or fewer are quicker one by one there
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
 _plain = njit(cache=True, error_model="numpy")  # makes its block's scratch array: of constant width, so that the compiler sees the strides
@@ -149,11 +149,12 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
     h = dt / substeps
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
+    current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
     wide = _in_blocks(p.shape[1], W, FEW)
     if wide:
-        _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x, window, wide)
+        _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, wide)
     if wide < p.shape[1]:
-        _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x, window, wide)
+        _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x, window, wide)
 
 
 def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
@@ -173,6 +174,29 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
 
 
+@_plain
+def _currents(mean, dt, substeps, behind):
+    """Currents (n, substeps) between the samples, from the logged means: linear in each interval, of its mean, its slope the neighbours'.
+
+    Interval k begins ``behind`` after sample k - 1; a step that begins in the interval before takes its share of both.
+    """
+    n = len(mean)
+    out = np.empty((n, substeps))
+    h = 1.0 / substeps
+    slope_before, before = 0.0, mean[0]
+    for k in range(n):
+        slope = 0.5 * (mean[k + 1] - mean[k - 1]) if 0 < k < n - 1 else 0.0  # per interval
+        for m in range(substeps):
+            begin = m * h - behind / dt
+            old = min(max(-begin, 0.0), h)  # length in the interval before
+            in_old = before + slope_before * (begin + 0.5 * old + 0.5)
+            in_own = mean[k] + slope * (begin + 0.5 * (h + old) - 0.5)
+            share = old / h
+            out[k, m] = share * in_old + (1.0 - share) * in_own
+        slope_before, before = slope, mean[k]
+    return out
+
+
 def _in_blocks(lanes, width, few):
     """How many of the lanes run in blocks; the rest of at most ``few`` one by one."""
     rest = lanes % width
@@ -184,7 +208,7 @@ def _rest(p, s, i, n_r):
     """Valve and oil at rest under the current ``i`` (A) at ``n_r`` (%)."""
     for j in range(p.shape[1]):
         current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
-        s[CURRENT, j] = s[LAGGED, j] = current
+        s[CURRENT : CURRENT + 4, j] = s[LAGGED, j] = current
         load = aero_load.step(n_r, p[AERO_LOAD, j])
         s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
 
@@ -225,23 +249,18 @@ def _between(a, k):
     return 0.5 * (a[k - 1] + a[k])
 
 
-@inlined
-def _current(i_cmd, k, m, h, behind):
-    """Mean current in step m of length ``h`` after sample k - 1, where the logged means act ``behind`` later."""
-    old = min(max(behind / h - m, 0.0), 1.0)
-    return i_cmd[k] if old == 0.0 else old * i_cmd[k - 1] + (1.0 - old) * i_cmd[k]
-
-
 @_plain
-def _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_lvdt, window, first):
-    """The lanes from ``first`` on, one after the other."""
+def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, first):
+    """The lanes from ``first`` on, one after the other; current[k, m] in step m after sample k - 1."""
+    n, substeps = current.shape
+    h = dt / substeps
     for j in range(first, p.shape[1]):
-        effects, h = p[DRIVE_EFFECTS, j] != 0.0, dt / substeps
-        for k in range(len(i_cmd)):
+        effects = p[DRIVE_EFFECTS, j] != 0.0
+        for k in range(n):
             if k > 0:
                 speed, supply, warm = _between(n_r, k), _between(p_s, k), _between(t_oil, k)
                 for m in range(substeps):
-                    chain.drive_step(s, p, j, _current(i_cmd, k, m, h, behind), speed, supply, warm, h, 1)
+                    chain.drive_step(s, p, j, current[k, m], speed, supply, warm, h, 1)
             if not effects:
                 s[READING, j] = s[X_LVDT, j]
             if window > 0 and k % window == 0:
@@ -257,15 +276,16 @@ def _actuator_lanes(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_l
 
 
 # rows of a block's scratch array: state, what the step needs, what the sample needs
-(_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _CURRENT) = range(10)
-(_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(10, 24)
-(_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(24, 34)
-(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _N_ROWS) = range(34, 39)
+(_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _H1, _H2, _H3, _H4) = range(13)
+(_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
+(_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
+(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _N_ROWS) = range(37, 42)
 
 
 @_plain
-def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_lvdt, window, lanes):
-    """The first ``lanes`` lanes, eight at a time."""
+def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lanes):
+    """The first ``lanes`` lanes, eight at a time; current[k, m] in step m after sample k - 1."""
+    n, substeps = current.shape
     h = dt / substeps
     b = np.empty((_N_ROWS, W))
     for j0 in range(0, lanes, W):
@@ -277,7 +297,8 @@ def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
             b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q]
-            b[_CURRENT, j], b[_BIAS, j], b[_WIDTH, j] = s[CURRENT, q], p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q]
+            b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
+            b[_BIAS, j], b[_WIDTH, j] = p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q]
             b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
             b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = p[VALVE_A11, q], p[VALVE_A12, q], p[VALVE_A21, q], p[VALVE_A22, q]
             b[_OVERLAP, j] = p[VALVE_DEAD_BAND, q] / p[RATED_CURRENT, q]
@@ -289,7 +310,7 @@ def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_
             b[_STIFFNESS, j] = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, q])
             b[_COMPLIANCE, j], b[_DRAG, j] = p[OIL_COMPRESSIBILITY, q], p[OIL_COMPRESSIBILITY + 1, q]
             b[_PER_P_REF, j], b[_PER_AREA, j] = 1.0 / p[P_REF, q], 1.0 / p[AREA, q]
-        for k in range(len(i_cmd)):
+        for k in range(n):
             if k > 0:
                 supply, warm, speed = _between(p_s, k), _between(t_oil, k), _between(n_r, k)
                 for j in range(W):
@@ -300,10 +321,10 @@ def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_
                     b[_LOAD, j] = aero_load.step(speed, p[AERO_LOAD, q])
                 if loaded:
                     for m in range(substeps):
-                        _block_substep(b, _current(i_cmd, k, m, h, behind), supply, h, True)
+                        _block_substep(b, current[k, m], supply, h, True)
                 else:
                     for m in range(substeps):
-                        _block_substep(b, _current(i_cmd, k, m, h, behind), supply, h, False)
+                        _block_substep(b, current[k, m], supply, h, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
                     x = true_stroke(x_lvdt[k], p, j0 + j, t_oil[k])
@@ -324,14 +345,16 @@ def _actuator_blocks(i_cmd, n_r, p_s, t_oil, dt, substeps, behind, p, s, out, x_
             q = j0 + j
             s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j]
             s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q] = b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j]
-            s[CURRENT, q] = b[_CURRENT, j]
+            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j]
 
 
 @inlined
 def _block_substep(b, i_cmd, p_s, h, loaded):
     """One plant step of every lane of the block."""
     for j in range(W):
-        i = valve_hysteresis.step(b[_CURRENT, j], valve_null_bias.step(i_cmd, b[_BIAS, j]), b[_WIDTH, j])
+        i = valve_null_bias.step(i_cmd, b[_BIAS, j])
+        y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j])
+        i = valve_hysteresis.mean(y1, y2, y3, y4)
         u, du, v, x, y, lagged, z, give, reading = chain.drive_substep(
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j],
             i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
@@ -339,7 +362,8 @@ def _block_substep(b, i_cmd, p_s, h, loaded):
             b[_LIMIT, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j], b[_COMPLIANCE, j], b[_DRAG, j],
             b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded,
         )  # fmt: skip
-        b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_CURRENT, j] = u, du, v, x, y, i
+        b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = u, du, v, x, y
+        b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = y1, y2, y3, y4
         b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = lagged, z, give, reading
 
 

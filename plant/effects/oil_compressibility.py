@@ -26,7 +26,7 @@ EFFECT = Effect(
     "actuator",
     ("actuator",),
     (
-        Parameter("compliance", "mm/kN", 0.0, 0.0, 2.0, "give of the oil beyond nominal"),
+        Parameter("compliance", "mm/kN", 0.0, 0.0, 10.0, "give of the oil beyond nominal"),
         Parameter("drag", "N/(m/s)", 1500.0, 0.0, 20000.0, "viscous force of seals and oil, as it compresses the oil"),
     ),
     ("give",),

@@ -2,16 +2,18 @@
 
 Equation::
 
-    level = force + excess S(v),   S(v) = (1 + (v/speed)^2 / 8)^-8
+    level = force + excess S(v),   S(v) = (1 + r / 8)^-8 (1 + 50 r) / (1 + 100 r),   r = (v/speed)^2
 
 Symbols: level greatest friction force (N), force Coulomb's (N), excess above it at rest (N), v speed of the oil
-(m/s), speed Stribeck speed (m/s). S is within 0.035 of the usual exp(-(v/speed)^2) and needs no transcendental
-function.
-Limits: the piston is massless and v is the oil's speed: no stick-slip oscillation comes out, only the lost motion and
-the force.
+(m/s), speed Stribeck speed (m/s). The first factor of S is within 0.035 of the usual exp(-r) and needs no
+transcendental function. The second falls from 1 to 1/2 about a tenth of the Stribeck speed: there the piston sticks
+and slips on its oil column, and the mean of that sawtooth is half the excess.
+Limits: the sawtooth itself, some hundred hertz and up to C excess high, is not in it (C see oil_compressibility); it
+stays as scatter.
 In a log: lost motion at reversals as with piston_friction, 2 C (force + excess), but hardly slower at speed; after
-slow reversals a small catching up when it lets go.
-Source: Stribeck curve, Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), section 2.
+slow reversals a small catching up when it lets go; scatter of some micrometres in slow motion.
+Source: Stribeck curve and stick-slip, Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), sections 2
+and 3.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ def step(force, v, excess, speed):
     """Return the greatest friction force (N) at the speed ``v`` (m/s)."""
     if excess == 0.0:
         return force
-    r = v / speed
-    a = 1.0 / (1.0 + 0.125 * r * r)
+    r2 = (v / speed) * (v / speed)
+    a = 1.0 / (1.0 + 0.125 * r2)
     a *= a
     a *= a
-    return force + excess * (a * a)
+    return force + excess * (a * a) * (1.0 + 50.0 * r2) / (1.0 + 100.0 * r2)

@@ -1,17 +1,18 @@
-"""Magnetic memory of the torque motor and friction of the spool: rising and falling current open the valve differently.
+"""Magnetic memory of the torque motor: rising and falling current open the valve differently.
 
-Equation, a play with i the command, y the current that counts::
+Equation, plays in parallel, with i the command and y the current that counts::
 
-    y <- min(max(y, i - width/2), i + width/2)
+    y_k <- min(max(y_k, i - w_k / 2), i + w_k / 2),   w_k = width (1/4, 3/4, 5/4, 7/4),   y = mean of y_k
 
-Symbols: i, y (A), width total (A).
-Limits: a play has parallel branches and sharp corners; magnetic minor loops are narrower and round. Rate-independent.
-Dither, which shrinks it in practice, counts as a smaller width.
-In a log: at a reversal of i_cmd the stroke's speed keeps its value until the current has come back by the width.
-Unlike a dead band it is centred on the last turn, not on zero current, and a dwell at rest can sit anywhere within
-the width.
-Source: Krasnosel'skii and Pokrovskii, Systems with Hysteresis (1989), section 2; 2 to 4 % of rated current are usual
-(Moog type 30 catalogue).
+Symbols: i, y (A), width total (A), of a loop over the whole range. Equal shares of plays from 0 to 2 width are
+Rayleigh's law of magnetisation: a small reversal shows little of the width and its loop is round.
+Limits: rate-independent; the same at every current (no saturation of the iron). Dither, which shrinks it in practice,
+counts as a smaller width. On a log of mean currents the turns between two samples are not seen.
+In a log: after a reversal of i_cmd the stroke's speed follows the current only in part until it has come back by
+twice the width. Unlike a dead band it is centred on the last turn, not on zero current; the current of a dwell at
+rest depends on how it was reached.
+Source: Bertotti, Hysteresis in Magnetism (1998), ch. 2, Rayleigh law; Krasnosel'skii and Pokrovskii, Systems with
+Hysteresis (1989), section 2; 2 to 4 % of rated current are usual (Moog type 30 catalogue).
 """
 
 from __future__ import annotations
@@ -19,21 +20,32 @@ from __future__ import annotations
 from plant.compiled import compiled
 from plant.effect import Effect, Parameter
 
-__all__ = ["EFFECT", "step"]
+__all__ = ["EFFECT", "mean", "step"]
 
 EFFECT = Effect(
     "valve_hysteresis",
     "valve",
     ("actuator",),
     (Parameter("width", "mA", 0.0, 0.0, 20.0, "total width between rising and falling current"),),
-    ("current",),
+    ("current_1", "current_2", "current_3", "current_4"),
     "the valve remembers where its current came from",
     "reversals of the current",
 )
 
 
 @compiled
-def step(y, i, width):
-    """Return the current (A) that counts, for the command ``i`` (A) and the one that counted before, ``y`` (A)."""
-    half = 0.5 * width
-    return min(max(y, i - half), i + half)
+def step(y1, y2, y3, y4, i, width):
+    """Return the four plays' currents (A) for the command ``i`` (A); what counts is their `mean`."""
+    a, b, c, d = 0.125 * width, 0.375 * width, 0.625 * width, 0.875 * width
+    return (
+        min(max(y1, i - a), i + a),
+        min(max(y2, i - b), i + b),
+        min(max(y3, i - c), i + c),
+        min(max(y4, i - d), i + d),
+    )
+
+
+@compiled
+def mean(y1, y2, y3, y4):
+    """Return the current (A) that moves the spool; of four equal numbers it is exactly that number."""
+    return 0.25 * ((y1 + y2) + (y3 + y4))
