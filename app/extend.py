@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from app.common import chain_of
@@ -53,6 +54,9 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(
                 f"--effect {name!r} is not in the library{f'; probably {close[0]!r} is meant' if close else ''}; docs/effects.md lists it"
             )
+    out = Path(args.out)
+    if out.is_dir() or not out.parent.is_dir():  # before the fit, which takes a while
+        raise InputError(f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})")
     before = load_model(args.model) if args.model else Model()
     chain = chain_of(args, Model())
     started = time.perf_counter()

@@ -87,6 +87,8 @@ class Search:
         self.fits: dict[frozenset[str], Fit] = {}
         self.finished: set[frozenset[str]] = set()
         self.base = self.of(())
+        # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the largest sizes
+        self.quiet = not _above_floor(judge, self.base, 1.0)
         self.starts = self._screen()
 
     def of(self, effects: tuple[str, ...], start: Array | None = None, iterations: int = 12) -> Fit:
@@ -104,7 +106,7 @@ class Search:
         index = stage.index()
         thetas, owner = [], []
         for e in stage.effects:
-            for s in e.starts:
+            for s in e.starts[-2:] if self.quiet else e.starts:
                 theta = self.base.theta.copy()
                 theta[index[e.name]] = s
                 thetas.append(theta)
@@ -128,8 +130,10 @@ class Search:
         self.reach: dict[str, float] = {}
         for name in dict.fromkeys(owner):
             mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
-            out[name] = [thetas[i] for _, i in mine[:2]]
             base_cost = float(np.sum(e0 * e0))
+            # a second start is worth its time where it is nearly as good as the first
+            near = mine[0][0] + 0.2 * max(base_cost - mine[0][0], 0.02 * base_cost)
+            out[name] = [thetas[i] for c, i in mine[:2] if c <= near]
             self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
         return out
 
@@ -267,9 +271,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
 
     candidates = []
     names = [e.name for e in stage.effects]
-    # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the screening
-    quiet = not _above_floor(judge, base, 1.0)
-    singles = {name: base if quiet else search.single(name) for name in names}
+    singles = {name: base if search.quiet else search.single(name) for name in names}
     leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
     correlation = min(_correlation(judge, leader.theta), 50.0)
     for name in names:

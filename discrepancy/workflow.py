@@ -175,6 +175,13 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
             }
         )  # fmt: skip
     effects.sort(key=lambda e: -float(str(e["probability"])))
+    # an effect that shows in two stages is one effect: the stage where it gains most speaks for it
+    best = {}
+    for s in d.stages:
+        for f in s.effects:
+            if f.effect not in best or f.nats > best[f.effect][0]:
+                best[f.effect] = (f.nats, s.stage)
+    effects = [e for e in effects if best[str(e["effect"])][1] == e["stage"]]
     return {
         "schema": 1,
         "log": log,
