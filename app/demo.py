@@ -67,8 +67,8 @@ def main() -> None:
         )  # fmt: skip
         _step("The extended model against the log", "compare", hidden, "--model", model, allowed=(0, 1))
     print("\npages to open in a browser:")
-    for page in sorted(OUT.glob("*.html")):
-        print(f"  {page}")
+    for written in sorted(OUT.glob("*.html")):
+        print(f"  {written}")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if missing or not outputs:
             absent[name] = "no " + ", ".join(missing or gives)
             continue
-        if name in ("servo", "demand") and dt > 2.5 * RASTER:
+        if name in ("servo", "demand") and dt > 1.5 * RASTER:
             absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
             continue
         stage = make(t, have, machine, cal, outputs, run, present)
@@ -225,7 +225,7 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
         if stage not in e.stages or e.name in present:
             continue
         ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high, 0.0, _vane(p.name)) for p in e.parameters)
-        effects.append(Effect(e.name, ps, _starts(e.name, ps), NEEDS.get(e.name, "")))
+        effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
         rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
         si += [p.si for p in e.parameters]
     return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
@@ -236,23 +236,6 @@ def _vane(name: str) -> str | None:
     return next((v for v in STAGES if v in name), None)
 
 
-NEEDS = {  # what a log must hold for an effect to show
-    "aero_load": "stroke under load at speeds that differ",
-    "end_stop_shift": "strokes that reach the end stops",
-    "internal_leakage": "a load on the piston (aero_load or friction)",
-    "oil_compressibility": "a load on the piston that changes",
-    "oil_viscosity": "oil temperature that changes while the stroke moves",
-    "supply_pressure_droop": "fast strokes, above 30 mm/s",
-    "valve_flow_saturation": "strokes faster than the flow at which the valve saturates",
-    "valve_lag": "currents that change within some milliseconds",
-    "lvdt_lag": "strokes that change speed within some milliseconds",
-    "lvdt_thermal_drift": "oil temperature that changes",
-    "thermal_growth": "oil temperature that changes",
-    "linkage_wear": "a log of some hours, or fast wear",
-    "linkage_compliance": "rotor speeds that differ",
-    "trend_threshold_error": "reversals of the demand",
-    "acceleration_limit_error": "demands that rise faster than the engine accelerates",
-}
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3}  # of second parameters
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)

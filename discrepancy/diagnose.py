@@ -30,8 +30,10 @@ FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
 FLOOR_KNOWN = 0.02  # relative error of a noise floor that was estimated from the log
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
-LEAST_SHARE = 0.15  # of the excess over the floor that a further effect must explain: less is one effect patching another's equation
-RESIDUAL_SHARE = 0.1  # of the excess over the floor that a model of the right kind may leave (its equation is not nature's)
+# Share of the excess over the floor that a further effect must explain (less is one effect patching another's equation), and that
+# a model of the right kind may leave (its equation is not nature's): what is left then would not have earned a further effect either.
+LEAST_SHARE = 0.15
+LEFT_FLOORS = 3.0  # noise floors that a named model may leave, whatever share of the excess it explains
 
 
 @dataclass
@@ -323,7 +325,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
     excess_before, excess_after = rms(base) ** 2 - 1.0, rms(current) ** 2 - 1.0
     limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
     leftover = rms(current) > limit
-    if leftover and excess_after > RESIDUAL_SHARE * max(excess_before, 1e-12):
+    if leftover and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms(current) > LEFT_FLOORS):
         verdict, effects = "unknown", []
     elif chosen:
         verdict = "missing"
@@ -413,5 +415,7 @@ def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
             p = stage.parameters[c]
             low, high = float(fit.low[k]), float(fit.high[k])
             if not low <= p.value <= high:
-                out.append({"parameter": p.name, "value": float(fit.theta[c]), "low": low, "high": high, "unit": p.unit})
+                limit = abs(fit.theta[c] - p.value) >= 0.999 * p.tolerance  # the data pull on beyond what the tolerance allows
+                value = float(fit.theta[c])
+                out.append({"parameter": p.name, "value": value, "low": low, "high": high, "unit": p.unit, "at_limit": bool(limit)})
     return out

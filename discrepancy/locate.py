@@ -182,7 +182,7 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
         total = float(np.mean((y[use] - y[use].mean()) ** 2)) + float(y[use].mean() ** 2)
         features: dict[str, tuple[Array, Array, str]] = {}
         direction = stage.regimes.get("direction")
-        for name, v in stage.regimes.items():
+        for name, v in sorted(stage.regimes.items(), key=lambda item: item[0] == "time"):  # time explains what nothing physical does
             features[name] = (v, y, stage.regime_units.get(name, ""))
             if direction is not None and name != "direction":
                 features[f"{name}, against the motion"] = (v, y * direction, stage.regime_units.get(name, ""))

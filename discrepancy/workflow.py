@@ -64,13 +64,14 @@ def floor_of(stage: Stage) -> Array:
     return stage.floor
 
 
+REMAINDER = 1.1  # noise floors left by a named model from which the shape of what is left is told too
 _WORK: list[Stage] = []
 
 
 def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
     d = diagnose_stage(stage, floor_of(stage))
-    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" else []
+    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" or d.excess > REMAINDER else []
 
 
 def diagnose(
@@ -114,7 +115,12 @@ def extend_stage(stage: Stage, effects: tuple[str, ...]) -> StageDiagnosis:
     for _ in range(3):
         judge = Judge(stage, floor)
         search = Search(judge)
-        fits = [search.base, *(search.joined(effects[: k + 1]) for k in range(len(effects)))]
+        for e in effects:
+            search.single(e)
+        order: tuple[str, ...] = ()
+        while len(order) < len(effects):  # the one that explains most first
+            order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
+        fits = [search.base, *(search.joined(order[: k + 1]) for k in range(len(order)))]
         final = fits[-1]
         if stage.noise is None:
             break
@@ -126,7 +132,7 @@ def extend_stage(stage: Stage, effects: tuple[str, ...]) -> StageDiagnosis:
     def rms(fit: Fit) -> float:
         return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1)))
 
-    names = ["nominal", *(f"+ {e}" for e in effects)]
+    names = ["nominal", *(f"+ {e}" for e in order)]
     steps = list(zip(names, map(rms, fits), strict=True))
     if stage.finer is not None:
         d = judge.errors(final.theta[None]) - judge._whiten(stage.finer(final.theta[None]))
@@ -162,7 +168,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
                 {"effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals}
             )
         recalibrated += s.recalibrated
-        if s.verdict == "unknown":
+        if s.verdict == "unknown" or s.excess > REMAINDER:
             text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
             leaning = [c.effect for c in s.candidates if c.nats > 12.0][:3]
             unknown.append({"stage": s.stage, "shape": text, "nearest_effects": leaning})
@@ -176,7 +182,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
         )  # fmt: skip
     effects.sort(key=lambda e: -float(str(e["probability"])))
     # an effect that shows in two stages is one effect: the stage where it gains most speaks for it
-    best = {}
+    best: dict[str, tuple[float, str]] = {}
     for s in d.stages:
         for f in s.effects:
             if f.effect not in best or f.nats > best[f.effect][0]:

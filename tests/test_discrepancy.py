@@ -248,7 +248,7 @@ def test_extending_by_what_was_named_brings_the_held_out_error_to_the_floor() ->
     stage = integrator(5, dead_band=0.6, gain_asymmetry=0.06)
     d = extend_stage(stage, ("dead_band", "gain_asymmetry"))
     errors = [e for _, e in d.steps]
-    assert [n for n, _ in d.steps] == ["nominal", "+ dead_band", "+ gain_asymmetry"]
+    assert [n for n, _ in d.steps] == ["nominal", "+ gain_asymmetry", "+ dead_band"]  # what explains most comes first
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 1.1 and d.error_after[0] < 1.1 * NOISE
     assert d.error_before[0] > 3 * NOISE
