@@ -147,9 +147,32 @@ class Search:
             best = min(fits, key=lambda f: float(f.cost.sum()))
             if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
                 best = self.judge.fit((name,), best.theta, 8)
+                best = self._refine(name, best)
             self.fits[key] = best
             self.tick()
         return self.fits[key]
+
+    def _refine(self, name: str, fit: Fit) -> Fit:
+        """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no slope to follow."""
+        starts = np.unique([s[0] for s in self.stage.effect(name).starts])
+        column = self.stage.index()[name].start
+        at = fit.theta[column]
+        if len(self.stage.effect(name).parameters) != 1 or np.min(np.abs(starts - at)) > 1e-9 * max(1.0, abs(at)):
+            return fit  # it moved away from its start: there is a slope
+        i = int(np.argmin(np.abs(starts - at)))
+        low, high = starts[max(i - 1, 0)], starts[min(i + 1, len(starts) - 1)]
+        best = at
+        for _ in range(2):
+            sizes = np.linspace(low, high, 13)
+            thetas = np.repeat(fit.theta[None], len(sizes), axis=0)
+            thetas[:, column] = sizes
+            costs = self.judge.block_costs(self.judge.errors(thetas)).sum(axis=1)
+            k = int(np.argmin(costs))
+            best, low, high = sizes[k], sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]
+        theta = fit.theta.copy()
+        theta[column] = best
+        refined = self.judge.fit((name,), theta, 4)
+        return refined if refined.cost.sum() < fit.cost.sum() else fit
 
     def joined(self, effects: tuple[str, ...], finished: bool = True) -> Fit:
         """Fit with several effects, started from the fits with one fewer; ``finished`` False: a few iterations, enough to rank it."""
