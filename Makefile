@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all bench lint clean
+.PHONY: help demo test test-all test-can bench lint clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -26,11 +26,16 @@ demo: $(READY)  ## replay a recorded engine run and the long engine test; writes
 
 test: lint  ## lint, types, and every test but the slow ones
 	@$(SAY) 'pytest'
-	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow'
+	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow and not socketcan'
+	@$(PY) -m tests.uml.run
 
 test-all: lint  ## lint, types, and every test, with the slow campaigns
 	@$(SAY) 'pytest, with the slow campaigns'
-	@$(PY) -m pytest -n $(JOBS) --dist worksteal
+	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
+	@$(PY) -m tests.uml.run
+
+test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, or that of user-mode Linux
+	@$(PY) -m tests.uml.run
 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)
