@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 
 from benchmarks.ours import OurLoop, Setup
-from controller import tick
-from controller.firmware import I_CMD, N_INPUTS, N_STATE, X_DEM
+from controller import new_inputs, tick
+from controller.firmware import I_CMD, N_STATE, X_DEM
 from plant import chain
 
 __all__ = ["SIGNALS", "run"]
@@ -39,10 +39,10 @@ def run(setup: Setup) -> np.ndarray:
 
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
     p_s, t_oil, run_request = rows[0, 2], rows[0, 3], 1.0
-    inputs = np.zeros(N_INPUTS)
+    inputs = new_inputs()
 
     def ticked(z, u):
-        inputs[:] = u[0], u[1], u[2], 0.0, run_request, u[3]
+        inputs[:6] = u[0], u[1], u[2], 0.0, run_request, u[3]
         z = z.copy()
         tick(inputs, z, cal)
         return z

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from controller import firmware
 from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
 
-__all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_state"]
+__all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_inputs", "new_state"]
 
 STRATEGIES = ("single", "dual")
 _SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3}  # mA/mm = A/m and the other ratios need no factor
@@ -199,6 +199,14 @@ def load_calibration(
     k = np.array([flat[name] for name in firmware.SCALARS])
     table = np.array([stroke.speed.values] + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")])
     return Calibration(k, table)
+
+
+def new_inputs() -> np.ndarray:
+    """Inputs of a controller to which nothing has come yet, without stem potentiometers; it is asked to run."""
+    inputs = np.zeros(firmware.N_INPUTS)
+    inputs[firmware.IN_MODE_REQUEST] = 1.0
+    inputs[firmware.IN_VIGV : firmware.IN_VGV2 + 1] = np.nan
+    return inputs
 
 
 def new_state() -> np.ndarray:

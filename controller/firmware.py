@@ -24,7 +24,7 @@ from numba import njit
 compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  # type: ignore[call-overload]
 
 # ---- inputs -------------------------------------------------------------------------------------------------------------------------
-INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt")
+INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2")
 N_INPUTS = len(INPUTS)
 (
     IN_N_DEM,  # %, demand of the last good ECU frame
@@ -33,6 +33,9 @@ N_INPUTS = len(INPUTS)
     IN_REJECTED,  # ECU frames refused since the last tick (CRC, counter, length)
     IN_MODE_REQUEST,  # 0 standby, 1 run
     IN_X_LVDT,  # m, stroke as the LVDT gives it
+    IN_VIGV,  # rad, vane angles as the stem potentiometers give them; NaN = not fitted
+    IN_VGV1,
+    IN_VGV2,
 ) = range(N_INPUTS)
 
 # ---- modes --------------------------------------------------------------------------------------------------------------------------

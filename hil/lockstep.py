@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from controller import Calibration, load_calibration, new_state, tick
+from controller import Calibration, load_calibration, new_inputs, new_state, tick
 from controller.firmware import (
     BLEND,
     DIRECTION,
@@ -32,12 +32,12 @@ from controller.firmware import (
     IN_N_DEM,
     IN_N_R,
     IN_REJECTED,
+    IN_VIGV,
     IN_X_LVDT,
     KFF,
     KI,
     KP,
     MODE,
-    N_INPUTS,
     SLOW,
     TREND_CHANGE,
     TREND_RATE_ON,
@@ -105,13 +105,14 @@ class Run:
 
 
 @compiled
-def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mean, every, out, snapshots):
+def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mean, every, out, snapshots, pots):
     """Advance the loop by ``ticks`` ticks from tick ``k0``.
 
     noise      float64[ticks or 1, 5] standard normal numbers (LVDT, three potentiometers, speed), sigma float64[5] their rms in SI
     mean       float64[2] sum and number of currents since the last logged sample
     out        float64[rows, 12] in SI, a row every ``every`` ticks
     snapshots  float64[ticks or 0, n] copies of the whole state at each tick
+    pots       float64[frames or 0, 6] what the controller gets of each potentiometer: share of its reading, offset (rad), stage by stage
     """
     noisy = noise.shape[0] > 1
     keep = snapshots.shape[0] > 0
@@ -147,6 +148,11 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
             inputs[IN_REJECTED] = 0.0
         p_s, t_oil = stimulus[frame, S_P_S], stimulus[frame, S_T_OIL]
         inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[m, 0], t_oil)
+        for q in range(3):
+            inputs[IN_VIGV + q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[m, 1 + q]
+            if pots.shape[0] > 0:
+                at = min(frame, pots.shape[0] - 1)
+                inputs[IN_VIGV + q] = pots[at, 2 * q] * inputs[IN_VIGV + q] + pots[at, 2 * q + 1]
         tick(inputs, z, calibration)
         mean[0] += z[I_CMD]
         mean[1] += 1.0
@@ -193,6 +199,8 @@ def lockstep(
     stroke_demand: float | None = None,
     duration: float | None = None,
     hashed: bool = True,
+    pots: np.ndarray | None = None,
+    watch: Callable[[np.ndarray], None] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Run:
     """Run controller and plant against ``stimulus``.
@@ -202,6 +210,9 @@ def lockstep(
     angles         rad, measured vane angles at t = 0, to start each stage's play where the machine's was
     stroke_demand  m, logged stroke demand at t = 0: the controller starts on the curve that is nearer to it
     duration       s, default the stimulus's length
+    pots           float64[frames, 6], what the controller gets of each stem potentiometer: share of its reading and offset (rad), stage by
+                   stage; share 0 = stuck, offset NaN = none. The log keeps the reading itself.
+    watch          called with the states of the controller and the plant at each of the next up to 10,000 ticks, side by side
     progress       called with the fraction done
     """
     machine = plant or _nominal()
@@ -211,22 +222,23 @@ def lockstep(
     ticks = int(round((duration if duration is not None else len(stimulus.rows) * FRAME) * 1000))
     p = machine.p
     n0 = stimulus.rows[0, S_N_R] if np.isfinite(stimulus.rows[0, S_N_R]) else stimulus.rows[0, S_N_DEM]
-    z, inputs, mean = new_state(), np.zeros(N_INPUTS), np.zeros(2)
+    z, inputs, mean = new_state(), new_inputs(), np.zeros(2)
     z[DIRECTION], z[BLEND] = _starting_curve(cal, n0, stroke_demand)
     stroke, t_oil = float(np.interp(n0, cal.table[0], cal.table[3])), float(stimulus.rows[0, S_T_OIL])
     s = machine.start(stroke=stroke, n_r=stimulus.rows[0, S_N_DEM], t_oil=t_oil)
     sigma = machine.sigma if seed is not None else np.zeros(5)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
     silent = np.zeros((1, 5))
-    no_out, no_snapshots = np.empty((0, len(COLUMNS))), np.empty((0, 0))
-    advance(-WARM_UP, WARM_UP, stimulus.rows[:1].copy(), silent, sigma, inputs, z, cal, s, p, mean, 10, no_out, no_snapshots)
+    no_out, no_snapshots, all_pots = np.empty((0, len(COLUMNS))), np.empty((0, 0)), np.empty((0, 6))
+    pots = all_pots if pots is None else np.ascontiguousarray(pots, dtype=np.float64)
+    advance(-WARM_UP, WARM_UP, stimulus.rows[:1].copy(), silent, sigma, inputs, z, cal, s, p, mean, 10, no_out, no_snapshots, pots)
     mean[:] = 0.0
     if angles is not None:
         machine.place_rings(s, angles, n0, t_oil)
 
     rows = stimulus.rows.copy()  # a late frame keeps the speed with which it was sent
     out = np.empty((-(-ticks // every), len(COLUMNS)))
-    buffers = [np.empty((CHUNK if hashed else 0, len(z) + len(s))) for _ in range(2)]
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(z) + len(s))) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()
     with ThreadPoolExecutor(1) as pool:
@@ -235,11 +247,13 @@ def lockstep(
             n = min(CHUNK, ticks - k0)
             noise = silent if seed is None else generator.standard_normal((n, 5))
             snap = buffers[c % 2][:n]
-            advance(k0, n, rows, noise, sigma, inputs, z, cal, s, p, mean, every, out[k0 // every :], snap)
+            advance(k0, n, rows, noise, sigma, inputs, z, cal, s, p, mean, every, out[k0 // every :], snap, pots)
             if pending is not None:
                 pending.result()
             if hashed:
                 pending = pool.submit(digest.update, memoryview(snap))  # type: ignore[arg-type]
+            if watch is not None:
+                watch(snap)
             if progress is not None:
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
@@ -256,7 +270,7 @@ def flashed(calibration: Calibration, plant: Plant) -> Calibration:
         k[row] = trend_threshold_error.step(k[row], p[chain.TREND_THRESHOLD_ERROR])
     for row in (KP, KI, KFF):
         k[row] = controller_gain_error.step(k[row], p[chain.CONTROLLER_GAIN_ERROR])
-    return Calibration(k, table)
+    return calibration._replace(k=k, table=table)
 
 
 def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:

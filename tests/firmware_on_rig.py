@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from controller import Calibration, load_calibration, new_state, tick
+from controller import Calibration, load_calibration, new_inputs, new_state, tick
 from controller.firmware import (
     I_CMD,
     IN_FRESH,
-    IN_MODE_REQUEST,
     IN_N_DEM,
     IN_N_R,
     IN_X_LVDT,
@@ -18,7 +15,6 @@ from controller.firmware import (
     KI,
     KP,
     MODE,
-    N_INPUTS,
     ROW_EXTENSION,
     ROW_RETRACTION,
     ROW_SINGLE,
@@ -34,8 +30,7 @@ __all__ = ["firmware"]
 def firmware(calibration: Calibration | None = None) -> Compiled:
     """Return the controller as the rig takes it; controller errors are put into its calibration."""
     cal = calibration or load_calibration()
-    inputs = np.zeros(N_INPUTS)
-    inputs[IN_MODE_REQUEST] = 1.0
+    inputs = new_inputs()
     out = Compiled(
         tick=tick, inputs=inputs, state=new_state(), calibration=cal, n_dem=IN_N_DEM, n_r=IN_N_R, x_lvdt=IN_X_LVDT, fresh=IN_FRESH,
         i_cmd=I_CMD, x_dem=X_DEM, mode=MODE,
@@ -49,6 +44,6 @@ def firmware(calibration: Calibration | None = None) -> Compiled:
             k[[TREND_RATE_ON, TREND_CHANGE]] *= parameters["factor"]
         else:
             k[[KP, KI, KFF]] *= parameters["factor"]
-        return replace(out, calibration=Calibration(k, table), change=None)
+        return replace(out, calibration=cal._replace(k=k, table=table), change=None)
 
     return replace(out, change=change)

@@ -810,6 +810,8 @@ def campaign(seed, n, cal, seen, trials, worst):
         row[fw.IN_REJECTED] = pick(kinds[3], 0.0)
         row[fw.IN_MODE_REQUEST] = pick(kinds[4], request)
         row[fw.IN_X_LVDT] = pick(kinds[5], x if frozen == 0.0 else z[fw.X_MEAS])
+        for q in range(3):
+            row[fw.IN_VIGV + q] = pick(kinds[fw.IN_VIGV + q], 20.0 * x - 0.5)  # rad, about the linkage's
         mode, x_dem = int(z[fw.MODE]), z[fw.X_DEM]
         lost = (int(z[fw.FAULT_BITS]) & fw.LVDT_MASK) != 0
         tick(row, z, cal)
