@@ -25,8 +25,8 @@ import numpy as np
 from tables import InputError
 
 __all__ = [
-    "DISORDER_S", "EXTENDED", "Frames", "LogError", "Message", "cut_signal", "e2e_crc", "encode", "load_dbc", "read_asc", "read_blf",
-    "read_candump", "read_trc", "select", "write_asc", "write_blf", "write_candump", "write_trc",
+    "DISORDER_S", "EXTENDED", "Frames", "LogError", "Message", "crc_table", "cut_signal", "e2e_crc", "encode", "load_dbc", "read_asc",
+    "read_blf", "read_candump", "read_trc", "select", "write_asc", "write_blf", "write_candump", "write_trc",
 ]  # fmt: skip
 
 EXTENDED = 1 << 31  # flag in `Frames.ident`, as socketcan sets it
@@ -652,7 +652,7 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
     return rows, notes
 
 
-def _crc_table() -> np.ndarray:
+def crc_table() -> np.ndarray:
     """CRC-8 SAE J1850, polynomial 0x1D."""
     c: Any = np.arange(256)
     for _ in range(8):
@@ -660,7 +660,7 @@ def _crc_table() -> np.ndarray:
     return c.astype(np.uint8)
 
 
-_CRC = _crc_table()
+_CRC = crc_table()
 
 
 def e2e_crc(data: np.ndarray, data_id: int) -> np.ndarray:

@@ -44,10 +44,10 @@ from controller.firmware import (
     X_DEM,
 )
 from plant import Plant, build_plant, chain
-from plant.compiled import compiled
+from plant.compiled import compiled, in_place
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 
-__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "flashed", "lockstep", "warm_up"]
+__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "flashed", "lockstep", "move", "sense", "spoil", "warm_up"]
 
 FRAME = 1e-2  # s, period of the ECU's frame
 CHUNK = 10_000  # ticks between two calls of the progress function
@@ -104,6 +104,29 @@ class Run:
         return self.columns["t"]
 
 
+@in_place
+def sense(inputs, s, p, sigma, noise, m, t_oil):
+    """Sample LVDT and stem potentiometers into the controller's inputs, with row ``m`` of ``noise``."""
+    inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[m, 0], t_oil)
+    for q in range(3):
+        inputs[IN_VIGV + q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[m, 1 + q]
+
+
+@in_place
+def spoil(inputs, pots, row):
+    """Replace each potentiometer's reading by a share of it and an offset (rad), from ``row`` of ``pots``."""
+    for q in range(3):
+        inputs[IN_VIGV + q] = pots[row, 2 * q] * inputs[IN_VIGV + q] + pots[row, 2 * q + 1]
+
+
+@in_place
+def move(k, s, p, i_cmd, n_dem, n_r, p_s, t_oil):
+    """Let the machine move on from tick ``k`` to the next under ``i_cmd`` (A), at demand ``n_dem`` and speed ``n_r`` (%)."""
+    chain.rotor_step(s, p, 0, n_dem, chain.TICK)
+    chain.drive_step(s, p, 0, i_cmd, n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
+    chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)
+
+
 @compiled
 def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mean, every, out, snapshots, pots):
     """Advance the loop by ``ticks`` ticks from tick ``k0``.
@@ -147,12 +170,9 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
             inputs[IN_FRESH] = 0.0
             inputs[IN_REJECTED] = 0.0
         p_s, t_oil = stimulus[frame, S_P_S], stimulus[frame, S_T_OIL]
-        inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[m, 0], t_oil)
-        for q in range(3):
-            inputs[IN_VIGV + q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[m, 1 + q]
-            if pots.shape[0] > 0:
-                at = min(frame, pots.shape[0] - 1)
-                inputs[IN_VIGV + q] = pots[at, 2 * q] * inputs[IN_VIGV + q] + pots[at, 2 * q + 1]
+        sense(inputs, s, p, sigma, noise, m, t_oil)
+        if pots.shape[0] > 0:
+            spoil(inputs, pots, min(frame, pots.shape[0] - 1))
         tick(inputs, z, calibration)
         mean[0] += z[I_CMD]
         mean[1] += 1.0
@@ -178,9 +198,7 @@ def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mea
                 snapshots[i, q] = z[q]
             for q in range(n_s):
                 snapshots[i, n_z + q] = s[q, 0]
-        chain.rotor_step(s, p, 0, sent_n_dem, chain.TICK)
-        chain.drive_step(s, p, 0, z[I_CMD], sent_n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
-        chain.vane_step(s, p, 0, sent_n_r, t_oil, (k + 1) * chain.TICK)
+        move(k, s, p, z[I_CMD], sent_n_dem, sent_n_r, p_s, t_oil)
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,383 @@
+"""Frames as the DBC says: compiled codec against cantools and autosar-e2e, receiver against what a bus brings, node against lockstep."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import can
+import cantools
+import e2e.p01
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+import tables
+from controller import new_inputs, new_state
+from hil import frames
+from hil.frames import ECU_DEMAND, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
+from hil.lockstep import COLUMNS, Stimulus, advance
+from hil.node import Ecu, Node, replay
+
+NONE = np.zeros((0, 2), np.int64)
+
+
+@pytest.fixture(scope="module")
+def db() -> Any:
+    return cantools.database.load_file(tables.path("vgv.dbc"))
+
+
+def data_of(payload: int) -> bytes:
+    return int(payload).to_bytes(8, "little", signed=True)
+
+
+def reference(message: Any, values: dict[str, float], counter: int) -> bytes:
+    """The frame as cantools and autosar-e2e make it."""
+    data = bytearray(message.encode({**values, "crc": 0, "counter": (counter - 1) % 15}, strict=False))
+    e2e.p01.e2e_p01_protect(data, 0x5600 + message.frame_id)
+    return bytes(data)
+
+
+def encode(ident: int, v: dict[str, float], counter: int) -> bytes:
+    """The frame as the compiled codec makes it."""
+    if ident == ECU_DEMAND:
+        word = frames.encode_demand(v["n_dem"], v["n_r"], int(v["mode_request"]), counter)
+    elif ident == VGV_STATUS:
+        word = frames.encode_status(v["x_dem"], v["x_lvdt"], int(v["state"]), counter)
+    elif ident == VGV_SERVO:
+        word = frames.encode_servo(v["i_cmd"], fault_bits(v), counter)
+    elif ident == VGV_ANGLES:
+        word = frames.encode_angles(v["vigv"], v["vgv1"], v["vgv2"], counter)
+    else:
+        word = frames.encode_health(v["p_s"], v["t_oil"], int(v["frames_lost"]), int(v["frames_rejected"]), counter)
+    return data_of(word)
+
+
+def fault_bits(v: dict[str, float]) -> int:
+    from controller import FAULTS as names
+
+    return sum(int(v[f"fault_{name}"]) << bit for bit, name in enumerate(names))
+
+
+@given(seed=st.integers(0, 2**32))
+def test_codec_equals_cantools_and_the_e2e_library(db: Any, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for message in db.messages:
+        for _ in range(40):
+            v = {
+                s.name: float(rng.uniform(s.minimum, s.maximum)) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1))
+                for s in message.signals
+                if s.name not in ("crc", "counter")
+            }
+            counter = int(rng.integers(0, 15))
+            theirs = reference(message, v, counter)
+            assert encode(message.frame_id, v, counter) == theirs
+            word = int.from_bytes(theirs, "little", signed=True)
+            ours = frames.decode(int(frames.word0(message.frame_id)), word)
+            expected = message.decode(theirs, decode_choices=False)
+            for name, value in ours.items():
+                assert value == (fault_bits(expected) if name == "faults" else expected[name]), name
+
+
+@given(st.binary(min_size=8, max_size=8))
+@example(b"1\xaf\x95\x08F\xd8W\x10")  # a right CRC, and 15 for a counter
+def test_any_eight_bytes_decode_as_cantools_has_them(db: Any, data: bytes) -> None:
+    for message in db.messages:
+        word = int.from_bytes(data, "little", signed=True)
+        ours = frames.decode(int(frames.word0(message.frame_id)), word)
+        expected = message.decode(data, decode_choices=False)
+        assert {k: v for k, v in ours.items() if k != "faults"} == {k: expected[k] for k in ours if k != "faults"}
+        right = e2e.p01.e2e_p01_check(bytearray(data), 0x5600 + message.frame_id)
+        assert right == (int(frames.crc(message.frame_id, word)) == data[0] and data[1] & 15 != 15)
+
+
+def test_every_frame_and_signal_of_the_dbc_is_known(db: Any) -> None:
+    assert {m.frame_id: m.name for m in db.messages} == frames.NAMES
+    assert {m.frame_id: m.cycle_time for m in db.messages} == frames.PERIOD
+    for m in db.messages:
+        names = {s.name for s in m.signals if s.name not in ("crc", "counter") and not s.name.startswith("fault_")}
+        assert names == set(frames.FRAMES[m.frame_id][1]) - {"faults"}
+        assert m.dbc.attributes["DataID"].value == 0x5600 + m.frame_id
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324])
+def test_values_that_no_frame_holds_are_held_at_the_limits_and_nan_is_not_available(db: Any, value: float) -> None:
+    words = {
+        ECU_DEMAND: frames.encode_demand(value, value, 1, 0),
+        VGV_STATUS: frames.encode_status(value, value, 2, 0),
+        VGV_SERVO: frames.encode_servo(value, 255, 0),
+        VGV_ANGLES: frames.encode_angles(value, value, value, 0),
+        VGV_HEALTH: frames.encode_health(value, value, 999, 999, 0),
+    }
+    for ident, word in words.items():
+        message = db.get_message_by_frame_id(ident)
+        raw = message.decode(data_of(word), scaling=False, decode_choices=False)
+        physical = message.decode(data_of(word), decode_choices=False)
+        for s in message.signals:
+            missing = (s.dbc.attributes or {}).get("NotAvailable")
+            if s.length != 16:
+                continue
+            if math.isnan(value):
+                assert raw[s.name] == missing.value
+            else:
+                assert physical[s.name] == pytest.approx(min(max(value, s.minimum), s.maximum), abs=s.scale / 2)
+                assert raw[s.name] != missing.value
+
+
+@given(
+    ident=st.integers(0, 2**29 - 1),
+    extended=st.booleans(),
+    kind=st.sampled_from(["data", "remote", "fd", "error"]),
+    data=st.binary(max_size=8),
+)
+def test_message_and_words_are_the_same_frame(ident: int, extended: bool, kind: str, data: bytes) -> None:
+    message = can.Message(
+        arbitration_id=ident if extended else ident & 0x7FF,
+        is_extended_id=extended and kind != "error",
+        is_remote_frame=kind == "remote",
+        is_fd=kind == "fd",
+        is_error_frame=kind == "error",
+        data=None if kind == "remote" else data,
+        dlc=len(data),
+    )
+    back = frames.to_message(*frames.from_message(message))
+    assert back.equals(message, timestamp_delta=None, check_channel=False)
+
+
+# ---- receiver -----------------------------------------------------------------------------------------------------------------------
+
+
+class Sender:
+    """Frames of ECU_DEMAND to a receiver, one each 10 ms."""
+
+    def __init__(self) -> None:
+        self.r = frames.new_receiver(ECU_DEMAND)
+        self.now, self.counter = 0, 0
+
+    def frame(self, n_dem: float = 70.0, counter: int | None = None) -> tuple[int, int]:
+        return int(frames.word0(ECU_DEMAND)), int(frames.encode_demand(n_dem, n_dem, 1, self.counter if counter is None else counter))
+
+    def give(self, head: int, data: int) -> str:
+        return frames.VERDICTS[frames.receive(self.r, head, data, self.now)]
+
+    def next(self, send: bool = True) -> str | None:
+        """One period on; send the next frame or lose it."""
+        self.now += 10
+        self.counter = (self.counter + 1) % 15
+        verdict = self.give(*self.frame()) if send else None
+        frames.grow_old(self.r, self.now)
+        return verdict
+
+    def count(self, name: str) -> int:
+        return int(self.r[frames.COUNTS.index(name)])
+
+    def started(self) -> Sender:
+        assert [self.next() for _ in range(3)] == ["sync", "good", "good"]
+        return self
+
+
+def test_good_frames_stay_good_through_many_turns_of_the_counter() -> None:
+    s = Sender().started()
+    assert {s.next() for _ in range(100)} == {"good"}
+    assert s.count("lost") == 0 and frames.refused(s.r) == 0
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3, 4])
+def test_a_short_loss_is_counted_and_the_next_frame_is_good(lost: int) -> None:
+    s = Sender().started()
+    for _ in range(lost):
+        s.next(send=False)
+    assert s.next() == "good"
+    assert s.count("lost") == lost and s.count("stale") == 0
+
+
+@pytest.mark.parametrize("lost", [5, 14, 15, 16, 40])
+def test_a_long_loss_is_stale_counted_by_time_and_takes_two_frames_to_end(lost: int) -> None:
+    s = Sender().started()
+    for _ in range(lost):
+        s.next(send=False)
+    assert s.count("stale") == 1
+    assert [s.next(), s.next()] == ["sync", "good"]
+    assert s.count("lost") == lost + 1  # the frame that only showed the counter was not used
+    assert frames.refused(s.r) == 0
+
+
+def test_a_repeated_frame_is_refused_and_does_not_disturb() -> None:
+    s = Sender().started()
+    assert s.give(*s.frame()) == "repeated"
+    assert s.next() == "good"
+    assert s.count("repeated") == 1 and s.count("lost") == 0
+
+
+def test_a_sender_that_only_repeats_itself_is_never_good() -> None:
+    s = Sender().started()
+    frozen = s.frame()
+    verdicts = set()
+    for _ in range(100):
+        s.now += 10
+        verdicts.add(s.give(*frozen))
+        frames.grow_old(s.r, s.now)
+    assert verdicts == {"repeated"} and s.count("stale") == 1
+
+
+@given(st.integers(0, 63))
+def test_any_flipped_bit_is_refused(bit: int) -> None:
+    s = Sender().started()
+    head, data = s.frame(counter=(s.counter + 1) % 15)
+    flipped = data ^ (1 << bit if bit < 63 else -(1 << 63))
+    assert s.give(head, flipped) == "wrong_crc"
+
+
+def test_replayed_old_frames_between_good_ones_are_refused() -> None:
+    s = Sender().started()
+    for _ in range(100):
+        assert s.give(*s.frame(counter=(s.counter + 8) % 15)) == "wrong_sequence"
+        assert s.next() == "good"
+
+
+def test_a_swapped_pair_costs_one_frame() -> None:
+    s = Sender().started()
+    late = s.frame(counter=(s.counter + 1) % 15)
+    s.next(send=False)
+    assert s.next() == "good"
+    assert s.give(*late) == "wrong_sequence"
+    assert s.next() == "good"
+
+
+def test_counter_15_is_no_counter() -> None:
+    s = Sender().started()
+    assert s.give(*s.frame(counter=15)) == "wrong_sequence"
+
+
+@pytest.mark.parametrize("length", [*range(8), 12, 64])
+def test_wrong_length_is_refused(length: int) -> None:
+    s = Sender().started()
+    _, data = s.frame(counter=(s.counter + 1) % 15)
+    assert s.give(length << 32 | ECU_DEMAND, data) == "wrong_length"
+
+
+@pytest.mark.parametrize("flag", [frames.EXTENDED, frames.REMOTE, frames.FD])
+def test_wrong_kind_of_frame_is_refused(flag: int) -> None:
+    s = Sender().started()
+    head, data = s.frame(counter=(s.counter + 1) % 15)
+    assert s.give(head | flag, data) == "wrong_kind"
+
+
+def test_error_frames_and_other_identifiers_are_nobodys_refusals() -> None:
+    s = Sender().started()
+    head, data = s.frame()
+    assert s.give(head | frames.ERROR, data) == "other"
+    assert s.give(head + 1, data) == "other"
+    assert s.give(head | frames.EXTENDED | 1 << 20, data) == "other"
+    assert frames.refused(s.r) == 0
+
+
+# ---- nodes --------------------------------------------------------------------------------------------------------------------------
+
+
+def test_node_does_what_lockstep_does_bit_for_bit() -> None:
+    raw = np.interp(np.arange(400), [0, 50, 150, 250, 399], [60, 60, 80, 70, 72])
+    n_dem = np.rint(raw / 0.002) * 0.002
+    n_r = np.rint((raw + 0.1) / 0.002) * 0.002
+    vgv = Node(n_r=60.0, seed=4)
+    sent = []
+    for k in range(4000):
+        row = np.array([[frames.word0(ECU_DEMAND), frames.encode_demand(n_dem[k // 10], n_r[k // 10], 1, k // 10 % 15)]], np.int64)
+        sent.append(vgv.tick(row if k % 10 == 0 else NONE).copy())
+
+    decoded = [frames.decode(ECU_DEMAND | 8 << 32, int(frames.encode_demand(a, b, 1, 0))) for a, b in zip(n_dem, n_r, strict=True)]
+    rows = Stimulus.of([d["n_dem"] for d in decoded], [d["n_r"] for d in decoded]).rows.copy()
+    rows[0, 4] = 0.0  # the first frame only shows the counter
+    like = Node(n_r=60.0, seed=4).arrays
+    like.s[0] = 60.0
+    out = np.empty((400, len(COLUMNS)))
+    noise = np.random.Generator(np.random.PCG64(4)).standard_normal((4000, 5))
+    z, s, mean = new_state(), like.s, np.zeros(2)
+    advance(0, 4000, rows, noise, like.sigma, new_inputs(), z, like.calibration, s, like.p, mean, 10, out, np.empty((0, 0)), np.empty((0, 6)))
+    assert np.array_equal(vgv.arrays.z, z)
+    assert np.array_equal(np.delete(vgv.arrays.s, 0), np.delete(s, 0))  # the node's own rotor starts one frame later
+
+    status = [frames.decode(*f.tolist()) for f in (t[0] for t in sent if len(t))]
+    servo = [frames.decode(*f.tolist()) for f in (t[1] for t in sent if len(t))]
+    assert np.allclose([v["x_lvdt"] for v in status], out[:, 4] * 1e3, atol=0.0005001)
+    assert np.allclose([v["x_dem"] for v in status], out[:, 3] * 1e3, atol=0.0005001)
+    assert np.allclose([v["i_cmd"] for v in servo], out[:, 5] * 1e3, atol=0.0010001)
+    assert [v["state"] for v in status] == out[:, 11].tolist()
+
+
+def together(ticks: int, disturb: Any = None) -> tuple[Node, Ecu, list[np.ndarray], list[np.ndarray]]:
+    """An ECU and a controller that hear each other one tick later; ``disturb(k, frames)`` changes what the controller hears."""
+    vgv, ecu = Node(seed=1), Ecu(seed=2)
+    to_vgv = to_ecu = NONE
+    heard, sent = [], []
+    for k in range(ticks):
+        ecu.set_demand(60.0 + 20.0 * min(k / 3000.0, 1.0))
+        if disturb is not None:
+            to_vgv = disturb(k, to_vgv)
+        heard.append(to_vgv.copy())
+        from_ecu = ecu.tick(to_ecu).copy()
+        to_ecu = vgv.tick(to_vgv).copy()
+        sent.append(to_ecu)
+        to_vgv = from_ecu
+    return vgv, ecu, heard, sent
+
+
+def test_ecu_and_controller_run_and_hear_each_other() -> None:
+    vgv, ecu, _, sent = together(3000)
+    assert vgv.mode == "RUN" and vgv.faults == 0 and ecu.stale() == []
+    assert ecu.values["state"] == 2.0 and ecu.values["x_lvdt"] == pytest.approx(vgv.arrays.inputs[5] * 1e3, abs=0.2)
+    assert [len(s) for s in sent[:101]].count(4) == 2 and sum(len(s) for s in sent) == 3 * 300 + 30
+
+
+def test_a_recorded_run_is_repeated_bit_for_bit() -> None:
+    rng = np.random.default_rng(3)
+
+    def disturb(k: int, rows: np.ndarray) -> np.ndarray:
+        rows = rows.copy()
+        if len(rows) and rng.random() < 0.1:
+            rows[0, 1] ^= 1 << int(rng.integers(0, 60))
+        return np.repeat(rows, rng.integers(0, 3), axis=0) if rng.random() < 0.1 else rows
+
+    vgv, _, heard, sent = together(2500, disturb)
+    assert vgv.counts["wrong_crc"] > 5 and vgv.counts["repeated"] > 2
+    again = Node(seed=1)
+    at = np.repeat(np.arange(2500), [len(h) for h in heard])
+    ticks, repeated = replay(again, at, np.concatenate(heard), 2500)
+    assert np.array_equal(repeated, np.concatenate(sent))
+    assert np.array_equal(ticks, np.repeat(np.arange(2500), [len(s) for s in sent]))
+    assert again.fingerprint() == vgv.fingerprint()
+
+
+def test_silence_is_degraded_then_fail_safe_and_run_returns() -> None:
+    modes = {}
+
+    def disturb(k: int, rows: np.ndarray) -> np.ndarray:
+        modes[k] = None
+        return NONE if 1000 <= k < 2000 else rows
+
+    vgv, ecu = Node(), Ecu()
+    to_vgv = to_ecu = NONE
+    seen = []
+    for k in range(3600):
+        from_ecu = ecu.tick(to_ecu).copy()
+        to_ecu = vgv.tick(disturb(k, to_vgv)).copy()
+        to_vgv = from_ecu
+        seen.append(vgv.mode)
+    last_good = 991
+    assert seen[last_good + 49] == "RUN" and seen[last_good + 50] == "DEGRADED"
+    assert seen[last_good + 549] == "DEGRADED" and seen[last_good + 550] == "FAIL_SAFE"
+    assert seen[3550] == "RUN"
+    assert vgv.counts["stale"] == 1 and 100 <= vgv.counts["lost"] <= 102
+
+
+def test_health_tells_what_was_lost_and_refused() -> None:
+    def disturb(k: int, rows: np.ndarray) -> np.ndarray:
+        if len(rows) and 500 <= k < 530:
+            rows = rows.copy()
+            rows[:, 1] ^= 1 << 40
+        return rows
+
+    vgv, ecu, _, _ = together(1000, disturb)
+    assert ecu.values["frames_rejected"] == 3 == vgv.counts["wrong_crc"]
+    assert ecu.values["frames_lost"] == 3
