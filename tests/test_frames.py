@@ -294,7 +294,9 @@ def test_node_does_what_lockstep_does_bit_for_bit() -> None:
     out = np.empty((400, len(COLUMNS)))
     noise = np.random.Generator(np.random.PCG64(4)).standard_normal((4000, 5))
     z, s, mean = new_state(), like.s, np.zeros(2)
-    advance(0, 4000, rows, noise, like.sigma, new_inputs(), z, like.calibration, s, like.p, mean, 10, out, np.empty((0, 0)), np.empty((0, 6)))
+    advance(
+        0, 4000, rows, noise, like.sigma, new_inputs(), z, like.calibration, s, like.p, mean, 10, out, np.empty((0, 0)), np.empty((0, 6))
+    )
     assert np.array_equal(vgv.arrays.z, z)
     assert np.array_equal(np.delete(vgv.arrays.s, 0), np.delete(s, 0))  # the node's own rotor starts one frame later
 
