@@ -1,0 +1,156 @@
+"""Which bus a command joins, and frames in and out of it without a python-can message for each."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hil.frames import FD, from_message, to_message
+from tables import InputError
+
+if TYPE_CHECKING:
+    import can
+
+__all__ = ["BUS_HELP", "Port", "open_bus"]
+
+BUS_HELP = "vcan0, can0, ...: SocketCAN; local[:NAME]: embedded bus between processes; lockstep: simulated time"
+_CAN_TYPE = "280"  # ARPHRD_CAN
+_NET = Path("/sys/class/net")
+
+
+def open_bus(name: str, **options: Any) -> can.BusABC:
+    """Open the bus that ``name`` says: ``vcan0``, ``can0`` ... (SocketCAN), ``local[:NAME]`` (embedded), ``lockstep[:NAME]``.
+
+    options go to the python-can interface (``receive_own_messages``, ``can_filters``, ...). InputError where there is no such bus.
+    """
+    import can
+
+    kind, _, rest = name.partition(":")
+    try:
+        if kind == "local":
+            from hil.local_bus import DEFAULT, LocalBus
+
+            return LocalBus(rest or DEFAULT, **options)
+        if kind == "lockstep":
+            from hil.lockstep_bus import LockstepBus
+
+            return LockstepBus(rest or "lockstep", **options)
+        if not rest and (re.fullmatch(r"v?can\d+", kind) or _is_can(kind)):
+            _check_socketcan(kind)
+            from can.interfaces.socketcan import SocketcanBus
+
+            return SocketcanBus(kind, **{"fd": True, **options})
+    except (OSError, can.CanError) as e:
+        raise InputError(f"--bus {name}: {getattr(e, 'strerror', None) or e}; --bus local joins the embedded bus instead") from None
+    raise InputError(f"--bus {name!r} is not known; allowed: vcan0, can0 or another CAN interface, local, local:NAME, lockstep")
+
+
+def _is_can(name: str) -> bool:
+    try:
+        return bool(re.fullmatch(r"[^/\s:]{1,15}", name)) and (_NET / name / "type").read_text().strip() == _CAN_TYPE
+    except OSError:
+        return False
+
+
+def _check_socketcan(name: str) -> None:
+    """Raise InputError, naming the way out, where the kernel has no such interface or it is down."""
+    instead = "--bus local joins the embedded bus instead"
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError):
+        raise InputError(f"--bus {name}: this kernel has no CAN; {instead}") from None
+    if not (_NET / name).exists():
+        hint = f" (sudo ip link add dev {name} type vcan makes it)" if name.startswith("v") else ""
+        raise InputError(f"--bus {name}: no such interface{hint}; {instead}")
+    if not _is_can(name):
+        raise InputError(f"--bus {name}: is not a CAN interface; {instead}")
+    flags = int((_NET / name / "flags").read_text(), 16)
+    if not flags & 1:  # IFF_UP
+        raise InputError(f"--bus {name}: is down (sudo ip link set {name} up); {instead}")
+
+
+class Port:
+    """Frames (rows of two int64, `hil.frames`) in and out of an open bus without waiting, as a control tick wants them.
+
+    lost     frames that the bus says this reader has lost (SocketCAN: dropped in the socket's buffer)
+    refused  frames that the bus did not take (queue full, interface down, bus-off)
+    errors   calls that the bus answered with an error (interface down)
+    """
+
+    def __init__(self, bus: can.BusABC):
+        self.bus = bus
+        self.refused = self.errors = 0
+        self._dropped = 0
+        self._kind = type(bus).__name__
+        if self._kind == "SocketcanBus":
+            self._socket: socket.socket = bus.socket  # type: ignore[attr-defined]
+            self._socket.setsockopt(socket.SOL_SOCKET, getattr(socket, "SO_RXQ_OVFL", 40), 1)
+            self._buffer = bytearray(72)
+            self._words = np.frombuffer(self._buffer, "<i8")
+
+    @property
+    def lost(self) -> int:
+        """Frames that this reader has lost."""
+        return self._dropped if self._kind == "SocketcanBus" else int(getattr(self.bus, "lost", 0))
+
+    def read(self, rows: np.ndarray) -> int:
+        """Take what has come into the first rows of ``rows`` (int64[n, 2]); return how many. What does not fit stays for the next call."""
+        if self._kind == "SocketcanBus":
+            return self._read_socketcan(rows)
+        if self._kind == "LocalBus":
+            return self._read_local(rows)
+        n = 0
+        while n < len(rows) and (message := self.bus.recv(0)) is not None:
+            rows[n] = from_message(message)
+            n += 1
+        return n
+
+    def _read_local(self, rows: np.ndarray) -> int:
+        n, receive = 0, self.bus.receive_packet  # type: ignore[attr-defined]
+        while n < len(rows) and (packet := receive()) is not None:
+            rows[n] = np.frombuffer(packet, "<i8", 2, 16)
+            rows[n, 0] &= 0x04FFFFFFFFFF
+            n += 1
+        return n
+
+    def _read_socketcan(self, rows: np.ndarray) -> int:
+        n = 0
+        while n < len(rows):
+            try:
+                size, extra, _, _ = self._socket.recvmsg_into([self._buffer], 64, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                break
+            except OSError:
+                self.errors += 1
+                break
+            for level, kind, data in extra:
+                if level == socket.SOL_SOCKET and kind == 40:
+                    self._dropped = int.from_bytes(data[:4], "little")
+            rows[n] = self._words[:2]
+            rows[n, 0] &= 0x04FFFFFFFFFF
+            if size == 72:
+                rows[n, 0] |= FD
+            n += 1
+        return n
+
+    def write(self, rows: np.ndarray) -> int:
+        """Send the frames; return how many the bus took. The others are gone and counted as refused."""
+        import can
+
+        taken = 0
+        for head, data in rows.tolist():
+            try:
+                if self._kind == "SocketcanBus":
+                    self._socket.send(head.to_bytes(8, "little") + data.to_bytes(8, "little", signed=True), socket.MSG_DONTWAIT)
+                elif self._kind == "LocalBus":
+                    self.bus.send_raw(head.to_bytes(8, "little") + data.to_bytes(8, "little", signed=True), 0)  # type: ignore[attr-defined]
+                else:
+                    self.bus.send(to_message(head, data), 0)
+                taken += 1
+            except (OSError, can.CanError):
+                self.refused += 1
+        return taken
