@@ -20,13 +20,13 @@ def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
     from discrepancy.adapter import build_chain
     from hil.lockstep import warm_up
     from hil.logs import LogError
-    from plant import build_plant, load_model
+    from plant import load_model
 
     if model is None and args.model:
-        model = load_model(args.model)
+        model = load_model(args.model, cli.machine_of(args))
     log = cli.read_log_of(args, require=())
     warm_up(lambda text: cli.say(args, text))
-    chain = build_chain(log, build_plant(model=model), present=tuple(model.effects) if model is not None else ())
+    chain = build_chain(log, cli.machine_of(args, model), present=tuple(model.effects) if model is not None else ())
     for note in chain.notes:
         cli.say(args, f"note: {note}")
     if not chain.stages:

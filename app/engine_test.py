@@ -5,19 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import model_validator
 
-from controller import load_calibration
+from controller import Calibration, load_calibration
 from hil import cli
 from hil.figures import error_figures
 from hil.lockstep import Stimulus, lockstep
 from hil.replay import STATISTICS, ReplayResult, replay_json
 from hil.report import PAPER_TABLE_5
-from plant import build_plant
+from plant import Plant, build_plant
 from tables import Axis, Bound, Bounded, Quantity, read
 
 __all__ = ["DESCRIPTION", "EngineTestTable", "add_options", "command", "engine_test", "load_profile"]
@@ -56,23 +57,39 @@ def load_profile(source: str | Path = "engine_test.toml") -> np.ndarray:
 
 
 def engine_test(
-    n_dem: np.ndarray, strategy: str, seed: int = 1, hysteresis: float | None = None, progress: Callable[[float], None] | None = None
+    n_dem: np.ndarray,
+    strategy: str,
+    seed: int = 1,
+    hysteresis: float | None = None,
+    progress: Callable[[float], None] | None = None,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
 ) -> ReplayResult:
     """Run the test under one strategy, noisy sensors and all.
 
     n_dem       %, one value every 10 ms
     strategy    single or dual
     hysteresis  deg, total width at the VIGV; default: the geometry's
+    plant       the machine; default: the shipped tables
+    calibration of the controller, with this strategy; default: the shipped tables
 
     Vane angles are what the (noisy) potentiometers measure, held against the schedule at the measured speed: Table 5 of the paper.
     """
-    machine = build_plant()
+    machine = plant or build_plant()
     if hysteresis is not None:
         from plant.parameters import PLAY
 
-        machine.p[PLAY, 0] *= hysteresis / machine.geometry.vigv.hysteresis.value
+        p = machine.p.copy()
+        width = machine.geometry.vigv
+        p[PLAY, 0] = np.deg2rad(hysteresis) * width.l.value / width.ld_prime.value
+        machine = replace(machine, p=p)
     run = lockstep(
-        Stimulus.of(n_dem), calibration=load_calibration(strategy=strategy), plant=machine, seed=seed, every=RASTER, progress=progress
+        Stimulus.of(n_dem),
+        calibration=calibration or load_calibration(strategy=strategy),
+        plant=machine,
+        seed=seed,
+        every=RASTER,
+        progress=progress,
     )
     speed = run.columns["n_r"]
     target = dict(zip(("vigv", "vgv1", "vgv2"), np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
@@ -91,6 +108,7 @@ hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual
 examples:
   vaneloop engine-test --report engine_test.html
   vaneloop engine-test --profile my_test.toml --seed 7 --json -
+  vaneloop engine-test --tables engine7/ --geometry engine7_as_built.toml
 
 exit codes: 0 the dual curves stay at or below the paper's figures, 1 they do not, 2 bad input"""
 
@@ -102,6 +120,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
     parser.add_argument("--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)")
+    cli.add_tables_option(parser)
+    parser.add_argument(
+        "--geometry", metavar="F.toml", help="the machine's own linkage where it is not what the tables were made for (default: theirs)"
+    )
     cli.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
@@ -117,11 +139,14 @@ def command(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
     n_dem = load_profile(args.profile)
+    files = cli.tables_of(args)
+    machine = build_plant(files["plant"], args.geometry or files["geometry"], files["schedules"])
+    calibrations = {strategy: cli.calibration_of(args, strategy) for strategy in ("single", "dual")}
     warm_up(lambda text: cli.say(args, text))
     results: dict[str, ReplayResult] = {}
     for strategy in ("single", "dual"):
         with cli.progress_bar(args, f"engine test, {strategy}") as progress:
-            results[strategy] = engine_test(n_dem, strategy, args.seed, args.hysteresis, progress)
+            results[strategy] = engine_test(n_dem, strategy, args.seed, args.hysteresis, progress, machine, calibrations[strategy])
     rows: list[list[str]] = []
     for strategy, r in results.items():
         for s in r.signals:

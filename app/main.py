@@ -19,6 +19,7 @@ COMMANDS = {
     "extend": ("app.extend", "add effects to the model, fitted to a log; writes a model file"),
     "experiment": ("app.experiment", "the demand profile that best tells the remaining rivals apart"),
     "hidden-effect": ("app.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
+    "schedule": ("app.schedule", "links and stroke tables from geometry, schedules and a measured stroke-angle loop"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
 }
 

@@ -16,12 +16,17 @@ __all__ = [
     "Parser",
     "add_log_options",
     "add_output_options",
+    "add_reading_options",
+    "add_tables_option",
+    "calibration_of",
+    "machine_of",
     "pairs",
     "print_table",
     "progress_bar",
     "read_log_of",
     "run",
     "say",
+    "tables_of",
     "write_json",
 ]
 
@@ -42,13 +47,63 @@ class Parser(argparse.ArgumentParser):
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Options that say how to read a log: the same for every command that takes one."""
     parser.add_argument("log", metavar="LOG", help="candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
-    group = parser.add_argument_group("reading the log (docs/logs.md)")
+    add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
+
+
+def add_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Options that say which name and unit a log uses."""
     group.add_argument("--dbc", metavar="F", help="database of a CAN log (default: the product's own vgv.dbc)")
     group.add_argument(
         "--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem"
     )
     group.add_argument("--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm")
     group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
+
+
+TABLES = ("calibration", "stroke_tables", "geometry", "schedules", "plant")
+
+
+def add_tables_option(group: Any) -> None:
+    """Declare ``--tables``."""
+    group.add_argument(
+        "--tables",
+        metavar="DIR",
+        help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule --out writes one",
+    )
+
+
+def tables_of(args: argparse.Namespace) -> dict[str, str]:
+    """File of each table, by name without suffix: from the folder ``--tables`` where it has it, else the shipped one."""
+    from pathlib import Path
+
+    from tables import InputError
+
+    files = {name: f"{name}.toml" for name in TABLES}
+    if getattr(args, "tables", None) is None:
+        return files
+    folder = Path(args.tables)
+    if not folder.is_dir():
+        raise InputError(f"--tables {folder}: is not a folder")
+    found = {name: str(folder / file) for name, file in files.items() if (folder / file).is_file()}
+    if not found:
+        raise InputError(f"--tables {folder}: holds none of {', '.join(files.values())}")
+    return {**files, **found}
+
+
+def machine_of(args: argparse.Namespace, model: Any = None) -> Any:
+    """The plant that ``--tables`` describes, with what ``model`` adds."""
+    from plant import build_plant
+
+    files = tables_of(args)
+    return build_plant(files["plant"], files["geometry"], files["schedules"], model)
+
+
+def calibration_of(args: argparse.Namespace, strategy: str | None = None) -> Any:
+    """The controller's calibration that ``--tables`` describes."""
+    from controller import load_calibration
+
+    files = tables_of(args)
+    return load_calibration(files["calibration"], files["stroke_tables"], strategy)
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:

@@ -196,6 +196,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--strategy", metavar="S", help="stroke curves of the controller: single (one mean curve) or dual (one per direction)"
     )
     group.add_argument("--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine")
+    cli.add_tables_option(group)
     group.add_argument(
         "--tolerance",
         metavar="signal=value",
@@ -216,21 +217,19 @@ def command(args: argparse.Namespace, extra: dict[str, Any] | None = None) -> in
     from tables import InputError
 
     limits = _limits(args.tolerance)
-    if args.strategy is not None:
-        from controller import load_calibration
-
-        load_calibration(strategy=args.strategy)  # refuse a wrong name before reading a long log
-    machine = None
+    calibration = cli.calibration_of(args, args.strategy)  # refuse a wrong name or table before reading a long log
+    model = None
     if args.model is not None:
-        from plant import build_plant, load_model
+        from plant import load_model
 
-        machine = build_plant(model=load_model(args.model))
+        model = load_model(args.model, cli.machine_of(args))
+    machine = cli.machine_of(args, model)
     log = cli.read_log_of(args)
     from hil.lockstep import warm_up
 
     warm_up(lambda text: cli.say(args, text))
     with cli.progress_bar(args, f"replaying {Path(args.log).name}") as progress:
-        result = replay(log, strategy=args.strategy, plant=machine, progress=progress)
+        result = replay(log, plant=machine, calibration=calibration, progress=progress)
     exceeded = _exceeded(result, limits)
     rows = [
         [s.signal, s.stage, s.reference, *(_figure(getattr(s, k)) for k in (*STATISTICS, "noise_floor")), s.unit, f"{s.samples:,}"]

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.engine_test import EngineTestTable
-from app.schedule import stroke_tables, write_stroke_tables
+from app.scheduling import stroke_tables, write_stroke_tables
 from controller import load_calibration
 from controller.calibration import CalibrationTable, StrokeTable
 from plant import build_plant
