@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hil.frames import FD, from_message, to_message
+from hil.frames import FD, HEAD_MASK, to_bytes
 from tables import InputError
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ __all__ = ["BUS_HELP", "Port", "open_bus"]
 
 BUS_HELP = "vcan0, can0, ...: SocketCAN; local[:NAME]: embedded bus between processes; lockstep: simulated time"
 _CAN_TYPE = "280"  # ARPHRD_CAN
+SO_RXQ_OVFL = 40  # the kernel tells how many frames it dropped
 _NET = Path("/sys/class/net")
 
 
@@ -76,48 +77,31 @@ def _check_socketcan(name: str) -> None:
 class Port:
     """Frames (rows of two int64, `hil.frames`) in and out of an open bus without waiting, as a control tick wants them.
 
-    lost     frames that the bus says this reader has lost (SocketCAN: dropped in the socket's buffer)
+    lost     frames that this reader was too slow for
     refused  frames that the bus did not take (queue full, interface down, bus-off)
-    errors   calls that the bus answered with an error (interface down)
+    errors   calls that SocketCAN answered with an error (interface down)
     """
 
-    def __init__(self, bus: can.BusABC):
+    def __init__(self, bus: Any):
         self.bus = bus
         self.refused = self.errors = 0
         self._dropped = 0
-        self._kind = type(bus).__name__
-        if self._kind == "SocketcanBus":
-            self._socket: socket.socket = bus.socket  # type: ignore[attr-defined]
-            self._socket.setsockopt(socket.SOL_SOCKET, getattr(socket, "SO_RXQ_OVFL", 40), 1)
+        self._rows = hasattr(bus, "read_rows")
+        if not self._rows:
+            self._socket: socket.socket = bus.socket
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
             self._buffer = bytearray(72)
             self._words = np.frombuffer(self._buffer, "<i8")
 
     @property
     def lost(self) -> int:
-        """Frames that this reader has lost."""
-        return self._dropped if self._kind == "SocketcanBus" else int(getattr(self.bus, "lost", 0))
+        """Frames that this reader was too slow for."""
+        return self.bus.lost if self._rows else self._dropped
 
     def read(self, rows: np.ndarray) -> int:
         """Take what has come into the first rows of ``rows`` (int64[n, 2]); return how many. What does not fit stays for the next call."""
-        if self._kind == "SocketcanBus":
-            return self._read_socketcan(rows)
-        if self._kind == "LocalBus":
-            return self._read_local(rows)
-        n = 0
-        while n < len(rows) and (message := self.bus.recv(0)) is not None:
-            rows[n] = from_message(message)
-            n += 1
-        return n
-
-    def _read_local(self, rows: np.ndarray) -> int:
-        n, receive = 0, self.bus.receive_packet  # type: ignore[attr-defined]
-        while n < len(rows) and (packet := receive()) is not None:
-            rows[n] = np.frombuffer(packet, "<i8", 2, 16)
-            rows[n, 0] &= 0x04FFFFFFFFFF
-            n += 1
-        return n
-
-    def _read_socketcan(self, rows: np.ndarray) -> int:
+        if self._rows:
+            return self.bus.read_rows(rows)
         n = 0
         while n < len(rows):
             try:
@@ -128,10 +112,10 @@ class Port:
                 self.errors += 1
                 break
             for level, kind, data in extra:
-                if level == socket.SOL_SOCKET and kind == 40:
+                if level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                     self._dropped = int.from_bytes(data[:4], "little")
             rows[n] = self._words[:2]
-            rows[n, 0] &= 0x04FFFFFFFFFF
+            rows[n, 0] &= HEAD_MASK
             if size == 72:
                 rows[n, 0] |= FD
             n += 1
@@ -139,18 +123,15 @@ class Port:
 
     def write(self, rows: np.ndarray) -> int:
         """Send the frames; return how many the bus took. The others are gone and counted as refused."""
-        import can
-
-        taken = 0
-        for head, data in rows.tolist():
-            try:
-                if self._kind == "SocketcanBus":
-                    self._socket.send(head.to_bytes(8, "little") + data.to_bytes(8, "little", signed=True), socket.MSG_DONTWAIT)
-                elif self._kind == "LocalBus":
-                    self.bus.send_raw(head.to_bytes(8, "little") + data.to_bytes(8, "little", signed=True), 0)  # type: ignore[attr-defined]
-                else:
-                    self.bus.send(to_message(head, data), 0)
-                taken += 1
-            except (OSError, can.CanError):
-                self.refused += 1
+        if self._rows:
+            taken = self.bus.write_rows(rows)
+        else:
+            taken = 0
+            for raw in to_bytes(rows):
+                try:
+                    self._socket.send(raw, socket.MSG_DONTWAIT)
+                    taken += 1
+                except OSError:
+                    continue
+        self.refused += len(rows) - taken
         return taken

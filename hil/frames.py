@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "REMOTE", "VGV_ANGLES", "VGV_HEALTH", "VGV_SERVO", "VGV_STATUS",
-    "decode", "from_bytes", "from_message", "new_receiver", "receive", "refused", "to_message", "word0",
+    "decode", "from_bytes", "from_message", "new_receiver", "receive", "refused", "to_bytes", "to_message", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+HEAD_MASK = 0x04FFFFFFFFFF  # what of word 0 has a meaning
 FD = 1 << 42  # bit 2 of the flags byte, CANFD_FDF
 IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
@@ -304,6 +305,12 @@ def decode(head: int, data: int) -> dict[str, float]:
 def from_bytes(raw: bytes) -> np.ndarray:
     """Return the frames (int64[n, 2]) in bytes laid out as ``struct can_frame``."""
     return np.frombuffer(raw, "<i8").reshape(-1, 2)
+
+
+def to_bytes(rows: np.ndarray) -> list[bytes]:
+    """Return each frame as the 16 bytes of ``struct can_frame``."""
+    raw = np.ascontiguousarray(rows, "<i8").tobytes()
+    return [raw[k : k + 16] for k in range(0, len(raw), 16)]
 
 
 def from_message(message: can.Message) -> tuple[int, int]:

@@ -21,8 +21,9 @@ import time
 from typing import Any
 
 import can
+import numpy as np
 
-from hil import broker
+from hil import broker, frames
 
 __all__ = ["DEFAULT", "LocalBus"]
 
@@ -180,6 +181,26 @@ class LocalBus(can.BusABC):
                 if self._is_shutdown:
                     raise can.CanOperationError(f"bus {self.channel} is shut down") from e
                 self._rejoin()
+
+    def read_rows(self, rows: np.ndarray) -> int:
+        """Take what is there into ``rows`` (int64[n, 2], `hil.frames`) without waiting; return how many."""
+        n = 0
+        while n < len(rows) and (packet := self.receive_packet()) is not None:
+            rows[n] = np.frombuffer(packet, "<i8", 2, broker.FRAME_AT)
+            rows[n, 0] &= frames.HEAD_MASK
+            n += 1
+        return n
+
+    def write_rows(self, rows: np.ndarray) -> int:
+        """Send the frames without waiting; return how many the bus took."""
+        taken = 0
+        for raw in frames.to_bytes(rows):
+            try:
+                self.send_raw(raw, 0)
+                taken += 1
+            except can.CanError:
+                continue
+        return taken
 
     def fileno(self) -> int:
         """File descriptor that is readable when a frame is there."""

@@ -405,10 +405,18 @@ class Ecu:
 
     def tick(self, received: np.ndarray, n: int | None = None) -> np.ndarray:
         """Run the next tick on the first ``n`` rows of ``received``; return the frames to send, a view that the next tick overwrites."""
-        noise = self._generator.standard_normal() if self._generator is not None and self.k % SLOW == 0 else 0.0
+        noise = self.noise(1)[self.k // SLOW % SLOW]
         m = ecu_tick(self.k, received, len(received) if n is None else n, noise, self.arrays, self._sent)
         self.k += 1
         return self._sent[:m]
+
+    def noise(self, ticks: int) -> np.ndarray:
+        """Return ten standard normal numbers for the speeds measured in the next ``ticks`` (at most 100): of tick k at k // 10 % 10."""
+        out = np.zeros(SLOW)
+        if self._generator is not None:
+            for k in range(-(-self.k // SLOW) * SLOW, self.k + ticks, SLOW):
+                out[k // SLOW % SLOW] = self._generator.standard_normal()
+        return out
 
     @property
     def values(self) -> dict[str, float]:

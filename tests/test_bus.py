@@ -18,6 +18,7 @@ import pytest
 
 from hil import broker, frames
 from hil.bus import Port, open_bus
+from hil.lockstep_bus import Channel, LockstepBus
 from hil.node import Ecu, Node
 from tables import InputError
 from tests.conftest import ROOT
@@ -157,6 +158,41 @@ class BusTests:
 def keep(opened: list[can.BusABC], bus: can.BusABC) -> can.BusABC:
     opened.append(bus)
     return bus
+
+
+class TestLockstep(BusTests):
+    """The simulated wire."""
+
+    has_fd = False
+    burst = 60
+
+    @pytest.fixture
+    def join(self) -> Iterator[Join]:
+        opened: list[can.BusABC] = []
+        channel = Channel()
+        yield lambda **options: keep(opened, LockstepBus(channel, **options))
+        for bus in opened:
+            bus.shutdown()
+
+    def wait(self, bus: can.BusABC) -> None:
+        bus.channel.advance(0.001)  # type: ignore[attr-defined]
+
+    step = wait
+
+
+class TestSocketcan(BusTests):
+    """The kernel's vcan0, where it has one."""
+
+    @pytest.fixture
+    def join(self) -> Iterator[Join]:
+        try:
+            open_bus("vcan0").shutdown()
+        except InputError as e:
+            pytest.skip(str(e))
+        opened: list[can.BusABC] = []
+        yield lambda **options: keep(opened, open_bus("vcan0", **options))
+        for bus in opened:
+            bus.shutdown()
 
 
 class TestLocal(BusTests):
