@@ -1,13 +1,14 @@
 """Classic CAN on the wire, in simulated time: who may send, how long each frame takes to the bit, what errors do.
 
-Time is an integer number of bits (2 us at 500 kbit/s). A frame starts when the wire has been free for the three bits of the intermission. Of
-all nodes whose first queued frame is ready then, the one with the lowest arbitration field sends; two frames that only differ behind it
+Time is an integer number of bits (2 us at 500 kbit/s). A frame starts when the wire has been free for the three bits of the intermission.
+Of all nodes whose first queued frame is ready then, the one with the lowest arbitration field sends; two frames that only differ behind it
 destroy each other. A frame's bits are the real ones: identifier, control, data, CRC-15, and a stuff bit after five equal bits.
 
 Faults and counters as ISO 11898-1 has them: a destroyed frame costs its sender 8 points (TEC) and each receiver 1 (REC), is answered by an
 error frame and sent again; a frame that went well takes a point back. Beyond 127 a node is error passive (8 bits of pause after its own
-frames), beyond 255 it is bus-off: it neither sends nor hears until 128 times 11 recessive bits have passed. A node that nobody acknowledges
-stays error passive. Simplified: all nodes see an error at the same bit (error flag of 6, delimiter of 8 bits), receivers never see one alone.
+frames), beyond 255 it is bus-off: it neither sends nor hears until 128 times 11 recessive bits have passed. A node that nobody
+acknowledges stays error passive. Simplified: all nodes see an error at the same bit (error flag of 6, delimiter of 8 bits), receivers
+never see one alone, and a node's counters change when its frame begins, up to a frame before they would.
 
 Everything works in place on one `Wire` and allocates nothing. Random numbers are drawn only where ``error_rate`` or ``loss`` is not 0.
 """

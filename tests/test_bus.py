@@ -38,6 +38,7 @@ class BusTests:
     """What every bus must do. A subclass gives `join`: open another participant of one and the same bus."""
 
     has_fd = True
+    tells_own_process = True  # SocketCAN says "transmitted" of every frame of this machine
     burst = 100  # frames that may wait on this bus
 
     @pytest.fixture
@@ -57,7 +58,7 @@ class BusTests:
         a.send(sent)
         assert same(own := a.recv(2), sent) and own is not None and not own.is_rx
         other = b.recv(2)
-        assert same(other, sent) and other is not None and other.is_rx
+        assert same(other, sent) and other is not None and (other.is_rx or not self.tells_own_process)
 
     @pytest.mark.parametrize("length", range(9))
     def test_every_length_and_both_kinds_of_identifier_arrive(self, join: Join, length: int) -> None:
@@ -180,15 +181,14 @@ class TestLockstep(BusTests):
     step = wait
 
 
+@pytest.mark.socketcan
 class TestSocketcan(BusTests):
-    """The kernel's vcan0, where it has one."""
+    """A real vcan0: this machine's own, or that of user-mode Linux."""
+
+    tells_own_process = False
 
     @pytest.fixture
     def join(self) -> Iterator[Join]:
-        try:
-            open_bus("vcan0").shutdown()
-        except InputError as e:
-            pytest.skip(str(e))
         opened: list[can.BusABC] = []
         yield lambda **options: keep(opened, open_bus("vcan0", **options))
         for bus in opened:
@@ -237,25 +237,23 @@ class TestLocal(BusTests):
 
     def test_any_python_can_program_joins_by_the_interface_name(self, join: Join, name: str, tmp_path: Path) -> None:
         a, log = join(), tmp_path / "heard.log"
-        command = [sys.executable, "-m", "can.logger", "-i", "vaneloop", "-c", name, "-f", str(log)]
-        logger = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        command = [sys.executable, "-u", "-m", "can.logger", "-i", "vaneloop", "-c", name, "-f", str(log)]
+        logger = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         try:
-            deadline = time.monotonic() + 60
-            while time.monotonic() < deadline and (not log.exists() or "0A0#" not in log.read_text()):
+            assert logger.stdout is not None
+            while b"Can Logger" not in logger.stdout.readline():
+                pass
+            time.sleep(0.2)
+            for _ in range(50):
                 a.send(data_frame(0x0A0, bytes(8)))
-                time.sleep(0.05)
-                with contextlib.suppress(OSError):
-                    os.sync()
-                if logger.poll() is not None:
-                    break
-                if time.monotonic() > deadline - 58:
-                    logger.send_signal(signal.SIGINT)
-            logger.wait(30)
+            time.sleep(0.5)
+            logger.send_signal(signal.SIGINT)
+            logger.communicate(timeout=30)
         finally:
             logger.kill()
             logger.wait()
         heard = list(can.LogReader(log))
-        assert heard and {m.arbitration_id for m in heard} == {0x0A0}
+        assert len(heard) == 50 and {m.arbitration_id for m in heard} == {0x0A0}
 
     def test_a_killed_broker_is_replaced_and_the_reader_told(self, join: Join, name: str) -> None:
         a, b = join(), join()

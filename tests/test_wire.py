@@ -157,7 +157,7 @@ def test_a_full_receive_buffer_is_told_in_place() -> None:
     for k in range(40):
         a.send(frame(k))
     a.channel.advance(0.02)
-    heard = [m for m in iter(lambda: b.recv(0), None)]
+    heard = list(iter(lambda: b.recv(0), None))
     assert [m.arbitration_id for m in heard] == list(range(16)) and b.lost == 24
     a.send(frame(99))
     told, late = b.recv(1), b.recv(1)
