@@ -21,6 +21,7 @@ COMMANDS = {
     "hidden-effect": ("app.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
     "schedule": ("app.schedule", "links and stroke tables from geometry, schedules and a measured stroke-angle loop"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
+    "web": ("app.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }
 
 _HELP = f"""Real-time engine-controller firmware simulator: variable guide vanes, their controller, their bus.

@@ -102,8 +102,8 @@ def diagnose(
     return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
 
 
-def extend_stage(stage: Stage, effects: tuple[str, ...]) -> StageDiagnosis:
-    """Fit a stage with exactly these effects, one added after the other.
+def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
+    """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
 
     The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step. Errors are held-out.
     Raises StageError for an effect that the stage does not have.
@@ -114,7 +114,7 @@ def extend_stage(stage: Stage, effects: tuple[str, ...]) -> StageDiagnosis:
     floor = floor_of(stage)
     for _ in range(3):
         judge = Judge(stage, floor)
-        search = Search(judge)
+        search = Search(judge, tick)
         for e in effects:
             search.single(e)
         order: tuple[str, ...] = ()

@@ -26,7 +26,7 @@ import tables
 from hil import canlog
 from hil.canlog import LogError
 
-__all__ = ["UNITS", "Channel", "Log", "LogError", "read_log", "write_log"]
+__all__ = ["UNITS", "Channel", "Log", "LogError", "offered", "read_log", "write_log"]
 
 # Signals and units at every border (docs/architecture.md).
 UNITS = {
@@ -169,6 +169,14 @@ def _split_unit(header: str) -> tuple[str, str]:
     return (m[1], (m[2] if m[2] is not None else m[3]).strip()) if m else (header.strip(), "")
 
 
+class _NoTime(LogError):
+    """A table without a column that can be its time; ``headers`` are what it has."""
+
+    def __init__(self, text: str, headers: list[str]):
+        super().__init__(text)
+        self.headers = headers
+
+
 def _time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> str:
     """The column of a table that holds the time: mapped to t, called t, or called like it."""
     asked = next((name for name, signal in mapping.items() if signal == "t"), None)
@@ -178,8 +186,9 @@ def _time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> 
                 if name in (fold(h), fold(h.strip()), fold(_split_unit(h)[0])):
                     return h
     if asked is not None:
-        raise LogError(f"{path}: no column {asked!r} to map to t{_close(asked, headers)}{_has('column', headers)}")
-    raise LogError(f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names another){_has('column', headers)}")
+        raise _NoTime(f"{path}: no column {asked!r} to map to t{_close(asked, headers)}{_has('column', headers)}", headers)
+    text = f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names another){_has('column', headers)}"
+    raise _NoTime(text, headers)
 
 
 def _close(name: str, have: Iterable[str]) -> str:
@@ -778,6 +787,17 @@ def read_log(
             raise LogError(f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}")
     _shift(channels, notes)
     return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])))
+
+
+def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
+    """Names that a log offers and that ``mapping`` may name. Raises LogError for a file that is no log."""
+    path = Path(path)
+    try:
+        source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {}))
+    except _NoTime as e:
+        return [h for h in e.headers if h]
+    time = getattr(source, "_time", None)  # a table's time column is a column like any other
+    return [*([time] if time else []), *source.names]
 
 
 def _shift(channels: dict[str, Channel], notes: list[str]) -> None:

@@ -1,0 +1,442 @@
+"""Page 1, Missing physics: a log in, where the model fails, which effect it lacks, and the error falling."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from nicegui import events, ui
+
+from app.web.charts import Chart, figure
+from app.web.frame import Live, card, command_line, complaint, dark, frame, progress, table, tone
+from app.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
+from discrepancy.locate import Regime
+from hil.logs import UNITS
+from hil.page import heat, number, overlay, waterfall
+from hil.page import Line as PageLine
+from hil.page import Panel as PagePanel
+from plant.effects import EFFECTS
+
+__all__ = ["build"]
+
+
+def build(session: Session, most: int) -> None:
+    """Draw the page; ``most`` is the largest upload in bytes."""
+    with frame(session, "/"):
+        live = Live(session)
+        page = _Page(session, live, most)
+        page.log()
+        page.where()
+        page.what()
+        page.next()
+
+
+class _Page:
+    def __init__(self, session: Session, live: Live, most: int):
+        self.s, self.live, self.most = session, live, most
+
+    # ---- 1: the log
+
+    def log(self) -> None:
+        """Drop or choose a log; names and units by form; the preview."""
+        with card("1  The log", "A measured run: any CAN log, MDF4, CSV or Parquet. It stays on this machine."):
+            with ui.element("div").classes("two"):
+                with ui.element("div").classes("stackc"):
+                    self.upload = ui.upload(
+                        label="drop a log here, or press +", auto_upload=True, max_file_size=self.most, on_upload=self._uploaded,
+                        on_rejected=self._rejected,
+                    )  # fmt: skip
+                    self.upload.props(f'accept="{",".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))}" flat')
+                    self.live.part(self._choose, "files", "log")
+                    self.live.part(self._about, "log", "jobs")
+                with ui.element("div").classes("stackc"):
+                    self.live.part(self._channels, "log")
+            self.live.part(self._form, "log")
+            with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
+                chart = Chart("log")
+            all_channels.props("dense")
+            self.live.watch(chart.refetch, "log")
+
+    def _choose(self) -> None:
+        s = self.s
+        options = {i: f.name for i, f in enumerate(s.files)}
+        at = next((i for i, f in enumerate(s.files) if f == s.choice.file), None)
+
+        def chosen(e: events.ValueChangeEventArguments) -> None:
+            if e.value is not None and s.files[e.value] != s.choice.file:
+                s.choose(s.files[e.value])
+
+        ui.select(options, value=at, label="or choose one", on_change=chosen).props("outlined dense options-dense").classes("w-full choose")
+
+    async def _uploaded(self, e: events.UploadEventArguments) -> None:
+        s = self.s
+        name = safe_name(e.file.name)
+        if not name.lower().endswith((*LOG_SUFFIXES, *OTHER_SUFFIXES)):
+            allowed = ", ".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))
+            s.errors["log"] = f"{name}: suffix {'.' + name.rpartition('.')[2]!r} is not a log's; allowed: {allowed}"
+            s.touch("log")
+            return
+        folder = s.folder / f"upload{len(list(s.folder.glob('upload*'))) + 1}"
+        folder.mkdir(mode=0o700)
+        path = folder / name
+        await e.file.save(path)
+        path.chmod(0o600)
+        file = LogFile(path, name, name)
+        if name.lower().endswith(LOG_SUFFIXES):
+            s.files.append(file)
+        s.choose(file)
+        s.touch("files")
+        self.upload.reset()
+
+    def _rejected(self) -> None:
+        limit = f"{self.most / 2**20:.0f} MB"
+        self.s.errors["log"] = f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(LOG_SUFFIXES)})"
+        self.s.touch("log")
+
+    def _about(self) -> None:
+        s = self.s
+        complaint(s, "log")
+        progress(s, "offers", "preview")
+        if s.preview is not None:
+            for note in s.preview["notes"][:6]:
+                ui.label(f"note: {note}").classes("note")
+
+    def _channels(self) -> None:
+        s = self.s
+        if s.choice.file is None:
+            ui.label("Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model lacks.").classes("soft")
+            return
+        if s.preview is None:
+            return
+        rows = []
+        for name, (unit, t, v) in s.preview["channels"].items():
+            step = f"{1.0 / ((t[-1] - t[0]) / (len(t) - 1)):.4g}" if len(t) > 1 and t[-1] > t[0] else "-"
+            given = s.choice.mapping.get(name, name)
+            rows.append([name, given, unit, f"{len(t):,}", step, f"{t[-1]:.1f}", f"{v.min():.4g} to {v.max():.4g}"])
+        table(["signal", "in the log", "unit", "samples", "per s", "until s", "range"], rows, numbers=(3, 4, 5))
+        absent = [n for n in UNITS if n not in s.preview["channels"]]
+        if absent:
+            ui.label(f"not in the log: {', '.join(absent)}").classes("note")
+
+    def _form(self) -> None:
+        s = self.s
+        if s.choice.file is None or not s.offered:
+            return
+        choice = s.choice
+        wrong = bool(s.errors.get("log"))
+        with ui.expansion("Names and units", value=wrong).classes("w-full names").props("dense"):
+            ui.label(
+                "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit that the log states."
+            ).classes("soft small")
+            names: dict[str, ui.select] = {}
+            units: dict[str, ui.input] = {}
+            with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"):
+                for signal in ("t", *UNITS):
+                    with ui.element("div").style("display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:8px;align-items:center"):
+                        ui.label(signal).classes("mono")
+                        options = ["", *s.offered]
+                        value = choice.mapping.get(signal, "")
+                        names[signal] = ui.select(options, value=value if value in options else "", with_input=True).props(
+                            f'outlined dense options-dense clearable aria-label="name of {signal} in the log"'
+                        )
+                        hint = UNITS.get(signal, "s")
+                        units[signal] = ui.input(value=choice.units.get(signal, ""), placeholder=hint).props(
+                            f'outlined dense aria-label="unit of {signal} in the log"'
+                        )
+            with ui.element("div").classes("rowc"):
+                rpm = ui.input("design speed [rpm]", value=choice.design_rpm).props("outlined dense").style("width:170px")
+                beside = [f for f in (choice.dbc, choice.model) if f is not None]
+                ui.label("with " + " and ".join(f.name for f in beside) if beside else "a .dbc or a model .toml: drop it above").classes("soft small")
+
+                def apply() -> None:
+                    choice.mapping = {k: str(v.value) for k, v in names.items() if v.value}
+                    choice.units = {k: str(v.value).strip() for k, v in units.items() if (v.value or "").strip()}
+                    choice.design_rpm = str(rpm.value or "")
+                    s.read()
+
+                def plain() -> None:
+                    choice.dbc = choice.model = None
+                    choice.mapping, choice.units, choice.design_rpm = {}, {}, ""
+                    s.read()
+
+                ui.button("Read again", icon="refresh", on_click=apply).props("unelevated dense padding='4px 14px'")
+                ui.button("Forget all of it", on_click=plain).props("flat dense padding='4px 14px'")
+
+    # ---- 2: where
+
+    def where(self) -> None:
+        """Errors stage by stage, and the failure map of one stage."""
+        with card("2  Where does the model fail?"):
+            self.live.part(self._compared, "compare", "jobs")
+            self.live.part(self._map, "compare", "theme")
+
+    def _compared(self) -> None:
+        s = self.s
+        complaint(s, "compare")
+        progress(s, "compare")
+        c = s.compared
+        if c is None:
+            if s.busy("compare") is None and "compare" not in s.errors:
+                ui.label("Choose a log: each stage of the machine is then driven by its own logged inputs and compared.").classes("soft")
+            return
+        worst = max(c["figures"], key=lambda f: f.rms / f.noise_floor)
+        ratio = worst.rms / worst.noise_floor
+        if ratio > 1.2:
+            text = f"The {worst.stage} stage fails most: {worst.signal} is off by {number(worst.rms)} {worst.unit} RMS, {number(ratio)} noise floors."
+        else:
+            text = "Every stage agrees with its measurements to within the noise."
+        ui.label(text).classes(f"verdict {'bad' if ratio > 2 else 'good' if ratio <= 1.2 else ''}")
+
+    def _map(self) -> None:
+        s = self.s
+        c = s.compared
+        if c is None:
+            return
+        with ui.element("div").classes("half"):
+            with ui.element("div").classes("stackc"):
+                rows = []
+                for f in c["figures"]:
+                    r = f.rms / f.noise_floor
+                    width = 100 * min(1.0, math.log10(max(r, 1.0)) / 2.2) + 2
+                    bar = f'<span class="bar {tone(r)}" style="width:{width:.0f}px"></span>'
+                    rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{r:.2f}", ("html", bar)])
+                for name, why in c["not_observed"].items():
+                    rows.append([name, f"not observed: {why}", "", "", "", "", ""])
+                table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
+                ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes("note")
+                if c["loop"]:
+                    with ui.expansion("The whole loop").classes("w-full").props("dense"):
+                        table(
+                            ["signal", "against", "RMS", "max", "unit"],
+                            [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in c["loop"]],
+                            numbers=(2, 3),
+                        )
+                elif c["loop_missing"]:
+                    ui.label(f"no whole loop: {s.clean(c['loop_missing'])}").classes("note")
+                command_line(s.command("compare"))
+                command_line(s.command("locate"))
+            with ui.element("div").classes("stackc"):
+                stages = list(c["maps"])
+                if stages:
+                    with ui.element("div").classes("rowc"):
+                        ui.label("Failure map of").classes("soft")
+                        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props("dense unelevated no-caps padding='2px 10px'")
+                    self._heat(c["maps"].get(s.stage, []), c["onset"].get(s.stage))
+
+    def _heat(self, found: list[Regime], onset: float | None) -> None:
+        hot = [r for r in found if r.significant.any()]
+        if not hot:
+            ui.label(f"The {self.s.stage} stage agrees everywhere once its nominal parameters are refitted within their tolerances.").classes("soft")
+            return
+        if onset is not None:
+            ui.label(f"The error begins at t = {onset:.0f} s.")
+        output = hot[0].output
+        mine = [r for r in hot if r.output == output][:9]
+        width = max(len(r.ratio) for r in mine)
+        cells = [[float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * (width - len(r.ratio)) for r in mine]
+        names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
+        f = heat(cells, [str(i + 1) for i in range(width)], names, "noise floors", "an eighth of the samples each, from the lowest values to the highest", "")
+        figure(f, dark(self.s), height=90 + 27 * max(3, len(names)))
+        ui.label(f"Worst: {mine[0].worst()}.").classes("note")
+
+    # ---- 3: what
+
+    def what(self) -> None:
+        """The search, switches of effects, waterfall, curves, sliders."""
+        with card("3  What is missing?"):
+            self.live.part(self._search, "diagnosis", "compare", "jobs", "diagnose")
+            with ui.element("div").classes("two"):
+                with ui.element("div").classes("stackc"):
+                    self.live.part(self._effects, "diagnosis", "fit")
+                with ui.element("div").classes("stackc"):
+                    self.live.part(self._fit_jobs, "jobs", "fit")
+                    self.live.part(self._fall, "fit", "diagnosis", "theme")
+                    self.live.part(self._sliders, "fit")
+                    self.chart_title = ui.label().classes("soft small")
+                    chart = Chart("stage")
+            self._title()
+            self.live.watch(self._title, "fit", "diagnosis", "compare", "hand")
+            self.live.watch(chart.refetch, "fit", "diagnosis", "compare", "hand")
+
+    def _title(self) -> None:
+        s = self.s
+        text = f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors to each side." if s.stage else ""
+        self.chart_title.set_text(text)
+
+    def _search(self) -> None:
+        s = self.s
+        if s.compared is None:
+            ui.label("After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named.").classes("soft")
+            return
+        if s.diagnosis is None:
+            job = s.busy("diagnose")
+            if job is None:
+                ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props("unelevated size=md")
+            progress(s, "diagnose")
+            complaint(s, "diagnose")
+            command_line(s.command("diagnose"))
+            return
+        j = s.diagnosis["json"]
+        tones = {"missing": "", "none": "good", "unknown": "bad"}
+        ui.label(s.diagnosis["verdict"]).classes(f"verdict {tones[j['verdict']]}")
+        for u in j["unknown"]:
+            near = f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
+            ui.label(f"What is left in the {u['stage']} stage: {u['shape']}.{near}").classes("note")
+        command_line(s.command("diagnose"))
+
+    def _effects(self) -> None:
+        s = self.s
+        d = s.stage_diagnosis()
+        if s.diagnosis is None:
+            return
+        stages = {x.stage: f"{x.stage}" for x in s.diagnosis["diagnosis"].stages}
+        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props("dense unelevated no-caps padding='2px 8px' size=sm")
+        if d is None:
+            return
+        found = {f.effect: f for f in d.effects}
+        named = {r: f.effect for f in d.effects for r in f.rivals}
+        gain = {c.effect: c for c in d.candidates}
+        top = max((c.nats for c in d.candidates), default=1.0)
+        on = s.chosen.get(s.stage, ())
+        with ui.element("div").classes("effects"):
+            for name in s.effects():
+                with ui.element("div").classes("effect" + (" on" if name in on else "")).props(f'data-effect="{name}"'):
+                    ui.switch(value=name in on, on_change=lambda e, name=name: s.switch(name, bool(e.value))).props(
+                        f'dense aria-label="{name}"'
+                    )
+                    ui.label(name).classes("name")
+                    c = gain.get(name)
+                    share = 0.0 if c is None or c.nats <= 0 or top <= 0 else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
+                    with ui.element("div").classes("gain").tooltip(f"gain alone: {c.nats:,.0f} nats on held-out data" if c else "not tried alone"):
+                        ui.element("i").style(f"width:{100 * share:.0f}%")
+                    ui.label(self._about_effect(name, found, named, c)).classes("about")
+
+    def _about_effect(self, name: str, found: dict[str, Any], named: dict[str, str], c: Any) -> str:
+        summary = EFFECTS[name].summary if name in EFFECTS else ""
+        if name in found:
+            f = found[name]
+            parts = [f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}" for n, p in f.parameters.items()]
+            text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
+            return text + (f". As good: {', '.join(f.rivals)}" if f.rivals else "") + (f". {summary}" if summary else "")
+        if name in named:
+            return f"Rival of {named[name]}: this log cannot tell them apart. {summary}"
+        if c is not None and c.reason:
+            return f"Not observable in this log; needs: {c.reason}"
+        return summary
+
+    def _fit_jobs(self) -> None:
+        complaint(self.s, "fit", "hand")
+        progress(self.s, "refit")
+
+    def _fall(self) -> None:
+        s = self.s
+        f = s.fitted()
+        if s.diagnosis is None or f is None:
+            return
+        r = f.result
+        k = int((r.error_before / r.floor).argmax())
+        with ui.element("div").classes("tiles error-tiles"):
+            for label, v in (("nominal", r.error_before[k]), ("with the effects that are on", r.error_after[k]), ("noise floor", r.floor[k])):
+                with ui.element("div").classes("tile"):
+                    ui.label(f"{number(v)} {r.units[k]}").classes("v")
+                    ui.label(f"{label}: {r.outputs[k]}").classes("l")
+            with ui.element("div").classes("tile"):
+                ui.label(f"{number(r.error_after[k] / r.floor[k])}").classes("v after").props(f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"')
+                ui.label("noise floors, held out").classes("l")
+        figure(waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250)
+
+    def _sliders(self) -> None:
+        s = self.s
+        f = s.fitted()
+        if s.diagnosis is None or f is None or not f.result.effects:
+            return
+        with ui.expansion("Turn the parameters by hand", value=bool(s.hand)).classes("w-full by-hand").props("dense"):
+            with ui.element("div").classes("rowc"):
+                readout = ui.label().classes("mono hand-error")
+                ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
+
+            def show() -> None:
+                left = [f"{o} {number(v, 4)} {u}" for (o, v), u in zip(s.hand_rms.items(), f.result.units, strict=False)]
+                readout.set_text("error by hand: " + ", ".join(left) if left else "error by hand: move a slider")
+
+            show()
+            self.live.watch(show, "hand")
+            now = s.values()
+            with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"):
+                for e in f.result.effects:
+                    for name, p in e.parameters.items():
+                        self._slider(e.effect, name, float(p["value"]), str(p["unit"]), now[e.effect][name])
+
+    def _slider(self, effect: str, name: str, fitted: float, unit: str, now: float) -> None:
+        p = EFFECTS[effect][name]
+        reach = abs(fitted - p.neutral) or abs(p.high - p.neutral) / 4
+        low, high = max(p.low, min(p.neutral, fitted) - reach), min(p.high, max(p.neutral, fitted) + reach)
+        with ui.element("div").classes("turn"):
+            ui.label(f"{effect}: {name} [{unit}], fitted {number(fitted, 4)}").classes("what soft")
+            slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(f'dense aria-label="{effect} {name}"')
+            box = ui.label(f"{now:.5g}").classes("mono")
+
+            def turned(e: events.GenericEventArguments) -> None:
+                value = float(e.args)
+                box.set_text(f"{value:.5g}")
+                self.s.turn(effect, name, value)
+
+            slider.on("update:model-value", turned, throttle=0.08)
+
+    # ---- 4: next
+
+    def next(self) -> None:
+        """The next experiment, and what can be saved."""
+        with card("4  What next?"), ui.element("div").classes("half"):
+            with ui.element("div").classes("stackc"):
+                self.live.part(self._experiment, "experiment", "diagnosis", "jobs", "theme")
+            with ui.element("div").classes("stackc"):
+                self.live.part(self._save, "save", "diagnosis", "fit", "jobs")
+
+    def _experiment(self) -> None:
+        s = self.s
+        ui.html("<h3>The next experiment</h3>", sanitize=False)
+        if s.diagnosis is None:
+            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes("soft small")
+            return
+        rivals = [(f.effect, r) for x in s.diagnosis["diagnosis"].stages for f in x.effects for r in f.rivals]
+        if not rivals:
+            ui.label("No rivals are left: this log needs no further experiment.").classes("soft small")
+        elif not s.experiment_done and s.busy("experiment") is None:
+            ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in rivals)).classes("small")
+            ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props("outline dense padding='4px 14px'")
+        progress(s, "experiment")
+        complaint(s, "experiment")
+        e = s.experiment
+        if e is not None:
+            ui.label(e["text"])
+            lines = [PageLine("n_dem", e["t"], e["n_dem"], "target")]
+            figure(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
+        command_line(s.command("experiment", "--out", "next_demand.csv"))
+
+    def _save(self) -> None:
+        s = self.s
+        ui.html("<h3>Save</h3>", sanitize=False)
+        if s.diagnosis is None:
+            ui.label("The extended model (TOML, for --model), and the report (HTML).").classes("soft small")
+            return
+        complaint(s, "save")
+        progress(s, "report", "command")
+        with ui.element("div").classes("rowc"):
+            ui.button("Report", icon="description", on_click=s.save_report).props("outline dense padding='4px 14px'")
+            if s.all_chosen():
+                ui.button("Extended model", icon="save", on_click=s.save_model).props("outline dense padding='4px 14px'")
+        links = {"report": "diagnosis.html", "model": "extended.toml", "extended": "extended.html"}
+        with ui.element("div").classes("rowc"):
+            for key, name in links.items():
+                if key in s.saved:
+                    ui.link(f"download {name}", f"/saved/{key}").props(f'download="{name}"').classes(f"saved-{key}").style("color:var(--measured)")
+            if "model" in s.saved:
+
+                def go_on() -> None:
+                    s.choose(LogFile(s.saved["model"], "extended.toml", "extended.toml"))
+
+                ui.button("Go on with this model", icon="arrow_forward", on_click=go_on).props("flat dense padding='2px 10px'")
+        command_line(s.command("diagnose", "--report", "diagnosis.html"))
+        if s.all_chosen():
+            command_line(s.command("extend", *s.extend_words()))

@@ -1,0 +1,302 @@
+"""A process beside the server that does the long work: reads logs, searches, refits. ``python -m app.web.worker FD`` speaks over a socket.
+
+It calls what the command line calls. Its own process group holds whatever it starts, so that ending the group ends everything; when the
+server is gone it ends itself. Answers come one by one, in the order of the questions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+__all__ = ["TASKS"]
+
+Progress = Callable[[float | None, str], None]
+MOST_MEMORY = 0.75  # of the machine's
+LEAST_MEMORY = 4 << 30  # bytes; compiled code reserves address space of its own
+
+
+# ---- what is kept between questions ---------------------------------------------------------------------------------------------------
+
+_CHAIN: dict[tuple[str, ...], Any] = {}  # of the latest log only
+
+
+def parsed(verb: str, words: list[str]) -> argparse.Namespace:
+    """Return the options of ``vaneloop VERB words`` as the command line parses them; InputError with its complaint."""
+    import importlib
+
+    from app.main import COMMANDS
+    from hil import cli
+    from tables import InputError
+
+    module = importlib.import_module(COMMANDS[verb][0])
+    parser = cli.Parser(prog=f"vaneloop {verb}", description=module.DESCRIPTION)
+    module.add_options(parser)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            args = parser.parse_args(words)
+    except SystemExit:
+        raise InputError(complaint.getvalue().strip().splitlines()[-1]) from None
+    args.quiet = True
+    return args
+
+
+def chain_for(words: list[str], progress: Progress) -> Any:
+    """Return the log that ``words`` name (with its options), as stages; read once."""
+    from app.common import chain_of
+    from hil.lockstep import warm_up
+
+    key = tuple(words)
+    if key not in _CHAIN:
+        warm_up(lambda text: progress(None, text))
+        _CHAIN.clear()
+        progress(None, "reading the log")
+        _CHAIN[key] = chain_of(parsed("diagnose", words))
+    return _CHAIN[key]
+
+
+# ---- tasks ----------------------------------------------------------------------------------------------------------------------------
+
+
+def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
+    """Names that the log offers, to be mapped."""
+    from hil.logs import offered
+
+    return offered(path, dbc=dbc)
+
+
+def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Read the log: its channels in our names and units."""
+    from hil import cli
+    from hil.logs import UNITS
+
+    log = cli.read_log_of(parsed("diagnose", words), require=())
+    return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in log.channels.items()}}
+
+
+def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Compare and locate: errors stage by stage and in the whole loop, failure maps, curves."""
+    from discrepancy.fit import Judge
+    from discrepancy.locate import onset, regimes
+    from discrepancy.workflow import compare_stages, floor_of
+    from hil import cli
+    from hil.replay import replay
+    from plant import build_plant, load_model
+    from tables import InputError
+
+    chain = chain_for(words, progress)
+    progress(0.1, "comparing")
+    figures = compare_stages(chain.stages)
+    maps, starts, curves = {}, {}, {}
+    for i, stage in enumerate(chain.stages):
+        progress(0.1 + 0.6 * i / len(chain.stages), f"locating: {stage.name}")
+        judge = Judge(stage, floor_of(stage))
+        fit = judge.fit((), stage.neutral())
+        maps[stage.name] = regimes(judge, fit, 2.0)
+        starts[stage.name] = onset(judge, fit) if any(r.significant.any() for r in maps[stage.name]) else None
+        curves[stage.name] = curves_of(judge, {"nominal model": stage.neutral()})
+    progress(0.7, "the whole loop")
+    args = parsed("diagnose", words)
+    loop: list[Any] = []
+    why = ""
+    try:
+        machine = build_plant(model=load_model(args.model)) if args.model else None
+        loop = replay(cli.read_log_of(args), plant=machine).signals
+    except InputError as e:
+        why = str(e)
+    progress(1.0, "")
+    return {
+        "figures": figures, "maps": maps, "onset": starts, "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
+        "loop": loop, "loop_missing": why, "span": float(chain.t[-1]), "samples": len(chain.t),
+    }  # fmt: skip
+
+
+def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
+    """Measured outputs of a stage and each model's error (in the output's unit), for plots. NaN where nothing counts."""
+    import numpy as np
+
+    stage = judge.stage
+    e = judge.errors(np.array(list(models.values()))) * judge.floor[None, :, None]
+    out = {}
+    for k, output in enumerate(stage.outputs):
+        valid = judge.valid[k]
+        out[output] = {
+            "unit": stage.units[k],
+            "floor": float(judge.floor[k]),
+            "measured": np.where(valid, stage.measured[k], np.nan),
+            "errors": {name: np.where(valid, e[i, k], np.nan) for i, name in enumerate(models)},
+        }
+    return {"t": stage.t, "outputs": out}
+
+
+def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Search every stage for missing effects, as ``vaneloop diagnose`` does."""
+    from discrepancy.report import verdict_sentence
+    from discrepancy.workflow import diagnose as search
+    from discrepancy.workflow import diagnosis_json
+
+    chain = chain_for(words, progress)
+    progress(0.0, "searching the library of effects")
+    d = search(chain.stages, chain.not_observed, lambda f: progress(f, "searching the library of effects"), 2)
+    d.notes = list(chain.notes)
+    return {"diagnosis": d, "json": diagnosis_json(d, words[0]), "verdict": verdict_sentence(d)}
+
+
+def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
+    """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
+    from discrepancy.fit import Judge
+    from discrepancy.workflow import extend_stage
+
+    chain = chain_for(words, progress)
+    s = chain.stage(stage)
+    expected = max(2.0, 1.5 * len(effects) * (len(effects) + 1))
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress(min(0.97, done / expected), f"fitting {' + '.join(effects) or 'the nominal model'}")
+
+    tick()
+    r = extend_stage(s, effects, tick)
+    judge = Judge(s, r.floor)
+    models = {"nominal model": r.base.theta}
+    if effects:
+        models["with effects"] = r.final.theta
+    return {"result": r, "curves": curves_of(judge, models), "theta": r.final.theta, "floor": r.floor}
+
+
+def hand(progress: Progress, words: list[str], stage: str, theta: Any, floor: Any, values: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared unit."""
+    import numpy as np
+
+    from discrepancy.fit import Judge
+
+    chain = chain_for(words, progress)
+    s = chain.stage(stage)
+    judge = Judge(s, np.asarray(floor))
+    by_hand = np.array(theta, dtype=float)
+    for effect, given in values.items():
+        at = s.index()[effect].start
+        for i, p in enumerate(s.effect(effect).parameters):
+            if p.name in given:
+                by_hand[at + i] = min(max(given[p.name], p.low), p.high)
+    curves = curves_of(judge, {"by hand": by_hand})
+    rms = {o: float(np.sqrt(np.nanmean(c["errors"]["by hand"] ** 2))) for o, c in curves["outputs"].items()}
+    return {"curves": curves, "rms": rms}
+
+
+def experiment(progress: Progress, diagnosis: Any) -> dict[str, Any] | None:
+    """Recommend the next experiment, as ``vaneloop experiment`` does."""
+    from app.experiment import recommend
+
+    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"))
+
+
+def report(progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None) -> str:
+    """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
+    from discrepancy.report import diagnosis_report
+
+    chain = chain_for(words, progress)
+    progress(None, "writing the page")
+    return str(diagnosis_report(diagnosis, chain, path, command, words[0], next_experiment))
+
+
+def command(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Run a whole command line of ours; return its exit code and what it said. InputError for exit code 2."""
+    from app.main import main
+    from tables import InputError
+
+    said, complained = io.StringIO(), io.StringIO()
+    sys.argv = ["vaneloop", *words]
+    progress(None, "vaneloop " + words[0])
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+        try:
+            code = main(words)
+        except SystemExit as e:
+            code = int(e.code or 0)
+    if code == 2:
+        lines = complained.getvalue().strip().splitlines()
+        raise InputError(lines[-1].removeprefix("vaneloop: ") if lines else "bad input")
+    return {"code": code, "text": said.getvalue()}
+
+
+TASKS: dict[str, Callable[..., Any]] = {
+    **{f.__name__: f for f in (offers, preview, compare, diagnose, refit, hand, experiment, report, command)},
+    "ahead": refit,  # the same, before the user asks for it
+}
+
+
+# ---- the process ----------------------------------------------------------------------------------------------------------------------
+
+
+def _limit_memory() -> None:
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    most = max(LEAST_MEMORY, int(MOST_MEMORY * whole))
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def main(fd: int) -> None:
+    """Answer questions until the server is gone."""
+    connection = Connection(fd)
+    _limit_memory()
+    os.nice(5)  # the page answers first
+    questions: queue.Queue[Any] = queue.Queue()
+
+    def listen() -> None:
+        try:
+            while True:
+                questions.put(connection.recv())
+        except (EOFError, OSError):
+            os.killpg(os.getpgrp(), signal.SIGKILL)  # the server is gone, and so is whatever this process has started
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        number, name, arguments = questions.get()
+        last = 0.0
+
+        def progress(fraction: float | None, text: str, number: int = number) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if fraction is None or fraction in (0.0, 1.0) or now - last > 0.05:
+                last = now
+                connection.send(("progress", number, (fraction, text)))
+
+        try:
+            answer = ("done", number, TASKS[name](progress, **arguments))
+        except BaseException as e:
+            answer = ("failed", number, _line(e))
+        connection.send(answer)
+
+
+def _line(e: BaseException) -> str:
+    """One line for the page: what the command line would say, or the kind of the mistake where it is ours."""
+    from tables import InputError
+
+    if isinstance(e, InputError):
+        return str(e)
+    if isinstance(e, MemoryError):
+        return "the machine's memory does not suffice for this log"
+    import traceback
+
+    traceback.print_exc()
+    where = traceback.extract_tb(e.__traceback__)[-1]
+    return f"internal error: {type(e).__name__}: {e} ({Path(where.filename).name}:{where.lineno})"[:300]
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
