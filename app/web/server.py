@@ -14,6 +14,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import uvicorn
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import FileResponse, PlainTextResponse
+from nicegui import app as pages
+from nicegui import ui
+
+from app.web import missing
+from app.web.charts import Curves, view
 from app.web.guard import Guard
 from app.web.session import LOG_SUFFIXES, LogFile, Session
 
@@ -65,8 +73,6 @@ def logs_in(folder: Path) -> list[LogFile]:
 def serve(sock: socket.socket, folder: Path, token: str | None, most: int, ready: Callable[[], None]) -> None:
     """Serve until Ctrl-C. ``sock`` listens already; ``most``: bytes of an upload."""
     private = Path(tempfile.mkdtemp(prefix="vaneloop-web-"))  # 0700
-    os.environ["NICEGUI_STORAGE_PATH"] = str(private / "nicegui")
-    os.environ.setdefault("MPLBACKEND", "agg")
     tempfile.tempdir = str(private)  # uploads on their way are private too
     try:
         _serve(sock, folder, token, most, ready, private)
@@ -75,15 +81,6 @@ def serve(sock: socket.socket, folder: Path, token: str | None, most: int, ready
 
 
 def _serve(sock: socket.socket, folder: Path, token: str | None, most: int, ready: Callable[[], None], private: Path) -> None:
-    import uvicorn
-    from fastapi import FastAPI, Request, Response
-    from fastapi.responses import FileResponse, PlainTextResponse
-    from nicegui import app as pages
-    from nicegui import ui
-
-    from app.web import missing
-    from app.web.charts import Curves, view
-
     sessions = Sessions(private, logs_in(folder))
     api = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
@@ -127,8 +124,6 @@ def _serve(sock: socket.socket, folder: Path, token: str | None, most: int, read
         reconnect_timeout=20.0, session_middleware_kwargs={"same_site": "strict"},
     )  # fmt: skip
     config = uvicorn.Config(Guard(api, token, most), log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2, lifespan="on")
-    server = uvicorn.Server(config)
-
     class Told(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
