@@ -6,7 +6,7 @@ const PAD = 0.34;
 
 export default {
   template: `<div class="curves"><div ref="legend" class="curves-legend"></div><div ref="stack"></div>
-    <div v-if="!live" class="curves-hint">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; double-click: everything</div></div>`,
+    <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; double-click: everything</div></div>`,
   props: { src: String, version: Number, live: Number, unit: String },
   mounted() {
     this.plots = [];
@@ -100,6 +100,7 @@ export default {
     },
     rebuild() { if (this.head) this.build(); },
     build() {
+      if (this.$refs.hint) this.$refs.hint.style.display = this.head.panels.length ? "" : "none";
       this.plots.forEach((p) => p.destroy());
       this.$refs.stack.replaceChildren();
       const colour = this.colours();

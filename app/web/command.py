@@ -10,12 +10,11 @@ import sys
 from pathlib import Path
 
 from app.web.guard import is_loopback
-from hil import cli
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Open the workbench: a page of this machine on which a log is dropped, the missing effect is found and switched on, vanes are
-scheduled, and the loop runs live. Whatever it does is a call of a command's function, and it shows that command.
+DESCRIPTION = """Open the workbench: a page of this machine on which a log is dropped, the missing effect is found and switched on, vanes
+are scheduled, and the loop runs live. Whatever it does is a call of a command's function, and it shows that command.
 
 It listens on loopback only. With another --host everyone who asks must know the token: the address printed carries it. Give your own in the
 environment variable VANELOOP_WEB_TOKEN (16 characters or more), or one is made up. There is no encryption: on a network that others listen
@@ -59,7 +58,9 @@ def command(args: argparse.Namespace) -> int:
     if not is_loopback(args.host):
         token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
         if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
-            raise InputError(f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} characters")
+            raise InputError(
+                f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} characters"
+            )
     try:
         import nicegui  # noqa: F401
         import tsdownsample  # noqa: F401

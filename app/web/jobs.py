@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
-__all__ = ["Cancelled", "Job", "Worker", "WorkError"]
+__all__ = ["Cancelled", "Job", "WorkError", "Worker"]
 
 
 class WorkError(Exception):

@@ -8,13 +8,13 @@ from typing import Any
 from nicegui import events, ui
 
 from app.web.charts import Chart, figure
-from app.web.frame import Live, card, command_line, complaint, dark, frame, progress, table, tone
+from app.web.frame import Live, card, command_line, complaint, dark, frame, opened, progress, table, tone
 from app.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
 from discrepancy.locate import Regime
 from hil.logs import UNITS
-from hil.page import heat, number, overlay, waterfall
 from hil.page import Line as PageLine
 from hil.page import Panel as PagePanel
+from hil.page import heat, number, overlay, waterfall
 from plant.effects import EFFECTS
 
 __all__ = ["build"]
@@ -34,6 +34,7 @@ def build(session: Session, most: int) -> None:
 class _Page:
     def __init__(self, session: Session, live: Live, most: int):
         self.s, self.live, self.most = session, live, most
+        self.readout: ui.label | None = None
 
     # ---- 1: the log
 
@@ -104,7 +105,9 @@ class _Page:
     def _channels(self) -> None:
         s = self.s
         if s.choice.file is None:
-            ui.label("Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model lacks.").classes("soft")
+            ui.label("Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model lacks.").classes(
+                "soft"
+            )
             return
         if s.preview is None:
             return
@@ -124,13 +127,15 @@ class _Page:
             return
         choice = s.choice
         wrong = bool(s.errors.get("log"))
-        with ui.expansion("Names and units", value=wrong).classes("w-full names").props("dense"):
+        with opened(s, "Names and units", wrong).classes("names"):
             ui.label(
                 "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit that the log states."
             ).classes("soft small")
             names: dict[str, ui.select] = {}
             units: dict[str, ui.input] = {}
-            with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"):
+            with ui.element("div").style(
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"
+            ):
                 for signal in ("t", *UNITS):
                     with ui.element("div").style("display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:8px;align-items:center"):
                         ui.label(signal).classes("mono")
@@ -146,7 +151,9 @@ class _Page:
             with ui.element("div").classes("rowc"):
                 rpm = ui.input("design speed [rpm]", value=choice.design_rpm).props("outlined dense").style("width:170px")
                 beside = [f for f in (choice.dbc, choice.model) if f is not None]
-                ui.label("with " + " and ".join(f.name for f in beside) if beside else "a .dbc or a model .toml: drop it above").classes("soft small")
+                ui.label("with " + " and ".join(f.name for f in beside) if beside else "a .dbc or a model .toml: drop it above").classes(
+                    "soft small"
+                )
 
                 def apply() -> None:
                     choice.mapping = {k: str(v.value) for k, v in names.items() if v.value}
@@ -182,7 +189,8 @@ class _Page:
         worst = max(c["figures"], key=lambda f: f.rms / f.noise_floor)
         ratio = worst.rms / worst.noise_floor
         if ratio > 1.2:
-            text = f"The {worst.stage} stage fails most: {worst.signal} is off by {number(worst.rms)} {worst.unit} RMS, {number(ratio)} noise floors."
+            off = f"{worst.signal} is off by {number(worst.rms)} {worst.unit} RMS, {number(ratio)} noise floors"
+            text = f"The {worst.stage} stage fails most: {off}."
         else:
             text = "Every stage agrees with its measurements to within the noise."
         ui.label(text).classes(f"verdict {'bad' if ratio > 2 else 'good' if ratio <= 1.2 else ''}")
@@ -203,9 +211,11 @@ class _Page:
                 for name, why in c["not_observed"].items():
                     rows.append([name, f"not observed: {why}", "", "", "", "", ""])
                 table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
-                ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes("note")
+                ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes(
+                    "note"
+                )
                 if c["loop"]:
-                    with ui.expansion("The whole loop").classes("w-full").props("dense"):
+                    with opened(s, "The whole loop"):
                         table(
                             ["signal", "against", "RMS", "max", "unit"],
                             [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in c["loop"]],
@@ -220,22 +230,28 @@ class _Page:
                 if stages:
                     with ui.element("div").classes("rowc"):
                         ui.label("Failure map of").classes("soft")
-                        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props("dense unelevated no-caps padding='2px 10px'")
+                        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props(
+                            "dense unelevated no-caps padding='2px 10px'"
+                        )
                     self._heat(c["maps"].get(s.stage, []), c["onset"].get(s.stage))
 
     def _heat(self, found: list[Regime], onset: float | None) -> None:
         hot = [r for r in found if r.significant.any()]
         if not hot:
-            ui.label(f"The {self.s.stage} stage agrees everywhere once its nominal parameters are refitted within their tolerances.").classes("soft")
+            ui.label(
+                f"The {self.s.stage} stage agrees everywhere once its nominal parameters are refitted within their tolerances."
+            ).classes("soft")
             return
         if onset is not None:
             ui.label(f"The error begins at t = {onset:.0f} s.")
         output = hot[0].output
         mine = [r for r in hot if r.output == output][:9]
         width = max(len(r.ratio) for r in mine)
-        cells = [[float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * (width - len(r.ratio)) for r in mine]
+        cells = [
+            [float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * (width - len(r.ratio)) for r in mine
+        ]
         names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
-        f = heat(cells, [str(i + 1) for i in range(width)], names, "noise floors", "an eighth of the samples each, from the lowest values to the highest", "")
+        f = heat(cells, [str(i + 1) for i in range(width)], names, "noise floors", "an eighth of the samples each, lowest to highest", "")
         figure(f, dark(self.s), height=90 + 27 * max(3, len(names)))
         ui.label(f"Worst: {mine[0].worst()}.").classes("note")
 
@@ -255,18 +271,25 @@ class _Page:
                     self.chart_title = ui.label().classes("soft small")
                     chart = Chart("stage")
             self._title()
+            self.live.watch(self._by_hand, "hand")
             self.live.watch(self._title, "fit", "diagnosis", "compare", "hand")
             self.live.watch(chart.refetch, "fit", "diagnosis", "compare", "hand")
 
     def _title(self) -> None:
         s = self.s
-        text = f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors to each side." if s.stage else ""
+        text = (
+            f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors to each side."
+            if s.stage
+            else ""
+        )
         self.chart_title.set_text(text)
 
     def _search(self) -> None:
         s = self.s
         if s.compared is None:
-            ui.label("After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named.").classes("soft")
+            ui.label(
+                "After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named."
+            ).classes("soft")
             return
         if s.diagnosis is None:
             job = s.busy("diagnose")
@@ -307,7 +330,11 @@ class _Page:
                     ui.label(name).classes("name")
                     c = gain.get(name)
                     share = 0.0 if c is None or c.nats <= 0 or top <= 0 else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
-                    with ui.element("div").classes("gain").tooltip(f"gain alone: {c.nats:,.0f} nats on held-out data" if c else "not tried alone"):
+                    with (
+                        ui.element("div")
+                        .classes("gain")
+                        .tooltip(f"gain alone: {c.nats:,.0f} nats on held-out data" if c else "not tried alone")
+                    ):
                         ui.element("i").style(f"width:{100 * share:.0f}%")
                     ui.label(self._about_effect(name, found, named, c)).classes("about")
 
@@ -315,7 +342,9 @@ class _Page:
         summary = EFFECTS[name].summary if name in EFFECTS else ""
         if name in found:
             f = found[name]
-            parts = [f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}" for n, p in f.parameters.items()]
+            parts = [
+                f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}" for n, p in f.parameters.items()
+            ]
             text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
             return text + (f". As good: {', '.join(f.rivals)}" if f.rivals else "") + (f". {summary}" if summary else "")
         if name in named:
@@ -336,12 +365,18 @@ class _Page:
         r = f.result
         k = int((r.error_before / r.floor).argmax())
         with ui.element("div").classes("tiles error-tiles"):
-            for label, v in (("nominal", r.error_before[k]), ("with the effects that are on", r.error_after[k]), ("noise floor", r.floor[k])):
+            for label, v in (
+                ("nominal", r.error_before[k]),
+                ("with the effects that are on", r.error_after[k]),
+                ("noise floor", r.floor[k]),
+            ):
                 with ui.element("div").classes("tile"):
                     ui.label(f"{number(v)} {r.units[k]}").classes("v")
                     ui.label(f"{label}: {r.outputs[k]}").classes("l")
             with ui.element("div").classes("tile"):
-                ui.label(f"{number(r.error_after[k] / r.floor[k])}").classes("v after").props(f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"')
+                ui.label(f"{number(r.error_after[k] / r.floor[k])}").classes("v after").props(
+                    f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
+                )
                 ui.label("noise floors, held out").classes("l")
         figure(waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250)
 
@@ -350,22 +385,23 @@ class _Page:
         f = s.fitted()
         if s.diagnosis is None or f is None or not f.result.effects:
             return
-        with ui.expansion("Turn the parameters by hand", value=bool(s.hand)).classes("w-full by-hand").props("dense"):
+        with opened(s, "Turn the parameters by hand").classes("by-hand"):
             with ui.element("div").classes("rowc"):
-                readout = ui.label().classes("mono hand-error")
+                self.readout = ui.label().classes("mono hand-error")
                 ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
-
-            def show() -> None:
-                left = [f"{o} {number(v, 4)} {u}" for (o, v), u in zip(s.hand_rms.items(), f.result.units, strict=False)]
-                readout.set_text("error by hand: " + ", ".join(left) if left else "error by hand: move a slider")
-
-            show()
-            self.live.watch(show, "hand")
+            self._by_hand()
             now = s.values()
             with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"):
                 for e in f.result.effects:
                     for name, p in e.parameters.items():
                         self._slider(e.effect, name, float(p["value"]), str(p["unit"]), now[e.effect][name])
+
+    def _by_hand(self) -> None:
+        s, f = self.s, self.s.fitted()
+        if self.readout is None or self.readout.is_deleted or f is None:
+            return
+        left = [f"{o} {number(v, 4)} {u}" for (o, v), u in zip(s.hand_rms.items(), f.result.units, strict=False)]
+        self.readout.set_text("error by hand: " + (", ".join(left) or "move a slider"))
 
     def _slider(self, effect: str, name: str, fitted: float, unit: str, now: float) -> None:
         p = EFFECTS[effect][name]
@@ -430,7 +466,9 @@ class _Page:
         with ui.element("div").classes("rowc"):
             for key, name in links.items():
                 if key in s.saved:
-                    ui.link(f"download {name}", f"/saved/{key}").props(f'download="{name}"').classes(f"saved-{key}").style("color:var(--measured)")
+                    ui.link(f"download {name}", f"/saved/{key}").props(f'download="{name}"').classes(f"saved-{key}").style(
+                        "color:var(--measured)"
+                    )
             if "model" in s.saved:
 
                 def go_on() -> None:

@@ -124,6 +124,7 @@ def _serve(sock: socket.socket, folder: Path, token: str | None, most: int, read
         reconnect_timeout=20.0, session_middleware_kwargs={"same_site": "strict"},
     )  # fmt: skip
     config = uvicorn.Config(Guard(api, token, most), log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2, lifespan="on")
+
     class Told(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
