@@ -25,11 +25,13 @@ demo: $(READY)  ## replay a recorded engine run and the long engine test; writes
 	@$(PY) -m app.demo
 
 test: lint  ## lint, types, and every test but the slow ones
+	@$(need_chromium)
 	@$(SAY) 'pytest'
 	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow and not socketcan'
 	@$(PY) -m tests.uml.run
 
 test-all: lint  ## lint, types, and every test, with the slow campaigns
+	@$(need_chromium)
 	@$(SAY) 'pytest, with the slow campaigns'
 	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
 	@$(PY) -m tests.uml.run
@@ -110,5 +112,15 @@ if ! command -v gcc >/dev/null; then \
     apt-get update -qq >/dev/null || true; \
     apt-get install -y -qq gcc libc6-dev >/dev/null; \
   else $(SAY) 'the comparison with C needs gcc: install it and try again'; exit 1; fi; \
+fi
+endef
+
+define need_chromium
+if ! command -v chromium chromium-browser google-chrome >/dev/null; then \
+  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+    $(SAY) 'installing chromium with apt-get, for the tests of the workbench'; \
+    export DEBIAN_FRONTEND=noninteractive; \
+    { apt-get update -qq && apt-get install -y -qq chromium; } >/dev/null || $(SAY) 'chromium could not be installed: THE TESTS OF THE WORKBENCH ARE SKIPPED'; \
+  else $(SAY) 'no chromium, and not root to install it: THE TESTS OF THE WORKBENCH ARE SKIPPED'; fi; \
 fi
 endef

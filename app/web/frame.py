@@ -15,7 +15,7 @@ from hil.page import THEMES
 
 __all__ = ["PAGES", "Live", "card", "command_line", "complaint", "frame", "opened", "progress", "table", "tone"]
 
-PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
+PAGES = (("/", "Missing physics"),)
 PRIMARY = "#1f6fc4"
 
 
