@@ -230,7 +230,7 @@ def test_a_multiplexed_signal_is_read_where_its_selector_says_so(tmp_path: Path)
 
 def test_every_format_has_a_test() -> None:
     assert set(logs._FORMATS) == {*TABLES, *BUSES, ".mf4"}
-    assert sorted(logs.__all__) == ["Channel", "Log", "LogError", "UNITS", "read_log", "write_log"]
+    assert sorted(logs.__all__) == ["Channel", "Log", "LogError", "UNITS", "offered", "read_log", "write_log"]
 
 
 @pytest.mark.parametrize("suffix", [*TABLES, ".mf4"])
