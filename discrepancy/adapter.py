@@ -328,6 +328,18 @@ def _actuator(
 
     stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, 4 * substeps)
+    window = int(round(WINDOW / dt))
+
+    def excerpt(at: Array) -> Stage:
+        begins = np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1)
+        keep = run[at]
+        for b in begins:  # the spool and the lags come from another time
+            keep[b : b + window] = False
+        part = _actuator(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
+        part.floor, part.noise = stage.floor, stage.noise
+        return part
+
+    stage.excerpt = excerpt
     return stage
 
 
@@ -353,12 +365,27 @@ def _linkage(
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
     # until the stroke has crossed the play twice over, nobody knows where in it the rings started
-    reach = np.maximum.accumulate(c["x_lvdt"]) - np.minimum.accumulate(c["x_lvdt"])
-    known = reach > 3.0
+    known = _crossed(c["x_lvdt"])
     if known.any():
         run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
-    return Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
+    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
+
+    def excerpt(at: Array) -> Stage:
+        keep = run[at]
+        for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
+            keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
+        part = _linkage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
+        part.floor, part.noise = stage.floor, stage.noise
+        return part
+
+    stage.excerpt = excerpt
+    return stage
+
+
+def _crossed(x: Array) -> Array:
+    """Samples from which on the stroke x (mm) has crossed any ring's play: where in it the ring began is forgotten."""
+    return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
 
 
 def _servo(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,9 @@ TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
 # Share of the excess over the floor that a further effect must explain (less is one effect patching another's equation), and that
 # a model of the right kind may leave (its equation is not nature's): what is left then would not have earned a further effect either.
 LEAST_SHARE = 0.15
+LONG = 60_000  # samples; a stage with more is searched on an excerpt
+SEARCHED = 40_000  # samples of an excerpt, about
+PIECE = 4_000  # samples in a row: longer than the memory of any stage here
 LEFT_FLOORS = 3.0  # noise floors that a named model may leave, whatever share of the excess it explains
 
 
@@ -265,8 +268,81 @@ def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bo
 def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
     """Search the stage's library for what is missing; see `_diagnose`.
 
-    The floor is measured again on the errors of the best model and the search repeated where it was too high: a gross effect makes the
-    nominal model's error move so fast that it passes for noise.
+    floor  RMS of each output's error when nothing is missing
+    keep   samples that count
+    tick   called after every fit, for a progress bar
+
+    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most. What is found there is
+    fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from what is left.
+    """
+    if stage.excerpt is None or len(stage.t) < LONG:
+        return _to_the_floor(stage, floor, keep, tick)
+    judge = Judge(stage, floor, keep)
+    base = judge.fit((), stage.neutral(), 5)
+    found = None
+    for _ in range(2):
+        at = _excerpt(judge, base if found is None else found.final)
+        part = stage.excerpt(at)
+        said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick)
+        found = _confirm(stage, keep, floor, base, said)
+        if found.verdict != "unknown" or said.verdict == "unknown":
+            break
+    return found
+
+
+def _excerpt(judge: Judge, fit: Fit) -> Array:
+    """Samples to search on: pieces of whole windows, half of them evenly spaced, the others where ``fit`` fails most."""
+    stage = judge.stage
+    n = len(stage.t)
+    dt = float(np.median(np.diff(stage.t)))
+    window = max(1, round((stage.window or dt) / dt))
+    length = max(1, round(PIECE / window)) * window
+    pieces = n // length
+    squares = np.sum(judge.errors(fit.theta[None])[0] ** 2, axis=0)
+    cost = squares[: pieces * length].reshape(pieces, length).sum(axis=1)
+    many = max(2, SEARCHED // length)
+    chosen = set(np.linspace(0, pieces - 1, many - many // 2).round().astype(int).tolist())
+    for k in np.argsort(-cost):
+        if len(chosen) >= many:
+            break
+        chosen.add(int(k))
+    return (np.array(sorted(chosen))[:, None] * length + np.arange(length)).reshape(-1)
+
+
+def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: StageDiagnosis) -> StageDiagnosis:
+    """Fit what an excerpt said to the whole log; an effect that the whole log does not need is dropped."""
+    judge = Judge(stage, said.floor, keep)
+    nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
+    chosen, current = said.final.effects, nominal
+    if chosen:
+        current = judge.fit(chosen, said.final.theta, 8)
+    correlation = min(_correlation(judge, current.theta), 50.0)
+    while chosen:
+        rest = [tuple(c for c in chosen if c != name) for name in chosen]
+        without = [judge.fit(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) if r else nominal for r in rest]
+        idle = [k for k, f in enumerate(without) if not significant(judge, f, current, correlation)]
+        if not idle:
+            break
+        chosen, current = rest[idle[0]], without[idle[0]]
+    effects = [replace(f, parameters=_parameters(stage, current, f.effect)) for f in said.effects if f.effect in chosen]
+    steps = [("nominal", float(np.sqrt(nominal.held_out.sum() / max(judge.n, 1))))]
+    if chosen:
+        steps.append((" + ".join(chosen), float(np.sqrt(current.held_out.sum() / max(judge.n, 1)))))
+    return _conclude(judge, nominal, current, effects, said.candidates, correlation, steps)
+
+
+def _allowed(stage: Stage, effects: tuple[str, ...]) -> Array:
+    """Columns that a model with only these effects may have away from neutral: bool[parameters]."""
+    out = np.ones(len(stage.all_parameters()), dtype=bool)
+    for name, columns in stage.index().items():
+        out[columns] = name in effects
+    return out
+
+
+def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None) -> StageDiagnosis:
+    """Search, measure the floor again on the errors of the best model, and repeat where it was too high.
+
+    A gross effect makes the nominal model's error move so fast that it passes for noise.
     """
     d = _diagnose(stage, floor, keep, tick)
     for _ in range(2):
@@ -280,12 +356,7 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
 
 
 def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
-    """Search the stage's library for what is missing.
-
-    floor  RMS of each output's error when nothing is missing
-    keep   samples that count
-    tick   called after every fit, for a progress bar
-    """
+    """Search the stage's library for what is missing."""
     judge = Judge(stage, floor, keep)
     search = Search(judge, tick)
     base = search.base
@@ -345,12 +416,27 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
                 break
 
     effects = _name(judge, search, chosen, current, candidates, correlation)
-    excess_before, excess_after = rms(base) ** 2 - 1.0, rms(current) ** 2 - 1.0
+    return _conclude(judge, base, current, effects, candidates, correlation, steps)
+
+
+def _conclude(
+    judge: Judge,
+    base: Fit,
+    current: Fit,
+    effects: list[Found],
+    candidates: list[Candidate],
+    correlation: float,
+    steps: list[tuple[str, float]],
+) -> StageDiagnosis:
+    """Give the verdict on the best model found."""
+    stage = judge.stage
+    n = max(judge.n, 1)
+    rms_before, rms_after = (float(np.sqrt(f.held_out.sum() / n)) for f in (base, current))
+    excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
     limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
-    leftover = rms(current) > limit
-    if leftover and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms(current) > LEFT_FLOORS):
+    if rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms_after > LEFT_FLOORS):
         verdict, effects = "unknown", []
-    elif chosen:
+    elif current.effects:
         verdict = "missing"
     else:
         verdict = "none"
@@ -370,7 +456,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
         candidates=candidates,
         correlation=correlation,
         steps=steps,
-        excess=rms(current),
+        excess=rms_after,
     )
 
 

@@ -61,7 +61,7 @@ class Judge:
         t = stage.t
         span = t[-1] - t[0]
         if stage.window:
-            w = np.minimum(((t - t[0]) / stage.window).astype(int), max(int(span / stage.window) - 1, 0))
+            w = np.minimum(((t - t[0]) / stage.window + 1e-9).astype(int), max(int(span / stage.window + 1e-9) - 1, 0))
         else:
             w = None
         blocks = int(np.clip(span / BLOCK_S, MIN_BLOCKS, 60))

@@ -70,6 +70,8 @@ class Stage:
     finer     ``run`` with a finer step of its own, for stages that have one: their difference is the numerical error
     noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
               known, whose errors hold less of the machine's motion
+    excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long log is searched on
+              an excerpt, and the answer confirmed on the whole; None: always searched whole
     """
 
     name: str
@@ -87,6 +89,7 @@ class Stage:
     floor: Array | None = None
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None
+    excerpt: Callable[[Array], Stage] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and names."""
