@@ -12,12 +12,12 @@ A gain counts when it passes both thresholds. They are set on the maximum over t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from discrepancy.fit import Fit, Judge
+from discrepancy.fit import Fit, Judge, Task
 from discrepancy.stage import Array, Stage, noise_of
 
 __all__ = ["Candidate", "Found", "Search", "StageDiagnosis", "diagnose_stage", "found_of", "recalibrated", "rms_per_output"]
@@ -117,8 +117,7 @@ class Search:
                 thetas.append(theta)
                 owner.append(e.name)
         free = self.base.free
-        low, high = judge.bounds()
-        e0, jac = judge._linearise(self.base.theta, free, judge.scale[free], low, high)
+        e0, jac = judge.linearise(self.base.theta, free)
         flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
         costs = []
@@ -144,18 +143,27 @@ class Search:
 
     def single(self, name: str) -> Fit:
         """Fit with one effect, from its best starts."""
+        return self.singles([name])[name]
+
+    def singles(self, names: Sequence[str]) -> dict[str, Fit]:
+        """Fits with one effect each, side by side."""
+        return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
+
+    def _single(self, name: str) -> Task[Fit]:
         key = frozenset((name,))
         if key not in self.fits:
-            fits = [self.judge.fit((name,), s, 3) for s in self.starts[name][:2]]
+            fits = []
+            for start in self.starts[name][:2]:
+                fits.append((yield from self.judge.fitting((name,), start, 3)))
             best = min(fits, key=lambda f: float(f.cost.sum()))
             if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
-                best = self.judge.fit((name,), best.theta, 8)
-                best = self._refine(name, best)
+                best = yield from self.judge.fitting((name,), best.theta, 8)
+                best = yield from self._refine(name, best)
             self.fits[key] = best
             self.tick()
         return self.fits[key]
 
-    def _refine(self, name: str, fit: Fit) -> Fit:
+    def _refine(self, name: str, fit: Fit) -> Task[Fit]:
         """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no slope to follow."""
         starts = np.unique([s[0] for s in self.stage.effect(name).starts])
         column = self.stage.index()[name].start
@@ -169,47 +177,55 @@ class Search:
             sizes = np.linspace(low, high, 13)
             thetas = np.repeat(fit.theta[None], len(sizes), axis=0)
             thetas[:, column] = sizes
-            costs = self.judge.block_costs(self.judge.errors(thetas)).sum(axis=1)
+            costs = self.judge.block_costs((yield thetas)).sum(axis=1)
             k = int(np.argmin(costs))
             best, low, high = sizes[k], sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]
         theta = fit.theta.copy()
         theta[column] = best
-        refined = self.judge.fit((name,), theta, 4)
+        refined = yield from self.judge.fitting((name,), theta, 4)
         return refined if refined.cost.sum() < fit.cost.sum() else fit
 
-    def joined(self, effects: tuple[str, ...], finished: bool = True) -> Fit:
-        """Fit with several effects, started from the fits with one fewer; ``finished`` False: a few iterations, enough to rank it."""
+    def joined(self, effects: tuple[str, ...]) -> Fit:
+        """Fit with several effects, started from the fits with one fewer."""
+        return self.judge.together([self._joined(effects, True)])[0]
+
+    def _joined(self, effects: tuple[str, ...], finished: bool) -> Task[Fit]:
+        """``finished`` False: a few iterations, enough to rank it."""
         if len(effects) == 1:
-            return self.single(effects[0])
+            return (yield from self._single(effects[0]))
         key = frozenset(effects)
         if key not in self.fits:
             index = self.stage.index()
+            single = {}
+            for name in effects:
+                single[name] = (yield from self._single(name)).theta
             begins = []
             for leave in effects:
                 rest = frozenset(effects) - {leave}
                 if rest in self.fits:
-                    for source in (self.starts[leave][0], self.single(leave).theta):
+                    for source in (self.starts[leave][0], single[leave]):
                         theta = self.fits[rest].theta.copy()
                         theta[index[leave]] = source[index[leave]]
                         begins.append(theta)
             if not begins:
-                theta = self.single(effects[0]).theta.copy()
+                theta = single[effects[0]].copy()
                 for other in effects[1:]:
-                    theta[index[other]] = self.single(other).theta[index[other]]
+                    theta[index[other]] = single[other][index[other]]
                 begins.append(theta)
-            costs = self.judge.block_costs(self.judge.errors(np.array(begins))).sum(axis=1)
-            self.fits[key] = self.judge.fit(tuple(effects), begins[int(np.argmin(costs))], 3)
+            costs = self.judge.block_costs((yield np.array(begins))).sum(axis=1)
+            self.fits[key] = yield from self.judge.fitting(tuple(effects), begins[int(np.argmin(costs))], 3)
             self.tick()
         if finished and key not in self.finished:
-            self.fits[key] = self.judge.fit(tuple(effects), self.fits[key].theta, 8)
+            self.fits[key] = yield from self.judge.fitting(tuple(effects), self.fits[key].theta, 8)
             self.finished.add(key)
             self.tick()
         return self.fits[key]
 
-    def best_of(self, sets: list[tuple[str, ...]]) -> list[Fit]:
+    def best_of(self, sets: Sequence[tuple[str, ...]]) -> list[Fit]:
         """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
-        quick = sorted((self.joined(s, finished=False) for s in sets), key=lambda f: float(f.held_out.sum()))
-        out = [self.joined(f.effects) for f in quick[:FINISHED]] + quick[FINISHED:]
+        quick = self.judge.together([self._joined(s, False) for s in sets])
+        quick.sort(key=lambda f: float(f.held_out.sum()))
+        out = self.judge.together([self._joined(f.effects, True) for f in quick[:FINISHED]]) + quick[FINISHED:]
         return sorted(out, key=lambda f: float(f.held_out.sum()))
 
 
@@ -272,8 +288,8 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
     keep   samples that count
     tick   called after every fit, for a progress bar
 
-    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most. What is found there is
-    fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from what is left.
+    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most. What is found
+    there is fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG:
         return _to_the_floor(stage, floor, keep, tick)
@@ -319,7 +335,8 @@ def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: St
     correlation = min(_correlation(judge, current.theta), 50.0)
     while chosen:
         rest = [tuple(c for c in chosen if c != name) for name in chosen]
-        without = [judge.fit(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) if r else nominal for r in rest]
+        tasks = [judge.fitting(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) for r in rest if r]
+        without = judge.together(tasks) if rest[0] else [nominal]
         idle = [k for k, f in enumerate(without) if not significant(judge, f, current, correlation)]
         if not idle:
             break
@@ -367,7 +384,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
 
     candidates = []
     names = [e.name for e in stage.effects]
-    singles = {name: base if search.quiet else search.single(name) for name in names}
+    singles = dict.fromkeys(names, base) if search.quiet else search.singles(names)
     leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
     correlation = min(_correlation(judge, leader.theta), 50.0)
     for name in names:

@@ -10,17 +10,23 @@ equations, so the held-out error of every block costs no further simulation (exa
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from discrepancy.stage import Array, Stage
 
-__all__ = ["Fit", "Judge"]
+__all__ = ["Fit", "Judge", "Task"]
+
+Answer = TypeVar("Answer")
+Task = Generator[Array, Array, Answer]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
 
 MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
 BLOCK_S = 10.0  # s, longer than the memory of any stage here
-MAX_SETS = 48  # parameter sets in one call of run
+MAX_SETS = 64  # parameter sets in one call of run
+MAX_VALUES = 8_000_000  # errors of several tasks held at one time
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
@@ -135,6 +141,40 @@ class Judge:
 
         weights: of every block, default 1; 0 leaves a block out
         """
+        return self.together([self.fitting(effects, start, iterations, weights)])[0]
+
+    def together(self, tasks: Sequence[Task[Answer]]) -> list[Answer]:
+        """Run tasks side by side; return what each returns, in their order.
+
+        A task yields parameter sets and gets their whitened errors. What all tasks ask for at one time is simulated in few calls of the
+        stage's ``run``, many sets side by side.
+        """
+        answers: list[Any] = [None] * len(tasks)
+        asked: list[tuple[int, Array]] = []
+
+        def step(i: int, errors: Array | None) -> None:
+            try:
+                asked.append((i, tasks[i].send(errors)))  # type: ignore[arg-type]
+            except StopIteration as end:
+                answers[i] = end.value
+
+        for i in range(len(tasks)):
+            step(i, None)
+        size = self.stage.measured.size
+        while asked:
+            batch, sets = [], 0
+            while asked and (not batch or (sets + len(asked[0][1])) * size <= MAX_VALUES):
+                batch.append(asked.pop(0))
+                sets += len(batch[-1][1])
+            errors = self.errors(np.concatenate([thetas for _, thetas in batch]))
+            at = 0
+            for i, thetas in batch:
+                step(i, errors[at : at + len(thetas)])
+                at += len(thetas)
+        return answers
+
+    def fitting(self, effects: tuple[str, ...], start: Array, iterations: int = 12, weights: Array | None = None) -> Task[Fit]:
+        """`fit` as a task for `together`."""
         s = self.stage
         free = self.columns(effects)
         low, high = self.bounds()
@@ -146,15 +186,17 @@ class Judge:
         prior = np.array([3.0 / tolerance[c] ** 2 if c < n_nominal else 0.0 for c in free])
         scale = self.scale[free]
         block_weights = np.ones(self.n_blocks) if weights is None else weights
-        per_sample = np.repeat(block_weights, np.diff(np.append(self.block_start, len(s.t))))
+        per_sample = np.repeat(np.sqrt(block_weights), np.diff(np.append(self.block_start, len(s.t))))
 
         def total(cost: Array, thetas: Array) -> Array:
             return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
 
         damping = 1e-3
         best: float | None = None
+        known: Array | None = None  # errors at theta
         for _ in range(iterations):
-            e, jac = self._linearise(theta, free, scale, low, high)
+            thetas, derivative = self._differences(theta, free, scale, high, known)
+            e, jac = derivative((yield thetas))
             here = float(total(self.block_costs(e[None]), theta[None])[0])
             if best is not None and best - here < 0.2 * len(free) and best >= here:
                 best = here
@@ -162,10 +204,12 @@ class Judge:
             best = here
             if len(free) == 0:
                 break
-            j2 = jac.reshape(len(free), e.size) * np.tile(np.sqrt(per_sample), len(s.outputs))
-            r2 = e.reshape(-1) * np.tile(np.sqrt(per_sample), len(s.outputs))
+            if weights is not None:
+                e, jac = e * per_sample, jac * per_sample
+            j2, r2 = jac.reshape(len(free), e.size), e.reshape(-1)
             a = j2 @ j2.T + np.diag(prior * scale**2)
             g = j2 @ r2 - prior * scale * (theta[free] - nominal[free])
+            del e, jac, j2, r2  # other tasks need the memory while this one waits
             trials = []
             for factor in (0.01, 1.0, 300.0):
                 lam = damping * factor
@@ -174,17 +218,27 @@ class Judge:
                 trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
                 trials.append((lam, trial))
             thetas = np.array([t for _, t in trials])
-            costs = total(self.block_costs(self.errors(thetas)), thetas)
+            errors = yield thetas
+            costs = total(self.block_costs(errors), thetas)
             k = int(np.argmin(costs))
             if not costs[k] < here:
                 break
-            damping, theta = max(trials[k][0], 1e-9), thetas[k]
+            damping, theta, known = max(trials[k][0], 1e-9), thetas[k], errors[k].copy()
             if here - costs[k] < 0.2 * max(1, len(free)):
                 break
-        return self._finish(effects, theta, free, prior, scale, nominal, low, high)
+        thetas, derivative = self._differences(theta, free, scale, high, known)
+        e, jac = derivative((yield thetas))
+        return self._finish(effects, theta, free, prior, scale, nominal, low, high, e, jac)
 
-    def _linearise(self, theta: Array, free: Array, scale: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    def linearise(self, theta: Array, free: Array) -> tuple[Array, Array]:
         """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs, samples)."""
+        thetas, derivative = self._differences(theta, free, self.scale[free], self.bounds()[1])
+        return derivative(self.errors(thetas))
+
+    def _differences(
+        self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
+    ) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+        """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta, if they are."""
         names = self.stage.outputs
         owner = [names.index(p.output) if p.output in names else None for p in self.stage.all_parameters()]
         row = np.zeros(len(free), dtype=int)
@@ -206,17 +260,21 @@ class Judge:
                 d = -d
             thetas[row[i] + 1, c] += d
             steps[i] = d / scale[i]
-        e = self.errors(thetas)
-        jac = np.zeros((len(free), *e[0].shape))
-        for i, c in enumerate(free):
-            only = slice(None) if owner[c] is None else owner[c]
-            jac[i, only] = (e[0, only] - e[row[i] + 1, only]) / steps[i]
-        return e[0], jac
+
+        def derivative(e: Array) -> tuple[Array, Array]:
+            here, moved = (e[0].copy(), e[1:]) if known is None else (known, e)
+            jac = np.zeros((len(free), *here.shape))
+            for i, c in enumerate(free):
+                only = slice(None) if owner[c] is None else owner[c]
+                jac[i, only] = (here[only] - moved[row[i], only]) / steps[i]
+            return here, jac
+
+        return thetas if known is None else thetas[1:], derivative
 
     def _finish(
-        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array
-    ) -> Fit:
-        e, jac = self._linearise(theta, free, scale, low, high)
+        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array,
+        e: Array, jac: Array,
+    ) -> Fit:  # fmt: skip
         k = len(free)
         cost = self.block_costs(e[None])[0]
         gradients = np.empty((self.n_blocks, k))

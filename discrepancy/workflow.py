@@ -115,8 +115,7 @@ def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None
     for _ in range(3):
         judge = Judge(stage, floor)
         search = Search(judge, tick)
-        for e in effects:
-            search.single(e)
+        search.singles(effects)
         order: tuple[str, ...] = ()
         while len(order) < len(effects):  # the one that explains most first
             order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects

@@ -10,6 +10,7 @@ The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 from numba import njit
@@ -121,7 +122,8 @@ WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would b
 SOME = 5  # so few lanes or fewer are quicker one by one there
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
-_plain = njit(cache=True, error_model="numpy")  # makes its block's scratch array: of constant width, so that the compiler sees the strides
+# makes its block's scratch array: of constant width, so that the compiler sees the strides
+_plain = njit(cache=True, nogil=True, error_model="numpy")
 
 
 def engine_run(n_dem, dt, p, s, out):
@@ -150,11 +152,12 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
+    # a block in which one lane carries a load computes it for all eight: those that do are put side by side
+    order = np.argsort(p[DRIVE_LOADED] != 0.0, kind="stable")
     wide = _in_blocks(p.shape[1], W, FEW)
-    if wide:
-        _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, wide)
+    _on_cores(wide, W, lambda first, last: _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order, first, last))
     if wide < p.shape[1]:
-        _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x, window, wide)
+        _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[wide:])
 
 
 def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
@@ -168,8 +171,7 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
     ahead, behind = np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1), np.maximum(np.arange(len(x_lvdt)) - reach, 0)
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
     wide = _in_blocks(p.shape[1], WIDE, SOME)
-    if wide:
-        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
+    _on_cores(wide, WIDE, lambda first, last: _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first, last))
     if wide < p.shape[1]:
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
 
@@ -195,6 +197,18 @@ def _currents(mean, dt, substeps, behind):
             out[k, m] = share * in_old + (1.0 - share) * in_own
         slope_before, before = slope, mean[k]
     return out
+
+
+def _on_cores(lanes, width, run):
+    """Call run(first, end) for all ``lanes``, whole blocks of ``width`` in two threads where there are enough."""
+    half = (lanes // width + 1) // 2 * width
+    if 0 < half < lanes:
+        other = threading.Thread(target=run, args=(half, lanes))
+        other.start()
+        run(0, half)
+        other.join()
+    elif lanes:
+        run(0, lanes)
 
 
 def _in_blocks(lanes, width, few):
@@ -250,11 +264,11 @@ def _between(a, k):
 
 
 @_plain
-def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, first):
-    """The lanes from ``first`` on, one after the other; current[k, m] in step m after sample k - 1."""
+def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lanes):
+    """These ``lanes``, one after the other; current[k, m] in step m after sample k - 1."""
     n, substeps = current.shape
     h = dt / substeps
-    for j in range(first, p.shape[1]):
+    for j in lanes:
         effects = p[DRIVE_EFFECTS, j] != 0.0
         for k in range(n):
             if k > 0:
@@ -283,16 +297,16 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, fir
 
 
 @_plain
-def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lanes):
-    """The first ``lanes`` lanes, eight at a time; current[k, m] in step m after sample k - 1."""
+def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, order, first, end):
+    """Lanes ``order[first:end]``, eight at a time; current[k, m] in step m after sample k - 1."""
     n, substeps = current.shape
     h = dt / substeps
     b = np.empty((_N_ROWS, W))
-    for j0 in range(0, lanes, W):
-        last = min(W, lanes - j0)
+    for j0 in range(first, end, W):
+        last = min(W, end - j0)
         loaded = sensed = False
         for j in range(W):
-            q = j0 + min(j, last - 1)
+            q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
@@ -314,7 +328,7 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, la
             if k > 0:
                 supply, warm, speed = _between(p_s, k), _between(t_oil, k), _between(n_r, k)
                 for j in range(W):
-                    q = j0 + min(j, last - 1)
+                    q = order[j0 + min(j, last - 1)]
                     gain = oil_viscosity.step(p[FLOW_GAIN, q], warm, p[OIL_VISCOSITY, q])
                     b[_EXTENDING, j], b[_RETRACTING, j] = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, q])
                     b[_ROOT, j] = speed_factor(supply, 0.0, p[P_REF, q])
@@ -327,7 +341,7 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, la
                         _block_substep(b, current[k, m], supply, h, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
-                    x = true_stroke(x_lvdt[k], p, j0 + j, t_oil[k])
+                    x = true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k])
                     if k == 0:
                         b[_X, j] = b[_Y, j] = b[_READING, j] = x
                     else:
@@ -337,12 +351,12 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, la
                         b[_READING, j] += shift
             if sensed:
                 for j in range(last):
-                    out[k, j0 + j] = measured_stroke(b[_READING, j], p, j0 + j, t_oil[k])
+                    out[k, order[j0 + j]] = measured_stroke(b[_READING, j], p, order[j0 + j], t_oil[k])
             else:
                 for j in range(last):
-                    out[k, j0 + j] = b[_READING, j]
+                    out[k, order[j0 + j]] = b[_READING, j]
         for j in range(last):
-            q = j0 + j
+            q = order[j0 + j]
             s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j]
             s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q] = b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j]
             s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j]
@@ -406,13 +420,13 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first):
 
 
 @_plain
-def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
-    """The first ``lanes`` lanes, `WIDE` at a time."""
+def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first, end):
+    """The lanes from ``first`` to ``end``, `WIDE` at a time."""
     g = GEOMETRY
     b = np.empty((_N_LANE, WIDE))
     w = np.empty((3, _N_STAGE, WIDE))
-    for j0 in range(0, lanes, WIDE):
-        last = min(WIDE, lanes - j0)
+    for j0 in range(first, end, WIDE):
+        last = min(WIDE, end - j0)
         rubbed = eccentric = False
         for j in range(WIDE):
             q = j0 + min(j, last - 1)

@@ -1,0 +1,90 @@
+"""The search of one stage beside `scipy.optimize.least_squares`, one parameter set after the other, on the same compiled stage.
+
+The peer does the same work: the same starts are screened, and every fit that the search made is made again, from the same start, with the
+same difference steps, scales, bounds and prior, and at most as many iterations.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from discrepancy import fit as fitting
+from discrepancy.diagnose import Search, diagnose_stage
+from discrepancy.fit import DIFFERENCE, Judge
+from discrepancy.stage import Stage
+
+__all__ = ["in_scipy", "ours"]
+
+Job = tuple[Judge, tuple[str, ...], np.ndarray, int]
+
+
+@contextmanager
+def _recorded() -> Iterator[list[Any]]:
+    """Every fit and every screening that is made inside, in a list."""
+    jobs: list[Any] = []
+    fit, screen = fitting.Judge.fitting, Search._screen
+
+    def note_fit(self: Judge, effects: tuple[str, ...], start: np.ndarray, iterations: int = 12, weights: Any = None) -> Any:
+        jobs.append((self, effects, np.array(start), iterations))
+        return fit(self, effects, start, iterations, weights)
+
+    def note_screen(self: Search) -> Any:
+        jobs.append(self)
+        return screen(self)
+
+    fitting.Judge.fitting, Search._screen = note_fit, note_screen  # type: ignore[method-assign]
+    try:
+        yield jobs
+    finally:
+        fitting.Judge.fitting, Search._screen = fit, screen  # type: ignore[method-assign]
+
+
+def ours(stage: Stage) -> tuple[float, list[Any], list[float]]:
+    """Search the stage: wall seconds, what was done, and the cost that each fit of one effect reached, by effect."""
+    assert stage.floor is not None
+    started = time.perf_counter()
+    diagnose_stage(stage, stage.floor)
+    elapsed = time.perf_counter() - started
+    with _recorded() as jobs:
+        said = diagnose_stage(stage, stage.floor)
+    return elapsed, jobs, [float(said.base.cost.sum()), float(said.final.cost.sum())]
+
+
+def in_scipy(stage: Stage, jobs: list[Any]) -> tuple[float, int, list[float]]:
+    """Do the same one after the other: wall seconds, fits made, lowest and highest cost among them."""
+    nominal = stage.neutral()
+    tolerance = np.array([p.tolerance for p in stage.all_parameters()])
+    costs, fits = [], 0
+    started = time.perf_counter()
+    for job in jobs:
+        if isinstance(job, Search):
+            for e in stage.effects:
+                for s in e.starts:
+                    theta = job.base.theta.copy()
+                    theta[stage.index()[e.name]] = s
+                    job.judge.block_costs(job.judge.errors(theta[None]))
+            continue
+        judge, effects, start, iterations = job
+        free = judge.columns(effects)
+        low, high = (b[free] for b in judge.bounds())
+        pull = np.array([np.sqrt(3.0) / tolerance[c] if c < len(stage.parameters) else 0.0 for c in free])
+
+        def residuals(z: np.ndarray, judge: Judge = judge, start: np.ndarray = start, free: Any = free, pull: Any = pull) -> np.ndarray:
+            theta = start.copy()
+            theta[free] = z
+            return np.concatenate([judge.errors(theta[None])[0].ravel(), pull * (z - nominal[free])])
+
+        inside = np.clip(start[free], np.nextafter(low, np.inf), np.nextafter(high, -np.inf))
+        step = DIFFERENCE * judge.scale[free] / np.maximum(np.abs(inside), 1e-12)  # relative, as scipy wants it
+        found = least_squares(
+            residuals, inside, bounds=(low, high), x_scale=judge.scale[free], diff_step=step, max_nfev=iterations + 1, ftol=1e-5
+        )
+        costs.append(2.0 * found.cost)
+        fits += 1
+    return time.perf_counter() - started, fits, [max(costs), min(costs)]
