@@ -15,7 +15,9 @@ errors of the nominal model, whose motion is mostly gone, and where the raster i
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -281,6 +283,17 @@ def _lanes(machine: Plant, thetas: Array, rows: Array, si: Array) -> Array:
     return p
 
 
+def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int) -> Array:
+    """simulate(thetas), half of it in a second thread where there are more than ``least`` sets: compiled code needs no interpreter."""
+    if len(thetas) <= least:
+        return simulate(thetas)
+    half = -(-len(thetas) // 2 // least) * least
+    with ThreadPoolExecutor(1) as other:
+        second = other.submit(simulate, thetas[half:])
+        first = simulate(thetas[:half])
+        return np.concatenate([first, second.result()])
+
+
 # ---- stages -------------------------------------------------------------------------------------------------------------------------
 
 
@@ -326,7 +339,9 @@ def _actuator(
         actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
         return out.T[:, None, :] * 1e3
 
-    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, np.where(run, c["x_lvdt"], np.nan)[None], window=WINDOW)
+    measured = np.where(run, c["x_lvdt"], np.nan)[None]
+    both = partial(_on_two_cores, simulate, least=8)  # a block of lanes
+    stage = Stage("actuator", outputs, ("mm",), parameters, effects, both, t, measured, window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, 4 * substeps)
     window = int(round(WINDOW / dt))
 
@@ -369,7 +384,8 @@ def _linkage(
     if known.any():
         run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
-    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
+    both = partial(_on_two_cores, simulate, least=32)  # a block of lanes
+    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, both, t, measured)
 
     def excerpt(at: Array) -> Stage:
         keep = run[at]

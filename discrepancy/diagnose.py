@@ -289,20 +289,22 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
     tick   called after every fit, for a progress bar
 
     A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most. What is found
-    there is fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from what is left.
+    there is fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from
+    what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG:
         return _to_the_floor(stage, floor, keep, tick)
     judge = Judge(stage, floor, keep)
     base = judge.fit((), stage.neutral(), 5)
-    found = None
+    left = base
     for _ in range(2):
-        at = _excerpt(judge, base if found is None else found.final)
+        at = _excerpt(judge, left)
         part = stage.excerpt(at)
         said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick)
         found = _confirm(stage, keep, floor, base, said)
         if found.verdict != "unknown" or said.verdict == "unknown":
             break
+        left = found.final
     return found
 
 

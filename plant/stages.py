@@ -10,7 +10,6 @@ The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps
 from __future__ import annotations
 
 import math
-import threading
 
 import numpy as np
 from numba import njit
@@ -155,7 +154,8 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
     # a block in which one lane carries a load computes it for all eight: those that do are put side by side
     order = np.argsort(p[DRIVE_LOADED] != 0.0, kind="stable")
     wide = _in_blocks(p.shape[1], W, FEW)
-    _on_cores(wide, W, lambda first, last: _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order, first, last))
+    if wide:
+        _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[:wide])
     if wide < p.shape[1]:
         _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[wide:])
 
@@ -171,7 +171,8 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
     ahead, behind = np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1), np.maximum(np.arange(len(x_lvdt)) - reach, 0)
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
     wide = _in_blocks(p.shape[1], WIDE, SOME)
-    _on_cores(wide, WIDE, lambda first, last: _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first, last))
+    if wide:
+        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
     if wide < p.shape[1]:
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
 
@@ -197,18 +198,6 @@ def _currents(mean, dt, substeps, behind):
             out[k, m] = share * in_old + (1.0 - share) * in_own
         slope_before, before = slope, mean[k]
     return out
-
-
-def _on_cores(lanes, width, run):
-    """Call run(first, end) for all ``lanes``, whole blocks of ``width`` in two threads where there are enough."""
-    half = (lanes // width + 1) // 2 * width
-    if 0 < half < lanes:
-        other = threading.Thread(target=run, args=(half, lanes))
-        other.start()
-        run(0, half)
-        other.join()
-    elif lanes:
-        run(0, lanes)
 
 
 def _in_blocks(lanes, width, few):
@@ -297,13 +286,13 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 
 
 @_plain
-def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, order, first, end):
-    """Lanes ``order[first:end]``, eight at a time; current[k, m] in step m after sample k - 1."""
+def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, order):
+    """The lanes of ``order``, eight at a time; current[k, m] in step m after sample k - 1."""
     n, substeps = current.shape
     h = dt / substeps
     b = np.empty((_N_ROWS, W))
-    for j0 in range(first, end, W):
-        last = min(W, end - j0)
+    for j0 in range(0, len(order), W):
+        last = min(W, len(order) - j0)
         loaded = sensed = False
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
@@ -420,13 +409,13 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first):
 
 
 @_plain
-def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first, end):
-    """The lanes from ``first`` to ``end``, `WIDE` at a time."""
+def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
+    """The first ``lanes`` lanes, `WIDE` at a time."""
     g = GEOMETRY
     b = np.empty((_N_LANE, WIDE))
     w = np.empty((3, _N_STAGE, WIDE))
-    for j0 in range(first, end, WIDE):
-        last = min(WIDE, end - j0)
+    for j0 in range(0, lanes, WIDE):
+        last = min(WIDE, lanes - j0)
         rubbed = eccentric = False
         for j in range(WIDE):
             q = j0 + min(j, last - 1)
