@@ -20,6 +20,8 @@ COMMANDS = {
     "experiment": ("app.experiment", "the demand profile that best tells the remaining rivals apart"),
     "hidden-effect": ("app.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
     "schedule": ("app.schedule", "links and stroke tables from geometry, schedules and a measured stroke-angle loop"),
+    "spatial": ("app.spatial", "the planar linkage against the mechanism in space, by constraint equations"),
+    "clearance": ("app.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
     "web": ("app.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }
