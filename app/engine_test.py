@@ -43,14 +43,14 @@ class EngineTestTable(Bounded):
         return self
 
 
-def load_profile(source: str | Path = "engine_test.toml") -> np.ndarray:
-    """Return the speed demand (%) of a profile table, one value every 10 ms."""
+def load_profile(source: str | Path = "engine_test.toml", dwells: float = 1.0) -> np.ndarray:
+    """Return the speed demand (%) of a profile table, one value every 10 ms; each dwell for the share ``dwells`` of its time."""
     table = read(source, EngineTestTable)
     times, speeds = [0.0], [table.start.value]
     for speed, rate, dwell in zip(table.speed.values, table.rate.values, table.dwell.values, strict=True):
         times.append(times[-1] + abs(speed - speeds[-1]) / rate)
         speeds.append(speed)
-        times.append(times[-1] + dwell)
+        times.append(times[-1] + dwells * dwell)
         speeds.append(speed)
     t = np.arange(0.0, times[-1], 1e-2)
     return np.interp(t, times, speeds)
@@ -68,7 +68,7 @@ def engine_test(
     """Run the test under one strategy, noisy sensors and all.
 
     n_dem       %, one value every 10 ms
-    strategy    single or dual
+    strategy    one of `controller.STRATEGIES`
     hysteresis  deg, total width at the VIGV; default: the geometry's
     plant       the machine; default: the shipped tables
     calibration of the controller, with this strategy; default: the shipped tables
@@ -105,8 +105,11 @@ def engine_test(
 DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and falls, 1.6 deg of
 hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual curves, beside the figures of the paper's Table 5.
 
+--strategy adds further strategies to the table and the JSON; the page and the exit code are about the two.
+
 examples:
   vaneloop engine-test --report engine_test.html
+  vaneloop engine-test --strategy inverse --strategy adaptive
   vaneloop engine-test --profile my_test.toml --seed 7 --json -
   vaneloop engine-test --tables engine7/ --geometry engine7_as_built.toml
 
@@ -117,6 +120,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the shipped engine_test.toml)"
+    )
+    parser.add_argument(
+        "--strategy", metavar="S", action="append", default=[], help="run this one too: inverse or adaptive (may be repeated)"
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
     parser.add_argument("--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)")
@@ -141,10 +147,10 @@ def command(args: argparse.Namespace) -> int:
     n_dem = load_profile(args.profile)
     files = cli.tables_of(args)
     machine = build_plant(files["plant"], args.geometry or files["geometry"], files["schedules"])
-    calibrations = {strategy: cli.calibration_of(args, strategy) for strategy in ("single", "dual")}
+    calibrations = {strategy: cli.calibration_of(args, strategy) for strategy in ("single", "dual", *args.strategy)}
     warm_up(lambda text: cli.say(args, text))
     results: dict[str, ReplayResult] = {}
-    for strategy in ("single", "dual"):
+    for strategy in calibrations:
         with cli.progress_bar(args, f"engine test, {strategy}") as progress:
             results[strategy] = engine_test(n_dem, strategy, args.seed, args.hysteresis, progress, machine, calibrations[strategy])
     rows: list[list[str]] = []

@@ -16,6 +16,7 @@ COMMANDS = {
     "locate": ("app.locate", "which stage fails, under which conditions, since when"),
     "diagnose": ("app.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
     "engine-test": ("app.engine_test", "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures"),
+    "strategies": ("app.strategies", "control strategies against each other on worn, hot, noisy engines: errors and cost"),
     "extend": ("app.extend", "add effects to the model, fitted to a log; writes a model file"),
     "experiment": ("app.experiment", "the demand profile that best tells the remaining rivals apart"),
     "hidden-effect": ("app.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),

@@ -7,7 +7,8 @@ line is `app.schedule`, the page `app.schedule_page`. Lengths in mm and angles i
     measure_loop(stroke, angle, geometry, stage) -> MeasuredLoop    one stage's loop split into its two curves
     adjust_links(geometry, schedules, ...) -> list[LinkChange]      Lb and Lc that best meet the schedules
     stroke_tables(geometry, schedules) -> float64[4, n]             the controller's tables from the model's play
-    write_tables(result, folder)                                    stroke_tables.toml, geometry.toml, schedules.toml
+    vane_angle_table(geometry) -> float64[4, n]                     what the strategies inverse and adaptive know of the linkage
+    write_tables(result, folder)                                    stroke_tables.toml, vane_angles.toml, geometry.toml, schedules.toml
 """
 
 from __future__ import annotations
@@ -56,8 +57,10 @@ __all__ = [
     "schedule",
     "stroke_tables",
     "table_speeds",
+    "vane_angle_table",
     "write_stroke_tables",
     "write_tables",
+    "write_vane_angles",
 ]
 
 Array = NDArray[np.float64]
@@ -257,10 +260,36 @@ def write_stroke_tables(table: Array, path: str | Path, origin: str) -> None:
     """Write ``stroke_tables.toml`` as the controller loads it; ``table`` as from `stroke_tables`."""
     lines = ["# Stroke against rotor speed for the VIGV schedule: one curve per direction of the demand, and their mean.", ""]
     for name, unit, row in zip(("speed", "extension", "retraction", "single"), ("%", "mm", "mm", "mm"), table, strict=True):
-        lines += [f"[{name}]", f'unit = "{unit}"', f"origin = {_quoted(origin)}", "values = ["]
-        lines += ["  " + ", ".join(f"{v:.4f}".rstrip("0").rstrip(".") for v in row[i : i + 10]) + "," for i in range(0, len(row), 10)]
-        lines += ["]", ""]
+        lines += _axis(name, unit, origin, row)
     _write(path, "\n".join(lines))
+
+
+def vane_angle_table(geometry: Geometry, stroke: Array | None = None) -> Array:
+    """Return float64[4, n]: stroke (mm; default 0 to 48 in steps of 1) and the angles (deg) of VIGV, VGV1, VGV2 in the middle of the play.
+
+    Between the strokes a straight line is off by at most 0.002 deg.
+    """
+    x = np.arange(0.0, 49.0) if stroke is None else stroke
+    return np.vstack([x, np.rad2deg(vane_angles(x * 1e-3, geometry)).T])
+
+
+def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin: str) -> None:
+    """Write ``vane_angles.toml`` as the controller loads it: ``table`` as from `vane_angle_table`, the plays of ``geometry``."""
+    lines = ["# Vane angles against stroke in the middle of the play, and the play: what the strategies inverse and adaptive know.", ""]
+    for stage in STAGES:
+        q = getattr(geometry, stage).hysteresis
+        lines.append(f'play_{stage} = {{ value = {q.value!r}, unit = "deg", origin = {_quoted(q.origin)} }}')
+    lines.append("")
+    for name, unit, row in zip(("stroke", *STAGES), ("mm", "deg", "deg", "deg"), table, strict=True):
+        lines += _axis(name, unit, origin, row)
+    _write(path, "\n".join(lines))
+
+
+def _axis(name: str, unit: str, origin: str, row: Array) -> list[str]:
+    """Lines of a list of numbers, ten a line."""
+    lines = [f"[{name}]", f'unit = "{unit}"', f"origin = {_quoted(origin)}", "values = ["]
+    lines += ["  " + ", ".join(f"{v:.4f}".rstrip("0").rstrip(".") for v in row[i : i + 10]) + "," for i in range(0, len(row), 10)]
+    return [*lines, "]", ""]
 
 
 # ---------------------------------------------------------------- the measured loop
@@ -891,13 +920,13 @@ def _branch_errors(
 
 
 def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
-    """Write stroke_tables.toml, geometry.toml and schedules.toml into ``folder`` (made where missing); each number with its origin."""
+    """Write stroke_tables, vane_angles, geometry and schedules (.toml) into ``folder`` (made where missing); each number with its origin."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{folder}: cannot be made ({e.strerror})") from None
-    out = [folder / "stroke_tables.toml", folder / "geometry.toml", folder / "schedules.toml"]
+    out = [folder / f"{name}.toml" for name in ("stroke_tables", "geometry", "schedules", "vane_angles")]
     write_stroke_tables(result.table, out[0], result.origin)
     lines = ["# Linkage of the three stages, as measured and adjusted: vaneloop schedule.", ""]
     for name in ("crank", *STAGES):
@@ -911,6 +940,7 @@ def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
     for name, axis in result.schedules:
         lines += [f"[{name}]", f'unit = "{axis.unit}"', f"origin = {_quoted(axis.origin)}", f"values = {axis.values!r}", ""]
     _write(out[2], "\n".join(lines))
+    write_vane_angles(vane_angle_table(result.geometry), result.geometry, out[3], result.origin)
     return out
 
 

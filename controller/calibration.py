@@ -13,19 +13,22 @@ from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
 
 __all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_inputs", "new_state"]
 
-STRATEGIES = ("single", "dual")
-_SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3}  # mA/mm = A/m and the other ratios need no factor
+STRATEGIES = firmware.STRATEGIES
+_DEG = np.pi / 180.0
+_SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3, "deg": _DEG, "deg/s": _DEG}  # mA/mm = A/m and the other ratios need no factor
 
 
 class Calibration(NamedTuple):
     """What `controller.tick` reads.
 
-    k      float64[N_SCALARS], SI, in the order of `firmware.SCALARS`
-    table  float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
+    k       float64[N_SCALARS], SI, in the order of `firmware.SCALARS`
+    table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
+    angles  float64[4, m]: stroke (m), then the angle (rad) of VIGV, VGV1, VGV2 at it in the middle of the play
     """
 
     k: np.ndarray
     table: np.ndarray
+    angles: np.ndarray
 
 
 class Trend(Bounded):
@@ -112,6 +115,41 @@ class ServoMonitor(Bounded):
     saturated_time: Annotated[Quantity, Bound("s", 0.001, 60.0)]
 
 
+class Observer(Bounded):
+    """The engine as the strategies inverse and adaptive know it."""
+
+    engine_lag: Annotated[Quantity, Bound("s", 0.05, 60.0)]
+    engine_acceleration: Annotated[Quantity, Bound("%/s", 0.01, 1000.0)]
+    engine_deceleration: Annotated[Quantity, Bound("%/s", 0.01, 1000.0)]
+    observer_alpha: Annotated[Quantity, Bound("-", 1e-3, 1.0)]
+    observer_beta: Annotated[Quantity, Bound("-", 0.0, 1.0)]
+    observer_band: Annotated[Quantity, Bound("%", 0.0, 10.0)]
+
+
+class Inverse(Bounded):
+    """When to cross the play: strategies inverse and adaptive."""
+
+    lead: Annotated[Quantity, Bound("s", 0.0, 0.5)]
+    look_ahead: Annotated[Quantity, Bound("s", 0.0, 1.0)]
+    turn_band: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+    turn_noise: Annotated[Quantity, Bound("-", 0.0, 100.0)]
+
+
+class Adaptive(Bounded):
+    """What is believed of the stem potentiometers, and learned: strategy adaptive."""
+
+    pot_low: Annotated[Quantity, Bound("deg", -90.0, 90.0)]
+    pot_high: Annotated[Quantity, Bound("deg", -90.0, 90.0)]
+    pot_gate: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+    pot_trust: Annotated[Quantity, Bound("deg", 0.1, 60.0)]
+    learn_time: Annotated[Quantity, Bound("s", 0.1, 3600.0)]
+    learn_rate: Annotated[Quantity, Bound("deg/s", 0.0, 1.0)]
+    learn_budget: Annotated[Quantity, Bound("deg", 0.0, 5.0)]
+    apply_rate: Annotated[Quantity, Bound("deg/s", 0.0, 1.0)]
+    offset_limit: Annotated[Quantity, Bound("deg", 0.0, 5.0)]
+    width_limit: Annotated[Quantity, Bound("deg", 0.0, 5.0)]
+
+
 class CalibrationTable(Table):
     """``calibration.toml``: every scalar of the controller, by job."""
 
@@ -122,6 +160,9 @@ class CalibrationTable(Table):
     demand_monitor: DemandMonitor
     lvdt_monitor: LvdtMonitor
     servo_monitor: ServoMonitor
+    observer: Observer
+    inverse: Inverse
+    adaptive: Adaptive
 
     @model_validator(mode="after")
     def _together(self) -> CalibrationTable:
@@ -137,6 +178,11 @@ class CalibrationTable(Table):
             (m.lvdt_low.value < low, *_named(m, "lvdt_low"), f"below stroke_min (={low:g} mm)"),
             (m.lvdt_high.value > high, *_named(m, "lvdt_high"), f"above stroke_max (={high:g} mm)"),
             (m.stuck_margin.value < half, *_named(m, "stuck_margin"), f"below {half:g}, half the way from stroke_min to stroke_max"),
+            (
+                self.adaptive.pot_low.value < self.adaptive.pot_high.value,
+                *("adaptive.pot_low", self.adaptive.pot_low.value, "deg"),
+                f"below pot_high (={self.adaptive.pot_high.value:g} deg)",
+            ),
             (m.stuck_current.value < limit, *_named(m, "stuck_current"), f"below current_limit (={limit:g} mA)"),
         ):
             if not good:
@@ -176,8 +222,34 @@ class StrokeTable(Bounded):
         return self
 
 
+class AngleTable(Bounded):
+    """``vane_angles.toml``: vane angles against stroke in the middle of the play, and the total play at the vane."""
+
+    play_vigv: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+    play_vgv1: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+    play_vgv2: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+
+    stroke: Annotated[Axis, Bound("mm", -10.0, 100.0)]
+    vigv: Annotated[Axis, Bound("deg", -90.0, 90.0)]
+    vgv1: Annotated[Axis, Bound("deg", -90.0, 90.0)]
+    vgv2: Annotated[Axis, Bound("deg", -90.0, 90.0)]
+
+    @model_validator(mode="after")
+    def _axes(self) -> AngleTable:
+        self.stroke.increasing("stroke")
+        n = len(self.stroke.values)
+        for key in ("vigv", "vgv1", "vgv2"):
+            axis = getattr(self, key).increasing(key)
+            if len(axis.values) != n:
+                raise ValueError(f"{key}.values has {len(axis.values)} numbers; stroke has {n}")
+        return self
+
+
 def load_calibration(
-    calibration: str | Path = "calibration.toml", strokes: str | Path = "stroke_tables.toml", strategy: str | None = None
+    calibration: str | Path = "calibration.toml",
+    strokes: str | Path = "stroke_tables.toml",
+    strategy: str | None = None,
+    angles: str | Path = "vane_angles.toml",
 ) -> Calibration:
     """Read, check and flatten the controller's tables.
 
@@ -186,6 +258,7 @@ def load_calibration(
     """
     cal = read(calibration, CalibrationTable)
     stroke = read(strokes, StrokeTable)
+    angle = read(angles, AngleTable)
     if strategy is not None and strategy not in STRATEGIES:
         raise InputError(f"strategy (={strategy!r}) must be one of {', '.join(STRATEGIES)}")
     flat = {
@@ -196,9 +269,11 @@ def load_calibration(
         for key, q in getattr(cal, section):
             if isinstance(q, Quantity):
                 flat[key] = q.value * _SI.get(q.unit, 1.0)
+    flat |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
     k = np.array([flat[name] for name in firmware.SCALARS])
     table = np.array([stroke.speed.values] + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")])
-    return Calibration(k, table)
+    vanes = [np.array(angle.stroke.values) * 1e-3, *(np.deg2rad(getattr(angle, s).values) for s in ("vigv", "vgv1", "vgv2"))]
+    return Calibration(k, table, np.array(vanes))
 
 
 def new_inputs() -> np.ndarray:

@@ -38,6 +38,10 @@ N_INPUTS = len(INPUTS)
     IN_VGV2,
 ) = range(N_INPUTS)
 
+# ---- strategies: how the stroke demand follows from the speed, docs/strategies.md ---------------------------------------------------
+STRATEGIES = ("single", "dual", "inverse", "adaptive")
+SINGLE, DUAL, INVERSE, ADAPTIVE = range(4)
+
 # ---- modes --------------------------------------------------------------------------------------------------------------------------
 INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE = range(5)
 MODES = ("INIT", "STANDBY", "RUN", "DEGRADED", "FAIL_SAFE")
@@ -58,7 +62,7 @@ N_FAULTS = len(FAULTS)
 
 # ---- calibration scalars ------------------------------------------------------------------------------------------------------------
 SCALARS = (
-    "strategy",  # 0 single mean curve, 1 dual curves
+    "strategy",  # of `STRATEGIES`
     "table_input",  # 0 table entered with filtered n_r, 1 with n_dem
     "trend_alpha",  # - fixed gains of the trend's Kalman filter, per 10 ms
     "trend_beta",
@@ -97,6 +101,29 @@ SCALARS = (
     "tracking_limit",  # m
     "tracking_time",  # s
     "saturated_time",  # s
+    "engine_lag",  # s: the engine as the speed observer knows it
+    "engine_acceleration",  # %/s
+    "engine_deceleration",  # %/s
+    "observer_alpha",  # - fixed gains of the speed observer, per 10 ms
+    "observer_beta",
+    "observer_band",  # %: farthest from the filtered speed that the observer may be
+    "play_vigv",  # rad: total play at the vane, as built
+    "play_vgv1",
+    "play_vgv2",
+    "lead",  # s: delay from the stroke demand to the vane, made up for
+    "look_ahead",  # s: how early the gap is crossed before the vanes must turn round
+    "turn_band",  # rad: the vanes' error that is not worth a reversal
+    "turn_noise",  # - the same in multiples of the observed speed's noise
+    "pot_low",  # rad
+    "pot_high",  # rad
+    "pot_gate",  # rad: farthest from its expected value that a reading is believed
+    "pot_trust",  # rad over which a reading must have followed the linkage before it is learned from
+    "learn_time",  # s: time constant of learning
+    "learn_rate",  # rad/s: fastest change of what is known already
+    "learn_budget",  # rad by which what is known may change before the readings must have followed the linkage again
+    "apply_rate",  # rad/s: fastest change of the compensation in use
+    "offset_limit",  # rad
+    "width_limit",  # rad from the play as built
 )
 N_SCALARS = len(SCALARS)
 (
@@ -139,6 +166,29 @@ N_SCALARS = len(SCALARS)
     TRACKING_LIMIT,
     TRACKING_TIME,
     SATURATED_TIME,
+    ENGINE_LAG,
+    ENGINE_ACCELERATION,
+    ENGINE_DECELERATION,
+    OBSERVER_ALPHA,
+    OBSERVER_BETA,
+    OBSERVER_BAND,
+    PLAY_VIGV,
+    PLAY_VGV1,
+    PLAY_VGV2,
+    LEAD,
+    LOOK_AHEAD,
+    TURN_BAND,
+    TURN_NOISE,
+    POT_LOW,
+    POT_HIGH,
+    POT_GATE,
+    POT_TRUST,
+    LEARN_TIME,
+    LEARN_RATE,
+    LEARN_BUDGET,
+    APPLY_RATE,
+    OFFSET_LIMIT,
+    WIDTH_LIMIT,
 ) = range(N_SCALARS)
 
 # ---- state --------------------------------------------------------------------------------------------------------------------------
@@ -182,7 +232,34 @@ STATE = (
     "x_servo",  # m, reference of the servo at this tick
     "run_request",  # 1 if the last good frame asked for RUN
     "trend_last",  # %, demand of the 10 ms step before
-)
+    # inverse and adaptive only
+    "speed",  # %, observed speed
+    "speed_rate",  # %/s, as observed
+    "speed_drift",  # %/s by which the engine runs away from its model
+    "speed_noise",  # %^2, mean square of what each new speed brings
+    "side",  # +1, -1: the pushing side of the VIGV's gap that the stroke is to be on; 0 not yet known
+    "crossing",  # -1 .. 1: where in the gap the stroke demand is
+    "x_slow",  # m, stroke as measured, without its noise
+    "quiet",  # s for which the stroke demand has stood
+    "offset_in_use",  # rad, VIGV
+    "width_in_use",  # rad beyond the play as built, VIGV
+    *(f"{name}_{stage}" for name in (
+        "farthest",  # rad, farthest drive of the stage along its engaged side
+        "engaged",  # +1, -1: the side of the gap on which the stage was last pushed; 0 not yet known
+        "pot",  # rad, potentiometer, filtered
+        "pot_seen",  # 1 once a reading came
+        "suspect",  # 0 .. 1: doubts about the readings; with 1 the trust is lost
+        "trusted",  # 1: the readings are learned from
+        "lowest",  # rad, least and greatest angle expected since the last doubt or proof
+        "highest",
+        "offset",  # rad, learned
+        "width",  # rad beyond the play as built, learned
+        "proved_offset",  # rad, when the readings last followed the linkage over a motion
+        "proved_width",
+        "learned_up",  # s learned on side +1
+        "learned_down",  # s learned on side -1
+    ) for stage in ("vigv", "vgv1", "vgv2")),
+)  # fmt: skip
 N_STATE = len(STATE)
 (
     MODE,
@@ -224,6 +301,58 @@ N_STATE = len(STATE)
     X_SERVO,
     RUN_REQUEST,
     TREND_LAST,
+    SPEED,
+    SPEED_RATE,
+    SPEED_DRIFT,
+    SPEED_NOISE,
+    SIDE,
+    CROSSING,
+    X_SLOW,
+    QUIET,
+    OFFSET_IN_USE,
+    WIDTH_IN_USE,
+    FARTHEST,  # here and below: three rows, one a stage
+    _,
+    _,
+    ENGAGED,
+    _,
+    _,
+    POT,
+    _,
+    _,
+    POT_SEEN,
+    _,
+    _,
+    SUSPECT,
+    _,
+    _,
+    TRUSTED,
+    _,
+    _,
+    LOWEST,
+    _,
+    _,
+    HIGHEST,
+    _,
+    _,
+    OFFSET,
+    _,
+    _,
+    WIDTH,
+    _,
+    _,
+    PROVED_OFFSET,
+    _,
+    _,
+    PROVED_WIDTH,
+    _,
+    _,
+    LEARNED_UP,
+    _,
+    _,
+    LEARNED_DOWN,
+    _,
+    _,
 ) = range(N_STATE)
 
 TICK = 1e-3  # s, servo rate 1 kHz
@@ -234,7 +363,25 @@ HALF_TICK = 0.5 * TICK  # s: timers are sums of ticks; half a tick keeps their r
 # ---- rows of the stroke table -------------------------------------------------------------------------------------------------------
 ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
 
+ANGLE_STROKE, ANGLE_VIGV = 0, 1  # rows of the angle table; VGV1 and VGV2 follow
+
 FAR = 1.0  # m, beyond any stroke
+
+
+# ---- of the strategies inverse and adaptive
+DRIFT_LIMIT = 3.0  # %/s
+NOISE_SHARE = 2e-3  # of 10 ms: the noise is known after 5 s
+QUICK = 0.02  # rad/s: targets that run faster are worth a faster crossing
+SOFT_END = 0.25  # of what is left of the gap in 10 ms
+POT_SHARE = 0.1  # of 1 ms: a lag of 10 ms
+STROKE_SHARE = 0.1
+OVERSHOT = 3e-5  # m: six times the LVDT's noise
+SUSPICION, FORGIVEN = 0.2, 0.02  # of 10 ms: five implausible readings cost the trust, one plausible takes back a tenth of one
+QUIET_MOTION, QUIET_ERROR = 2e-5, 1e-4  # m in 10 ms, m: the stroke is at rest
+SETTLED = 0.1  # s at rest
+UNSETTLED, MOVING = 0.004, 60.0  # rad, rad/m: what lags may add while the stroke moves: three steps at 20 rad/m
+KNOWN, WELL_KNOWN = 15.0, 30.0  # s of learning on a side
+SEEN_AGAIN = 0.6  # of well known: a side to which the stage comes back may have moved since
 
 
 @compiled
@@ -294,7 +441,7 @@ def trend_step(z, k, n_dem):
 
 @compiled
 def schedule_step(z, k, table):
-    """Stroke demand from the speed: one 10 ms step.
+    """Strategies `SINGLE` and `DUAL`: stroke demand from the speed by curves, one 10 ms step.
 
     The extension curve serves a rising demand, the retraction curve a falling one. Between them ``blend`` moves at a limited rate, so the
     change of table is bumpless; the demand itself is limited to ``stroke_rate``.
@@ -310,6 +457,192 @@ def schedule_step(z, k, table):
         extension = look_up(ROW_SPEED, ROW_EXTENSION, table, n)
         target = retraction + z[BLEND] * (extension - retraction)
     z[X_TARGET] = min(max(target, k[STROKE_MIN]), k[STROKE_MAX])
+
+
+@compiled
+def observe_speed(z, k):
+    """Rotor speed and its rate without the noise and the lag of a filter: one 10 ms step.
+
+    ::
+
+        rate = clip((n_dem - n) / engine_lag, -engine_deceleration, engine_acceleration) + drift
+        n- = n + rate T,   e = n_r - n-,   n = n- + observer_alpha e,   drift = drift + observer_beta e / T
+
+    The engine's model is driven by the demand, so the rate is there before the speed has moved. ``drift`` takes up what the model does not
+    know. Whatever the model says, n stays within ``observer_band`` of the filtered measurement. Without a new frame the model goes on
+    alone; without one for ``demand_timeout`` the speed stands.
+    """
+    if k[TABLE_INPUT] == 1.0:
+        z[SPEED], z[SPEED_RATE] = z[N_DEM], z[TREND_RATE]
+        return
+    if z[DEMAND_AGE] >= k[DEMAND_TIMEOUT] - HALF_TICK:
+        z[SPEED_RATE] = 0.0
+    else:
+        model = min(max((z[N_DEM] - z[SPEED]) / k[ENGINE_LAG], -k[ENGINE_DECELERATION]), k[ENGINE_ACCELERATION])
+        z[SPEED_RATE] = model + z[SPEED_DRIFT]
+        z[SPEED] += z[SPEED_RATE] * SLOW_TICK
+        if z[DEMAND_AGE] < SLOW_TICK - HALF_TICK:
+            e = z[N_R_RAW] - z[SPEED]
+            z[SPEED] += k[OBSERVER_ALPHA] * e
+            e = min(max(e, -k[OBSERVER_BAND]), k[OBSERVER_BAND])
+            z[SPEED_DRIFT] = min(max(z[SPEED_DRIFT] + k[OBSERVER_BETA] * e / SLOW_TICK, -DRIFT_LIMIT), DRIFT_LIMIT)
+            z[SPEED_NOISE] += NOISE_SHARE * (e * e - z[SPEED_NOISE])
+    z[SPEED] = min(max(z[SPEED], z[N_R] - k[OBSERVER_BAND]), z[N_R] + k[OBSERVER_BAND])
+
+
+@compiled
+def scheduled_angle(table, angles, n):
+    """Target (rad) of the VIGV at speed ``n`` (%)."""
+    return look_up(ANGLE_STROKE, ANGLE_VIGV, angles, look_up(ROW_SPEED, ROW_SINGLE, table, n))
+
+
+@compiled
+def follow_play(z, stage, drive, width):
+    """Where in its gap is a stage? One step of the play operator, with the ``drive`` angle and total ``width`` (rad).
+
+    The stage stands at ``farthest - engaged width / 2``: pushed there by the farthest drive on the engaged side, until the drive has come
+    back by the whole width and pushes from the other side.
+    """
+    side = z[ENGAGED + stage]
+    if side == 0.0:
+        z[ENGAGED + stage] = 1.0 if z[DIRECTION] > 0.0 else -1.0
+        z[FARTHEST + stage] = drive
+    elif side * (drive - z[FARTHEST + stage]) > 0.0:
+        z[FARTHEST + stage] = drive
+    elif side * (z[FARTHEST + stage] - drive) > width:
+        z[FARTHEST + stage] = drive
+        z[ENGAGED + stage] = -side
+        learned = LEARNED_DOWN if side > 0.0 else LEARNED_UP
+        z[learned + stage] = min(z[learned + stage], SEEN_AGAIN * WELL_KNOWN)
+
+
+@compiled
+def inverse_step(z, k, table, angles):
+    """Strategies `INVERSE` and `ADAPTIVE`: the stroke demand that brings the VIGV to its target through the play, one 10 ms step.
+
+    The stroke pushes on one side of the gap while the target moves on along it; it stands while the target comes back by less than a
+    band; beyond, it crosses the gap and pushes from the other side. The vane's present angle comes from the play followed along the
+    stroke demand, or the measured stroke where that is clearly elsewhere; the target from the observed speed, ahead by the servo's delay.
+    """
+    observe_speed(z, k)
+    stroke = z[X_DEM] + max(z[X_SLOW] - z[X_DEM] - OVERSHOT, 0.0) + min(z[X_SLOW] - z[X_DEM] + OVERSHOT, 0.0)
+    for stage in range(3):
+        drive = look_up(ANGLE_STROKE, ANGLE_VIGV + stage, angles, stroke)
+        extra = z[WIDTH_IN_USE] if stage == 0 else z[WIDTH + stage]
+        follow_play(z, stage, drive, max(k[PLAY_VIGV + stage] + extra, 0.0))
+    width = max(k[PLAY_VIGV] + z[WIDTH_IN_USE], 0.0)
+    vane = z[FARTHEST] - 0.5 * z[ENGAGED] * width + z[OFFSET_IN_USE]
+    n, rate = z[SPEED], z[SPEED_RATE]
+    target = scheduled_angle(table, angles, n + rate * k[LEAD])
+    ahead = scheduled_angle(table, angles, n + rate * (k[LEAD] + k[LOOK_AHEAD]))
+    slope = abs(scheduled_angle(table, angles, n + 0.5) - scheduled_angle(table, angles, n - 0.5))  # rad/%
+    alpha = k[OBSERVER_ALPHA]
+    band = k[TURN_BAND] + k[TURN_NOISE] * slope * math.sqrt(max(z[SPEED_NOISE], 0.0) * alpha / (2.0 - alpha))
+    if z[SIDE] == 0.0:
+        z[SIDE] = z[CROSSING] = 1.0 if z[DIRECTION] > 0.0 else -1.0
+    side = z[SIDE]
+    if side * (ahead - vane) < -band:
+        side = z[SIDE] = -side
+    # across the gap in blend_time, faster where the target runs, ending softly so that the servo does not overshoot
+    left = side - z[CROSSING]
+    step = 2.0 * SLOW_TICK / k[BLEND_TIME] * (1.0 + min(slope * abs(rate) / QUICK, 3.0))
+    step = min(step, SOFT_END * abs(left) + 1e-3)
+    z[CROSSING] += min(max(left, -step), step)
+    aim = target if side * (target - vane) > 0.0 else vane
+    stroke = look_up(ANGLE_VIGV, ANGLE_STROKE, angles, aim - z[OFFSET_IN_USE] + 0.5 * z[CROSSING] * width)
+    z[X_TARGET] = min(max(stroke, k[STROKE_MIN]), k[STROKE_MAX])
+
+
+@compiled
+def filter_pots(z, k, inputs):
+    """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts against it."""
+    for stage in range(3):
+        y = inputs[IN_VIGV + stage]
+        if k[POT_LOW] <= y <= k[POT_HIGH]:
+            if z[POT_SEEN + stage] == 0.0:
+                z[POT_SEEN + stage] = 1.0
+                z[POT + stage] = y
+            z[POT + stage] += POT_SHARE * (y - z[POT + stage])
+        else:
+            z[SUSPECT + stage] += SUSPICION * TICK / SLOW_TICK
+
+
+@compiled
+def _judge_pot(z, k, stage, expected, plausible):
+    """Is a potentiometer trusted? One 10 ms step.
+
+    It is once its readings have followed the linkage over ``pot_trust`` without a doubt: one that is stuck may be right by chance where
+    it stands, not over a motion. What was learned until then is proved, and kept. With the doubts of some readings in a row the trust is
+    lost, and what was learned since the last proof goes back.
+    """
+    if plausible:
+        z[SUSPECT + stage] = max(z[SUSPECT + stage] - FORGIVEN, 0.0)
+        z[LOWEST + stage] = min(z[LOWEST + stage], expected)
+        z[HIGHEST + stage] = max(z[HIGHEST + stage], expected)
+        if z[HIGHEST + stage] - z[LOWEST + stage] >= k[POT_TRUST] and z[SUSPECT + stage] == 0.0:
+            z[TRUSTED + stage] = 1.0
+            z[PROVED_OFFSET + stage], z[PROVED_WIDTH + stage] = z[OFFSET + stage], z[WIDTH + stage]
+            z[LOWEST + stage] = z[HIGHEST + stage] = expected
+    else:
+        z[SUSPECT + stage] += SUSPICION
+        z[LOWEST + stage] = z[HIGHEST + stage] = expected
+    if z[SUSPECT + stage] >= 1.0:
+        if z[TRUSTED + stage] == 1.0:
+            z[OFFSET + stage], z[WIDTH + stage] = z[PROVED_OFFSET + stage], z[PROVED_WIDTH + stage]
+        z[TRUSTED + stage] = z[POT_SEEN + stage] = 0.0
+        z[SUSPECT + stage] = 1.0
+        z[LOWEST + stage] = z[HIGHEST + stage] = expected
+
+
+@compiled
+def learn(z, k):
+    """Learn offset and play of each stage from its potentiometer: one 10 ms step.
+
+    With the stroke at rest, the reading less the angle expected, r, is put into the side on which the stage is engaged::
+
+        expected = farthest + offset - engaged (play + width) / 2
+        offset = offset + share g r,   width = width - 2 engaged (1 - share) g r
+
+    share is 1/2 as long as one side is little known (each side is then learned on its own) and rises to 0.9: what moves later is growth
+    rather than wear. g r is limited to ``learn_rate``, up to twelve times that on a side that is new or seen again. A reading farther than
+    ``pot_gate`` from its expected value (while a side is new: than the limits allow) is implausible. Once both sides are known, offset
+    and width stay within ``learn_budget`` of what was proved last (`_judge_pot`). Without trust nothing is learned: the values stand.
+    """
+    quiet = z[MODE] == RUN and abs(z[X_DEM] - z[X_FROM]) < QUIET_MOTION and abs(z[X_DEM] - z[X_MEAS]) < QUIET_ERROR
+    z[QUIET] = min(z[QUIET] + SLOW_TICK, 1.0) if quiet else 0.0
+    for stage in range(3):
+        side = z[ENGAGED + stage]
+        play = k[PLAY_VIGV + stage]
+        expected = z[FARTHEST + stage] + z[OFFSET + stage] - 0.5 * side * max(play + z[WIDTH + stage], 0.0)
+        r = z[POT + stage] - expected
+        known = min(z[LEARNED_UP + stage], z[LEARNED_DOWN + stage])
+        gate = k[POT_GATE] if known >= KNOWN else k[POT_GATE] + k[OFFSET_LIMIT] + 0.5 * k[WIDTH_LIMIT]
+        if z[QUIET] < SETTLED:
+            gate += UNSETTLED + MOVING * abs(z[X_DEM] - z[X_FROM])
+        plausible = z[POT_SEEN + stage] == 1.0 and side != 0.0 and abs(r) <= gate
+        _judge_pot(z, k, stage, expected, plausible)
+        if not plausible or z[TRUSTED + stage] == 0.0 or z[QUIET] < SETTLED:
+            continue
+        learned = LEARNED_UP if side > 0.0 else LEARNED_DOWN
+        new = 1.0 - z[learned + stage] / WELL_KNOWN
+        rate = k[LEARN_RATE] * (1.0 + 11.0 * new)
+        step = min(max(r / (k[LEARN_TIME] * (1.0 - 0.75 * new)), -rate), rate) * SLOW_TICK
+        share = 0.5 + 0.4 * min(known / WELL_KNOWN, 1.0)
+        offset = z[OFFSET + stage] + share * step
+        width = z[WIDTH + stage] - 2.0 * side * (1.0 - share) * step
+        if known >= KNOWN:
+            budget, proved = k[LEARN_BUDGET], z[PROVED_OFFSET + stage]
+            offset = min(max(offset, proved - budget), proved + budget)
+            proved = z[PROVED_WIDTH + stage]
+            width = min(max(width, proved - budget), proved + budget)
+        z[OFFSET + stage] = min(max(offset, -k[OFFSET_LIMIT]), k[OFFSET_LIMIT])
+        z[WIDTH + stage] = min(max(width, -min(k[WIDTH_LIMIT], play)), k[WIDTH_LIMIT])
+        z[learned + stage] = min(z[learned + stage] + SLOW_TICK, WELL_KNOWN)
+        if known < KNOWN:
+            z[PROVED_OFFSET + stage], z[PROVED_WIDTH + stage] = z[OFFSET + stage], z[WIDTH + stage]
+    step = k[APPLY_RATE] * SLOW_TICK
+    z[OFFSET_IN_USE] += min(max(z[OFFSET] - z[OFFSET_IN_USE], -step), step)
+    z[WIDTH_IN_USE] += min(max(z[WIDTH] - z[WIDTH_IN_USE], -step), step)
 
 
 @compiled
@@ -439,6 +772,7 @@ def _monitor_demand(inputs, z, k):
         if z[DEMAND_SEEN] == 0.0:
             z[DEMAND_SEEN] = 1.0
             z[N_R] = n_r
+            z[SPEED] = n_r
             z[TREND_N] = n_dem
             z[TREND_TURN] = n_dem
             z[TREND_LAST] = n_dem
@@ -514,20 +848,29 @@ def tick(inputs, state, calibration):
 
     inputs       float64[N_INPUTS], see `INPUTS`; any value, NaN and infinity included, is safe
     state        float64[N_STATE], changed in place, see `STATE`; start from `controller.new_state()`
-    calibration  `controller.Calibration` (scalars ``k``, stroke ``table``)
+    calibration  `controller.Calibration` (scalars ``k``, stroke ``table``, vane ``angles``)
 
     Invariants: ``state[I_CMD]`` within +-current_limit, ``state[X_DEM]`` within [stroke_min, stroke_max], mode one of `MODES`.
     """
     z, k = state, calibration.k
     _condition_lvdt(z, k, inputs[IN_X_LVDT])
     _monitor_demand(inputs, z, k)
+    if k[STRATEGY] >= INVERSE:
+        z[X_SLOW] += STROKE_SHARE * (z[X_MEAS] - z[X_SLOW])
+    if k[STRATEGY] == ADAPTIVE:
+        filter_pots(z, k, inputs)
     mode = int(z[MODE])
     phase = int(z[TICKS]) % SLOW
     if phase == 0:
         if z[DEMAND_SEEN] == 1.0:
             z[N_R] += (z[N_R_RAW] - z[N_R]) * SLOW_TICK / (k[SPEED_FILTER] + SLOW_TICK)
             trend_step(z, k, z[N_DEM])
-            schedule_step(z, k, calibration.table)
+            if k[STRATEGY] <= DUAL:
+                schedule_step(z, k, calibration.table)
+            else:
+                if k[STRATEGY] == ADAPTIVE:
+                    learn(z, k)
+                inverse_step(z, k, calibration.table, calibration.angles)
         if mode == RUN or mode == DEGRADED:
             move_demand(z, k, z[X_TARGET], k[STROKE_RATE])
         elif mode == FAIL_SAFE:

@@ -60,7 +60,7 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
 
 
-TABLES = ("calibration", "stroke_tables", "geometry", "schedules", "plant")
+TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
 
 
 def add_tables_option(group: Any) -> None:
@@ -103,7 +103,7 @@ def calibration_of(args: argparse.Namespace, strategy: str | None = None) -> Any
     from controller import load_calibration
 
     files = tables_of(args)
-    return load_calibration(files["calibration"], files["stroke_tables"], strategy)
+    return load_calibration(files["calibration"], files["stroke_tables"], strategy, files["vane_angles"])
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:

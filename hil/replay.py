@@ -62,7 +62,7 @@ def replay(
 ) -> ReplayResult:
     """Run ``log`` through controller and plant and compare.
 
-    strategy     single or dual; default: the calibration's
+    strategy     one of `controller.STRATEGIES`; default: the calibration's
     plant        `plant.Plant`; default: the nominal one
     calibration  `controller.Calibration`; default: the shipped tables
 
@@ -193,7 +193,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cli.add_log_options(parser)
     group = parser.add_argument_group("the model and the judgement")
     group.add_argument(
-        "--strategy", metavar="S", help="stroke curves of the controller: single (one mean curve) or dual (one per direction)"
+        "--strategy", metavar="S", help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)"
     )
     group.add_argument("--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine")
     cli.add_tables_option(group)

@@ -24,6 +24,8 @@ from controller.firmware import DEGRADED, FAIL_SAFE, INIT, MODES, N_INPUTS, N_ST
 
 CAL = load_calibration()
 SINGLE = load_calibration(strategy="single")
+INVERSE = load_calibration(strategy="inverse")
+ADAPTIVE = load_calibration(strategy="adaptive")
 ROOT = Path(__file__).resolve().parent.parent
 
 # columns of a test's inputs: the controller's own, then how the LVDT column is meant and how strong the actuator is
@@ -857,7 +859,12 @@ def campaign(seed, n, cal, seen, trials, worst):
 
 
 @pytest.mark.parametrize(
-    "cal", [CAL, SINGLE._replace(k=np.where(np.arange(fw.N_SCALARS) == fw.TABLE_INPUT, 1.0, SINGLE.k))], ids=["dual", "single"]
+    "cal",
+    [
+        *(CAL, SINGLE._replace(k=np.where(np.arange(fw.N_SCALARS) == fw.TABLE_INPUT, 1.0, SINGLE.k))),
+        *(INVERSE, ADAPTIVE, ADAPTIVE._replace(k=np.where(np.arange(fw.N_SCALARS) == fw.TABLE_INPUT, 1.0, ADAPTIVE.k))),
+    ],
+    ids=["dual", "single", "inverse", "adaptive", "adaptive at n_dem"],
 )
 def test_a_million_ticks_of_insane_inputs_break_no_invariant_and_leave_no_state_without_a_way_back(cal):
     seen, worst = np.zeros((5, 5), dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -939,7 +946,11 @@ def test_names_and_indices_of_inputs_scalars_states_and_faults_belong_together()
     for i, name in enumerate(fw.SCALARS):
         assert getattr(fw, name.upper()) == i
     for i, name in enumerate(fw.STATE):
-        assert getattr(fw, "FAULT_BITS" if name == "faults" else name.upper()) == i
+        stem, _, stage = name.rpartition("_")
+        if stage in fw.INPUTS:  # one row a stage
+            assert getattr(fw, stem.upper()) + ("vigv", "vgv1", "vgv2").index(stage) == i
+        else:
+            assert getattr(fw, "FAULT_BITS" if name == "faults" else name.upper()) == i
     assert [fw.STATE[fw.T_STALE + bit] for bit in range(fw.N_FAULTS)] == [  # timers in the order of the bits
         *("t_stale", "t_rejected", "t_lvdt_range", "t_lvdt_rate", "t_lvdt_stuck", "t_tracking", "t_saturated", "t_demand_range")
     ]

@@ -216,7 +216,7 @@ def test_the_written_tables_are_what_the_commands_load(engine, tmp_path, capsys)
     out = tmp_path / "out"
     assert main(["schedule", "--log", str(engine / "loop.csv"), "--adjust", "none", "--out", str(out), "--quiet"]) == 0
     files = {f.name for f in out.iterdir()}
-    assert files == {"stroke_tables.toml", "geometry.toml", "schedules.toml"}
+    assert files == {"stroke_tables.toml", "vane_angles.toml", "geometry.toml", "schedules.toml"}
     assert "measured in loop.csv" in tomllib.loads((out / "stroke_tables.toml").read_text())["extension"]["origin"]
     t = np.arange(0.0, 60.0, 0.1)
     write_log(tmp_path / "demand.csv", {"n_dem": Channel(t, np.interp(t, [0, 20, 40, 60], [60, 95, 60, 95]))})

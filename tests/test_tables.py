@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.engine_test import EngineTestTable
-from app.scheduling import stroke_tables, write_stroke_tables
+from app.scheduling import stroke_tables, vane_angle_table, write_stroke_tables, write_vane_angles
 from controller import load_calibration
-from controller.calibration import CalibrationTable, StrokeTable
+from controller.calibration import AngleTable, CalibrationTable, StrokeTable
 from plant import build_plant
 from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
 from plant.parameters import PlantTable, load_plant
@@ -30,6 +30,7 @@ MODELS = {
     "plant.toml": PlantTable,
     "schedules.toml": Schedules,
     "stroke_tables.toml": StrokeTable,
+    "vane_angles.toml": AngleTable,
 }
 # what a program calls with a table, flattening included
 LOADERS = {
@@ -39,6 +40,7 @@ LOADERS = {
     "plant.toml": load_plant,
     "schedules.toml": load_schedules,
     "stroke_tables.toml": lambda f: load_calibration(strokes=f),
+    "vane_angles.toml": lambda f: load_calibration(angles=f),
 }
 SHIPPED = {name: tomllib.loads(path(name).read_text(encoding="utf-8")) for name in MODELS}
 
@@ -181,7 +183,7 @@ WRONG = [
     ("calibration.toml", "servo.kp", 16.0, "servo.kp (=16.0): must be a table with the keys value, unit, origin, tolerance"),
     ("calibration.toml", "servo", 16.0, "servo (=16.0): must be a table with the keys kp, ki, kff, current_limit"),
     ("calibration.toml", "servo.kp.origin", "", "servo.kp.origin (=''): String should have at least 4 characters"),
-    ("calibration.toml", "schedule.strategy", "tripple", "strategy (='tripple') must be one of single, dual"),
+    ("calibration.toml", "schedule.strategy", "tripple", "strategy (='tripple') must be one of single, dual, inverse, adaptive"),
     ("calibration.toml", "schedule.table_input", "n_x", "table_input (='n_x') must be n_r or n_dem"),
     # possible one by one, not together
     ("calibration.toml", "schedule.stroke_min.value", 47.6, "stroke_min (=47.6 mm) must be below stroke_max (=47.5 mm)"),
@@ -290,7 +292,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_no_error(tmp_path):
 
 
 def test_an_unknown_strategy_is_refused():
-    with pytest.raises(InputError, match=r"strategy \(='both'\) must be one of single, dual"):
+    with pytest.raises(InputError, match=r"strategy \(='both'\) must be one of single, dual, inverse, adaptive"):
         load_calibration(strategy="both")
 
 
@@ -374,6 +376,21 @@ def test_the_shipped_stroke_tables_follow_from_geometry_schedules_and_hysteresis
         assert np.array_equal(np.round(row, 4), axis.values)
     write_stroke_tables(derived, tmp_path / "again.toml", shipped.speed.origin)
     assert (tmp_path / "again.toml").read_text(encoding="utf-8") == path("stroke_tables.toml").read_text(encoding="utf-8")
+
+
+def test_the_shipped_vane_angles_follow_from_the_geometry_to_their_last_digit(tmp_path):
+    from plant.geometry import vane_angles
+
+    derived = vane_angle_table(load_geometry())
+    shipped = read("vane_angles.toml", AngleTable)
+    for row, key in zip(derived, ("stroke", "vigv", "vgv1", "vgv2"), strict=True):
+        assert np.array_equal(np.round(row, 4), getattr(shipped, key).values)
+    write_vane_angles(derived, load_geometry(), tmp_path / "again.toml", shipped.stroke.origin)
+    assert (tmp_path / "again.toml").read_text(encoding="utf-8") == path("vane_angles.toml").read_text(encoding="utf-8")
+    x, *angles = load_calibration().angles
+    fine = np.linspace(x[0], x[-1], 2000)
+    between = np.array([np.interp(fine, x, a) for a in angles]).T
+    assert np.abs(np.rad2deg(between - vane_angles(fine, load_geometry()))).max() < 2e-3
 
 
 def test_extension_needs_the_longest_stroke_and_retraction_the_shortest_at_every_speed():

@@ -1,0 +1,547 @@
+"""Control strategies side by side: the same engine run under each of them, what the vanes get and what it costs.
+
+Scenarios spoil the machine in the ways that a schedule's curves cannot know; the last one does it in all of them at once. Errors are those
+of the true vane angles against the schedule at the true speed, every 10 ms: no sensor's noise is in them. After that the potentiometers
+fail in the middle of the run, in several ways, and the strategy that uses them has to go on without a step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.engine_test import load_profile
+from controller import SCALARS, STATE, STRATEGIES, Calibration
+from hil import cli
+from hil.lockstep import Stimulus, lockstep
+from plant import Model, Plant, build_plant, chain
+from plant.compiled import compiled
+from plant.effect import T_REF
+from tables import InputError
+
+__all__ = ["DESCRIPTION", "FAILURES", "Failure", "Outcome", "Scenario", "add_options", "command", "failing", "run", "scenarios"]
+
+Array = NDArray[np.float64]
+
+STAGES = ("vigv", "vgv1", "vgv2")
+FIGURES = ("mean_abs", "max_abs", "mean_abs_99_100")
+MOVE = 2e-5  # m: a shorter motion of the piston is not counted; four times the LVDT's noise
+HEATING = 120.0  # s: lag of the casing's temperature behind the engine's power
+HEAT = 50.0  # K by which the casing is warmer at full speed than at idle
+IDLE, FULL = 45.0, 100.0  # %
+SWING = 20.0  # s for which a dither keeps its frequency
+FREQUENCIES = (0.1, 0.2, 0.5, 1.0)  # Hz
+AFTER = 10.0  # s after a failure in which a step is looked for
+STEP_TIME = 0.1  # s: a change within this is a step
+GAIN, TRAVEL, STEP = 3.0, 1.15, 0.2  # goals: error of dual over best, travel of best over dual, deg
+EVERY = 10  # ticks between samples that are kept
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is wrong with the machine.
+
+    play    deg, total play at the VIGV; the other stages' grow in proportion, as pins do that wear alike; None: as built
+    growth  deg, by which the casing's heat turns the vanes of every stage at full speed
+    noise   factor on the noise of all sensors
+    dither  %, amplitude of what the ECU adds to the demand between 99 and 100 %
+    """
+
+    name: str
+    play: float | None = None
+    growth: float = 0.0
+    noise: float = 1.0
+    dither: float = 0.0
+
+
+def scenarios(play: float = 2.4, growth: float = 0.5, noise: float = 3.0, dither: float = 0.15) -> tuple[Scenario, ...]:
+    """Return the rows of the comparison; the last one has everything."""
+    return (
+        Scenario("nominal"),
+        Scenario("worn", play=play),
+        Scenario("thermal growth", growth=growth),
+        Scenario("dither", dither=dither),
+        Scenario(f"noise x{noise:g}", noise=noise),
+        Scenario("all together", play, growth, noise, dither),
+    )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run. Curves on the raster ``t`` (s, 10 ms).
+
+    errors   float64[n, 3], deg, vane angle minus schedule of VIGV, VGV1, VGV2
+    vanes    float64[n, 3], deg
+    stroke_demand  mm
+    aim      deg, VIGV angle that the stroke demand stands for, the compensation taken off
+    side     -1 .. 1, where in the gap the stroke demand is
+    offset, width  deg, compensation in use: offset and play beyond the one as built
+    figures  stage -> mean_abs, max_abs, mean_abs_99_100 in deg
+    travel, demand_travel  mm, of the piston without motions shorter than 0.02 mm, and of the stroke demand
+    reversals  turning points of the piston, same threshold
+    current  mA rms
+    """
+
+    scenario: str
+    strategy: str
+    t: Array
+    n_r: Array
+    errors: Array
+    vanes: Array
+    stroke_demand: Array
+    aim: Array
+    side: Array
+    offset: Array
+    width: Array
+    figures: dict[str, dict[str, float | None]]
+    travel: float
+    demand_travel: float
+    reversals: int
+    current: float
+    faults: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values, without the curves."""
+        names = ("scenario", "strategy", "travel", "demand_travel", "reversals", "current", "faults")
+        units = {"travel": "travel_mm", "demand_travel": "demand_travel_mm", "current": "current_rms_ma"}
+        return {units.get(k, k): getattr(self, k) for k in names} | self.figures
+
+
+Outcomes = dict[tuple[str, str], Outcome]  # (scenario, strategy)
+
+
+@compiled
+def _motions(x, least, total, start):
+    """Add travel and turning points of ``x`` to total = [travel, turns]; start = [turn, extreme, direction] goes on from call to call."""
+    for i in range(x.shape[0]):
+        v = x[i]
+        if start[2] == 0.0:
+            if abs(v - start[0]) > least:
+                start[2] = 1.0 if v > start[0] else -1.0
+                start[1] = v
+        elif start[2] * (v - start[1]) >= 0.0:
+            start[1] = v
+        elif start[2] * (start[1] - v) > least:
+            total[0] += abs(start[1] - start[0])
+            total[1] += 1.0
+            start[0] = start[1]
+            start[1] = v
+            start[2] = -start[2]
+
+
+class _Recorder:
+    """Keeps of every tick's states what the figures need."""
+
+    KEPT = (*(len(STATE) + row for row in (chain.N_R, *range(chain.RING, chain.RING + 3))), *map(STATE.index, ("x_dem",)))
+    LEARNED = tuple(map(STATE.index, ("offset_in_use", "width_in_use", "crossing")))
+
+    def __init__(self) -> None:
+        self.rows: list[Array] = []
+        self.total, self.start, self.square, self.ticks = np.zeros(2), np.full(3, np.nan), 0.0, 0
+
+    def __call__(self, states: Array) -> None:
+        self.rows.append(states[::EVERY, [*self.KEPT, *self.LEARNED]])
+        x, i = np.ascontiguousarray(states[:, len(STATE) + chain.X]), states[:, STATE.index("i_cmd")]
+        if np.isnan(self.start[0]):
+            self.start[:] = x[0], x[0], 0.0
+        _motions(x, MOVE, self.total, self.start)
+        self.square += float(i @ i)
+        self.ticks += len(i)
+
+
+def machine(scenario: Scenario, plant: Plant) -> Plant:
+    """Return the machine of a scenario: ``plant`` with what is wrong with it."""
+    effects: dict[str, dict[str, float]] = {}
+    built = {s: getattr(plant.geometry, s).hysteresis.value for s in STAGES}
+    if scenario.play is not None:
+        effects["linkage_backlash"] = {s: v * (scenario.play / built["vigv"] - 1.0) for s, v in built.items()}
+    if scenario.growth:
+        effects["thermal_growth"] = dict.fromkeys(STAGES, scenario.growth / HEAT)
+    plant = Model(effects=effects).plant(plant)
+    return replace(plant, sigma=plant.sigma * scenario.noise)
+
+
+def casing(n_dem: Array) -> Array:
+    """Temperature (degC) that the casing has under a demand (%, every 10 ms): first-order lag behind the engine's power."""
+    from scipy.signal import lfilter
+
+    share = 1e-2 / HEATING
+    return T_REF + HEAT * lfilter([share], [1.0, share - 1.0], np.clip((n_dem - IDLE) / (FULL - IDLE), 0.0, 1.0))
+
+
+def dithered(n_dem: Array, amplitude: float) -> Array:
+    """Add a dither (%) of changing frequency to the demand where it is between 99 and 100 %."""
+    t = np.arange(len(n_dem)) * 1e-2
+    f = np.array(FREQUENCIES)[(t // SWING).astype(int) % len(FREQUENCIES)]
+    return n_dem + np.where((n_dem >= 99.0) & (n_dem <= 100.0), amplitude * np.sin(2.0 * np.pi * f * t), 0.0)
+
+
+def run(
+    scenario: Scenario,
+    n_dem: Array,
+    calibration: Calibration,
+    seed: int = 1,
+    pots: Array | None = None,
+    base: Plant | None = None,
+) -> Outcome:
+    """Run one scenario under the strategy of ``calibration``.
+
+    n_dem  %, one value every 10 ms
+    pots   as `hil.lockstep.lockstep` takes them, rad
+    base   the machine as built; default: the shipped tables
+    """
+    plant, recorder = machine(scenario, base or build_plant()), _Recorder()
+    stimulus = Stimulus.of(dithered(n_dem, scenario.dither), t_oil=casing(n_dem))
+    done = lockstep(
+        stimulus, calibration=calibration, plant=plant, seed=seed, every=100, hashed=False, pots=pots, watch=recorder
+    )
+    a = np.vstack(recorder.rows)
+    n_r, x_dem = a[:, 0], a[:, 4]
+    vanes = np.empty((len(a), 3))
+    for k in range(3):
+        ldp, lever = plant.lever(k)
+        vanes[:, k] = np.rad2deg(np.arcsin(np.clip(ldp * np.tan(a[:, 1 + k]) / lever, -1.0, 1.0)))
+    errors = vanes - np.rad2deg(plant.schedules.targets(n_r))
+    travel, start = recorder.total, recorder.start
+    angle = 180.0 / np.pi
+    offset, width, crossing = a[:, 5:8].T
+    drive = np.interp(x_dem, calibration.angles[0], calibration.angles[1])
+    aim = drive + offset - 0.5 * crossing * (calibration.k[SCALARS.index("play_vigv")] + width)
+    return Outcome(
+        scenario.name,
+        STRATEGIES[int(calibration.k[0])],
+        np.arange(len(a), dtype=np.float64) * (EVERY * 1e-3),
+        n_r,
+        errors,
+        vanes,
+        x_dem * 1e3,
+        aim * angle,
+        crossing,
+        offset * angle,
+        width * angle,
+        {s: _figures(errors[:, k], n_r) for k, s in enumerate(STAGES)},
+        float(travel[0] + abs(start[1] - start[0])) * 1e3,
+        float(np.abs(np.diff(x_dem)).sum()) * 1e3,
+        int(travel[1]),
+        float(np.sqrt(recorder.square / recorder.ticks)) * 1e3,
+        done.faults,
+    )
+
+
+def _figures(error: Array, n_r: Array) -> dict[str, float | None]:
+    e, near = np.abs(error), (n_r > 99.0) & (n_r < 100.0)
+    return {"mean_abs": float(e.mean()), "max_abs": float(e.max()), "mean_abs_99_100": float(e[near].mean()) if near.any() else None}
+
+
+# ---- potentiometers that fail -------------------------------------------------------------------------------------------------------
+
+# name -> (share of the reading, offset in deg at once, in deg/s from then on); stuck: at the angle of that moment
+FAILURES: dict[str, tuple[float, float, float]] = {
+    "no signal": (1.0, np.nan, 0.0),
+    "out of range": (0.0, 120.0, 0.0),
+    "stuck": (0.0, np.nan, 0.0),
+    "jump of 2 deg": (1.0, 2.0, 0.0),
+    "jump of 0.3 deg": (1.0, 0.3, 0.0),
+    "drift of 0.05 deg/s": (1.0, 0.0, 0.05),
+    "drift of 0.005 deg/s": (1.0, 0.0, 0.005),
+}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What followed a failure of all three potentiometers.
+
+    at      s
+    step    deg, VIGV: largest difference to the healthy run in the first 10 s, of the vane or of the angle that is aimed at; or largest
+            change of the compensation in use within 0.1 s at any later time
+    crossings  how often more than in the healthy run the stroke crossed the gap in the first 10 s (the vane stands meanwhile)
+    mean_abs, mean_abs_dual  deg, VIGV's error from then on, of this run and of dual
+    """
+
+    failure: str
+    at: float
+    step: float
+    crossings: int
+    mean_abs: float
+    mean_abs_dual: float
+
+
+def moment(n_dem: Array) -> int | None:
+    """Return the first sample after the middle at which the demand has stood at 99 % or more for 5 s and will for 10 s; None: nowhere."""
+    still = (np.abs(np.diff(n_dem, prepend=n_dem[0])) < 1e-9) & (n_dem >= 99.0)
+    length = np.convolve(still, np.ones(1500), "valid")
+    hits = np.flatnonzero(length[len(n_dem) // 2 :] >= 1500.0)
+    return int(hits[0]) + len(n_dem) // 2 + 500 if hits.size else None
+
+
+def failing(
+    name: str,
+    at: int,
+    healthy: Outcome,
+    dual: Outcome,
+    scenario: Scenario,
+    n_dem: Array,
+    calibration: Calibration,
+    seed: int = 1,
+    base: Plant | None = None,
+) -> tuple[Failure, Outcome]:
+    """Run a scenario again with the potentiometers failing from sample ``at`` (10 ms) on."""
+    share, offset, drift = FAILURES[name]
+    pots = np.tile([1.0, 0.0], (len(n_dem), 3))
+    t = np.arange(len(n_dem) - at) * 1e-2
+    for k in range(3):
+        pots[at:, 2 * k] = share
+        pots[at:, 2 * k + 1] = np.deg2rad(healthy.vanes[at, k] if name == "stuck" else offset + drift * t)
+    out = run(scenario, n_dem, calibration, seed, pots, base)
+    first = slice(at, at + int(AFTER / 1e-2))
+    lag = int(STEP_TIME / 1e-2)
+    compensation = np.abs(out.offset[at + lag :] - out.offset[at:-lag]) + 0.5 * np.abs(out.width[at + lag :] - out.width[at:-lag])
+    step = max(
+        float(np.abs(out.vanes[first, 0] - healthy.vanes[first, 0]).max()),
+        float(np.abs(out.aim[first] - healthy.aim[first]).max()),
+        float(compensation.max(initial=0.0)),
+    )
+    rest = [float(np.abs(o.errors[at:, 0]).mean()) for o in (out, dual)]
+    crossings = [int(np.abs(np.diff(np.sign(o.side[first]))).sum() / 2) for o in (out, healthy)]
+    return Failure(name, at * 1e-2, step, max(crossings[0] - crossings[1], 0), rest[0], rest[1]), out
+
+
+# ---- the command --------------------------------------------------------------------------------------------------------------------
+
+DESCRIPTION = """Compare the control strategies on the same engine run: single (one mean curve), dual (one curve a direction, the paper's),
+inverse (follows the play and crosses it when the vanes must turn round), adaptive (the same, and learns play and offset from the
+stem potentiometers). Six machines: nominal, worn, with thermal growth, dithered near 99 to 100 %, noisy, and all of it together;
+then the potentiometers fail in the middle of the last one. docs/strategies.md explains the strategies.
+
+examples:
+  vaneloop strategies --report strategies.html
+  vaneloop strategies --play 2.0 --growth 0.3 --json -
+  vaneloop strategies --tables engine7/ --seed 7
+
+exit codes: 0 all goals are held, 1 one is missed, 2 bad input"""
+
+_OPTIONS = {  # name -> default, low, high, unit, meaning
+    "play": (2.4, 0.0, 5.0, "deg", "total play of the worn VIGV; the other stages' in proportion"),
+    "growth": (0.5, -2.0, 2.0, "deg", "turn of all vanes by the casing's heat at full speed"),
+    "noise": (3.0, 0.0, 20.0, "X", "factor on the noise of all sensors"),
+    "dither": (0.15, 0.0, 1.0, "%", "amplitude of the demand's dither between 99 and 100 %%"),
+    "dwell": (0.25, 0.01, 10.0, "SHARE", "share of the profile's dwells that is run; 1 is the whole engine test"),
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the engine test's)")
+    for name, (default, _, _, unit, text) in _OPTIONS.items():
+        meta = unit.replace("%", "PCT").upper()
+        parser.add_argument(f"--{name}", type=float, metavar=meta, default=default, help=f"{text} (default {default:g})")
+    cli.add_tables_option(parser)
+    parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
+    cli.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def _checked(args: argparse.Namespace) -> None:
+    for name, (_, low, high, unit, _) in _OPTIONS.items():
+        v = getattr(args, name)
+        if not low <= v <= high:
+            raise InputError(f"--{name} (={v:g}{'' if unit in ('X', 'SHARE') else ' ' + unit}) must be in [{low:g}, {high:g}]")
+    if args.seed < 0:
+        raise InputError(f"--seed (={args.seed}) must be 0 or more")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from hil.lockstep import warm_up
+
+    _checked(args)
+    files = cli.tables_of(args)
+    plant = build_plant(files["plant"], files["geometry"], files["schedules"])
+    calibrations = {s: cli.calibration_of(args, s) for s in STRATEGIES}
+    n_dem = load_profile(args.profile, args.dwell)
+    rows = scenarios(args.play, args.growth, args.noise, args.dither)
+    warm_up(lambda text: cli.say(args, text))
+    at = moment(n_dem)
+    outcomes: Outcomes = {}
+    failures: list[tuple[Failure, Outcome]] = []
+    work = len(rows) * len(STRATEGIES) + (len(FAILURES) if at is not None else 0)
+    with cli.progress_bar(args, f"{work} runs of {len(n_dem) * 1e-2:,.0f} s") as progress:
+        for row in rows:
+            for strategy, calibration in calibrations.items():
+                outcomes[row.name, strategy] = run(row, n_dem, calibration, args.seed, base=plant)
+                if progress is not None:
+                    progress(len(outcomes) / work)
+        last, adaptive = rows[-1], calibrations["adaptive"]
+        for name in FAILURES if at is not None else ():
+            healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
+            failures.append(failing(name, at, healthy, dual, last, n_dem, adaptive, args.seed, plant))  # type: ignore[arg-type]
+            if progress is not None:
+                progress((len(outcomes) + len(failures)) / work)
+    best = min(STRATEGIES, key=lambda s: outcomes[last.name, s].figures["vigv"]["mean_abs"] or 0.0)
+    goals = _goals(rows, outcomes, [f for f, _ in failures], best)
+    _print(args, n_dem, outcomes, [f for f, _ in failures], goals)
+    if at is None:
+        cli.say(args, "note: the profile never rests at 99 % or more for 15 s after its middle; failing potentiometers were not tried")
+    missed = [g for g in goals if not g["held"]]
+    for g in missed:
+        cli.say(args, f"missed: {g['goal']}: {g['value']:.3g}, limit {g['limit']:.3g}")
+    cli.write_json(
+        args,
+        {
+            "schema": 1, "simulated_s": len(n_dem) * 1e-2, "seed": args.seed, "best": best,
+            "rows": [o.to_dict() for o in outcomes.values()], "failures": [asdict(f) for f, _ in failures], "goals": goals,
+        },
+    )  # fmt: skip
+    if args.report:
+        words = " ".join(["vaneloop strategies", *sys.argv[2:]])
+        page = report(args.report, rows, plant, outcomes, failures, goals, best, words)
+        cli.say(args, f"page: {page}")
+    return 1 if missed else 0
+
+
+def _goals(rows: tuple[Scenario, ...], outcomes: Outcomes, failures: list[Failure], best: str) -> list[dict[str, Any]]:
+    """Judge the best strategy against dual."""
+    goals: list[dict[str, Any]] = []
+
+    def judge(goal: str, value: float, limit: float, least: bool = False) -> None:
+        goals.append({"goal": goal, "value": value, "limit": limit, "held": bool(value >= limit if least else value <= limit)})
+
+    last = rows[-1].name
+    mean = {s: outcomes[last, s].figures["vigv"]["mean_abs"] or 0.0 for s in ("dual", best)}
+    judge(f"{last}: mean VIGV error of dual over that of {best}", mean["dual"] / max(mean[best], 1e-9), GAIN, least=True)
+    for row in rows:
+        mine, dual = outcomes[row.name, best], outcomes[row.name, "dual"]
+        judge(f"{row.name}: travel of {best} over that of dual", mine.travel / max(dual.travel, 1e-9), TRAVEL)
+        for k in FIGURES:
+            a, b = mine.figures["vigv"][k], dual.figures["vigv"][k]
+            if a is not None and b is not None:
+                judge(f"{row.name}: VIGV {_WORDS[k]} of {best} (deg), at most dual's", a, b)
+    for f in failures:
+        judge(f"potentiometers, {f.failure}: step (deg)", f.step, STEP)
+    return goals
+
+
+_WORDS = {"mean_abs": "mean", "max_abs": "maximum", "mean_abs_99_100": "mean at 99 to 100 %"}
+
+
+def _print(args: argparse.Namespace, n_dem: Array, outcomes: Outcomes, failures: list[Failure], goals: list[dict[str, Any]]) -> None:
+    rows: list[list[str]] = []
+    for (scenario, strategy), o in outcomes.items():
+        angles = [" ".join("-" if (v := o.figures[s][k]) is None else f"{v:.3f}" for k in FIGURES) for s in STAGES]
+        first = scenario if strategy == STRATEGIES[0] else ""
+        rows.append([first, strategy, *angles, f"{o.travel:,.0f}", f"{o.reversals:,}", f"{o.current:.2f}"])
+    title = f"{len(n_dem) * 1e-2:,.0f} s under each strategy; error of the true angles, deg: mean, max, mean at 99 to 100 % speed"
+    cli.print_table(args, title, ["machine", "strategy", *STAGES, "travel mm", "reversals", "current mA rms"], rows)
+    if failures:
+        text = [[f.failure, f"{f.step:.3f}", f"{f.crossings}", f"{f.mean_abs:.3f}", f"{f.mean_abs_dual:.3f}"] for f in failures]
+        title = f"adaptive, all together, potentiometers failing from t = {failures[0].at:,.1f} s on"
+        cli.print_table(args, title, ["failure", "step deg", "crossings", "mean VIGV error since", "of dual"], text)
+    held = sum(g["held"] for g in goals)
+    cli.say(args, f"goals held: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least {goals[0]['limit']:g})")
+
+
+def report(
+    path: str | Path,
+    rows: tuple[Scenario, ...],
+    plant: Plant,
+    outcomes: Outcomes,
+    failures: list[tuple[Failure, Outcome]],
+    goals: list[dict[str, Any]],
+    best: str,
+    words: str = "",
+) -> Path:
+    """Write the page; return its path."""
+    from hil.page import Line, Page, Panel, bars, loop, number, overlay
+
+    last = rows[-1]
+    both = dual, mine = outcomes[last.name, "dual"], outcomes[last.name, best]
+    errors = [o.figures["vigv"] for o in (dual, mine)]
+    missed = [g for g in goals if not g["held"]]
+    page = Page(
+        "Control strategies",
+        f"On a worn, hot, noisy engine with a dithering demand the VIGV is off by {number(errors[1]['mean_abs'])} deg on average "
+        f"under {best}, by {number(errors[0]['mean_abs'])} deg under the dual curves: {goals[0]['value']:.1f} times less, with "
+        f"{mine.travel / max(dual.travel, 1e-9):.2f} of the travel. "
+        + (f"{len(missed)} of {len(goals)} goals are missed." if missed else f"All {len(goals)} goals are held."),
+        tone="bad" if missed else "good",
+        subtitle="VIGV, VGV1, VGV2, closed loop of firmware and plant",
+        command=words,
+    )
+    page.tile("Mean VIGV error, all together", errors[1]["mean_abs"], "deg", f"{best}; dual {number(errors[0]['mean_abs'])}")
+    page.tile("Maximum", errors[1]["max_abs"], "deg", f"{best}; dual {number(errors[0]['max_abs'])}")
+    page.tile("Travel of the actuator", mine.travel, "mm", f"{best}; dual {number(dual.travel)}")
+    if failures:
+        page.tile("Largest step when potentiometers fail", max(f.step for f, _ in failures), "deg", f"allowed {STEP}")
+    roles = dict(zip(STRATEGIES, ("muted", "model", "target", "measured"), strict=True))
+    page.section("Error and cost", "Each group is one machine, each bar one strategy. Lower is better. Errors of the true angles.")
+    for title, value in (
+        ("mean VIGV error [deg]", lambda o: o.figures["vigv"]["mean_abs"]),
+        ("maximum VIGV error [deg]", lambda o: o.figures["vigv"]["max_abs"]),
+        ("mean VIGV error at 99 to 100 % [deg]", lambda o: o.figures["vigv"]["mean_abs_99_100"]),
+        ("travel of the actuator [mm]", lambda o: o.travel),
+    ):
+        series = {s: [value(outcomes[r.name, s]) for r in rows] for s in STRATEGIES}
+        page.plot(bars([r.name for r in rows], series, title, roles=roles), half=True)
+    figures = [f"{s} {_WORDS[k]}" for s in STAGES for k in FIGURES]
+    columns = ["machine", "strategy", *figures, "travel [mm]", "reversals", "current [mA rms]"]
+    page.table(
+        columns,
+        [[m, s, *(o.figures[v][k] for v in STAGES for k in FIGURES), o.travel, o.reversals, o.current] for (m, s), o in outcomes.items()],
+        "Errors in deg. The stroke is scheduled for the VIGV; VGV1 and VGV2 follow through their links, whose own error stays in.",
+    )
+    page.section("The run, all together", f"Rotor speed, VIGV error under the dual curves and under {best}, and the stroke.")
+    page.plot(
+        overlay(
+            [
+                Panel("VIGV error [deg]", [Line(o.strategy, o.t, o.errors[:, 0], roles[o.strategy]) for o in both], zero=True, height=1.4),
+                Panel("stroke demand [mm]", [Line(o.strategy, o.t, o.stroke_demand, roles[o.strategy]) for o in both]),
+                Panel("rotor speed [%]", [Line("rotor speed", mine.t, mine.n_r, "muted")]),
+            ]
+        )
+    )
+    adaptive = outcomes[last.name, "adaptive"]
+    worn = 0.0 if last.play is None else last.play - plant.geometry.vigv.hysteresis.value
+    growth = last.growth / HEAT * (casing(adaptive.n_r) - T_REF)
+    t, grown = adaptive.t, np.full(len(adaptive.t), worn)
+    page.section("What adaptive learns", "Offset and play beyond the one as built: as learned and as they are.")
+    page.plot(
+        overlay(
+            [
+                Panel("offset [deg]", [Line("true", t, growth, "muted"), Line("learned", t, adaptive.offset, "measured")]),
+                Panel("play beyond built [deg]", [Line("true", t, grown, "muted"), Line("learned", t, adaptive.width, "measured")]),
+            ]
+        )
+    )
+    page.section("VIGV against speed, all together", "All rises and falls on top of each other; the closer to one line, the better.")
+    for o in both:
+        page.plot(loop([Line(o.strategy, o.n_r, o.vanes[:, 0], roles[o.strategy])], "rotor speed [%]", "VIGV [deg]"), half=True)
+    if failures:
+        page.section(
+            "Potentiometers that fail",
+            "All three fail at once, in the middle of the run. The compensation stays as learned; nothing jumps. A drift slower than "
+            "what the casing may do cannot be told from growth: it is followed, slowly, up to the limit of the offset.",
+        )
+        page.table(
+            ["failure", "step [deg]", "crossings of the gap", "mean VIGV error since [deg]", "of dual [deg]"],
+            [[f.failure, f.step, f.crossings, f.mean_abs, f.mean_abs_dual] for f, _ in failures],
+        )
+        page.plot(
+            overlay(
+                [
+                    Panel(
+                        "offset in use [deg]",
+                        [Line("healthy", adaptive.t, adaptive.offset, "muted", 2.4)]
+                        + [Line(f.failure, o.t, o.offset, "other", shown=i < 4) for i, (f, o) in enumerate(failures)],
+                    )
+                ]
+            )
+        )
+    page.section("Goals", f"The best strategy, {best}, against the dual curves.")
+    page.table(["goal", "value", "limit", "held"], [[g["goal"], g["value"], g["limit"], g["held"]] for g in goals])
+    return page.write(path)
