@@ -45,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cli.add_reading_options(group)
     cli.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
-    parser.add_argument("--out", metavar="DIR", help="write stroke_tables, vane_angles, geometry, schedules (.toml); --tables DIR loads them")
+    parser.add_argument("--out", metavar="DIR", help="write stroke_tables, vane_angles, geometry, schedules .toml; --tables DIR loads it")
 
 
 def command(args: argparse.Namespace) -> int:

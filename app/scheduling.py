@@ -920,7 +920,7 @@ def _branch_errors(
 
 
 def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
-    """Write stroke_tables, vane_angles, geometry and schedules (.toml) into ``folder`` (made where missing); each number with its origin."""
+    """Write stroke_tables, vane_angles, geometry, schedules (.toml) into ``folder``, made where missing; each number with its origin."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
