@@ -159,9 +159,9 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     say(args, title)
     table = Table(box=box.SIMPLE_HEAD)
     for i, c in enumerate(columns):
-        table.add_column(
-            c, justify="left" if i == 0 or not any(ch.isdigit() for ch in "".join(r[i] for r in rows)) else "right", overflow="fold"
-        )
+        cells = [r[i] for r in rows]
+        text = i == 0 or max(map(len, cells), default=0) > 30 or not any(ch.isdigit() for ch in "".join(cells))
+        table.add_column(c, justify="left" if text else "right", overflow="fold")
     for r in rows:
         table.add_row(*r)
     console = Console(

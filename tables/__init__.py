@@ -6,7 +6,7 @@ import difflib
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -130,6 +130,11 @@ def _complaint(e: ValidationError, model: type[BaseModel]) -> str:
         hint = f", probably {meant[0]!r} is meant" if meant else ""
         kind = "missing" if err["type"] == "missing" else "unknown"
         return f"key {key!r} is {kind}{hint}; allowed here: {', '.join(allowed)}{more}"
+    if err["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        kind, got = err["ctx"]["discriminator"].strip("'"), err["ctx"].get("tag")
+        if got is None:
+            return f"{key}: key {kind!r} is missing{more}"
+        return f"{key}.{kind} (={_short(got)}): must be one of {err['ctx']['expected_tags']}{more}"
     message = err["msg"].removeprefix("Value error, ")
     if err["type"] == "value_error":
         return f"{key}{': ' if key else ''}{message}{more}"
@@ -147,6 +152,19 @@ def _allowed(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
     """Names of the keys allowed at ``loc`` inside ``model``."""
     here: Any = model
     for step in loc:
-        field = getattr(here, "model_fields", {}).get(step)
-        here = field.annotation if field is not None else here
+        here = _inside(here, step)
     return list(getattr(here, "model_fields", {}))
+
+
+def _inside(kind: Any, step: Any) -> Any:
+    """Type of what is at ``step`` (a key, a position, the tag of a union's member) inside a value of type ``kind``."""
+    if hasattr(kind, "model_fields"):
+        field = kind.model_fields.get(step)
+        return kind if field is None else field.annotation
+    parts = get_args(kind)
+    if get_origin(kind) is Annotated:
+        return _inside(parts[0], step)
+    if get_origin(kind) is list:
+        return parts[0]
+    members = [m for m in parts if hasattr(m, "model_fields")]
+    return next((m for m in members if any(f.default == step for f in m.model_fields.values())), kind)

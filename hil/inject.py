@@ -1,0 +1,505 @@
+"""Bad days on the bus, on purpose: run a scenario of frame and fault injection and say whether the controller reacted as it must.
+
+On ``lockstep`` (default) controller, ECU and bus run in simulated time: every action is possible and the same scenario gives the same run,
+bit for bit. On another bus (``local``, ``vcan0``) a controller and an ECU are running already and we are one more station on it, so only
+what an outsider can do is done, and only what the controller's frames show is judged.
+
+::
+
+    from hil import inject
+    outcome = inject.run("demand_stops")                       # a shipped scenario, a TOML file, or a Scenario made in Python
+    assert outcome.held, outcome.text()
+
+The schema of scenarios is `hil.scenario`; its names are here, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from controller.firmware import MODES
+from hil import cli, frames
+from hil.scenario import (
+    ACTIONS,
+    COUNTS,
+    Action,
+    Babble,
+    BusOff,
+    Corrupt,
+    Delay,
+    Drop,
+    Duplicate,
+    ErrorFrames,
+    Expect,
+    Flood,
+    Freeze,
+    Machine,
+    OnBus,
+    OnFrame,
+    Outsider,
+    Override,
+    Reorder,
+    Replay,
+    Scenario,
+    Send,
+    identifier,
+    library,
+    load_scenario,
+)
+from hil.tamper import Gateway, Intruder, tick_of
+from hil.verdict import TRANSITIONS, Check, Outcome, Trace, judge, outcome_of
+from tables import InputError
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from hil.node import Node
+    from plant import Plant
+
+__all__ = [
+    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood",
+    "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library", "load_scenario",
+    "run",
+]  # fmt: skip
+
+TICK = 1e-3  # s
+SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES", "VGV_HEALTH")}
+
+# ---- lockstep: controller, ECU and bus in simulated time ----------------------------------------------------------------------------
+
+
+class _Machine:
+    """What a `Machine` action does to the plant, undone at its end."""
+
+    def __init__(self, action: Machine, node: Node):
+        from plant.effects import EFFECTS, ROW
+
+        self.arrays, self.first, self.end = node.arrays, tick_of(action.start), tick_of(action.end)
+        self.new: dict[int, float] = {}
+        if action.effect is not None:
+            for i, q in enumerate(EFFECTS[action.effect].parameters):
+                if q.name in action.parameters:
+                    self.new[ROW[action.effect] + i] = action.parameters[q.name] * q.si
+        self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
+        if 0 in self.supply:
+            self.supply[0] *= 1e6
+        self.old: tuple[dict[int, float], dict[int, float]] = ({}, {})
+
+    def tick(self, k: int) -> None:
+        """Change the machine at the first tick, and back at the end."""
+        if k == self.first:
+            self.old = {r: float(self.arrays.p[r, 0]) for r in self.new}, {i: float(self.arrays.supply[i]) for i in self.supply}
+            self._set(self.new, self.supply)
+        elif k == self.end:
+            self._set(*self.old)
+
+    def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
+        from plant import chain
+        from plant.parameters import derive
+
+        for i, v in supply.items():
+            self.arrays.supply[i] = v
+        if rows:
+            for r, v in rows.items():
+                self.arrays.p[r, 0] = v
+            derive(self.arrays.p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+
+
+class _Disturber:
+    """What happens to the bus itself: error frames with a chance, nodes in bus-off."""
+
+    def __init__(self, actions: Sequence[Action], wire: Any, places: dict[str, int]):
+        self.wire, self.places = wire, places
+        self.errors = [(tick_of(a.start), tick_of(a.end), a.probability) for a in actions if isinstance(a, ErrorFrames)]
+        self.off = [(tick_of(a.start), tick_of(a.end), places[a.node]) for a in actions if isinstance(a, BusOff)]
+
+    def tick(self, k: int) -> None:
+        """Set the wire's state for tick ``k``."""
+        from hil import wire as w
+
+        if self.errors:
+            well = 1.0
+            for first, end, probability in self.errors:
+                well *= 1.0 - probability if first <= k < end else 1.0
+            self.wire.chance[0] = 1.0 - well
+        for first, end, place in self.off:
+            node = self.wire.node[place]
+            if k == first:
+                node[w.TEC], node[w.MODE], node[w.TO_RECOVER] = 256, w.BUS_OFF, w.RECOVER
+                node[w.REFUSED] += node[w.TX_N]
+                node[w.TX_N] = 0
+                node[w.BUS_OFFS] += 1
+            if end < np.inf and first <= k <= end and node[w.MODE] == w.BUS_OFF:
+                node[w.TO_RECOVER] = w.RECOVER if k == end else 1 << 40
+
+
+def _sender(action: Action) -> str:
+    """Return the node whose frames the action works on."""
+    return next(who for who, names in SENDER.items() if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names)
+
+
+def _lockstep(
+    name: str, scenario: Scenario, plant: Plant | None, calibration: Calibration | None, progress: Callable[[float], None] | None
+) -> Outcome:
+    """Run a scenario in simulated time."""
+    from controller.firmware import CURRENT_LIMIT, FAULT_BITS, I_CMD, MODE, N_DEM, N_R_RAW, STROKE_MAX, STROKE_MIN, X_DEM, X_MEAS
+    from hil.lockstep_bus import Channel
+    from hil.node import Ecu, Node
+    from hil.wire import BITS_PER_TICK, TX_N, put, run_wire, take
+    from plant import chain
+
+    started = time.perf_counter()
+    points = np.array(scenario.demand)
+    node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
+    ecu = Ecu(plant, n_dem=float(points[0, 1]), seed=scenario.seed + 1)
+    ticks = round(scenario.duration * 1000.0)
+    of = {kind: [a for a in scenario.inject if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
+    chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
+    gateways = [Gateway([a for a in of[OnFrame] if _sender(a) == who], c) for who, c in zip(("ECU", "VGV"), chance, strict=False)]
+    recorded: list[tuple[int, int, int]] = []
+    keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
+    intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
+    machines = [_Machine(a, node) for a in of[Machine]]  # type: ignore[arg-type]
+    channel = Channel(seed=scenario.seed)
+    wire, join = channel.wire, channel.join
+    places = {"ECU": join(), "VGV": join()}
+    outside = [join() for _ in intruders]
+    ears = join(silent=True) if keep else -1
+    disturber = _Disturber(of[OnBus], wire, places)
+    rows = np.zeros((256, 2), np.int64)
+
+    z, s, a = node.arrays.z, node.arrays.s, node.arrays
+    mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
+    values = np.empty((ticks, 8))
+    counts = np.empty((ticks, len(COUNTS)), np.int64)
+    late = np.zeros((ticks, 4), bool)
+    to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * 3)])
+    for k in range(ticks):
+        if k % 10 == 0:
+            ecu.set_demand(float(np.interp(k * TICK, points[:, 0], points[:, 1])))
+        for m in machines:
+            m.tick(k)
+        disturber.tick(k)
+        from_ecu = ecu.tick(rows, take(wire, places["ECU"], rows)).tolist()
+        from_vgv = node.tick(rows, take(wire, places["VGV"], rows)).tolist()
+        mode[k], faults[k] = z[MODE], z[FAULT_BITS]
+        values[k] = z[X_DEM], z[X_MEAS], z[I_CMD], z[N_DEM], z[N_R_RAW], s[chain.POT, 0], s[chain.POT + 1, 0], s[chain.POT + 2, 0]
+        counts[k, :8] = a.receiver[:8]
+        counts[k, 8] = frames.refused(a.receiver)
+        if k % 10 == 0:
+            missed = ecu.stale()
+            late[k : k + 10] = [n in missed for n in SENDER["VGV"]]
+        for who, gateway, sent in zip(("ECU", "VGV"), gateways, (from_ecu, from_vgv), strict=True):
+            for head, data in gateway.feed(k, sent):
+                put(wire, places[who], head, data)
+        for place, intruder in zip(outside, intruders, strict=True):
+            if intruder.first <= k < intruder.end:
+                for head, data in intruder.tick(k, int(wire.node[place, TX_N])):
+                    put(wire, place, head, data)
+        run_wire(wire, (k + 1) * BITS_PER_TICK, -1)
+        if keep:
+            recorded += [(k, head, data) for head, data in rows[: take(wire, ears, rows)].tolist()]
+        if progress is not None and k % 1000 == 0:
+            progress(k / ticks)
+    cal = a.calibration.k
+    trace = Trace(
+        np.arange(ticks) * TICK,
+        mode,
+        faults,
+        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2"), (values * to_border).T, strict=True)),
+        dict(zip(COUNTS, counts.T, strict=True)),
+        dict(zip(SENDER["VGV"], late.T, strict=True)),
+        (float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
+        float(cal[CURRENT_LIMIT]) * 1e3,
+    )
+    wall = time.perf_counter() - started
+    return outcome_of(name, scenario, "lockstep", trace, notes=[], simulated_s=ticks * TICK, wall_s=wall, state_hash=node.fingerprint())
+
+
+# ---- another bus: one station among others, in real time ----------------------------------------------------------------------------
+
+
+class _Witness:
+    """What the controller's frames say, as a trace grows from them."""
+
+    NAMES = ("x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2")
+
+    def __init__(self) -> None:
+        self.receivers = {i: frames.new_receiver(i) for i in (frames.VGV_STATUS, frames.VGV_SERVO, frames.VGV_ANGLES, frames.VGV_HEALTH)}
+        self.now: dict[str, float] = {}
+        self.rows: list[tuple[float, ...]] = []
+
+    def hear(self, head: int, data: int, t: float) -> None:
+        """Take one frame that came at ``t`` s; a sample is due with each VGV_STATUS once all signals are known."""
+        ident = head & frames.IDENT_MASK
+        receiver = self.receivers.get(ident)
+        if receiver is None or frames.receive(receiver, head, data, int(t * 1000.0)) != frames.GOOD:
+            return
+        self.now |= frames.decode(head, data)
+        if ident == frames.VGV_ANGLES and all(n in self.now for n in (*self.NAMES, "state", "faults")):
+            self.rows.append((t, self.now["state"], self.now["faults"], *(self.now[n] for n in self.NAMES)))
+
+    def trace(self, begin: float) -> Trace:
+        """Return the samples from ``begin`` s on, with times from there."""
+        from controller import load_calibration
+        from controller.firmware import CURRENT_LIMIT, STROKE_MAX, STROKE_MIN
+
+        table = np.array(self.rows)
+        table = table[table[:, 0] >= begin]
+        cal = load_calibration().k
+        return Trace(
+            table[:, 0] - begin,
+            table[:, 1].astype(int),
+            table[:, 2].astype(np.int64),
+            dict(zip(self.NAMES, table[:, 3:].T, strict=True)),
+            stroke=(float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
+            current=float(cal[CURRENT_LIMIT]) * 1e3,
+            exact=False,
+        )
+
+
+LISTEN = 5.0  # s in which the controller must be heard in RUN
+
+
+def cannot(scenario: Scenario) -> str:
+    """Return why an outsider cannot do what the scenario asks for; empty if it can."""
+    inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})  # type: ignore[attr-defined]
+    return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
+
+
+def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float], None] | None) -> Outcome:
+    """Play a scenario in real time on a bus on which a controller and an ECU run."""
+    from hil.bus import Port, open_bus
+
+    why = cannot(scenario)
+    if why:
+        raise InputError(f"{name} on {bus}: {why}")
+    recorded: list[tuple[int, int, int]] = []
+    chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(scenario.inject))]
+    intruders = [Intruder(a, c, recorded) for a, c in zip(scenario.inject, chance, strict=True)]
+    keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
+    witness, rows = _Witness(), np.zeros((256, 2), np.int64)
+    opened = open_bus(bus)
+    try:
+        port = Port(opened)
+        started = time.perf_counter()
+        begin: float | None = None  # time at which the controller was first heard in RUN: the scenario's 0
+        k = 0
+        while True:
+            now = time.perf_counter() - started
+            for head, data in rows[: port.read(rows)].tolist():
+                witness.hear(head, data, now)
+                if keep and begin is not None:
+                    recorded.append((round((now - begin) * 1000.0), head, data))
+            if begin is None:
+                if witness.rows and MODES[int(witness.rows[-1][1])] == "RUN":
+                    begin = now
+                elif now > LISTEN:
+                    heard = f"it is in {MODES[int(witness.rows[-1][1])]}" if witness.rows else "none was heard"
+                    start = f"start vaneloop run --bus {bus} and vaneloop ecu --bus {bus}"
+                    raise InputError(f"{bus}: no controller in RUN within {LISTEN:g} s ({heard}); {start}")
+            else:
+                t = now - begin
+                if t >= scenario.duration:
+                    break
+                while k <= t * 1000.0:
+                    for intruder in intruders:
+                        port.write(np.array(intruder.tick(k, 0), np.int64).reshape(-1, 2))
+                    k += 1
+                if progress is not None:
+                    progress(t / scenario.duration)
+            time.sleep(0.0005)
+    finally:
+        opened.shutdown()
+    notes = [f"{port.refused} frames were not taken by the bus"] if port.refused else []
+    notes += [f"{port.lost} frames came faster than they could be read"] if port.lost else []
+    trace = witness.trace(begin)
+    if not len(trace.t):
+        raise InputError(f"{bus}: the controller was not heard again after {begin:.1f} s")
+    wall = time.perf_counter() - started
+    return outcome_of(name, scenario, bus, trace, notes=notes, simulated_s=scenario.duration, wall_s=wall, state_hash=None)
+
+
+# ---- commands -----------------------------------------------------------------------------------------------------------------------
+
+
+def run(
+    scenario: Scenario | str | Path,
+    *,
+    bus: str = "lockstep",
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
+    name: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Outcome:
+    """Run a scenario and judge it.
+
+    scenario  a `Scenario`, the name of a shipped one, or a TOML file
+    bus       ``lockstep``, or a bus on which a controller and an ECU run (``local``, ``vcan0``)
+    plant, calibration  on lockstep: other than the shipped tables
+    Raises InputError for what cannot be read, or cannot be done on this bus.
+    """
+    made = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    called = name or (Path(str(scenario)).stem if not isinstance(scenario, Scenario) else "scenario")
+    if bus == "lockstep":
+        return _lockstep(called, made, plant, calibration, progress)
+    return _on_bus(called, made, bus, progress)
+
+
+DESCRIPTION = """Frame and fault injection: do to the bus what a scenario says, and judge whether the controller reacted as it must.
+
+  vaneloop inject --list                     what ships
+  vaneloop inject demand_stops               one of them
+  vaneloop inject --all --junit inject.xml   all of them, for continuous integration
+  vaneloop inject my_day.toml                your own (docs/injection.md)
+  vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
+
+On lockstep (default) controller, ECU and bus run in simulated time, bit for bit the same every time. On another bus only what an outsider
+can do is done (send, flood, babble, replay), and only what the controller's frames show is judged.
+
+exit codes: 0 every expectation held, 1 one did not, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("scenario", metavar="SCENARIO", nargs="*", help="scenario files (.toml), or names of shipped ones")
+    parser.add_argument("--all", action="store_true", help="all scenarios that ship")
+    parser.add_argument("--list", action="store_true", help="list the scenarios that ship, and stop")
+    parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
+    parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
+    cli.add_output_options(parser)
+    parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run what ``args`` ask for; return the exit code."""
+    known = library()
+    if args.list:
+        return _list(args, known)
+    if bool(args.scenario) == args.all:
+        raise InputError("give the scenarios to run, or --all (vaneloop inject --list shows those that ship)")
+    if args.seed is not None and args.seed < 0:
+        raise InputError(f"--seed {args.seed} must be 0 or more")
+    named = list(known) if args.all else args.scenario
+    made = [(Path(n).stem, load_scenario(n)) for n in named]
+    if args.seed is not None:
+        made = [(n, s.model_copy(update={"seed": args.seed})) for n, s in made]
+    if args.bus == "lockstep":
+        from hil.lockstep import warm_up
+
+        warm_up(lambda text: cli.say(args, text))
+    outcomes, skipped = [], []
+    with cli.progress_bar(args, "injecting") as progress:
+        for i, (name, scenario) in enumerate(made):
+            why = cannot(scenario) if args.bus != "lockstep" else ""
+            if why and len(made) > 1:
+                skipped.append((name, scenario.title, why))
+                continue
+
+            def share(fraction: float, i: int = i) -> None:
+                if progress is not None:
+                    progress((i + fraction) / len(made))
+
+            outcomes.append(run(scenario, bus=args.bus, name=name, progress=share if progress is not None else None))
+    _report(args, outcomes, skipped)
+    return 0 if all(o.held for o in outcomes) else 1
+
+
+def _list(args: argparse.Namespace, known: dict[str, Path]) -> int:
+    scenarios = {n: load_scenario(n) for n in known}
+    rows = [[n, s.title, f"{s.duration:g} s", "any" if not cannot(s) else "lockstep"] for n, s in scenarios.items()]
+    cli.print_table(args, f"{len(rows)} scenarios ship with VaneLoop", ["name", "what happens", "lasts", "bus"], rows)
+    cli.write_json(
+        args, {"schema": 1, "scenarios": [{"name": n, "title": s.title, "duration_s": s.duration} for n, s in scenarios.items()]}
+    )
+    return 0
+
+
+MARK = {True: "held", False: "BROKEN", None: "not seen"}
+
+
+def _report(args: argparse.Namespace, outcomes: list[Outcome], skipped: list[tuple[str, str, str]]) -> None:
+    if len(outcomes) == 1:
+        o = outcomes[0]
+        cli.print_table(
+            args,
+            f"{o.name} on {o.bus}: {o.title}",
+            ["", "expected", "seen", "because"],
+            [[MARK[c.held], c.expected, c.seen, c.because] for c in o.checks],
+        )
+        cli.say(args, "modes: " + ", ".join(f"{m} {t:.3f} s" for t, m in o.modes))
+        cli.say(args, "faults: " + (", ".join(f"{f} {t:.3f} s" for t, f in o.faults) or "none"))
+    elif outcomes:
+        rows = [
+            [
+                o.name,
+                MARK[o.held],
+                o.title,
+                " > ".join(m for _, m in o.modes[-4:]),
+                f"{sum(c.held is True for c in o.checks)} of {len(o.checks)}",
+            ]
+            for o in outcomes
+        ]
+        cli.print_table(
+            args, f"{len(outcomes)} scenarios on {outcomes[0].bus}", ["scenario", "", "what happens", "last modes", "held"], rows
+        )
+        for o in outcomes:
+            for c in o.checks:
+                if c.held is False:
+                    cli.say(args, f"broken: {o.name}: {c.expected}; seen: {c.seen}")
+    for o in outcomes:
+        for note in o.notes:
+            cli.say(args, f"note: {o.name}: {note}")
+    for name, _, why in skipped:
+        cli.say(args, f"skipped: {name}: {why}")
+    held = sum(o.held for o in outcomes)
+    seconds = sum(o.simulated_s for o in outcomes), sum(o.wall_s for o in outcomes)
+    cli.say(args, f"{held} of {len(outcomes)} scenarios held ({seconds[0]:.0f} s simulated in {seconds[1]:.1f} s)")
+    data = {"schema": 1, "bus": args.bus, "held": held == len(outcomes), "scenarios": [o.json() for o in outcomes]}
+    cli.write_json(args, data | {"skipped": [{"name": n, "reason": w} for n, _, w in skipped]})
+    if args.junit:
+        _write_junit(args.junit, outcomes, skipped)
+
+
+def _write_junit(file: str, outcomes: list[Outcome], skipped: list[tuple[str, str, str]]) -> None:
+    """Write JUnit's XML: a test case a scenario, its claims in the failure's text."""
+    from xml.etree import ElementTree as Xml
+
+    broken = sum(not o.held for o in outcomes)
+    numbers = {"tests": len(outcomes) + len(skipped), "failures": broken, "errors": 0, "skipped": len(skipped)}
+    seconds = f"{sum(o.wall_s for o in outcomes):.3f}"
+    suite = Xml.Element("testsuite", {"name": "vaneloop inject", "time": seconds, **{k: str(v) for k, v in numbers.items()}})
+    for o in outcomes:
+        case = Xml.SubElement(suite, "testcase", classname=f"vaneloop.inject.{o.bus}", name=o.name, time=f"{o.wall_s:.3f}")
+        first = next((c for c in o.checks if c.held is False), None)
+        if first is not None:
+            Xml.SubElement(case, "failure", message=f"{first.expected}; seen: {first.seen}").text = o.text()
+        Xml.SubElement(case, "system-out").text = o.text()
+    for name, _, why in skipped:
+        Xml.SubElement(Xml.SubElement(suite, "testcase", classname="vaneloop.inject", name=name, time="0"), "skipped", message=why)
+    root = Xml.Element("testsuites")
+    root.append(suite)
+    Xml.indent(root)
+    try:
+        Xml.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
+    except OSError as e:
+        raise InputError(f"{file}: cannot be written ({e.strerror})") from None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line of ``python -m hil.inject``."""
+    parser = cli.Parser(prog="python -m hil.inject", description=DESCRIPTION)
+    add_options(parser)
+    args = parser.parse_args(argv)
+    return cli.run(lambda: command(args))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
