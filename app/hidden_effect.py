@@ -38,6 +38,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
     parser.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of each log (default 300 s)")
     parser.add_argument("--rate", type=int, default=100, choices=(10, 100, 1000), help="rows a second (default 100)")
+    parser.add_argument(
+        "--experiments", action="store_true", help="where rivals remain, run the recommended experiment too, and see whether it decides"
+    )
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
     parser.add_argument(
         "--out", metavar="F.parquet", default="out/hidden_effect.parquet", help="results, a row a log; an existing file is continued"
@@ -77,7 +80,49 @@ def draw_case(seed: int, index: int) -> dict[str, Any]:
     return {"index": index, "kind": kind, "hidden": hidden, "machine_seed": int(rng.integers(1, 2**31))}
 
 
-def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, Any]:
+def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]]:
+    """True size of every hidden effect that was named, in border units, beside its interval (where both know the parameter)."""
+    from plant.effects import EFFECTS
+
+    rig, _ = _rig()
+    out = []
+    for h in hidden:
+        named = next((e for e in answer["effects"] if e["effect"] == h.name), None)
+        if named is None:
+            continue
+        sizes = dict(h.parameters)
+        which = int(sizes["stage"]) if "stage" in sizes else -1
+        key = ("vigv", "vgv1", "vgv2")[which] if which >= 0 else rig.EFFECTS[h.name].main
+        declared = next((p for p in EFFECTS[h.name].parameters if p.name == key), None)
+        if declared is not None:
+            truth = sizes[rig.EFFECTS[h.name].main] / declared.si
+            out.append({"effect": h.name, "parameter": key, "truth": truth, **named["parameters"][key]})
+    return out
+
+
+def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
+    """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
+    from dataclasses import replace
+
+    from app.experiment import recommend
+    from discrepancy.workflow import diagnose, diagnosis_json
+
+    e = recommend(d)
+    if e is None:
+        return None
+    out = {"profile": e["profile"], "nats": e["score"], "separable": e["separates"], "resolved": False}
+    if e["separates"]:
+        n = len(e["n_dem"])
+        if n > len(test.n_dem):
+            return None  # oil and supply are drawn for the log's own length
+        again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], p_s=test.p_s[:n], t_oil=test.t_oil[:n]))
+        said = diagnosis_json(diagnose(again.stages, again.not_observed, workers=1), "")
+        found = {x["effect"]: x["rivals"] for x in said["effects"]}
+        out |= {"resolved": all(found.get(h.name) == [] for h in case["hidden"]), "named": found}
+    return out
+
+
+def judge_case(seed: int, index: int, duration: float, rate: int, experiments: bool = False) -> dict[str, Any]:
     """Simulate, write, diagnose and score one log; a flat record."""
     import numpy as np
 
@@ -90,7 +135,7 @@ def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, A
     case = draw_case(seed, index)
     test = rig.manoeuvre(case["machine_seed"], duration)
 
-    def stages_of(hidden: list[Any]) -> Any:
+    def stages_of(hidden: list[Any], test: Any = test) -> Any:
         run = rig.simulate(test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "log.parquet"
@@ -122,6 +167,7 @@ def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, A
             detectable.append(bool(best > 3.0))
     named = [e["effect"] for e in answer["effects"]]
     rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
+    tried = _experiment(d, case, test, stages_of) if experiments and any(h in _all_named(answer) for h in truth) else None
     ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
     return {
         "seed": seed, "index": index, "kind": case["kind"], "truth": truth,
@@ -130,7 +176,12 @@ def judge_case(seed: int, index: int, duration: float, rate: int) -> dict[str, A
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
         "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed, "answer": json.dumps(cli.plain(answer)),
+        "intervals": json.dumps(cli.plain(_intervals(case["hidden"], answer))), "experiment": json.dumps(cli.plain(tried)),
     }  # fmt: skip
+
+
+def _all_named(answer: dict[str, Any]) -> set[str]:
+    return {name for e in answer["effects"] for name in (e["effect"], *e["rivals"])}
 
 
 def _hit(effect: str, row: dict[str, Any]) -> bool:
@@ -151,6 +202,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     alone = [r for r in single if r["verdict"] == "missing" and len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]]
     pairs = [r for r in rows if r["kind"] == "pair" and all(r["detectable"])]
     outside = [r for r in rows if r["kind"] == "outside"]
+    intervals = [i for r in rows for i in json.loads(r["intervals"])]
+    tried = [e for r in rows if (e := json.loads(r["experiment"]))]
     found = [r for r in single if _hit(r["truth"][0], r) and r["after_over_floor"] is not None]
     return {
         "logs": len(rows),
@@ -165,8 +218,40 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
              or (r["verdict"] == "none" and not r["detectable"][0]) for r in outside]
         ),
         "error after within 1.1 noise floors": share([r["after_over_floor"] <= 1.1 for r in found]),
+        "90 % interval covers the truth": share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
+        "parameter within 5 % of the truth": share([abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]),
+        "separable ties decided by the experiment": share([e["resolved"] for e in tried if e["separable"]]),
         "median seconds": sorted(r["elapsed_s"] for r in rows)[len(rows) // 2] if rows else None,
     }  # fmt: skip
+
+
+def reliability(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """How often effects named with a probability were hidden indeed: stated (mean), count, share right, 90 % interval."""
+    from statsmodels.stats.proportion import proportion_confint
+
+    said = [(p, n in r["truth"]) for r in rows for n, p in zip(r["named"], r["probabilities"], strict=True)]
+    out = []
+    for low, high in ((0.0, 0.4), (0.4, 0.6), (0.6, 0.9), (0.9, 1.01)):
+        inside = [(p, right) for p, right in said if low <= p < high]
+        if inside:
+            k, n = sum(right for _, right in inside), len(inside)
+            a, b = proportion_confint(k, n, 0.10, "wilson")
+            stated = sum(p for p, _ in inside) / n
+            out.append([f"{low:g} to {min(high, 1.0):g}", f"{stated:.2f}", f"{k} of {n}", f"{k / n:.2f}", f"{a:.2f} to {b:.2f}"])
+    return out
+
+
+def confusion(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """What was said of each hidden thing: a row a truth and an answer, with its count (answers: the names, none, unknown)."""
+    from collections import Counter
+
+    count: Counter[tuple[str, str]] = Counter()
+    for r in rows:
+        answers = r["named"] or [r["verdict"]]
+        for truth in r["truth"] or ["(clean)"]:
+            hit = truth if truth in answers else f"{answers[0]} (rival)" if _hit(truth, r) else " + ".join(answers)
+            count[truth, hit] += 1
+    return [[truth, said, str(n)] for (truth, said), n in sorted(count.items())]
 
 
 def misses(rows: list[dict[str, Any]]) -> list[str]:
@@ -205,6 +290,8 @@ def command(args: argparse.Namespace) -> int:
         except Exception as e:
             raise InputError(f"{path}: not a result of hidden-effect ({type(e).__name__})") from None
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
+    if rows and "intervals" not in rows[0]:
+        raise InputError(f"{path}: written by an older version, without intervals; give another --out")
     rows = [r for r in rows if r["seed"] == seed]
     cli.say(args, f"seed {seed}; {len(rows)} logs done before")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +302,7 @@ def command(args: argparse.Namespace) -> int:
         cli.progress_bar(args, f"{args.logs} logs") as progress,
         ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
-        jobs = [pool.submit(judge_case, seed, i, args.duration, args.rate) for i in todo]
+        jobs = [pool.submit(judge_case, seed, i, args.duration, args.rate, args.experiments) for i in todo]
         for job in as_completed(jobs):
             rows.append(job.result())
             pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
@@ -229,7 +316,12 @@ def command(args: argparse.Namespace) -> int:
         if isinstance(v, dict)
     ]
     cli.print_table(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", ["what", "count", "share", "90 % interval"], table)
+    cli.print_table(args, "what was hidden, what was said", ["hidden", "said", "logs"], confusion(rows))
+    cli.print_table(args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows))
     for line in misses(rows):
         cli.say(args, "miss " + line)
-    cli.write_json(args, {"schema": 1, "seed": seed, "summary": s, "misses": misses(rows)})
+    cli.write_json(
+        args,
+        {"schema": 1, "seed": seed, "summary": s, "confusion": confusion(rows), "reliability": reliability(rows), "misses": misses(rows)},
+    )
     return 0

@@ -27,6 +27,9 @@ MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stret
 BLOCK_S = 10.0  # s, longer than the memory of any stage here
 MAX_SETS = 64  # parameter sets in one call of run
 MAX_VALUES = 8_000_000  # errors of several tasks held at one time
+# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an error of form does not
+# average out however long the log. Set on logs of the rig, so that intervals cover the truth as often as they say (docs/diagnosis.md).
+EVIDENCE = 200.0
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
@@ -162,7 +165,8 @@ class Judge:
             step(i, None)
         size = self.stage.measured.size
         while asked:
-            batch, sets = [], 0
+            batch: list[tuple[int, Array]] = []
+            sets = 0
             while asked and (not batch or (sets + len(asked[0][1])) * size <= MAX_VALUES):
                 batch.append(asked.pop(0))
                 sets += len(batch[-1][1])
@@ -299,11 +303,17 @@ class Judge:
                 a = total - nm[b] + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
                 without[b] = np.linalg.solve(a, pull - gm[b])
             held = self._held_out(cost, theta, free, scale, low, high, move, gradients, normals)
-            covariance = np.linalg.pinv(total)
             centre = without.mean(axis=0)
-            spread = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
+            spread = np.zeros(k)
+            spread[move] = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
+            # a nominal parameter at the edge of its tolerance is still as uncertain as its tolerance
+            loose = move | (scaled_prior > 0.0)
             excess = max(1.0, cost.sum() / max(self.n, 1))
-            half[move] = 1.645 * np.sqrt(np.maximum(np.diag(covariance) * excess, spread)) * scale[move]
+            worth = min(1.0 / excess, EVIDENCE * len(self.stage.outputs) / max(self.n, 1))
+            info = normals.sum(axis=0)[np.ix_(loose, loose)] * worth + np.diag(scaled_prior[loose])
+            variance = np.zeros(k)
+            variance[loose] = np.diag(np.linalg.pinv(info))
+            half[move] = (1.645 * np.sqrt(np.maximum(variance, spread)) * scale)[move]
         return Fit(
             effects, theta, free, cost, np.maximum(held, cost * 0.5), gradients, normals, prior, theta[free] - half, theta[free] + half
         )
