@@ -6,6 +6,7 @@ import argparse
 import sys
 from dataclasses import asdict
 
+from app import own_model
 from app.common import chain_of
 from hil import cli, replay
 
@@ -26,10 +27,13 @@ exit codes: 0 agrees (or no tolerance given), 1 a tolerance is exceeded, 2 bad i
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options: those of replay."""
     replay.add_options(parser)
+    own_model.add_options(parser)
 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "compare")
     from discrepancy.workflow import compare_stages
     from hil.logs import LogError
 

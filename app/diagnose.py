@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import Any
 
+from app import own_model
 from app.common import add_model_option, chain_of
 from hil import cli
 
@@ -29,12 +30,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cli.add_log_options(parser)
     add_model_option(parser)
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
+    own_model.add_options(parser)
     cli.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "diagnose")
     from discrepancy.workflow import diagnose, diagnosis_json
     from tables import InputError
 

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from app import own_model
 from app.common import chain_of
 from hil import cli
 
@@ -32,12 +33,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="M.toml", help="model file to extend (default: the nominal model)")
     parser.add_argument("--effect", metavar="NAME", action="append", nargs="+", default=[], help="effect to add (docs/effects.md)")
     parser.add_argument("--out", metavar="M2.toml", required=True, help="model file to write")
+    own_model.add_options(parser)
     cli.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "extend")
     from discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage
     from plant import Model, load_model, write_model
     from plant.effects import EFFECTS

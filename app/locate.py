@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from app import own_model
 from app.common import add_model_option, chain_of
 from hil import cli
 
@@ -25,12 +26,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     cli.add_log_options(parser)
     add_model_option(parser)
+    own_model.add_options(parser)
     cli.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "locate")
     from discrepancy.fit import Judge
     from discrepancy.locate import onset, regimes
     from discrepancy.workflow import compare_stages, floor_of

@@ -101,7 +101,7 @@ class Judge:
                 away = np.abs(starts[:, i] - p.value)
                 away = away[away > 0]
                 out.append(float(np.median(away)) if len(away) else abs(p.value) or 1.0)
-        return np.array(out)
+        return np.array([p.scale or v for p, v in zip(s.all_parameters(), out, strict=True)])
 
     def errors(self, thetas: Array) -> Array:
         """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""

@@ -28,6 +28,7 @@ class Parameter:
     low, high  physical bounds
     tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
+    scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
     """
 
     name: str
@@ -37,6 +38,7 @@ class Parameter:
     high: float = np.inf
     tolerance: float = 0.0
     output: str | None = None
+    scale: float = 0.0
 
 
 @dataclass(frozen=True)

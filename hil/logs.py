@@ -624,9 +624,10 @@ class _Units:
     stated: Mapping[str, str]
     design_rpm: float | None
     notes: list[str]
+    signals: Mapping[str, str] = field(default_factory=lambda: UNITS)
 
     def convert(self, signal: str, key: str, values: np.ndarray, unit: str) -> np.ndarray:
-        own = UNITS.get(signal, "s")
+        own = self.signals.get(signal, "s")
         stated = signal in self.stated
         unit = self.stated.get(signal, unit).strip()
         if signal == "state" or unit == own or unit.casefold() in _NO_UNIT or (unit == "1" and not stated):
@@ -653,9 +654,9 @@ class _Units:
 # --- reading -----------------------------------------------------------------------------------------------------------------------------
 
 
-def _pairs(path: Path, mapping: Mapping[str, str] | None) -> dict[str, str]:
+def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, str] = UNITS) -> dict[str, str]:
     """Mapping as signal -> name in the log; both directions are understood, {"N1": "n_dem"} and {"n_dem": "N1"}."""
-    known = {*UNITS, "t"}
+    known = {*signals, "t"}
     out: dict[str, str] = {}
     for a, b in (mapping or {}).items():
         if b in known:
@@ -663,7 +664,7 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None) -> dict[str, str]:
         elif a in known:
             name, signal = b, a
         else:
-            raise LogError(f"{path}: map {a}={b}: {b!r} is not a signal{_close(b, known)}; allowed: {', '.join(UNITS)}, t")
+            raise LogError(f"{path}: map {a}={b}: {b!r} is not a signal{_close(b, known)}; allowed: {', '.join(signals)}, t")
         if signal in out and out[signal] != name:
             raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
         out[signal] = name
@@ -738,6 +739,7 @@ def read_log(
     units: Mapping[str, str] | None = None,
     design_rpm: float | None = None,
     require: Iterable[str] = ("n_dem",),
+    signals: Mapping[str, str] = UNITS,
 ) -> Log:
     """Read a log of any format into channels with the product's names and units.
 
@@ -747,23 +749,24 @@ def read_log(
     units       signal -> unit that the log uses for it, {"n_r": "rpm"}; goes before a unit in the file
     design_rpm  design speed, rpm; needed where a rotor speed is not in %
     require     signals without which the log is of no use; each needs two samples
+    signals     name -> unit of all signals to look for; default: the product's
 
     Raises LogError, one line, for whatever cannot be used.
     """
     path, require = Path(path), tuple(require)
-    named = _pairs(path, mapping)
+    named = _pairs(path, mapping, signals)
     for what, given in (("unit of", dict(units or {})), ("required", dict.fromkeys(require))):
         for signal in given:
-            if signal not in UNITS and signal != "t":
-                raise LogError(f"{path}: {what} {signal!r}: is not a signal{_close(signal, UNITS)}; allowed: {', '.join(UNITS)}, t")
+            if signal not in signals and signal != "t":
+                raise LogError(f"{path}: {what} {signal!r}: is not a signal{_close(signal, signals)}; allowed: {', '.join(signals)}, t")
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
     source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}))
     notes: list[str] = []
-    unit = _Units(path, units or {}, design_rpm, notes)
+    unit = _Units(path, units or {}, design_rpm, notes, signals)
     channels: dict[str, Channel] = {}
-    for signal in UNITS:
+    for signal in signals:
         name = named.get(signal, signal)
         said = len(source.notes), len(notes)
         try:

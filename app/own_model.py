@@ -1,0 +1,204 @@
+"""``vaneloop compare|locate|diagnose|extend --system my_model.py``: the four verbs on a user's own model."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from hil import cli
+
+__all__ = ["add_options", "asked", "command"]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of a user's own model."""
+    group = parser.add_argument_group("a model of your own (docs/your_own_model.md)")
+    group.add_argument("--system", metavar="MY.py", help="Python file with a discrepancy.System in it, instead of the vane chain")
+    group.add_argument("--also", metavar="LOG", action="append", nargs="+", default=[], help="further logs to fit, with --system")
+    group.add_argument(
+        "--test", metavar="LOG", action="append", nargs="+", default=[], help="logs that nothing is fitted to, with --system"
+    )
+
+
+def asked(args: argparse.Namespace) -> bool:
+    """Whether the user brought a model; refuses options that only then make sense."""
+    from tables import InputError
+
+    if not args.system:
+        for name in ("also", "test"):
+            if getattr(args, name):
+                raise InputError(f"--{name} needs --system MY.py")
+        return False
+    for name in ("strategy", "tolerance", "out"):
+        if getattr(args, name, None) and not (name == "out" and hasattr(args, "effect")):
+            raise InputError(f"--{name} does not go with --system")
+    return True
+
+
+def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
+    """One log as the system wants it: by its own reader, or by ours."""
+    import numpy as np
+
+    from discrepancy import Record, StageError
+
+    name = Path(path).name
+    if system.read is not None:
+        if not Path(path).is_file():
+            raise StageError(f"{path}: no such file")
+        try:
+            data = dict(system.read(path))
+        except Exception as e:
+            raise StageError(f"{path}: read() of system {system.name!r} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
+        if "t" not in data:
+            raise StageError(
+                f"{path}: read() of system {system.name!r} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed"
+            )
+        try:
+            columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
+        except (TypeError, ValueError) as e:
+            raise StageError(f"{path}: read() of system {system.name!r}: not numbers ({e})") from None
+        return Record(name, columns.pop("t"), columns)
+    from hil.logs import read_log
+
+    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {c: "" for c in (system.velocity,) if c}
+    signals = {**motion, **system.inputs, **system.outputs}
+    log = read_log(
+        path, dbc=args.dbc, mapping=cli.pairs(args.map, "map"), units=cli.pairs(args.unit, "unit"), design_rpm=args.design_rpm,
+        require=[c for c in signals if c not in system.optional()], signals=signals,
+    )  # fmt: skip
+    for note in log.notes:
+        cli.say(args, f"note: {name}: {note}")
+    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
+    t = reference.t
+    columns = {}
+    for c, channel in log.channels.items():
+        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
+        v = np.interp(t, channel.t, channel.values)
+        if c in system.outputs:  # outputs are never made up: far from a sample there is none
+            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
+            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
+        columns[c] = v
+    return Record(name, t, columns)
+
+
+def command(args: argparse.Namespace, verb: str) -> int:
+    """Run ``verb`` on the user's model; return the exit code."""
+    from discrepancy import StageError, load_system
+    from tables import InputError
+
+    try:
+        return _command(args, verb, load_system(args.system))
+    except StageError as e:
+        raise InputError(str(e)) from None
+
+
+def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
+    from discrepancy import own_model
+    from tables import InputError
+
+    wanted: list[str] = []
+    if verb == "extend":
+        wanted = list(dict.fromkeys(e for group in args.effect for e in group))
+        if not wanted:
+            raise InputError("extend needs at least one --effect NAME; vaneloop diagnose names candidates")
+        out = Path(args.out)
+        if out.is_dir() or not out.parent.is_dir():
+            raise InputError(f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})")
+    model = own_model.load_model(args.model, system) if args.model else None
+    logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
+    test = [_record(args, system, p) for group in args.test for p in group]
+    if verb == "compare":
+        answer = own_model.compare(system, logs, test, model)
+    elif verb == "locate":
+        answer = own_model.locate(system, logs, test, model)
+    elif verb == "diagnose":
+        with cli.progress_bar(args, "searching laws at all places") as progress:
+            answer = own_model.diagnose(system, logs, test, model, progress)
+    else:
+        answer = own_model.extend(system, logs, wanted, test, model)
+    _show(args, verb, answer)
+    data = answer.json()
+    data["log"] = args.log
+    if verb in ("compare", "locate"):
+        data |= _older(answer)
+    words = " ".join([f"vaneloop {verb}", *sys.argv[2:]])
+    if verb == "extend":
+        answer.model.history.append(words)
+        own_model.write_model(args.out, answer.model)
+        cli.say(args, f"model: {args.out}")
+        data["model"] = args.out
+    cli.write_json(args, data)
+    if args.report:
+        from discrepancy.own_report import own_report
+
+        cli.say(args, f"page: {own_report(answer, args.report, words, args.log)}")
+    if verb == "compare":
+        return 0
+    if verb == "locate":
+        return 1 if any(r.significant.any() for r in answer.regimes) else 0
+    d = answer.diagnosis
+    if verb == "extend":
+        return 0 if float((d.error_after / d.floor).max()) <= own_model.LEFT else 1
+    return 0 if d.verdict == "none" else 1
+
+
+def _older(answer: Any) -> dict[str, Any]:
+    """What compare and locate give for the vane chain too."""
+    d = answer.diagnosis
+    signals = [
+        {
+            "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured", "rms": d.error_before[k],
+            "noise_floor": d.floor[k], "samples": int((answer.bound.measured[k] == answer.bound.measured[k]).sum()),
+        }
+        for k in range(len(d.outputs))
+    ]  # fmt: skip
+    hot = [r for r in answer.regimes if r.significant.any()]
+    stage = {
+        "stage": d.stage, "fails": bool(hot), "onset_s": answer.onset,
+        "regimes": [
+            {
+                "signal": r.output, "unit": r.unit, "condition": r.condition, "condition_unit": r.condition_unit, "edges": r.edges,
+                "rms": r.rms, "noise_floors": r.ratio, "samples": r.samples, "significant": [bool(b) for b in r.significant],
+                "contrast": r.contrast,
+            }
+            for r in answer.regimes
+        ],
+    }  # fmt: skip
+    if answer.verb == "locate":
+        return {"stages": [stage]}
+    return {"signals": signals}
+
+
+def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
+    """Print the answer."""
+    d = answer.diagnosis
+    for note in answer.notes:
+        cli.say(args, f"note: {note}")
+    steps = list(answer.logs)
+    rows = []
+    fitted = set(answer.bound.logs)
+    for log in answer.logs[steps[0]]:
+        for k, output in enumerate(d.outputs):
+            figures = [f"{answer.logs[s][log][k]:.4g}" for s in steps]
+            relative = f"{100 * answer.logs[steps[-1]][log][k] / answer._size(log, k):.3g} %"
+            rows.append([log, "fitted" if log in fitted else "test", output, *figures, relative, d.units[k]])
+    heads = ["model", *(f"+ {s.split(' + ')[-1]}" for s in steps[1:])]
+    cli.print_table(args, f"RMS error log by log ({answer.elapsed_s:.1f} s)", ["log", "", "signal", *heads, "of RMS", "unit"], rows)
+    if verb in ("compare", "locate"):
+        if verb == "locate":
+            hot = [r for r in answer.regimes if r.significant.any()]
+            cli.say(args, f"{d.stage}: " + ("agrees everywhere" if not hot else f"fails in {len(hot)} of {len(answer.regimes)} conditions"))
+            if answer.onset is not None:
+                cli.say(args, f"  begins at t = {answer.onset:.0f} s")
+            for r in hot[:6]:
+                cli.say(args, f"  {r.worst()}")
+        return
+    for p in answer.parameters():
+        cli.say(args, f"parameter {p['parameter']}: {p['value']:.5g} [{p['low']:.5g}, {p['high']:.5g}] {p['unit']}")
+    for f in d.effects:
+        values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
+        rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
+        cli.say(args, f"missing: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}")
+    cli.say(args, answer.sentence())
