@@ -310,6 +310,10 @@ def _swap(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
 def _name(explorer: Explorer, fit: Fit, names: list[str]) -> list[Found]:
     """Each law with those that would do as well in its place, and how often it wins over resampled blocks."""
     judge, stage = explorer.judge, explorer.stage
+
+    def added(f: Fit) -> int:
+        return sum(len(stage.effect(e).parameters) for e in f.effects)
+
     count = int(np.sum(judge.samples > 0))
     draws = np.random.default_rng(0).integers(0, count, (400, count))
     out = []
@@ -325,13 +329,13 @@ def _name(explorer: Explorer, fit: Fit, names: list[str]) -> list[Found]:
         rivals = [
             m
             for m, f in alternatives.items()
-            if m != name and len(f.free) <= len(fit.free) and score(judge, f) < mine + RIVAL and worth(judge, rest, f).good
+            if m != name and added(f) <= added(fit) and score(judge, f) < mine + RIVAL and worth(judge, rest, f).good
         ]
         table = np.array(
             [
                 [score(judge, f, d) for d in draws]
                 for m, f in alternatives.items()
-                if m == name or (m not in rivals and len(f.free) <= len(fit.free))
+                if m == name or (m not in rivals and added(f) <= added(fit))
             ]
         )
         wins = np.mean(np.argmin(table, axis=0) == 0)
