@@ -25,7 +25,7 @@ from discrepancy.system import Bound, Record, System
 __all__ = ["Answer", "Model", "compare", "diagnose", "extend", "load_model", "locate", "write_model"]
 
 LEFT = 1.1  # noise floors left from which the shape of what is left is told
-NO_HELP = 0.95  # error with a law over error without it, from which it does not help
+NO_HELP = 0.85  # error with a law over error without it, from which it hardly helps
 
 
 @dataclass
@@ -274,7 +274,8 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
     for name, ratios in answer.ablation.items():
         for log, r in ratios.items():
             if r > NO_HELP:
-                answer.notes.append(f"{name} does not help on {log}: error with it over error without it is {r:.2f}")
+                how = "hardly helps" if r < 0.98 else "does not help"
+                answer.notes.append(f"{name} {how} on {log}: error with it over error without it is {r:.2f}")
     for p, v0 in zip(bound.stage.parameters, d.base.theta, strict=False):
         i = bound.stage.parameters.index(p)
         if d.final.theta[i] == 0.0 and v0 != 0.0 and p.low == 0.0 and p.tolerance > 0:

@@ -65,7 +65,7 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         for n in names:
             idle = [x for x in logs if answer.ablation[n][x] > NO_HELP]
             if idle:
-                page.text(f"{n} does not help on {', '.join(idle)}.")
+                page.text(f"{n} hardly helps, or does harm, on {', '.join(idle)}.")
     if d.effects:
         page.section(
             "Laws found", "Parameters with their 90 % intervals. Rivals do as well on the fitted logs: another experiment must decide."
