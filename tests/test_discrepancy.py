@@ -472,3 +472,63 @@ def test_comparing_refits_nothing() -> None:
 def test_a_stage_that_cannot_be_used_says_why(make: Callable[[], object], says: str) -> None:
     with pytest.raises(StageError, match=says):
         make()
+
+
+# ---- long logs --------------------------------------------------------------------------------------------------------------------------
+
+
+def in_pieces(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> tuple[Stage, list[int]]:
+    """A stage that is searched on a third of its samples, and a list that notes how many the search saw."""
+    monkeypatch.setattr("discrepancy.diagnose.LONG", N)
+    monkeypatch.setattr("discrepancy.diagnose.SEARCHED", N // 3)
+    monkeypatch.setattr("discrepancy.diagnose.PIECE", 400)
+    seen: list[int] = []
+
+    def excerpt(at: np.ndarray) -> Stage:
+        seen.append(len(at))
+        return replace(stage, run=lambda thetas: stage.run(thetas)[..., at], t=stage.t[at], measured=stage.measured[:, at], excerpt=None)
+
+    return replace(stage, excerpt=excerpt), seen
+
+
+def test_a_long_log_is_searched_on_an_excerpt_and_judged_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    terms = [linear("slope", (1, 1, 1), V), linear("tilt", (1, 0, -1), W)]
+    stage, seen = in_pieces(gauges(terms, [0.0, 0.05]), monkeypatch)
+    d = search(stage)
+    assert seen and max(seen) < 0.4 * N
+    assert d.verdict == "missing" and names(d) == {"tilt"} and holds(d.effects[0], "size", 0.05)
+    assert len(d.final.cost) == len(Judge(stage, GAUGE_FLOOR).block_start)  # the verdict's errors are the whole log's
+
+
+def test_an_effect_that_acts_in_one_stretch_of_a_long_log_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    stretch = np.where((T > 41.0) & (T < 52.0), W, 0.0)
+    terms = [linear("slope", (1, 1, 1), V), linear("stretch", (1, 1, 0), stretch)]
+    stage, _ = in_pieces(gauges(terms, [0.0, 0.2]), monkeypatch)
+    d = search(stage)
+    assert names(d) == {"stretch"} and holds(d.effects[0], "size", 0.2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clean_long_log_lacks_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, _ = in_pieces(gauges([linear("slope", (1, 1, 1), V), linear("tilt", (1, 0, -1), W)], [0.0, 0.0], seed), monkeypatch)
+    assert search(stage).verdict == "none"
+
+
+def test_an_integrating_stage_is_cut_at_its_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage, seen = in_pieces(integrator(4, dead_band=0.6), monkeypatch)
+    assert names(search(stage)) == {"dead_band"} and all(n % 100 == 0 for n in seen)
+
+
+# ---- fits side by side ------------------------------------------------------------------------------------------------------------------
+
+
+def test_fits_made_together_are_those_made_one_by_one() -> None:
+    judge = Judge(integrator(7, null_bias=0.3), FLOOR)
+    starts = {e.name: judge.stage.neutral() for e in LIBRARY}
+    for e in LIBRARY:
+        starts[e.name][judge.stage.index()[e.name]] = e.starts[0]
+    together = judge.together([judge.fitting((name,), theta) for name, theta in starts.items()])
+    for fit, (name, theta) in zip(together, starts.items(), strict=True):
+        alone = judge.fit((name,), theta)
+        np.testing.assert_array_equal(fit.theta, alone.theta)
+        np.testing.assert_array_equal(fit.held_out, alone.held_out)
