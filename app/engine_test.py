@@ -145,7 +145,7 @@ def command(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
     n_dem = load_profile(args.profile)
-    files = cli.tables_of(args)
+    files = cli.tables_of(args, tell=True)
     machine = build_plant(files["plant"], args.geometry or files["geometry"], files["schedules"])
     calibrations = {strategy: cli.calibration_of(args, strategy) for strategy in ("single", "dual", *args.strategy)}
     warm_up(lambda text: cli.say(args, text))

@@ -792,8 +792,14 @@ def schedule(
             raise LogError(f"{log.path}: no {' and no '.join(missing)}; a loop needs stroke and angle")
         for done, name in enumerate(STAGES):
             if name in log.channels:
-                loops[name] = measure_loop(log.channels["x_lvdt"], log.channels[name], geometry, name, log.path)
-                notes += loops[name].notes
+                try:
+                    loops[name] = measure_loop(log.channels["x_lvdt"], log.channels[name], geometry, name, log.path)
+                except LogError as e:
+                    if name == "vigv":
+                        raise
+                    notes.append(f"{name} is not measured, the geometry's own curves stand for it: {e}")
+                else:
+                    notes += loops[name].notes
             if progress is not None:
                 progress(0.8 * (done + 1) / len(STAGES))
     speed = table_speeds(schedules)
@@ -831,6 +837,10 @@ def schedule(
     if loops:
         changes = {n: {k: round(v, 4) for k, v in c.items()} for n, c in changes.items()}
     machine = geometry_with(geometry, changes, origins)
+    try:
+        check_assembly(machine.arrays(initial=True))
+    except InputError:  # the arms as first built do not go with the new links
+        machine = geometry_with(machine, {n: {"lb_initial": getattr(machine, n).lb.value} for n in STAGES})
     both = [_branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(STAGES)]
     works = (speed >= WORKING_SPEED[0]) & (speed <= WORKING_SPEED[1])
     out = []

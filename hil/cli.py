@@ -72,8 +72,8 @@ def add_tables_option(group: Any) -> None:
     )
 
 
-def tables_of(args: argparse.Namespace) -> dict[str, str]:
-    """File of each table, by name without suffix: from the folder ``--tables`` where it has it, else the shipped one."""
+def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
+    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says which."""
     from pathlib import Path
 
     from tables import InputError
@@ -87,6 +87,8 @@ def tables_of(args: argparse.Namespace) -> dict[str, str]:
     found = {name: str(folder / file) for name, file in files.items() if (folder / file).is_file()}
     if not found:
         raise InputError(f"--tables {folder}: holds none of {', '.join(files.values())}")
+    if tell:
+        say(args, f"tables from {folder}: {', '.join(found)}")
     return {**files, **found}
 
 

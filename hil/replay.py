@@ -217,6 +217,7 @@ def command(args: argparse.Namespace, extra: dict[str, Any] | None = None) -> in
     from tables import InputError
 
     limits = _limits(args.tolerance)
+    cli.tables_of(args, tell=True)
     calibration = cli.calibration_of(args, args.strategy)  # refuse a wrong name or table before reading a long log
     model = None
     if args.model is not None:

@@ -17,6 +17,8 @@ from hil.logs import Channel, Log, LogError, write_log
 from plant import Geometry, build_plant, load_geometry, load_schedules
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, STAGES, stage_ring_angle, vane_angle
 from tables import InputError, path
+from tests.firmware_on_rig import firmware
+from tests.rig import Hidden, Manoeuvre, simulate
 
 GEOMETRY = load_geometry()
 SCHEDULES = load_schedules()
@@ -212,6 +214,31 @@ def test_log_to_tables_to_engine_test_shows_small_errors(engine, capsys):
     assert own.mean_abs < 0.2 * single.signals[0].mean_abs
 
 
+@pytest.mark.parametrize("seed", [5, 11])
+def test_a_log_of_the_independent_rig_gives_tables_that_serve_the_same_machine(seed):
+    t = np.arange(0.0, 135.0, 0.01)
+    n = np.interp(t, [0, 3, 33, 36, 66, 69, 99, 102, 132, 135], [42, 42, 104, 104, 42, 42, 104, 104, 42, 42])
+    loops = Manoeuvre("loops", 0, n, np.full(t.size, 21e6), np.full(t.size, 40.0))
+    t = np.arange(0.0, 90.0, 0.01)
+    times = [0, 4, 9, 16, 20, 27, 32, 40, 48, 55, 58, 66, 67, 72, 90]
+    n = np.interp(t, times, [48, 48, 62, 62, 75, 75, 92, 99.5, 99.5, 84, 84, 99, 99, 60, 60])
+    engine_run = Manoeuvre("engine run", 0, n, np.full(t.size, 21e6), np.full(t.size, 40.0))
+    hidden = [Hidden("link_length_error", {"error": 6e-4, "stage": 0}), Hidden("linkage_backlash", {"width": 5e-3})]
+    run = simulate(loops, firmware(), hidden, seed=seed, rate=100)
+    channels = {k: Channel(run.log["t"], run.log[k]) for k in ("x_lvdt", *STAGES)}
+    r = schedule(GEOMETRY, SCHEDULES, Log("rig", channels))
+    assert r.loops["vigv"].lc == pytest.approx(497.7, abs=0.08)  # a bias of the potentiometer is within: 0.1 deg are 0.06 mm
+    assert r.loops["vigv"].width == pytest.approx(1.6 + np.degrees(5e-3), abs=0.08)  # the rig draws the play within 0.05 deg
+    shipped = load_calibration()
+    own = shipped._replace(table=np.vstack([r.table[0], r.table[1:] * 1e-3]))
+    errors = []
+    for calibration in (shipped, own):
+        log = simulate(engine_run, firmware(calibration), hidden, seed=seed, rate=100).log
+        errors.append(float(np.mean(np.abs(log["vigv"] - np.degrees(SCHEDULES.targets(log["n_r"])[:, 0])))))
+    assert errors[1] < 0.12
+    assert errors[1] < 0.15 * errors[0]
+
+
 def test_the_written_tables_are_what_the_commands_load(engine, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["schedule", "--log", str(engine / "loop.csv"), "--adjust", "none", "--out", str(out), "--quiet"]) == 0
@@ -275,6 +302,14 @@ def test_a_log_without_a_loop_is_refused_in_one_line(make, says):
     assert says in str(e.value) and "\n" not in str(e.value)
 
 
+def test_a_dead_potentiometer_of_vgv1_is_named_and_left_out():
+    t, x = zigzag([1.0, 47.0, 1.0])
+    log = Log("loop.csv", {"x_lvdt": Channel(t, x), "vigv": Channel(t, angles(GEOMETRY, 0, x)), "vgv1": Channel(t, 0.0 * t + 3.0)})
+    r = schedule(GEOMETRY, SCHEDULES, log)
+    assert set(r.loops) == {"vigv"}
+    assert any("vgv1 is not measured" in n and "vgv1 stays at 3 deg" in n for n in r.notes)
+
+
 def edited(name: str, tmp_path: Path, old: str, new: str) -> str:
     text = path(name).read_text()
     assert old in text
@@ -320,6 +355,26 @@ def test_a_vgv1_schedule_that_no_length_meets_names_speed_stroke_and_error(tmp_p
 )
 def test_a_bad_option_is_refused_by_name_and_value(argv, says, capsys):
     assert says in refused(argv, capsys)
+
+
+def test_a_csv_of_other_names_and_units_gives_the_same_loop(engine, tmp_path, capsys):
+    rows = [line.split(",") for line in (engine / "loop.csv").read_text().split()]
+    at = {name: rows[0].index(name) for name in ("t", "x_lvdt", "vigv")}
+    lines = ["time,stroke,igv"]
+    for i, r in enumerate(rows[1:]):
+        igv = "nan" if i % 50 == 7 else repr(float(np.radians(float(r[at["vigv"]]))))
+        lines.append(f"{r[at['t']]},{float(r[at['x_lvdt']]) * 1e-3!r},{igv}")
+    (tmp_path / "other.csv").write_text("\n".join(lines) + "\n")
+    names = ["--map", "time=t", "--map", "stroke=x_lvdt", "--map", "igv=vigv", "--unit", "x_lvdt=m", "--unit", "vigv=rad"]
+    assert main(["schedule", "--log", str(tmp_path / "other.csv"), *names, "--quiet", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["loops"]["vigv"]["width"] == pytest.approx(2.3, abs=0.05)
+
+
+def test_a_log_without_stroke_or_angle_names_what_is_missing(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("t,n_dem\n" + "".join(f"{i},{50 + i}\n" for i in range(40)))
+    assert "x_lvdt" in refused(["--log", str(tmp_path / "a.csv")], capsys)
+    (tmp_path / "b.csv").write_text("t,x_lvdt,vigv\n" + "".join(f"{i},{1 + i},nan\n" for i in range(40)))
+    assert "vigv" in refused(["--log", str(tmp_path / "b.csv")], capsys)
 
 
 def test_nan_in_a_schedule_is_refused(tmp_path, capsys):
