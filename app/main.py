@@ -24,6 +24,7 @@ COMMANDS = {
     "spatial": ("app.spatial", "the planar linkage against the mechanism in space, by constraint equations"),
     "clearance": ("app.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
     "inject": ("hil.inject", "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must"),
+    "fuzz": ("hil.fuzz", "safety campaign: random and mutated frames by the million; limits, transitions, recovery must hold"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
     "web": ("app.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }

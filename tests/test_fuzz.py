@@ -1,0 +1,165 @@
+"""The safety campaign: it holds, it finds what is wrong, and what it finds is small and replays."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.main import main
+from hil import fuzz
+from hil.frames import ERROR, REMOTE
+from hil.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
+from tests.conftest import ROOT
+
+
+def held(campaign: Campaign, frames: int) -> None:
+    assert campaign.failure is None, campaign.failure
+    assert campaign.frames == frames and (campaign.kinds > 0).all() and campaign.longest_recovery_s < 2.1
+    assert not campaign.transitions[~fuzz.TRANSITIONS].any()
+    assert all(count > 0 for count in campaign.verdicts.values()), campaign.verdicts
+    assert (campaign.ticks_in > 0).all()
+
+
+def test_three_hundred_thousand_frames_do_no_harm() -> None:
+    held(fuzz.fuzz(300_000, seed=11), 300_000)
+
+
+@pytest.mark.slow
+def test_ten_million_frames_do_no_harm() -> None:
+    held(fuzz.fuzz(10_000_000, seed=12), 10_000_000)
+
+
+def test_the_same_seed_gives_the_same_campaign_and_another_another() -> None:
+    a, b, c = (fuzz.fuzz(5_000, seed=s) for s in (3, 3, 4))
+    assert a.verdicts == b.verdicts and np.array_equal(a.transitions, b.transitions)
+    assert a.verdicts != c.verdicts
+
+
+def test_attacks_are_what_they_are_said_to_be() -> None:
+    """Each kind is judged as its description says, as far as it says something."""
+    from hil import frames
+
+    rng = np.random.default_rng(5)
+    rows, kinds = [], []
+    while len(kinds) < 20_000:
+        attack, kind = make_attack(rng)
+        assert (np.diff(attack.at) >= 0).all() and attack.end > attack.at[-1]
+        rows += attack.rows.tolist()
+        kinds += kind.tolist()
+    by_kind: dict[str, set[str]] = {name: set() for name in KINDS}
+    for (head, data), kind in zip(rows, kinds, strict=True):
+        by_kind[KINDS[kind]].add(frames.VERDICTS[frames.receive(frames.new_receiver(0xA0), head, data, 0)])
+    assert by_kind["payload"] <= {"wrong_crc", "sync", "wrong_sequence"} and "wrong_crc" in by_kind["payload"]
+    assert by_kind["insane"] == by_kind["good"] == {"sync"}
+    assert by_kind["wrong kind"] == {"wrong_kind", "other"}
+    assert by_kind["foreign"] == {"other", "sync"}  # a tenth of them is left a frame of the ECU
+    assert {"wrong_length", "sync"} == by_kind["length"]
+    assert {"sync", "wrong_sequence"} == by_kind["counter"]
+    assert "wrong_crc" in by_kind["mutated"] and by_kind["noise"] >= {"other", "wrong_kind", "wrong_crc", "wrong_length"}
+
+
+SCRIPT = (
+    "from hil.fuzz import fuzz; c = fuzz({frames}, seed=21); print(c.failure, c.verdicts, c.transitions.tolist(), c.longest_recovery_s)"
+)
+
+
+def test_no_index_is_out_of_bounds_and_compiled_code_does_what_the_source_says() -> None:
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT.format(frames=40)],
+            cwd=ROOT,
+            env={**os.environ, **env},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for env in ({}, {"NUMBA_DISABLE_JIT": "1"})  # plain Python raises IndexError, and OverflowError where an int64 is not enough
+    ]
+    assert answers[0] == answers[1] and answers[0].startswith("None")
+
+
+# ---- what it does with a failure ------------------------------------------------------------------------------------------------------
+
+
+TIGHT = np.array([0.040, 0.0, 0.030])  # A, m, m: the controller is allowed 0.0475 m
+
+
+def test_a_failure_is_shrunk_written_and_replays(tmp_path: Path) -> None:
+    campaign = fuzz.fuzz(200_000, seed=1, limits=TIGHT)
+    f = campaign.failure
+    assert f is not None and f.claim == "the stroke demand left its limits"
+    whole = make_attack(np.random.default_rng([1, f.episode]))[0]
+    assert 1 <= len(f.attack.at) < len(whole.at) / 10
+    log = tmp_path / "failure.log"
+    write_attack(log, f.attack)
+    claim, tick, _ = run_attack(read_attack(log), TIGHT)
+    assert claim == f.claim and tick == f.tick
+    assert run_attack(read_attack(log))[0] == "held"
+
+
+def test_no_frame_can_be_left_out_of_a_shrunk_failure() -> None:
+    f = fuzz.fuzz(200_000, seed=1, limits=TIGHT).failure
+    assert f is not None
+    assert 1 <= len(f.attack.at) < 10
+    for k in range(len(f.attack.at)):
+        at, rows = np.delete(f.attack.at, k), np.delete(f.attack.rows, k, axis=0)
+        assert run_attack(fuzz.Attack(at, rows, f.attack.end, f.attack.counter, f.attack.warm), TIGHT)[0] != f.claim
+
+
+def test_a_log_carries_every_kind_of_frame(tmp_path: Path) -> None:
+    attack, _ = make_attack(np.random.default_rng([7, 3]))
+    log = tmp_path / "attack.log"
+    write_attack(log, attack)
+    back = read_attack(log)
+    warm = 60 if attack.warm else 0
+    n = len(attack.at)
+    rows, error, remote = back.rows[warm : warm + n], attack.rows[:, 0] & ERROR != 0, attack.rows[:, 0] & REMOTE != 0
+    assert np.array_equal(back.at[warm : warm + n], attack.at)
+    assert np.array_equal(rows[~error & ~remote], attack.rows[~error & ~remote]) and error.any() and remote.any()
+    assert (rows[error, 0] & ERROR != 0).all()
+    assert np.array_equal(rows[remote, 0], attack.rows[remote, 0] & ~0xFF00000000)  # python-can does not write a remote frame's length
+
+
+# ---- command ----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_command_reports_and_exits_0_when_everything_held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "answer.json"
+    assert main(["fuzz", "--frames", "20000", "--seed", "2", "--json", str(out)]) == 0
+    answer = json.loads(out.read_text())
+    assert answer["held"] and answer["frames"] == 20000 and answer["failure"] is None
+    assert sum(answer["kinds"].values()) == 20000
+    assert "held: limits, transitions, recovery" in capsys.readouterr().out
+
+
+def test_command_exits_1_on_a_failure_and_its_log_replays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "failure.log"
+    assert main(["fuzz", "--frames", "200000", "--seed", "1", "--stroke-limit", "30", "--out", str(log)]) == 1
+    assert "the stroke demand left its limits" in capsys.readouterr().out
+    assert main(["fuzz", "--replay", str(log), "--stroke-limit", "30"]) == 1
+    assert main(["fuzz", "--replay", str(log)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frames", "0"], "--frames (=0) must be at least 1"),
+        (["--seed", "-1"], "--seed (=-1)"),
+        (["--recovery", "nan"], "--recovery (=nan)"),
+        (["--current-limit", "-3"], "--current-limit (=-3)"),
+        (["--stroke-limit", "1e9"], "--stroke-limit (=1e+09)"),
+        (["--replay", "no such file"], "no such file"),
+        (["--replay", "README.md"], "README.md"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(options: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    os.chdir(ROOT)
+    assert main(["fuzz", *options]) == 2
+    err = capsys.readouterr().err
+    assert said in err and len(err.strip().splitlines()) == 1
