@@ -10,7 +10,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measure import MEASUREMENTS, ROOT, Row, machine
+from benchmarks import bus, measure
+from benchmarks.measure import ROOT, Row, machine
+
+MEASUREMENTS = measure.MEASUREMENTS | bus.MEASUREMENTS
 
 
 def main() -> None:
@@ -21,11 +24,11 @@ def main() -> None:
     host = machine()
     console.print("  ".join(f"{k} {v}" for k, v in host.items()))
     rows: list[Row] = []
-    for i, (name, measure) in enumerate(MEASUREMENTS.items(), 1):
+    for i, (name, rows_of) in enumerate(MEASUREMENTS.items(), 1):
         console.print(f"[{i}/{len(MEASUREMENTS)}] measuring {name} ...")
         started = time.perf_counter()
         try:
-            rows += list(measure())
+            rows += list(rows_of())
         except Exception as e:  # a benchmark reports, it does not fail
             rows.append(Row(name, "not measured", note=f"{type(e).__name__}: {e}".splitlines()[0][:200]))
         console.print(f"      {time.perf_counter() - started:.0f} s")
