@@ -183,6 +183,9 @@ def main(name: str) -> int:
     os.setsid()
     if os.fork():
         os._exit(0)
+    with contextlib.suppress(OSError, AttributeError):  # who starts it may be a real-time process bound to one core
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
     null = os.open(os.devnull, os.O_RDWR)
     for fd in (0, 1, 2):
         os.dup2(null, fd)

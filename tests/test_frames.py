@@ -383,3 +383,36 @@ def test_health_tells_what_was_lost_and_refused() -> None:
     vgv, ecu, _, _ = together(1000, disturb)
     assert ecu.values["frames_rejected"] == 3 == vgv.counts["wrong_crc"]
     assert ecu.values["frames_lost"] == 3
+
+
+@pytest.mark.parametrize(("refused", "mode"), [(4, "RUN"), (5, "DEGRADED")])
+def test_the_fifth_refused_frame_of_a_burst_degrades_in_its_own_tick(refused: int, mode: str) -> None:
+    vgv, ecu, _, _ = together(1000)
+    wrong = np.repeat(ecu._sent.copy(), refused, axis=0)
+    wrong[:, 1] ^= 1 << 30
+    vgv.tick(wrong)
+    assert vgv.mode == mode and vgv.faults == (2 if mode == "DEGRADED" else 0)
+
+
+@pytest.mark.parametrize(("share", "tolerated"), [(10, True), (5, False)])
+def test_one_wrong_frame_in_ten_is_tolerated_for_ever_one_in_five_is_not(share: int, tolerated: bool) -> None:
+    modes = set()
+
+    def disturb(k: int, rows: np.ndarray) -> np.ndarray:
+        if len(rows) and k > 500 and k // 10 % share == 0:
+            rows = rows.copy()
+            rows[0, 1] ^= 1 << 20
+        return rows
+
+    vgv, _, _, sent = together(6000, disturb)
+    modes = {frames.decode(*s[0].tolist())["state"] for s in sent[700:] if len(s)}
+    assert (modes == {2.0}) == tolerated
+
+
+@pytest.mark.parametrize("value", [65535, 60001])
+def test_a_speed_out_of_range_under_a_right_crc_degrades_with_the_frame(value: int) -> None:
+    vgv, ecu, _, _ = together(1001)  # the last tick sent a frame that has not been heard
+    counter = int(ecu.arrays.counter[0])
+    data = int(frames.encode_demand(70.0, 70.0, 1, 0)) & ~0xFFFF0000 | value << 16
+    vgv.tick(np.array([[frames.word0(ECU_DEMAND), frames.protect(ECU_DEMAND, data, counter)]], np.int64))
+    assert vgv.mode == "DEGRADED" and vgv.faults == 1 << 7
