@@ -76,7 +76,7 @@ def command(args: argparse.Namespace) -> int:
             rows.append([f"{s.stage}: {words}", "", "", *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))])
     columns = ["error of the vane angle, deg", "Lb, mm", "Lc, mm", "at 100 %", "rms", "max"]
     cli.print_table(args, "links, and what remains (target minus angle; rms and max over 40 to 102 % speed)", columns, rows)
-    pick = [i for i, n in enumerate(result.speed) if n % 10 == 0 or n >= 95]
+    pick = [i for i, n in enumerate(result.speed) if n % 10 == 0 or n >= 95 or i == len(result.speed) - 1]
     rows = [
         [
             f"{result.speed[i]:g}",

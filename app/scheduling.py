@@ -381,11 +381,11 @@ def measure_loop(
     width = float(np.mean(gap[inside]))
     notes = []
     if fit.drift is None:
-        notes.append(f"{stage}: fewer than two loops there and back: a drift of the angle could not be told from the loop's width")
+        notes.append("fewer than two loops there and back: a drift of the angle could not be told from the loop's width")
     reach = min(fit.covered[1][1], fit.covered[-1][1]), max(fit.covered[1][0], fit.covered[-1][0])
     if covered[0] > STROKE_LIMITS[0] + 3.0 or covered[1] < STROKE_LIMITS[1] - 4.0:
         notes.append(
-            f"{stage}: measured from {covered[0]:.1f} to {covered[1]:.1f} mm (both branches {reach[1]:.1f} to {reach[0]:.1f}); "
+            f"measured from {covered[0]:.1f} to {covered[1]:.1f} mm (both branches {reach[1]:.1f} to {reach[0]:.1f}); "
             "beyond, the curves follow the geometry"
         )
     keep = np.linspace(0, x.size - 1, min(x.size, 20_000)).astype(int)
@@ -798,11 +798,17 @@ def schedule(
                     if name == "vigv":
                         raise
                     notes.append(f"{name} is not measured, the geometry's own curves stand for it: {e}")
-                else:
-                    notes += loops[name].notes
             if progress is not None:
                 progress(0.8 * (done + 1) / len(STAGES))
+    said: dict[str, list[str]] = {}
+    for name, loop in loops.items():
+        for note in loop.notes:
+            said.setdefault(note, []).append(name)
+    notes += [f"{', '.join(names)}: {note}" for note, names in said.items()]
     speed = table_speeds(schedules)
+    if not speed[0] <= DESIGN_SPEED <= speed[-1]:
+        nearest = speed[schedules_at_design(speed)]
+        notes.append(f"the schedule's table runs from {speed[0]:g} to {speed[-1]:g} %: figures at 100 % speed are those at {nearest:g} %")
     target = np.rad2deg(schedules.targets(speed))
     design = schedules_at_design(speed)
     table = _tables(geometry, schedules, speed, loops.get("vigv"), notes)
