@@ -801,8 +801,8 @@ def schedule(
             if progress is not None:
                 progress(0.8 * (done + 1) / len(STAGES))
     said: dict[str, list[str]] = {}
-    for name, loop in loops.items():
-        for note in loop.notes:
+    for name, measured in loops.items():
+        for note in measured.notes:
             said.setdefault(note, []).append(name)
     notes += [f"{', '.join(names)}: {note}" for note, names in said.items()]
     speed = table_speeds(schedules)
