@@ -44,8 +44,9 @@ __all__ = ["FLUSH", "FRAME", "SUFFIXES", "Recorder", "RecorderProcess", "free_na
 FLUSH = 0.5  # s between two appends; at most this much is lost
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
 
-# a frame on its way to the file: time since 1970, then struct can_frame, with the direction in one of its unused bytes
-FRAME = np.dtype([("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (8,))])
+# a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused bytes
+FRAME = np.dtype([("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (64,))])
+FD = 4  # in `flags`; 1 is the bit-rate switch, 2 the error state, as SocketCAN has them
 
 
 class _Format(Protocol):
@@ -67,10 +68,12 @@ class _Candump:
 
     def append(self, frames: np.ndarray) -> None:
         text, lines = frames["data"].tobytes().hex().upper(), []
-        columns = (frames["ns"] // 1000, frames["ident"], frames["length"], frames["tx"])
-        for k, (us, ident, n, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+        columns = (frames["ns"] // 1000, frames["ident"], frames["length"], frames["flags"], frames["tx"])
+        for k, (us, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
             name = f"{ident & 0x1FFFFFFF:08X}" if ident & EXTENDED else f"{ident:08X}" if ident & ERROR else f"{ident & 0x7FF:03X}"
-            data = f"R{n or ''}" if ident & REMOTE else text[16 * k : 16 * k + 2 * n]
+            data = f"R{n or ''}" if ident & REMOTE else text[128 * k : 128 * k + 2 * n]
+            if flags & FD:
+                data = f"#{flags & 3:X}{data}"
             lines.append(f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) {self.channel} {name}#{data} {'T' if tx else 'R'}\n")
         _append(self.fd, "".join(lines).encode("ascii"))
 
@@ -164,18 +167,19 @@ def messages(frames: np.ndarray) -> Any:
     """Give frames as python-can messages."""
     import can
 
-    columns = (frames["ns"] * 1e-9, frames["ident"], frames["length"], frames["tx"])
+    columns = (frames["ns"] * 1e-9, frames["ident"], frames["length"], frames["flags"], frames["tx"])
     data = frames["data"].tobytes()
-    for k, (t, ident, n, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+    for k, (t, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
         yield can.Message(
             timestamp=t, arbitration_id=ident & 0x1FFFFFFF, is_extended_id=bool(ident & EXTENDED), is_remote_frame=bool(ident & REMOTE),
-            is_error_frame=bool(ident & ERROR), channel=0, dlc=n, data=None if ident & REMOTE else data[8 * k : 8 * k + n], is_rx=not tx,
+            is_error_frame=bool(ident & ERROR), channel=0, dlc=n, data=None if ident & REMOTE else data[64 * k : 64 * k + n], is_rx=not tx,
+            is_fd=bool(flags & FD), bitrate_switch=bool(flags & 1), error_state_indicator=bool(flags & 2),
         )  # fmt: skip
 
 
 # ---- MDF4 ---------------------------------------------------------------------------------------------------------------------------
 
-_COLUMNS = [("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"), ("DataBytes", "u1", (8,)),
+_COLUMNS = [("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"), ("DataBytes", "u1", (64,)),
             ("Dir", "u1"), ("EDL", "u1"), ("BRS", "u1"), ("ESI", "u1")]  # fmt: skip
 _START_TIME = 64 + 24 + 48  # in the file: identification block, head and links of the header block
 
@@ -223,8 +227,10 @@ class _Mdf:
 
     def _records(self, k: int, frames: np.ndarray) -> np.ndarray:
         out, name = np.zeros(len(frames), self.kinds[k]), self.KINDS[k]
-        values = {"BusChannel": 1, "ID": frames["ident"] & 0x1FFFFFFF, "IDE": frames["ident"] >> 31, "DLC": frames["length"],
-                  "DataLength": frames["length"], "DataBytes": frames["data"], "Dir": frames["tx"]}  # fmt: skip
+        length, flags = frames["length"], frames["flags"]
+        values = {"BusChannel": 1, "ID": frames["ident"] & 0x1FFFFFFF, "IDE": frames["ident"] >> 31,
+                  "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], length), "DataLength": length, "DataBytes": frames["data"],
+                  "Dir": frames["tx"], "EDL": flags & FD != 0, "BRS": flags & 1, "ESI": flags >> 1 & 1}  # fmt: skip
         out["t"] = (frames["ns"] - self.start) * 1e-9
         for key, v in values.items():
             out[f"{name}.{key}"] = v
@@ -311,14 +317,13 @@ class _Parquet:
         import pyarrow as pa
 
         ident, n = frames["ident"], len(frames)
-        error, remote = ident & ERROR != 0, ident & REMOTE != 0
-        plain = canlog.Frames(
-            np.zeros(n), np.where(error | remote, np.uint32(ERROR), ident), np.zeros(n, np.int32), frames["length"], frames["data"]
-        )
+        error, remote, fd = ident & ERROR != 0, ident & REMOTE != 0, frames["flags"] & FD != 0
+        ours = np.where(error | remote | fd, np.uint32(ERROR), ident)
+        plain = canlog.Frames(np.zeros(n), ours, np.zeros(n, np.int32), frames["length"], np.ascontiguousarray(frames["data"][:, :8]))
         columns: dict[str, Any] = {
             "t": (frames["ns"] - self.start) * 1e-9, "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
             "id": ident & 0x1FFFFFFF, "extended": ident & EXTENDED != 0,
-            "kind": np.where(error, "error", np.where(remote, "remote", "data")), "tx": frames["tx"] != 0, "length": frames["length"],
+            "kind": np.select([error, remote, fd], ["error", "remote", "fd"], "data"), "tx": frames["tx"] != 0, "length": frames["length"],
             "bytes": [d[:k].tobytes() for d, k in zip(frames["data"], frames["length"].tolist(), strict=True)],
         }  # fmt: skip
         for message in self.messages:
@@ -563,7 +568,7 @@ def _keep_old(path: Path) -> Path | None:
 
 
 class RecorderProcess:
-    """A recording in a process of its own. `put` is one write into a pipe that holds a minute of frames; it never waits.
+    """A recording in a process of its own. `put` is one write into a pipe that holds half a minute of frames; it never waits.
 
     Frames that do not fit, because the disk stands still, are counted in ``lost``. Raises InputError for what `Recorder` refuses.
     """
@@ -611,7 +616,7 @@ class RecorderProcess:
 def _enlarge(pipe: int, size: int = 1 << 20) -> None:
     import fcntl
 
-    with contextlib.suppress(OSError):  # an unprivileged user may be allowed less: 64 KiB are six seconds
+    with contextlib.suppress(OSError):  # an unprivileged user may be allowed less: 64 KiB are two seconds
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, size)
 
 

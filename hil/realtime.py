@@ -1,0 +1,338 @@
+"""Real time: ticks at absolute deadlines, how late each began, and what is done to be late seldom.
+
+A tick's lateness is the time from its deadline to its begin, deadlines being start + k ms, whatever the ticks before did. The loop sleeps until
+shortly before the deadline (``clock_nanosleep``, absolute) and spins the rest.
+
+Overrun. A tick that begins after the deadline of the next one has *missed* it. What then:
+
+``catch-up``  (default) every tick is run, late ones back to back, until the loop is on time again: the firmware's clock stays with the wall
+              clock, a stall shows as a burst. After more than 100 ms (a suspended machine) the rest is skipped, and counted.
+``skip``      deadlines that have passed are left out and counted: no bursts, but the firmware's clock falls behind the wall clock.
+
+Frames are recorded with the tick in which they were taken or sent: start + k ms. The start is a whole millisecond, so a record says exactly
+what to give to which tick, and the run can be repeated in lockstep bit for bit (`hil.repeat`).
+
+Only this module reads a clock to decide when to run; `controller`, `plant` and `hil.node` have none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import signal
+import struct
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+__all__ = ["POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "stop_on_signals", "undisturbed"]
+
+TICK_NS = 1_000_000
+POLICIES = ("catch-up", "skip")
+MOST_BEHIND = 100  # ticks to catch up; beyond, the rest is skipped
+SPIN_US = 100  # sleeps end 50 us late at the default timer slack, a few us late at ours; the spin hides both
+MOST_READ = 64  # frames taken in one tick (a full 500 kbit/s bus carries five); the rest wait for the next
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = [("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long)]
+
+
+_CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+
+
+def _steps() -> np.ndarray:
+    """Edges of the histogram, ns: 0.1 us up to 1 ms, 10 us up to 100 ms, 1 ms up to 10 s."""
+    return np.concatenate([np.arange(0, 10**6, 100), np.arange(10**6, 10**8, 10**4), np.arange(10**8, 10**10, 10**6), [10**10]])
+
+
+class Lateness:
+    """Histogram of times, fine enough for percentiles (0.1 us below 1 ms, 1 % above), and the largest of them.
+
+    count  number of times;  worst_ns, worst_tick  the largest, and the tick to which it belongs
+    """
+
+    EDGES = _steps()
+    SHOWN = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 100_000)  # us, upper edges of the printed histogram
+
+    def __init__(self) -> None:
+        self.bins = np.zeros(len(self.EDGES), np.int64)
+        self._bins = memoryview(self.bins)
+        self.worst_ns, self.worst_tick = 0, 0
+
+    def add(self, ns: int, tick: int) -> None:
+        """Count one time."""
+        if ns < 10**6:
+            i = ns // 100
+        elif ns < 10**8:
+            i = 10_000 + (ns - 10**6) // 10**4
+        else:
+            i = min(19_900 + (ns - 10**8) // 10**6, 29_800)
+        self._bins[i] += 1
+        if ns > self.worst_ns:
+            self.worst_ns, self.worst_tick = ns, tick
+
+    @property
+    def count(self) -> int:
+        """Number of times counted."""
+        return int(self.bins.sum())
+
+    def quantile(self, q: float) -> float:
+        """Return the time (us) that the share ``q`` of all stays below or at; the upper edge of its bin."""
+        if q >= 1.0 or not self.count:
+            return self.worst_ns * 1e-3
+        i = int(np.searchsorted(np.cumsum(self.bins), q * self.count))
+        return min(float(self.EDGES[min(i + 1, len(self.EDGES) - 1)]), self.worst_ns) * 1e-3
+
+    def share_over(self, us: float) -> float:
+        """Return the share of times above ``us``, to the width of a bin."""
+        first = int(np.searchsorted(self.EDGES, us * 1e3))
+        return float(self.bins[first:].sum()) / max(self.count, 1)
+
+    def shown(self) -> list[tuple[str, int]]:
+        """Return label and count of a few wide bins."""
+        out, before, total = [], 0, np.cumsum(self.bins)
+        for us in self.SHOWN:
+            upto = int(total[int(np.searchsorted(self.EDGES, us * 1000)) - 1])
+            out.append((f"< {us} us" if us < 1000 else f"< {us // 1000} ms", upto - before))
+            before = upto
+        return [*out, (f">= {self.SHOWN[-1] // 1000} ms", int(total[-1]) - before)]
+
+    def figures(self) -> dict[str, float]:
+        """Return p50, p99, p99.9 and the largest, us, and the share above 500 us."""
+        return {
+            "p50_us": self.quantile(0.5),
+            "p99_us": self.quantile(0.99),
+            "p999_us": self.quantile(0.999),
+            "max_us": self.worst_ns * 1e-3,
+            "over_500us": self.share_over(500.0),
+        }
+
+
+class Ticker:
+    """Deadlines at start + k periods. `wait` sleeps until the next one and says how late it is.
+
+    missed   ticks that began after the deadline of the next one
+    skipped  deadlines left out (`policy`)
+    """
+
+    def __init__(self, period_ns: int = TICK_NS, *, spin_us: float = SPIN_US, policy: str = "catch-up"):
+        self.period, self.spin, self.policy = period_ns, int(spin_us * 1000), policy
+        self.missed = self.skipped = 0
+        self._time = _Timespec()
+        self._sleep, self._at = _libc.clock_nanosleep, ctypes.byref(self._time)
+        self.start = self.deadline = 0
+
+    def begin(self) -> None:
+        """Set the first deadline one period from now."""
+        self.start = self.deadline = time.monotonic_ns() + self.period
+
+    def wait(self) -> int:
+        """Sleep until the deadline; set the next one. Returns the lateness, ns."""
+        clock, deadline = time.monotonic_ns, self.deadline
+        early = deadline - self.spin
+        now = clock()
+        while now < early:
+            self._time.tv_sec, self._time.tv_nsec = divmod(early, 1_000_000_000)
+            self._sleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, self._at, None)  # a signal may end it early
+            now = clock()
+        while now < deadline:
+            now = clock()
+        late = now - deadline
+        self.deadline = deadline + self.period
+        if late >= self.period:
+            self.missed += 1
+            behind = late // self.period
+            if self.policy == "skip" or behind > MOST_BEHIND:
+                self.skipped += behind
+                self.deadline += behind * self.period
+        return late
+
+
+class Stop:
+    """A request to end, which a signal or another thread sets."""
+
+    def __init__(self) -> None:
+        self.asked = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.asked)
+
+
+@contextlib.contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to end; a second SIGINT interrupts at once."""
+    stop = Stop()
+    before: dict[int, Any] = {}
+
+    def ask(number: int, frame: Any) -> None:
+        if stop.asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        stop.asked = signal.Signals(number).name
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        before[number] = signal.signal(number, ask)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def undisturbed(priority: int | None = None, cpu: int | None = None) -> Iterator[list[str]]:
+    """Keep this process from being late: memory locked, garbage collection off, timers exact, optionally SCHED_FIFO and one processor.
+
+    priority  of SCHED_FIFO, 1..99; None = the ordinary scheduler
+    cpu       number of the processor to stay on
+
+    Gives notes on what the system did not allow. Raises PermissionError or OSError where ``priority`` or ``cpu`` are refused.
+    """
+    notes: list[str] = []
+    affinity, slack, collecting = os.sched_getaffinity(0), _libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0), gc.isenabled()
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        if cpu is not None:
+            os.sched_setaffinity(0, {cpu})
+        if priority is not None:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+        # pages are locked once they are used: the libraries reserve far more than that
+        if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
+            notes.append(f"memory is not locked ({os.strerror(ctypes.get_errno())}); ulimit -l or root allows it")
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        yield notes
+    finally:
+        if collecting:
+            gc.enable()
+        gc.unfreeze()
+        _libc.munlockall()
+        _libc.prctl(_PR_SET_TIMERSLACK, max(slack, 1), 0, 0, 0)
+        os.sched_setscheduler(0, policy, parameters)
+        os.sched_setaffinity(0, affinity)
+
+
+# ---- a node in real time ------------------------------------------------------------------------------------------------------------
+
+
+class Ticking(Protocol):
+    """A node: frames since the last tick in, frames to send out (`hil.node`)."""
+
+    k: int
+
+    def tick(self, received: np.ndarray, n: int) -> np.ndarray:
+        """Run the next tick."""
+
+
+class Port(Protocol):
+    """Frames in and out of a bus without waiting (`hil.bus.Port`)."""
+
+    def read(self, rows: np.ndarray) -> int:
+        """Take what has come."""
+
+    def write(self, rows: np.ndarray) -> int:
+        """Send."""
+
+
+@dataclass
+class Report:
+    """How a real-time run went.
+
+    ticks     run;  missed, skipped as `Ticker` counts them
+    begin     lateness of each tick's begin;  end  from the deadline until its frames were sent;  work  the tick itself
+    received, sent  frames
+    started_ns      time since 1970 of tick 0
+    """
+
+    ticks: int = 0
+    missed: int = 0
+    skipped: int = 0
+    received: int = 0
+    sent: int = 0
+    started_ns: int = 0
+    wall_s: float = 0.0
+    ended: str = ""
+    begin: Lateness = field(default_factory=Lateness)
+    end: Lateness = field(default_factory=Lateness)
+    work: Lateness = field(default_factory=Lateness)
+
+
+_pack = struct.Struct("<qqq56x").pack  # hil.recorder.FRAME of a frame in two words
+_TX = 1 << 48
+
+
+def packed(ns: int, rows: np.ndarray, sent: bool = False) -> bytes:
+    """Return frames (int64[n, 2]) as the recorder takes them, with the time ``ns`` since 1970."""
+    mark = _TX if sent else 0
+    return b"".join([_pack(ns, head | mark, data) for head, data in rows.tolist()])
+
+
+def run_realtime(
+    node: Ticking,
+    port: Port,
+    *,
+    ticks: int | None = None,
+    ticker: Ticker | None = None,
+    stop: Stop | None = None,
+    put: Callable[[bytes], None] | None = None,
+    live: Callable[[Report], None] | None = None,
+    watch: Callable[[int], str | None] | None = None,
+) -> Report:
+    """Run ``node`` on the bus behind ``port``, a tick a millisecond, for ``ticks`` ticks or until ``stop``.
+
+    put    takes recorded frames (`packed`); it must not wait
+    live   called every second, after a tick's work; it must not wait
+    watch  called with k after each tick's work; a text ends the run and becomes `Report.ended`
+
+    Call it inside `undisturbed`. The frames that the node still has to get are those that came until its last tick.
+    """
+    ticker, stop = ticker or Ticker(), stop or Stop()
+    rows = np.zeros((MOST_READ, 2), np.int64)
+    report = Report()
+    read, write, tick, clock = port.read, port.write, node.tick, time.monotonic_ns
+    add_begin, add_end, add_work = report.begin.add, report.end.add, report.work.add
+    while port.read(rows):  # what came while nobody listened is old
+        pass
+    report.started_ns = (time.time_ns() // TICK_NS + 1) * TICK_NS
+    ticker.begin()
+    k, started = 0, ticker.start
+    try:
+        while not stop and (ticks is None or k < ticks):
+            deadline = ticker.deadline
+            late = ticker.wait()
+            n = read(rows)
+            out = tick(rows, n)
+            if len(out):
+                report.sent += write(out)
+            done = clock()
+            add_begin(late, k)
+            add_end(done - deadline, k)
+            add_work(done - deadline - late, k)
+            if put is not None and (n or len(out)):
+                ns = report.started_ns + k * TICK_NS
+                put(packed(ns, rows[:n]) + packed(ns, out, True))
+            report.received += n
+            if watch is not None and (why := watch(k)):
+                report.ended = why
+                k += 1
+                break
+            k += 1
+            if live is not None and k % 1000 == 0:
+                report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
+                live(report)
+    finally:
+        report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
+        report.wall_s = (clock() - started) * 1e-9
+        report.ended = report.ended or stop.asked
+    return report
