@@ -9,8 +9,8 @@ Overrun. A tick that begins after the deadline of the next one has *missed* it. 
               clock, a stall shows as a burst. After more than 100 ms (a suspended machine) the rest is skipped, and counted.
 ``skip``      deadlines that have passed are left out and counted: no bursts, but the firmware's clock falls behind the wall clock.
 
-Frames are recorded with the tick in which they were taken or sent: start + k ms. The start is a whole millisecond, so a record says exactly
-what to give to which tick, and the run can be repeated in lockstep bit for bit (`hil.repeat`).
+Frames are recorded with the time of the tick in which they were taken or sent: start + k ms, within a tick 1 us apart in their order. The
+start is a whole millisecond, so a record says exactly what to give to which tick, and lockstep repeats the run bit for bit.
 
 Only this module reads a clock to decide when to run; `controller`, `plant` and `hil.node` have none.
 """
@@ -253,6 +253,7 @@ class Report:
     begin     lateness of each tick's begin;  end  from the deadline until its frames were sent;  work  the tick itself
     received, sent  frames
     started_ns      time since 1970 of tick 0
+    ended, failed   what asked for the end, empty at the end of the time; what made it impossible to go on
     """
 
     ticks: int = 0
@@ -263,6 +264,7 @@ class Report:
     started_ns: int = 0
     wall_s: float = 0.0
     ended: str = ""
+    failed: str = ""
     begin: Lateness = field(default_factory=Lateness)
     end: Lateness = field(default_factory=Lateness)
     work: Lateness = field(default_factory=Lateness)
@@ -272,10 +274,12 @@ _pack = struct.Struct("<qqq56x").pack  # hil.recorder.FRAME of a frame in two wo
 _TX = 1 << 48
 
 
-def packed(ns: int, rows: np.ndarray, sent: bool = False) -> bytes:
-    """Return frames (int64[n, 2]) as the recorder takes them, with the time ``ns`` since 1970."""
-    mark = _TX if sent else 0
-    return b"".join([_pack(ns, head | mark, data) for head, data in rows.tolist()])
+def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
+    """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us apart, in their order."""
+    out = [_pack(ns + 1000 * i, head, data) for i, (head, data) in enumerate(received.tolist())]
+    ns += 1000 * len(out)
+    out += [_pack(ns + 1000 * i, head | _TX, data) for i, (head, data) in enumerate(sent.tolist())]
+    return b"".join(out)
 
 
 def run_realtime(
@@ -297,6 +301,8 @@ def run_realtime(
 
     Call it inside `undisturbed`. The frames that the node still has to get are those that came until its last tick.
     """
+    from can import CanError
+
     ticker, stop = ticker or Ticker(), stop or Stop()
     rows = np.zeros((MOST_READ, 2), np.int64)
     report = Report()
@@ -320,8 +326,7 @@ def run_realtime(
             add_end(done - deadline, k)
             add_work(done - deadline - late, k)
             if put is not None and (n or len(out)):
-                ns = report.started_ns + k * TICK_NS
-                put(packed(ns, rows[:n]) + packed(ns, out, True))
+                put(packed(report.started_ns + k * TICK_NS, rows[:n], out))
             report.received += n
             if watch is not None and (why := watch(k)):
                 report.ended = why
@@ -331,6 +336,8 @@ def run_realtime(
             if live is not None and k % 1000 == 0:
                 report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
                 live(report)
+    except CanError as e:
+        report.failed = f"the bus failed: {e}"
     finally:
         report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
         report.wall_s = (clock() - started) * 1e-9

@@ -30,6 +30,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -39,13 +40,14 @@ from hil import canlog
 from tables import InputError
 from tables import path as table_path
 
-__all__ = ["FLUSH", "FRAME", "SUFFIXES", "Recorder", "RecorderProcess", "free_name"]
+__all__ = ["FLUSH", "FRAME", "SUFFIXES", "Recorder", "RecorderProcess", "Record", "free_name", "read_record"]
 
 FLUSH = 0.5  # s between two appends; at most this much is lost
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
 
 # a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused bytes
 FRAME = np.dtype([("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (64,))])
+_WHOLE = select.PIPE_BUF // FRAME.itemsize * FRAME.itemsize  # bytes that a pipe takes whole or not at all
 FD = 4  # in `flags`; 1 is the bit-rate switch, 2 the error state, as SocketCAN has them
 
 
@@ -567,6 +569,60 @@ def _keep_old(path: Path) -> Path | None:
     return other
 
 
+@dataclass(frozen=True)
+class Record:
+    """Frames of a recording, in order: ms since 1970 (int64[n]), as two words each (int64[n, 2], `hil.frames`), and whether it sent them."""
+
+    ms: np.ndarray
+    rows: np.ndarray
+    sent: np.ndarray
+
+
+def read_record(path: str | Path) -> Record:
+    """Read what a `Recorder` wrote, or another program in a format that python-can reads. Raises LogError."""
+    from hil.frames import from_message
+
+    path = Path(path)
+    canlog.check_file(path)
+    try:
+        if path.suffix.lower() == ".parquet":
+            us, rows, sent = _read_parquet(path)
+        else:
+            import can
+
+            with can.LogReader(path) as reader:
+                found = [(round(m.timestamp * 1e6), *from_message(m), not m.is_rx) for m in reader]
+            us = np.array([f[0] for f in found], np.int64)
+            rows = np.array([f[1:3] for f in found], np.int64).reshape(-1, 2)
+            sent = np.array([f[3] for f in found], bool)
+    except InputError:
+        raise
+    except Exception as e:  # readers meet a damaged file with any exception there is
+        raise canlog.LogError(f"{path}: cannot be read as a recording of frames ({type(e).__name__}: {e})") from None
+    if not len(us):
+        raise canlog.LogError(f"{path}: no CAN frame in it")
+    order = np.argsort(us, kind="stable")
+    return Record(us[order] // 1000, rows[order], sent[order])
+
+
+def _read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    import pyarrow.parquet as pq
+
+    names = ["time", "id", "extended", "kind", "tx", "length", "bytes"]
+    held = pq.ParquetFile(path).schema_arrow.names
+    if missing := [n for n in names if n not in held]:
+        raise canlog.LogError(f"{path}: no column {missing[0]!r}: holds signals, not frames")
+    t = pq.read_table(path, columns=names).to_pydict()
+    us = pq.read_table(path, columns=["time"])["time"].cast("int64").to_numpy() // 1000
+    flags = {"data": 0, "fd": FD << 40, "remote": REMOTE, "error": ERROR}
+    rows = [
+        (ident | (EXTENDED if extended and kind != "error" else 0) | flags[kind] | length << 32,
+         int.from_bytes(data[:8].ljust(8, b"\0"), "little", signed=True))
+        for ident, extended, kind, length, data in zip(t["id"], t["extended"], t["kind"], t["length"], t["bytes"], strict=True)
+    ]  # fmt: skip
+    return us, np.array(rows, np.int64).reshape(-1, 2), np.array(t["tx"], bool)
+
+
 class RecorderProcess:
     """A recording in a process of its own. `put` is one write into a pipe that holds half a minute of frames; it never waits.
 
@@ -592,14 +648,13 @@ class RecorderProcess:
         return self._process.stdout.readline().decode().strip()
 
     def put(self, frames: bytes) -> None:
-        """Take frames (bytes of FRAME, at most PIPE_BUF of them: written whole or not at all)."""
-        try:
-            os.write(self._pipe, frames)
-        except BlockingIOError:
-            self.lost += len(frames) // FRAME.itemsize
-        except BrokenPipeError:
-            self.lost += len(frames) // FRAME.itemsize
-            self.error = self.error or "ended early"
+        """Take frames (bytes of FRAME)."""
+        for at in range(0, len(frames), _WHOLE):
+            part = frames[at : at + _WHOLE]
+            try:
+                os.write(self._pipe, part)
+            except (BlockingIOError, BrokenPipeError):
+                self.lost += len(part) // FRAME.itemsize
 
     def close(self) -> None:
         """End the recording and wait until the file is whole. ``frames`` then says how many are in it, ``error`` what went wrong."""
