@@ -25,6 +25,9 @@ COMMANDS = {
     "clearance": ("app.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
     "inject": ("hil.inject", "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must"),
     "fuzz": ("hil.fuzz", "safety campaign: random and mutated frames by the million; limits, transitions, recovery must hold"),
+    "run": ("app.run", "controller and plant as a node on the CAN bus, in real time or in lockstep"),
+    "ecu": ("app.ecu", "the engine control unit on the CAN bus: demand from a profile, a log or the keyboard"),
+    "record": ("app.record", "all frames of a CAN bus into MDF4, BLF, candump or Parquet; survives kill -9"),
     "design": ("app.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
     "web": ("app.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }

@@ -1,8 +1,8 @@
 """The external engine control unit: where its demand comes from, and when it gives the controller up.
 
 The node itself is `hil.node.Ecu`: ECU_DEMAND every 10 ms with the speed that its engine model (or the log) has, and a watch on the
-controller's frames. Here it gets a demand for each tick. The demand's time starts with the first good VGV_STATUS, so that it does not matter
-which of controller and ECU is started first; until then its first value is sent.
+controller's frames. Here it gets a demand for each tick. The demand's time starts with the first good VGV_STATUS: controller and ECU can be
+started in any order; until then its first value is sent.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def read_profile(path: str | Path) -> Demand:
         columns: dict[str, np.ndarray] = {}
         for key in ("t", "n_dem"):
             values = table.get(key)
-            if not isinstance(values, list) or not values or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+            if not isinstance(values, list) or not values or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
                 raise InputError(f"{path}: {key} must be a list of numbers, as t = [0, 10] and n_dem = [60, 90]")
             columns[key] = np.array(values, float)
         if unknown := sorted(set(table) - {"t", "n_dem"}):

@@ -1,7 +1,7 @@
 """Real time: ticks at absolute deadlines, how late each began, and what is done to be late seldom.
 
-A tick's lateness is the time from its deadline to its begin, deadlines being start + k ms, whatever the ticks before did. The loop sleeps until
-shortly before the deadline (``clock_nanosleep``, absolute) and spins the rest.
+A tick's lateness is the time from its deadline to its begin, deadlines being start + k ms, whatever the ticks before did. The loop sleeps
+until shortly before the deadline (``clock_nanosleep``, absolute) and spins the rest.
 
 Overrun. A tick that begins after the deadline of the next one has *missed* it. What then:
 
@@ -66,7 +66,7 @@ class Lateness:
 
     def __init__(self) -> None:
         self.bins = np.zeros(len(self.EDGES), np.int64)
-        self._bins = memoryview(self.bins)
+        self._bins = memoryview(self.bins)  # type: ignore[arg-type]
         self.worst_ns, self.worst_tick = 0, 0
 
     def add(self, ns: int, tick: int) -> None:
@@ -179,8 +179,8 @@ def stop_on_signals() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.asked = signal.Signals(number).name
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        before[number] = signal.signal(number, ask)
+    for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        before[name] = signal.signal(name, ask)
     try:
         yield stop
     finally:
@@ -229,8 +229,6 @@ def undisturbed(priority: int | None = None, cpu: int | None = None) -> Iterator
 class Ticking(Protocol):
     """A node: frames since the last tick in, frames to send out (`hil.node`)."""
 
-    k: int
-
     def tick(self, received: np.ndarray, n: int) -> np.ndarray:
         """Run the next tick."""
 
@@ -275,7 +273,7 @@ _TX = 1 << 48
 
 
 def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
-    """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us apart, in their order."""
+    """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us apart, in order."""
     out = [_pack(ns + 1000 * i, head, data) for i, (head, data) in enumerate(received.tolist())]
     ns += 1000 * len(out)
     out += [_pack(ns + 1000 * i, head | _TX, data) for i, (head, data) in enumerate(sent.tolist())]

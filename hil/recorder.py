@@ -32,7 +32,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -40,13 +40,21 @@ from hil import canlog
 from tables import InputError
 from tables import path as table_path
 
-__all__ = ["FLUSH", "FRAME", "SUFFIXES", "Recorder", "RecorderProcess", "Record", "free_name", "read_record"]
+if TYPE_CHECKING:
+    import can
+
+__all__ = [
+    "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message", "read_record",
+]  # fmt: skip
 
 FLUSH = 0.5  # s between two appends; at most this much is lost
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
 
 # a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused bytes
-FRAME = np.dtype([("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (64,))])
+FRAME = np.dtype(
+    [("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (64,))]
+)
+_FRAME = struct.Struct("<qIBBBx64s")
 _WHOLE = select.PIPE_BUF // FRAME.itemsize * FRAME.itemsize  # bytes that a pipe takes whole or not at all
 FD = 4  # in `flags`; 1 is the bit-rate switch, 2 the error state, as SocketCAN has them
 
@@ -111,7 +119,7 @@ class _Blf:
         with self.path.open("r+b") as file:
             head, end = file.read(144), file.seek(0, io.SEEK_END)
             part = _Tail(head, end)
-            writer = self.writer(part, append=True)
+            writer = self.writer(part, append=True)  # type: ignore[arg-type]
             if writer.object_count == 0:
                 writer.start_timestamp = None
             for message in messages(frames):
@@ -231,8 +239,9 @@ class _Mdf:
         out, name = np.zeros(len(frames), self.kinds[k]), self.KINDS[k]
         length, flags = frames["length"], frames["flags"]
         values = {"BusChannel": 1, "ID": frames["ident"] & 0x1FFFFFFF, "IDE": frames["ident"] >> 31,
-                  "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], length), "DataLength": length, "DataBytes": frames["data"],
-                  "Dir": frames["tx"], "EDL": flags & FD != 0, "BRS": flags & 1, "ESI": flags >> 1 & 1}  # fmt: skip
+                  "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], length), "DataLength": length,
+                  "DataBytes": frames["data"], "Dir": frames["tx"],
+                  "EDL": flags & FD != 0, "BRS": flags & 1, "ESI": flags >> 1 & 1}  # fmt: skip
         out["t"] = (frames["ns"] - self.start) * 1e-9
         for key, v in values.items():
             out[f"{name}.{key}"] = v
@@ -571,7 +580,7 @@ def _keep_old(path: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class Record:
-    """Frames of a recording, in order: ms since 1970 (int64[n]), as two words each (int64[n, 2], `hil.frames`), and whether it sent them."""
+    """Frames of a recording, in order: ms since 1970 (int64[n]), both words (int64[n, 2], `hil.frames`), and whether it sent them."""
 
     ms: np.ndarray
     rows: np.ndarray
@@ -621,6 +630,16 @@ def _read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for ident, extended, kind, length, data in zip(t["id"], t["extended"], t["kind"], t["length"], t["bytes"], strict=True)
     ]  # fmt: skip
     return us, np.array(rows, np.int64).reshape(-1, 2), np.array(t["tx"], bool)
+
+
+def packed_message(message: can.Message) -> bytes:
+    """Return a python-can message as the recorder takes it (FRAME)."""
+    ident = message.arbitration_id | (EXTENDED if message.is_extended_id else 0) | (REMOTE if message.is_remote_frame else 0)
+    if message.is_error_frame:
+        ident = message.arbitration_id | ERROR
+    flags = (FD if message.is_fd else 0) | (1 if message.bitrate_switch else 0) | (2 if message.error_state_indicator else 0)
+    length = message.dlc if message.is_remote_frame else len(message.data)
+    return _FRAME.pack(round(message.timestamp * 1e6) * 1000, ident, length, flags, not message.is_rx, bytes(message.data))
 
 
 class RecorderProcess:

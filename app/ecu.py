@@ -1,0 +1,230 @@
+"""``vaneloop ecu``: the external engine control unit on the bus."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import select
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from app import station
+from hil import cli
+
+__all__ = ["DESCRIPTION", "add_options", "command", "demand_of"]
+
+DESCRIPTION = """The engine control unit on the CAN bus: sends ECU_DEMAND every 10 ms with the speed that its engine model has (or the log
+had), and watches the controller's frames. Start it before or after vaneloop run: its demand begins with the first good VGV_STATUS.
+
+The demand is a profile, a log, or what is typed: a number sets n_dem (%), +N or -N changes it, run and standby ask for the mode, quit ends;
+at a terminal the arrow keys change it by 1 %, page up and down by 5 %. The end of standard input leaves the last demand standing.
+
+profiles: idle, step, ramp, slam, staircase, sine, engine-test; a TOML file with lists t (s) and n_dem (%); a CSV file with columns t,n_dem
+
+examples:
+  vaneloop ecu --bus vcan0 --profile staircase
+  vaneloop ecu --log examples/engine_run.blf --duration 60
+  (echo 70; sleep 5; echo 90; sleep 5; echo quit) | vaneloop ecu
+
+exit codes: 0 good (also after Ctrl-C), 1 the controller did not answer or stopped answering, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--bus", metavar="B", help=f"{station.BUS_HELP}; default: vcan0 if there is one, else local")
+    parser.add_argument("--profile", metavar="F", help="speed demand: a name, or a file (.toml, .csv)")
+    parser.add_argument("--log", metavar="F", help="speed demand, and measured speed if it has one, from any log (docs/logs.md)")
+    parser.add_argument(
+        "--duration", metavar="S", type=float, help="seconds from the first VGV_STATUS on (default: the profile's, the log's; typed: no end)"
+    )
+    parser.add_argument(
+        "--timeout", metavar="S", type=float, default=0.5, help="give up after this long without a good VGV_STATUS (default 0.5)"
+    )
+    parser.add_argument("--wait", metavar="S", type=float, default=10.0, help="wait this long for the first VGV_STATUS (default 10)")
+    parser.add_argument("--mode", choices=("run", "standby"), default="run", help="mode asked for with a profile or log (default run)")
+    parser.add_argument("--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)")
+    station.add_realtime_options(parser)
+    cli.add_output_options(parser)
+    parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
+
+
+def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
+    """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed one."""
+    from hil import ecu
+    from tables import InputError
+
+    if args.profile and args.log:
+        raise InputError("--profile and --log exclude each other")
+    if args.log:
+        from hil.logs import read_log
+
+        return ecu.demand_of_log(read_log(args.log))
+    name = args.profile or default
+    if name is None:
+        return None
+    if name in ecu.BUILTIN:
+        return ecu.builtin(name)
+    path = Path(name)
+    if name == "engine-test" or (path.suffix.lower() == ".toml" and path.is_file() and "speed" in ecu.read_toml(path)):
+        import numpy as np
+
+        from app.engine_test import load_profile
+
+        n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
+        return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
+    if not path.suffix:
+        raise InputError(f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)")
+    return ecu.read_profile(path)
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from controller.firmware import FAULTS, MODES
+    from hil.bus import Port
+    from hil.ecu import EcuStation, Typed
+    from hil.node import Ecu
+    from hil.realtime import Ticker, run_realtime, stop_on_signals
+    from tables import InputError
+
+    station.check_realtime_options(args)
+    station.check_seconds(args, "timeout", "wait")
+    if args.seed is not None and args.seed < 0:
+        raise InputError(f"--seed (={args.seed}) must be 0 or more")
+    name = station.bus_name(args)
+    if name.partition(":")[0] == "lockstep":
+        raise InputError("--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own")
+    demand = demand_of(args)
+    typed = Typed() if demand is None else None
+    source: Any = typed if demand is None else demand
+    station.warm_nodes(args)
+    first = 60.0 if demand is None else float(demand.per_frame()[0, 0])
+    ecu = EcuStation(
+        source, timeout=args.timeout, wait=args.wait, mode_request=int(args.mode == "run"),
+        ecu=Ecu(n_dem=first, seed=args.seed),
+    )  # fmt: skip
+    duration = args.duration if args.duration is not None or demand is None else demand.duration
+    complaint = ""
+    with stop_on_signals() as stop, station.joined(name, can_filters=station.ACCEPTED) as bus, _typing(args, typed):
+        port = Port(bus)
+        live = station.Live(args)
+
+        def show(report: Any) -> None:
+            v = ecu.ecu.values
+            state = "waiting" if ecu.met is None else MODES[int(v["state"])]
+            faults = ", ".join(f for bit, f in enumerate(FAULTS) if v["faults"] == v["faults"] and int(v["faults"]) >> bit & 1)
+            n_dem, n_r, _ = ecu.ecu.arrays.demand
+            n_r = ecu.ecu.arrays.s[0, 0] if n_r != n_r else n_r
+            note = typed.complaint if typed is not None else ""
+            live.say(
+                f"{ecu.t:>6.0f} s  n_dem {n_dem:6.2f} %  n_r {n_r:6.2f} %  {state:<9}  x_dem {v['x_dem']:6.2f}  "
+                f"x_lvdt {v['x_lvdt']:6.2f} mm  vigv {v['vigv']:6.2f} deg  {faults}  {note}"
+            )
+            if typed is not None:
+                typed.complaint = ""
+
+        cli.say(args, f"ECU on {name}, {args.profile or args.log or Typed.HELP}; Ctrl-C ends")
+        try:
+            with station.undisturbed(args) as notes:
+                report = run_realtime(
+                    ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop, live=show if live.on else None,
+                    watch=ecu.watcher(duration),
+                )  # fmt: skip
+        finally:
+            live.close()
+    if report.failed:
+        complaint = report.failed
+    elif report.ended not in ("done", "quit", *("SIGINT", "SIGTERM", "SIGHUP")):
+        complaint = report.ended
+    values, receivers = ecu.ecu.values, ecu.ecu.arrays.receiver
+    state = MODES[int(values["state"])] if values["state"] == values["state"] else "never heard"
+    good, lost = int(receivers[:, 0].sum()), int(receivers[:, 7].sum())
+    ended = f", ended by {report.ended}" if report.ended.startswith("SIG") else ""
+    cli.say(args, f"{ecu.t:,.3f} s of demand on {name}{ended}; controller: {state}")
+    cli.say(args, f"frames: {report.sent:,} sent, {port.refused:,} not taken by the bus; from the controller {good:,} good, {lost:,} lost")
+    f = report.begin.figures()
+    cli.say(args, f"lateness: p50 {f['p50_us']:,.1f}, p99 {f['p99_us']:,.1f}, max {f['max_us']:,.1f} us; missed ticks {report.missed:,}")
+    if complaint:
+        print(f"vaneloop ecu: {complaint}", file=sys.stderr)
+    cli.write_json(args, {
+        "schema": 1, "bus": name, "ended": report.ended or "done", "demand_s": ecu.t, "state": state, "values": values,
+        "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost, "lost_by_reader": port.lost},
+        **station.realtime_json(report), "notes": notes, "complaint": complaint,
+    })  # fmt: skip
+    return 1 if complaint else 0
+
+
+# ---- typing -------------------------------------------------------------------------------------------------------------------------
+
+KEYS = {"\x1b[A": "+1", "\x1b[B": "-1", "\x1b[5~": "+5", "\x1b[6~": "-5", "+": "+1", "-": "-1", "r": "run", "s": "standby", "q": "quit"}
+
+
+@contextlib.contextmanager
+def _typing(args: argparse.Namespace, typed: Any) -> Iterator[None]:
+    """Give what comes through standard input to ``typed``: keys of a terminal that is ours, lines otherwise."""
+    if typed is None or sys.stdin is None or sys.stdin.closed:
+        yield
+        return
+    fd = sys.stdin.fileno()
+    ours = os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
+    if os.isatty(fd) and not ours:  # started with &: the terminal is the shell's
+        yield
+        return
+    if not ours:
+        threading.Thread(target=_lines, args=(args, fd, typed), daemon=True).start()
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(fd)
+    tty.setcbreak(fd)
+    threading.Thread(target=_keys, args=(fd, typed), daemon=True).start()
+    try:
+        yield
+    finally:
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def _lines(args: argparse.Namespace, fd: int, typed: Any) -> None:
+    rest = b""
+    while True:
+        try:
+            data = os.read(fd, 4096)
+        except OSError:
+            return
+        *lines, rest = (rest + data).split(b"\n")
+        if not data:
+            lines.append(rest)
+        for line in lines:
+            typed.line(line.decode(errors="replace"))
+            if typed.complaint:
+                print(f"vaneloop ecu: {typed.complaint}", file=sys.stderr, flush=True)
+                typed.complaint = ""
+        if not data:
+            return
+
+
+def _keys(fd: int, typed: Any) -> None:
+    number = ""
+    while not typed.quit:
+        if not select.select([fd], [], [], 0.2)[0]:
+            continue
+        text = os.read(fd, 64).decode(errors="replace")
+        if text in KEYS and not number:
+            typed.line(KEYS[text])
+            continue
+        for c in text:
+            if c in "\r\n":
+                typed.line(number)
+                number = ""
+            elif c in "\x7f\b":
+                number = number[:-1]
+            elif c.isdigit() or c in ".+-" or (c.isalpha() and len(number) < 20):
+                number = KEYS[c] if c in "rsq" and not number else number + c
+                if number in ("run", "standby", "quit"):
+                    typed.line(number)
+                    number = ""

@@ -1,0 +1,299 @@
+"""``vaneloop run``: controller and plant as a node on the bus, in real time or in lockstep."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from app import station
+from hil import cli
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Controller with its plant as a node on the CAN bus: it takes ECU_DEMAND and sends VGV_STATUS, VGV_SERVO, VGV_ANGLES and
+VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real time, until --duration or Ctrl-C; at the end it says how late
+its ticks were. On lockstep in simulated time with an ECU of its own, or with the frames of a record (--inputs).
+
+examples:
+  vaneloop run --bus vcan0                      (and in another terminal: vaneloop ecu --bus vcan0 --profile ramp)
+  vaneloop run --bus local --duration 60 --record run.mf4 --limit-late-us 2000
+  vaneloop run --bus lockstep --profile slam --record slam.log
+  vaneloop run --bus lockstep --inputs run.mf4  the recorded run again: must send the same frames, bit for bit
+
+exit codes: 0 good (also after Ctrl-C), 1 a limit is exceeded, the repeated run differs or the record is incomplete, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--bus", metavar="B", help=f"{station.BUS_HELP}, or lockstep (simulated time); default: vcan0 if there is one, else local"
+    )
+    parser.add_argument(
+        "--duration", metavar="S", type=float, help="seconds to run (default: until Ctrl-C; in lockstep the profile's or the record's)"
+    )
+    parser.add_argument(
+        "--record", metavar="F", help="record the frames taken and sent, at their ticks: .log (candump), .blf, .mf4 or .parquet"
+    )
+    parser.add_argument("--limit-late-us", metavar="N", type=float, help="exit 1 if a tick began more than N us after its deadline")
+    parser.add_argument(
+        "--limit-share", metavar="P", type=float, default=0.0, help="per cent of ticks that may be later than --limit-late-us (default 0)"
+    )
+    parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
+    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects of the machine")
+    parser.add_argument(
+        "--start-speed", metavar="N", type=float, default=60.0, help="rotor speed, %%, that the machine starts at (default 60)"
+    )
+    group = parser.add_argument_group("lockstep")
+    group.add_argument("--inputs", metavar="RECORD", help="repeat a recorded run with the frames it took; compare the frames it sent")
+    group.add_argument("--profile", metavar="F", help="demand of the run's own ECU: as in vaneloop ecu (default: ramp)")
+    group.add_argument("--log", metavar="F", help="demand of the run's own ECU from a log")
+    station.add_realtime_options(parser)
+    cli.add_output_options(parser)
+    parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from tables import InputError
+
+    station.check_realtime_options(args)
+    if args.limit_late_us is not None and not args.limit_late_us >= 0.0:
+        raise InputError(f"--limit-late-us (={args.limit_late_us:g}) must be 0 or more")
+    if not 0.0 <= args.limit_share < 100.0:
+        raise InputError(f"--limit-share (={args.limit_share:g} %) must be in [0, 100)")
+    if not 0.0 <= args.start_speed <= 120.0:
+        raise InputError(f"--start-speed (={args.start_speed:g} %) must be in [0, 120]")
+    if args.seed is not None and args.seed < 0:
+        raise InputError(f"--seed (={args.seed}) must be 0 or more")
+    if args.record:
+        from hil.recorder import check_name
+
+        check_name(args.record)
+    name = station.bus_name(args)
+    lockstep = name.partition(":")[0] == "lockstep"
+    for option in ("inputs", "profile", "log"):
+        if getattr(args, option) and not lockstep:
+            raise InputError(f"--{option} is for --bus lockstep; on {name} the demand comes from the bus: vaneloop ecu --bus {name}")
+    if lockstep and args.limit_late_us is not None:
+        raise InputError("--limit-late-us is for real time; --bus lockstep is never late")
+    if sum(bool(o) for o in (args.inputs, args.profile, args.log)) > 1:
+        raise InputError("--inputs, --profile and --log exclude each other")
+    if not lockstep:
+        return _in_real_time(args, name)
+    return _repeat(args) if args.inputs else _in_lockstep(args, name)
+
+
+def _node(args: argparse.Namespace) -> Any:
+    from hil.node import Node
+
+    machine = station.machine_of(args)
+    station.warm_nodes(args)
+    return Node(machine, n_r=args.start_speed, seed=args.seed)
+
+
+def _node_json(node: Any) -> dict[str, Any]:
+    from controller import FAULTS
+
+    faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
+    return {"mode": node.mode, "faults": faults, "counts": node.counts, "state_hash": node.fingerprint()}
+
+
+def _say_node(args: argparse.Namespace, node: Any) -> None:
+    c, state = node.counts, _node_json(node)
+    faults = ", ".join(state["faults"]) or "none"
+    refused = sum(c[k] for k in ("wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind"))
+    cli.say(args, f"controller: {node.mode}; faults now: {faults}; ECU_DEMAND good {c['good']:,}, lost {c['lost']:,}, refused {refused:,}")
+    cli.say(args, f"state hash: {state['state_hash']}")
+
+
+# ---- real time ----------------------------------------------------------------------------------------------------------------------
+
+
+def _in_real_time(args: argparse.Namespace, name: str) -> int:
+    from hil.bus import Port
+    from hil.realtime import Ticker, run_realtime, stop_on_signals
+
+    node = _node(args)
+    ticks = None if args.duration is None else round(args.duration * 1000)
+    with stop_on_signals() as stop, station.joined(name, can_filters=station.ACCEPTED) as bus:
+        port = Port(bus)
+        live = station.Live(args)
+
+        def show(report: Any) -> None:
+            begin = report.begin
+            live.say(
+                f"{report.ticks // 1000:>6} s  {node.mode:<9}  late: p99 {begin.quantile(0.99):.0f}, p99.9 {begin.quantile(0.999):.0f}, "
+                f"max {begin.worst_ns / 1000:.0f} us  missed {report.missed}  frames in {report.received}, out {report.sent}"
+            )
+
+        with station.recording(args, name) as recorder:
+            cli.say(args, f"controller and plant on {name}, 1 kHz{'' if ticks is None else f', {args.duration:g} s'}; Ctrl-C ends")
+            try:
+                with station.undisturbed(args) as notes:
+                    report = run_realtime(
+                        node, port, ticks=ticks, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
+                        put=recorder.put if recorder is not None else None, live=show if live.on else None,
+                    )  # fmt: skip
+            finally:
+                live.close()
+    for note in notes:
+        cli.say(args, f"note: {note}")
+    cli.say(args, f"{report.ticks / 1000:,.3f} s on {name}{f', ended by {report.ended}' if report.ended else ''}")
+    station.print_lateness(args, report)
+    cli.say(args, f"frames: {report.received:,} taken, {report.sent:,} sent, {port.refused:,} not taken by the bus, {port.lost:,} lost")
+    _say_node(args, node)
+    exceeded = []
+    if report.failed:
+        exceeded.append(report.failed)
+    if args.limit_late_us is not None:
+        worst = report.begin.worst_ns * 1e-3
+        share = 100.0 * (report.begin.share_over(args.limit_late_us) if args.limit_share else float(worst > args.limit_late_us))
+        if share > args.limit_share:
+            what = f"{share:.3f} % of ticks" if args.limit_share else f"a tick ({worst:,.1f} us)"
+            allowed = f"; allowed: {args.limit_share:g} %" if args.limit_share else ""
+            exceeded.append(f"{what} began later than the limit of {args.limit_late_us:g} us{allowed}")
+    record = _record_json(args, recorder, exceeded)
+    for line in exceeded:
+        cli.say(args, f"exceeded: {line}")
+    cli.write_json(args, {
+        "schema": 1, "bus": name, "time": "real", "ended": report.ended, **station.realtime_json(report),
+        "policy": args.policy, "realtime_priority": args.realtime_priority, "spin_us": args.spin_us, "notes": notes,
+        "frames": {"received": report.received, "sent": report.sent, "refused": port.refused, "lost": port.lost, "bus_errors": port.errors},
+        **_node_json(node), "record": record, "exceeded": exceeded,
+    })  # fmt: skip
+    return 1 if exceeded else 0
+
+
+def _record_json(args: argparse.Namespace, recorder: Any, exceeded: list[str]) -> dict[str, Any] | None:
+    """Say what is in the record; what is not goes into ``exceeded``."""
+    if recorder is None:
+        return None
+    if recorder.error:
+        exceeded.append(f"the record is incomplete: {recorder.error}")
+    elif recorder.lost:
+        exceeded.append(f"the record is incomplete: the disk was too slow for {recorder.lost:,} frames")
+    cli.say(args, f"record: {args.record}, {recorder.frames:,} frames")
+    return {"path": args.record, "frames": recorder.frames, "lost": recorder.lost, "error": recorder.error}
+
+
+# ---- lockstep -----------------------------------------------------------------------------------------------------------------------
+
+
+def _in_lockstep(args: argparse.Namespace, name: str) -> int:
+    import time
+
+    import numpy as np
+
+    from app.ecu import demand_of
+    from hil.ecu import EcuStation
+    from hil.node import Ecu
+    from hil.realtime import packed
+    from hil.recorder import Recorder
+
+    demand = demand_of(args, default="ramp")
+    node = _node(args)
+    first = float(demand.per_frame()[0, 0])
+    ecu = EcuStation(demand, ecu=Ecu(n_dem=first, seed=None if args.seed is None else args.seed + 1))
+    duration = args.duration if args.duration is not None else demand.duration
+    ticks = round(duration * 1000)
+    recorder = Recorder(args.record, "lockstep") if args.record else None
+    start = time.time_ns() // 10**9 * 10**9
+    to_node, to_ecu = np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64)
+    started = time.perf_counter()
+    try:
+        with cli.progress_bar(args, "lockstep") as progress:
+            for k in range(ticks):
+                taken = to_node
+                to_node = ecu.tick(to_ecu, len(to_ecu)).copy()
+                to_ecu = node.tick(taken, len(taken)).copy()
+                if recorder is not None and (len(taken) or len(to_ecu)):
+                    recorder.put(packed(start + k * 10**6, taken, to_ecu))
+                    if k % 1000 == 0:
+                        recorder.poll()
+                if progress is not None and k % 1000 == 0:
+                    progress(k / ticks)
+    finally:
+        if recorder is not None:
+            recorder.close()
+    wall = time.perf_counter() - started
+    cli.say(args, f"{ticks / 1000:,.3f} s simulated in {wall:.2f} s ({ticks / 1000 / wall:,.0f} times real time)")
+    _say_node(args, node)
+    if recorder is not None:
+        cli.say(args, f"record: {args.record}, {recorder.frames:,} frames")
+    cli.write_json(args, {
+        "schema": 1, "bus": name, "time": "simulated", "ticks": ticks, "simulated_s": ticks / 1000, "wall_s": wall, **_node_json(node),
+        "record": {"path": args.record, "frames": recorder.frames} if recorder is not None else None, "exceeded": [],
+    })  # fmt: skip
+    return 0
+
+
+def _repeat(args: argparse.Namespace) -> int:
+    import time
+
+    import numpy as np
+
+    from hil.frames import NAMES
+    from hil.node import replay
+    from hil.recorder import read_record
+    from tables import InputError
+
+    record = read_record(args.inputs)
+    node = _node(args)
+    # the first frame sent is VGV_STATUS of tick 0; a record of another program's knows no directions and begins with its first frame
+    start = record.ms[np.argmax(record.sent)] if record.sent.any() else record.ms[0]
+    tick = record.ms - start
+    taken = ~record.sent
+    if (tick[taken] < 0).any():
+        raise InputError(f"{args.inputs}: frames were taken before the first one was sent: not a record of vaneloop run")
+    last = int(tick[-1]) + 1
+    ticks = last if args.duration is None else round(args.duration * 1000)  # a run ends up to 9 ticks after the last frame it sent
+    started = time.perf_counter()
+    at, sent = replay(node, tick[taken], record.rows[taken], ticks)
+    wall = time.perf_counter() - started
+    held = record.sent & (tick < ticks)
+    was_at, was = tick[held], record.rows[held]
+    cli.say(args, f"{ticks / 1000:,.3f} s of {args.inputs} repeated in {wall:.2f} s ({ticks / 1000 / wall:,.0f} times real time)")
+    exceeded: list[str] = []
+    if not len(was):
+        cli.say(args, "the record says of no frame that it was sent: nothing to compare with")
+    else:
+        n = min(len(was), len(sent))
+        same = (was_at[:n] == at[:n]) & (was[:n] == sent[:n]).all(axis=1)
+        if not same.all():
+            k = int(np.argmin(same))
+            before, now = (
+                f"tick {int(tick):,} {NAMES.get(int(row[0]) & 0x7FF, '?')} {int(row[1]).to_bytes(8, 'little', signed=True).hex().upper()}"
+                for tick, row in ((was_at[k], was[k]), (at[k], sent[k]))
+            )
+            needed = "the same --seed, --model and --start-speed are needed"
+            exceeded.append(f"frame {k + 1:,} of {len(was):,}: {before} was sent, now {now}; {needed}")
+        elif len(was) != len(sent):
+            exceeded.append(f"{len(was):,} frames were sent, now {len(sent):,}")
+        else:
+            cli.say(args, f"all {len(was):,} frames sent are the same, bit for bit, in the same ticks")
+    _say_node(args, node)
+    for line in exceeded:
+        cli.say(args, f"differs: {line}")
+    cli.write_json(args, {
+        "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks, "simulated_s": ticks / 1000,
+        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "exceeded": exceeded,
+    })  # fmt: skip
+    if args.record:
+        _write_repeated(args, record.rows[taken], tick[taken], at, sent, int(start))
+    return 1 if exceeded else 0
+
+
+def _write_repeated(args: argparse.Namespace, received: Any, received_at: Any, at: Any, sent: Any, start: int) -> None:
+    """Record the repeated run as the first one was."""
+    import numpy as np
+
+    from hil.realtime import packed
+    from hil.recorder import Recorder
+
+    recorder = Recorder(args.record, "lockstep")
+    for k in np.union1d(received_at, at).tolist():
+        a, b = np.searchsorted(received_at, [k, k + 1])
+        c, d = np.searchsorted(at, [k, k + 1])
+        recorder.put(packed((start + k) * 10**6, received[a:b], sent[c:d]))
+    recorder.close()
+    cli.say(args, f"record: {args.record}, {recorder.frames:,} frames")
