@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="F", help="speed demand: a name, or a file (.toml, .csv)")
     parser.add_argument("--log", metavar="F", help="speed demand, and measured speed if it has one, from any log (docs/logs.md)")
     parser.add_argument(
-        "--duration", metavar="S", type=float, help="seconds from the first VGV_STATUS on (default: the profile's, the log's; typed: no end)"
+        "--duration", metavar="S", type=float, help="seconds from the first VGV_STATUS on (default: the profile's, the log's)"
     )
     parser.add_argument(
         "--timeout", metavar="S", type=float, default=0.5, help="give up after this long without a good VGV_STATUS (default 0.5)"
