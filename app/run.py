@@ -93,9 +93,11 @@ def _node(args: argparse.Namespace) -> Any:
 
 def _node_json(node: Any) -> dict[str, Any]:
     from controller import FAULTS
+    from controller.firmware import N_DEM
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
-    return {"mode": node.mode, "faults": faults, "counts": node.counts, "state_hash": node.fingerprint()}
+    n_dem = float(node.arrays.z[N_DEM])
+    return {"mode": node.mode, "n_dem": n_dem, "faults": faults, "counts": node.counts, "state_hash": node.fingerprint()}
 
 
 def _say_node(args: argparse.Namespace, node: Any) -> None:

@@ -301,7 +301,8 @@ def run_realtime(
     """
     from can import CanError
 
-    ticker, stop = ticker or Ticker(), stop or Stop()
+    ticker = ticker or Ticker()
+    stop = Stop() if stop is None else stop  # one that nobody has asked yet is false
     rows = np.zeros((MOST_READ, 2), np.int64)
     report = Report()
     read, write, tick, clock = port.read, port.write, node.tick, time.monotonic_ns

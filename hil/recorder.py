@@ -521,7 +521,8 @@ class Recorder:
 
     def put(self, frames: bytes) -> None:
         """Take frames (bytes of FRAME)."""
-        self._waiting.append(frames)
+        if frames:
+            self._waiting.append(frames)
 
     def poll(self) -> None:
         """Append what has come in, if it is time. Raises InputError where the file cannot be written: it then ends before these frames."""

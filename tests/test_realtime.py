@@ -1,0 +1,433 @@
+"""Real time: lateness, overruns, clean ends; controller and ECU as two processes; a recorded run again in lockstep."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.main import main
+from hil.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, read_profile
+from hil.logs import read_log
+from hil.node import Ecu, Node
+from hil.realtime import TICK_NS, Lateness, Stop, Ticker, run_realtime, stop_on_signals, undisturbed
+from hil.recorder import read_record
+from tables import InputError
+from tests.conftest import ROOT
+
+COMMAND = [sys.executable, "-m", "app.main"]
+_number = count()
+
+
+@pytest.fixture
+def own_bus() -> str:
+    """Name of an embedded bus that no other test uses."""
+    return f"local:test{os.getpid()}-{next(_number)}"
+
+
+def start(*args: str, **options: Any) -> subprocess.Popen[str]:
+    """Start a command in a process of its own, with both outputs in pipes."""
+    return subprocess.Popen([*COMMAND, *args], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def ended(process: subprocess.Popen[str], timeout: float = 120.0) -> tuple[int, str, str]:
+    """Wait for a command; return its exit code, output and complaints."""
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+    assert "Traceback" not in err, err
+    return process.returncode, out, err
+
+
+def follow(process: subprocess.Popen[str], text: str) -> None:
+    """Read the command's standard output up to a line with ``text``."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if text in line:
+            return
+    raise AssertionError(f"ended without saying {text!r}: {process.communicate()}")
+
+
+# ---- clock and figures --------------------------------------------------------------------------------------------------------------
+
+
+def test_percentiles_are_those_of_all_times_to_a_bin() -> None:
+    rng = np.random.default_rng(1)
+    times = (10 ** rng.uniform(1, 9.5, 20_000)).astype(np.int64)  # 10 ns to 3 s
+    h = Lateness()
+    for k, ns in enumerate(times.tolist()):
+        h.add(ns, k)
+    for q in (0.5, 0.9, 0.99, 0.999):
+        exact = float(np.sort(times)[int(np.ceil(q * len(times))) - 1]) * 1e-3
+        assert exact <= h.quantile(q) <= max(exact * 1.011, exact + 0.1)
+    assert h.quantile(1.0) == times.max() * 1e-3
+    assert h.worst_tick == int(times.argmax())
+    assert h.count == len(times) == sum(n for _, n in h.shown())
+    assert h.share_over(500.0) == pytest.approx(float((times >= 500_000).mean()))
+
+
+@pytest.mark.parametrize("policy", ["catch-up", "skip"])
+def test_a_stall_is_caught_up_or_skipped_as_the_policy_says(policy: str) -> None:
+    ticker = Ticker(policy=policy)
+    ticker.begin()
+    ticker.wait()
+    time.sleep(0.030)
+    ticks = 0
+    while ticks < 200:
+        ticker.wait()
+        ticks += 1
+    elapsed = (ticker.deadline - ticker.start) // TICK_NS  # deadlines passed or set: firmware's ticks and those left out
+    assert elapsed == ticks + 1 + ticker.skipped
+    if policy == "skip":
+        assert ticker.skipped >= 29
+    else:
+        assert ticker.skipped == 0 and ticker.missed >= 28
+
+
+def test_a_long_stall_is_skipped_under_either_policy() -> None:
+    ticker = Ticker(policy="catch-up")
+    ticker.begin()
+    ticker.wait()
+    time.sleep(0.15)
+    late = ticker.wait()
+    assert late >= 140 * TICK_NS and ticker.skipped >= 140
+    assert ticker.deadline > time.monotonic_ns() - 50 * TICK_NS
+
+
+def test_no_tick_begins_before_its_deadline() -> None:
+    ticker = Ticker(spin_us=200.0)
+    ticker.begin()
+    for k in range(100):
+        assert ticker.wait() >= 0
+        assert time.monotonic_ns() >= ticker.start + k * TICK_NS
+
+
+class Silent:
+    """A bus on which nothing happens; ``at_tick`` is called with the number of each read."""
+
+    def __init__(self, at_tick: Any = None):
+        self.reads, self.at_tick = 0, at_tick
+
+    def read(self, rows: np.ndarray) -> int:
+        self.reads += 1
+        if self.at_tick is not None:
+            self.at_tick(self.reads)
+        return 0
+
+    def write(self, rows: np.ndarray) -> int:
+        return len(rows)
+
+
+def test_a_signal_ends_the_run_after_a_whole_tick() -> None:
+    node = Node()
+    with stop_on_signals() as stop:
+        report = run_realtime(node, Silent(lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 20 else None), stop=stop)
+    assert report.ended == "SIGTERM"
+    assert node.k == report.ticks == report.begin.count == 19  # one read before the first tick empties the bus
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_stop_asked_for_later_is_heard() -> None:
+    stop = Stop()
+
+    def ask(n: int) -> None:
+        stop.asked = "enough" if n > 5 else ""
+
+    assert run_realtime(Node(), Silent(ask), stop=stop, ticks=1000).ticks < 10
+
+
+def test_memory_is_unlocked_and_collection_on_again_afterwards() -> None:
+    import gc
+
+    with undisturbed() as notes:
+        assert not gc.isenabled()
+        assert all("memory is not locked" in n for n in notes)
+    assert gc.isenabled()
+    locked = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmLck"))
+    assert locked.split()[1] == "0"
+
+
+# ---- the ECU's demand ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BUILTIN)
+def test_builtin_profiles_are_demands_that_the_firmware_takes(name: str) -> None:
+    rows = builtin(name).per_frame()
+    assert len(rows) > 100 and (rows[:, 0] >= 40).all() and (rows[:, 0] <= 100).all() and np.isnan(rows[:, 1]).all()
+
+
+def test_a_profile_is_straight_lines_and_the_same_in_both_formats(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text("t = [5, 6, 6.01, 8]\nn_dem = [60, 70, 80, 80]\n")
+    (tmp_path / "p.csv").write_text("t,n_dem\n5,60\n6,70\n6.01,80\n8,80\n")
+    a, b = read_profile(tmp_path / "p.toml").per_frame(), read_profile(tmp_path / "p.csv").per_frame()
+    assert np.array_equal(a, b, equal_nan=True)
+    assert len(a) == 301
+    assert a[[0, 50, 100, 101, 300], 0] == pytest.approx([60, 65, 70, 80, 80])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("t = [0, 1]\n", "n_dem must be a list of numbers"),
+        ("t = [0, 1]\nn_dem = [60]\n", "t has 2 numbers, n_dem 1"),
+        ("t = [0, 1, 1]\nn_dem = [60, 61, 62]\n", r"t \(=1 s after 1 s\) must increase"),
+        ("t = [0, 1]\nn_dem = [60, 121]\n", r"n_dem \(=121 %\) must be in \[0, 120\]"),
+        ("t = [0, nan]\nn_dem = [60, 61]\n", "must be finite"),
+        ("t = [0, 1]\nn_dem = [60, 61]\nrate = 3\n", "'rate' is unknown"),
+        ("t = [0, 1\n", "is not TOML"),
+    ],
+)
+def test_a_wrong_profile_is_refused_in_one_line(text: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text(text)
+    with pytest.raises(InputError, match=says) as e:
+        read_profile(tmp_path / "p.toml")
+    assert "\n" not in str(e.value)
+
+
+def test_typed_lines_set_the_demand_and_nonsense_is_refused() -> None:
+    typed = Typed()
+    for line, n_dem, request in [("70", 70, 1), ("+5", 75, 1), ("-0.5", 74.5, 1), ("standby", 74.5, 0), ("", 74.5, 0), ("run", 74.5, 1)]:
+        typed.line(line)
+        assert (typed.n_dem, typed.mode_request, typed.complaint) == (n_dem, request, "")
+    for line in ("121", "-200", "nan", "1e9", "up"):
+        typed.line(line)
+        assert typed.n_dem == 74.5 and typed.complaint
+        typed.complaint = ""
+    typed.line("quit")
+    assert typed.quit
+
+
+def test_the_demand_begins_with_the_first_good_status_and_silence_ends_it() -> None:
+    demand = Demand(np.array([0.0, 10.0]), np.array([60.0, 70.0]))
+    ecu, node, watch = EcuStation(demand, timeout=0.1, wait=2.0, ecu=Ecu(n_dem=60.0)), Node(), None
+    watch = ecu.watcher(None)
+    to_ecu = to_node = np.zeros((0, 2), np.int64)
+    met = end = None
+    for k in range(3000):
+        taken = to_node
+        to_node = ecu.tick(to_ecu, len(to_ecu)).copy()
+        to_ecu = node.tick(taken, len(taken)).copy() if 300 <= k < 2300 else to_ecu[:0]
+        if ecu.met is not None and met is None:
+            met = k
+        if (why := watch(k)) is not None:
+            end = why
+            break
+    assert met is not None and 300 < met < 330
+    assert end == f"timed out: no good VGV_STATUS for 0.10 s at t = {(k - met) / 1000:.2f} s" and 2380 < k < 2402
+    assert ecu.ecu.arrays.demand[0] == pytest.approx(60.0 + (k - met) / 1000, abs=0.011)
+    assert EcuStation(demand, wait=0.5).watcher(None)(500) == "no good VGV_STATUS within 0.5 s: is a controller running?"
+
+
+# ---- bad input ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["run", "--bus", "nosuch"], "'nosuch' is not known"),
+        (["run", "--bus", "local", "--duration", "0"], "--duration (=0 s) must be above 0"),
+        (["run", "--bus", "local", "--duration", "nan"], "--duration (=nan s) must be above 0"),
+        (["run", "--bus", "local", "--realtime-priority", "100"], "--realtime-priority (=100) must be in [1, 99]"),
+        (["run", "--bus", "local", "--limit-late-us", "-1"], "--limit-late-us (=-1) must be 0 or more"),
+        (["run", "--bus", "local", "--inputs", "x.log"], "--inputs is for --bus lockstep"),
+        (["run", "--bus", "local", "--cpu", "999"], "--cpu (=999) must be one of"),
+        (["run", "--bus", "local", "--record", "x.csv"], "suffix '.csv' is not one of a recording"),
+        (["run", "--bus", "lockstep", "--inputs", "no.log"], "no.log: cannot be read"),
+        (["run", "--bus", "lockstep", "--profile", "nosuch"], "--profile 'nosuch' is not known; allowed: idle"),
+        (["run", "--bus", "lockstep", "--limit-late-us", "5"], "--limit-late-us is for real time"),
+        (["run", "--bus", "lockstep", "--model", "no.toml"], "no.toml"),
+        (["ecu", "--bus", "lockstep"], "vaneloop run --bus lockstep --profile F"),
+        (["ecu", "--bus", "local", "--log", "no.csv"], "no.csv: cannot be read"),
+        (["ecu", "--bus", "local", "--log", "a.csv", "--profile", "idle"], "exclude each other"),
+        (["ecu", "--bus", "local", "--timeout", "0"], "--timeout (=0 s) must be above 0"),
+        (["record", "x.log", "--bus", "lockstep"], "--bus lockstep exists within one process"),
+        (["record", "x.txt"], "suffix '.txt'"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(args: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(args) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and says in err
+
+
+# ---- commands -----------------------------------------------------------------------------------------------------------------------
+
+
+def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> None:
+    """Controller and ECU as two processes for ``seconds``; both end well, the record is complete and repeats bit for bit."""
+    record, told = folder / "run.mf4", folder / "run.json"
+    run = start("run", "--bus", bus, "--record", str(record), "--json", str(told), "--seed", "5")
+    ecu = start("ecu", "--bus", bus, "--profile", "sine", "--duration", str(seconds), "--wait", "60", "--timeout", "5", "--json", "-")
+    code, out, err = ended(ecu, seconds + 120)
+    run.send_signal(signal.SIGINT)
+    run_code, run_out, run_err = ended(run)
+    assert code == 0, err
+    heard = json.loads(out)
+    assert heard["state"] == "RUN" and heard["demand_s"] >= seconds and heard["values"]["faults"] == 0
+    assert heard["frames"]["lost"] == 0
+    assert run_code == 0, run_err
+    said = json.loads(told.read_text())
+    assert said["ended"] == "SIGINT" and said["frames"]["lost"] == said["frames"]["refused"] == 0
+    sent = heard["frames"]["sent"]
+    assert said["counts"]["good"] + said["counts"]["sync"] <= sent and said["counts"]["good"] >= 95 * seconds
+    assert said["ticks"] >= 1000 * seconds and sum(b["ticks"] for b in said["lateness"]["histogram"]) == said["ticks"]
+    for part in ("p50", "p99", "p99.9", "max", "missed ticks", "worst tick", "state hash"):
+        assert part in run_out
+    held = read_record(record)
+    assert len(held.ms) == said["record"]["frames"] == said["frames"]["received"] + said["frames"]["sent"]
+    n_dem = read_log(record).channels["n_dem"]
+    assert n_dem.values.max() > 80.0
+    again = ended(start("run", "--bus", "lockstep", "--inputs", str(record), "--seed", "5", "--duration", str(said["ticks"] / 1000), "--json", "-"))
+    assert again[0] == 0, again
+    repeated = json.loads(again[1])
+    assert repeated["same"] and repeated["compared"] == said["frames"]["sent"]
+    assert repeated["state_hash"] == said["state_hash"]
+
+
+class TestRunAndEcu:
+    """Two processes on a bus."""
+
+    def test_on_the_embedded_bus(self, own_bus: str, tmp_path: Path) -> None:
+        check_run_and_ecu(own_bus, 2.0, tmp_path)
+
+    @pytest.mark.socketcan
+    def test_on_vcan0_for_60_seconds(self, tmp_path: Path) -> None:
+        check_run_and_ecu("vcan0", 60.0, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folder with a real-time run in which things happened: a stall of 0.4 s, the ECU gone before the end; and what was said of it."""
+    folder = tmp_path_factory.mktemp("recorded")
+    bus = f"local:recorded{os.getpid()}"
+    run = start("run", "--bus", bus, "--record", str(folder / "run.log"), "--json", str(folder / "run.json"), "--live", "--limit-late-us", "1e5")
+    ecu = start("ecu", "--bus", bus, "--profile", "staircase", "--wait", "60", "--timeout", "0.3", "--json", str(folder / "ecu.json"))
+    assert run.stderr is not None
+    while "RUN" not in (line := run.stderr.readline()):
+        assert line
+    run.send_signal(signal.SIGSTOP)
+    time.sleep(0.6)
+    run.send_signal(signal.SIGCONT)
+    ecu_ended = ended(ecu)
+    while "FAIL_SAFE" not in (line := run.stderr.readline()):
+        assert line
+    run.send_signal(signal.SIGTERM)
+    (folder / "ended.json").write_text(json.dumps({"ecu": ecu_ended, "run": ended(run)}))
+    yield folder
+
+
+def test_a_stalled_controller_times_the_ecu_out_in_one_line(recorded: Path) -> None:
+    code, _, err = json.loads((recorded / "ended.json").read_text())["ecu"]
+    assert code == 1
+    assert err.count("\n") == 1 and "vaneloop ecu: timed out: no good VGV_STATUS for 0.3" in err
+
+
+def test_a_stall_is_reported_and_the_limit_makes_exit_code_1(recorded: Path) -> None:
+    code, out, _ = json.loads((recorded / "ended.json").read_text())["run"]
+    said = json.loads((recorded / "run.json").read_text())
+    assert code == 1 and "exceeded: a tick (" in out and said["exceeded"]
+    assert said["lateness"]["max_us"] > 400_000 and said["skipped"] > 300 and said["missed"] >= 1
+    assert said["ended"] == "SIGTERM" and said["mode"] == "FAIL_SAFE" and said["faults"] == ["demand_stale"]
+
+
+def test_a_recorded_run_repeats_in_lockstep_bit_for_bit(recorded: Path) -> None:
+    said = json.loads((recorded / "run.json").read_text())
+    args = ("run", "--bus", "lockstep", "--inputs", str(recorded / "run.log"), "--duration", str(said["ticks"] / 1000))
+    code, out, err = ended(start(*args, "--record", str(recorded / "again.log")))
+    assert code == 0, (out, err)
+    assert f"all {said['frames']['sent']:,} frames sent are the same, bit for bit, in the same ticks" in out
+    assert said["state_hash"] in out
+    first, second = ([line.split() for line in (recorded / f).read_text().splitlines()] for f in ("run.log", "again.log"))
+    assert [(t, *rest) for t, _, *rest in first] == [(t, *rest) for t, _, *rest in second]
+
+
+def test_a_changed_frame_is_found_when_the_run_is_repeated(recorded: Path, tmp_path: Path) -> None:
+    lines = (recorded / "run.log").read_text().splitlines(keepends=True)
+    k = next(i for i, line in enumerate(lines) if " 0B0#" in line and i > len(lines) // 2)
+    lines[k] = lines[k].replace(" 0B0#", " 0B0#FF", 1)[: len(lines[k]) - 5] + " T\n"
+    (tmp_path / "changed.log").write_text("".join(lines))
+    code, out, _ = ended(start("run", "--bus", "lockstep", "--inputs", str(tmp_path / "changed.log")))
+    assert code == 1 and "differs: frame" in out and "VGV_STATUS" in out
+
+
+def test_a_lost_demand_frame_changes_the_run(recorded: Path, tmp_path: Path) -> None:
+    lines = (recorded / "run.log").read_text().splitlines(keepends=True)
+    k = [i for i, line in enumerate(lines) if " 0A0#" in line]
+    del lines[k[len(k) // 2]]
+    (tmp_path / "short.log").write_text("".join(lines))
+    code, out, _ = ended(start("run", "--bus", "lockstep", "--inputs", str(tmp_path / "short.log")))
+    assert code == 1 and "differs: frame" in out
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".mf4", ".parquet"])
+def test_a_lockstep_run_is_recorded_and_repeats(suffix: str, tmp_path: Path) -> None:
+    file = tmp_path / f"run{suffix}"
+    args = ["run", "--bus", "lockstep", "--profile", "slam", "--duration", "4", "--seed", "2"]
+    assert main([*args, "--record", str(file), "--quiet", "--json", str(tmp_path / "a.json")]) == 0
+    assert main([*args, "--quiet", "--json", str(tmp_path / "b.json")]) == 0
+    a, b = (json.loads((tmp_path / f"{x}.json").read_text()) for x in "ab")
+    assert a["state_hash"] == b["state_hash"] and a["mode"] == "RUN" and a["counts"]["good"] >= 395
+    again = ["run", "--bus", "lockstep", "--inputs", str(file), "--duration", "4"]
+    assert main([*again, "--seed", "2", "--quiet", "--json", str(tmp_path / "c.json")]) == 0
+    c = json.loads((tmp_path / "c.json").read_text())
+    assert c["same"] and c["compared"] == a["record"]["frames"] - a["frames"]["received"] and c["state_hash"] == a["state_hash"]
+    assert main([*again, "--seed", "3", "--quiet"]) == 1
+
+
+def test_a_recorded_run_is_a_log_for_replay(tmp_path: Path) -> None:
+    file = tmp_path / "run.parquet"
+    assert main(["run", "--bus", "lockstep", "--profile", "step", "--record", str(file), "--quiet"]) == 0
+    assert main(["replay", str(file), "--quiet", "--json", str(tmp_path / "r.json"), "--tolerance", "x_lvdt=0.2", "--tolerance", "vigv=0.2"]) == 0
+    signals = {s["signal"] for s in json.loads((tmp_path / "r.json").read_text())["signals"] if s["reference"] == "measured"}
+    assert {"x_dem", "x_lvdt", "i_cmd", "vigv"} <= signals
+
+
+def test_typed_demand_reaches_the_controller(own_bus: str, tmp_path: Path) -> None:
+    run = start("run", "--bus", own_bus, "--json", str(tmp_path / "run.json"))
+    ecu = start("ecu", "--bus", own_bus, "--wait", "60", "--timeout", "5", "--json", "-", stdin=subprocess.PIPE)
+    assert ecu.stdin is not None
+    follow(run, "Ctrl-C ends")
+    ecu.stdin.write("70\nfaster\n+5.5\n")
+    ecu.stdin.flush()
+    time.sleep(4.0)
+    ecu.stdin.write("quit\n")
+    ecu.stdin.flush()
+    code, out, err = ended(ecu)
+    run.send_signal(signal.SIGINT)
+    assert ended(run)[0] == 0
+    assert code == 0 and "'faster' is not known" in err
+    assert json.loads(out)["state"] == "RUN"
+    assert json.loads((tmp_path / "run.json").read_text())["n_dem"] == pytest.approx(75.5)
+
+
+def test_an_ecu_without_a_controller_gives_up_in_one_line(own_bus: str) -> None:
+    code, _, err = ended(start("ecu", "--bus", own_bus, "--profile", "idle", "--wait", "0.3"))
+    assert code == 1
+    assert err == "vaneloop ecu: no good VGV_STATUS within 0.3 s: is a controller running?\n"
+
+
+def test_priority_that_is_not_allowed_is_one_line(own_bus: str) -> None:
+    if os.geteuid() == 0:
+        if shutil.which("setpriv") is None:
+            pytest.skip("root may always; setpriv (util-linux) to give that up is not installed")
+        command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", *COMMAND]
+    else:
+        command = COMMAND
+    args = ["run", "--bus", own_bus, "--duration", "1", "--realtime-priority", "50"]
+    done = subprocess.run([*command, *args], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    if done.returncode == 0:
+        pytest.skip("this user may use SCHED_FIFO")
+    assert done.returncode == 2
+    assert done.stderr == "vaneloop: --realtime-priority 50: Operation not permitted; run as root, or allow it with ulimit -r 50\n"
