@@ -80,7 +80,7 @@ def command(args: argparse.Namespace) -> int:
         raise InputError("--inputs, --profile and --log exclude each other")
     if not lockstep:
         return _in_real_time(args, name)
-    return _repeat(args) if args.inputs else _in_lockstep(args, name)
+    return _repeat(args) if args.inputs else _in_lockstep(args)
 
 
 def _node(args: argparse.Namespace) -> Any:
@@ -181,50 +181,45 @@ def _record_json(args: argparse.Namespace, recorder: Any, exceeded: list[str]) -
 # ---- lockstep -----------------------------------------------------------------------------------------------------------------------
 
 
-def _in_lockstep(args: argparse.Namespace, name: str) -> int:
+def _in_lockstep(args: argparse.Namespace) -> int:
     import time
 
     import numpy as np
 
     from app.ecu import demand_of
-    from hil.ecu import EcuStation
-    from hil.node import Ecu
-    from hil.realtime import packed
-    from hil.recorder import Recorder
+    from hil.frames import ECU_DEMAND, IDENT_MASK
+    from hil.lockstep_bus import run_lockstep
+    from hil.node import Ecu, replay
+    from hil.wire import BIT_RATE, BITS_PER_TICK
 
     demand = demand_of(args, default="ramp")
+    profile = demand.per_frame()
     node = _node(args)
-    first = float(demand.per_frame()[0, 0])
-    ecu = EcuStation(demand, ecu=Ecu(n_dem=first, seed=None if args.seed is None else args.seed + 1))
-    duration = args.duration if args.duration is not None else demand.duration
-    ticks = round(duration * 1000)
-    recorder = Recorder(args.record, "lockstep") if args.record else None
-    start = time.time_ns() // 10**9 * 10**9
-    to_node, to_ecu = np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64)
-    started = time.perf_counter()
-    try:
-        with cli.progress_bar(args, "lockstep") as progress:
-            for k in range(ticks):
-                taken = to_node
-                to_node = ecu.tick(to_ecu, len(to_ecu)).copy()
-                to_ecu = node.tick(taken, len(taken)).copy()
-                if recorder is not None and (len(taken) or len(to_ecu)):
-                    recorder.put(packed(start + k * 10**6, taken, to_ecu))
-                    if k % 1000 == 0:
-                        recorder.poll()
-                if progress is not None and k % 1000 == 0:
-                    progress(k / ticks)
-    finally:
-        if recorder is not None:
-            recorder.close()
-    wall = time.perf_counter() - started
-    cli.say(args, f"{ticks / 1000:,.3f} s simulated in {wall:.2f} s ({ticks / 1000 / wall:,.0f} times real time)")
+    ecu = Ecu(n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
+    with cli.progress_bar(args, "lockstep") as progress:
+        run = run_lockstep(
+            profile[:, 0], profile[:, 1], vgv=node, ecu=ecu, duration=args.duration if args.duration is not None else demand.duration,
+            keep=bool(args.record), progress=progress,
+        )  # fmt: skip
+    ticks = node.k
+    cli.say(args, f"{run.simulated_s:,.3f} s simulated in {run.wall_s:.2f} s ({run.simulated_s / run.wall_s:,.0f} times real time)")
+    cli.say(args, f"bus: {run.frames:,} frames, {run.error_frames:,} error frames, load {100 * run.load:.1f} % of 500 kbit/s")
     _say_node(args, node)
-    if recorder is not None:
-        cli.say(args, f"record: {args.record}, {recorder.frames:,} frames")
+    record = None
+    if args.record:
+        # a frame is taken in the first tick that begins after its last bit; in which ticks frames were sent, the same ticks say again
+        tick = -(-np.rint(run.t * BIT_RATE).astype(np.int64) // BITS_PER_TICK)
+        taken = (run.rows[:, 0] & IDENT_MASK == ECU_DEMAND) & (tick < ticks)
+        again = _node(args)
+        at, sent = replay(again, tick[taken], run.rows[taken], ticks)
+        if again.fingerprint() != node.fingerprint():
+            raise RuntimeError("the run does not repeat with the frames that it took: a fault of vaneloop")
+        start = time.time_ns() // 10**9 * 1000
+        record = _write_record(args, run.rows[taken], tick[taken], at, sent, start)
     cli.write_json(args, {
-        "schema": 1, "bus": name, "time": "simulated", "ticks": ticks, "simulated_s": ticks / 1000, "wall_s": wall, **_node_json(node),
-        "record": {"path": args.record, "frames": recorder.frames} if recorder is not None else None, "exceeded": [],
+        "schema": 1, "bus": "lockstep", "time": "simulated", "ticks": ticks, "simulated_s": run.simulated_s, "wall_s": run.wall_s,
+        "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames}, **_node_json(node),
+        "record": record, "exceeded": [],
     })  # fmt: skip
     return 0
 
@@ -281,21 +276,26 @@ def _repeat(args: argparse.Namespace) -> int:
         "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "exceeded": exceeded,
     })  # fmt: skip
     if args.record:
-        _write_repeated(args, record.rows[taken], tick[taken], at, sent, int(start))
+        _write_record(args, record.rows[taken], tick[taken], at, sent, int(start))
     return 1 if exceeded else 0
 
 
-def _write_repeated(args: argparse.Namespace, received: Any, received_at: Any, at: Any, sent: Any, start: int) -> None:
-    """Record the repeated run as the first one was."""
+def _write_record(args: argparse.Namespace, received: Any, received_at: Any, at: Any, sent: Any, start: int) -> dict[str, Any]:
+    """Record a run in lockstep as one in real time is: frames taken and sent, with their ticks; ``start`` in ms since 1970."""
     import numpy as np
 
     from hil.realtime import packed
     from hil.recorder import Recorder
 
     recorder = Recorder(args.record, "lockstep")
-    for k in np.union1d(received_at, at).tolist():
-        a, b = np.searchsorted(received_at, [k, k + 1])
-        c, d = np.searchsorted(at, [k, k + 1])
+    if recorder.kept is not None:
+        cli.say(args, f"{args.record} was there already: it is now {recorder.kept}")
+    ticks = np.union1d(received_at, at)
+    ends = [np.searchsorted(these, ticks, side=side).tolist() for these in (received_at, at) for side in ("left", "right")]
+    for n, (k, a, b, c, d) in enumerate(zip(ticks.tolist(), *ends, strict=True), 1):
         recorder.put(packed((start + k) * 10**6, received[a:b], sent[c:d]))
+        if n % 10_000 == 0:
+            recorder.flush()
     recorder.close()
     cli.say(args, f"record: {args.record}, {recorder.frames:,} frames")
+    return {"path": args.record, "frames": recorder.frames, "taken": len(received), "sent": len(sent)}

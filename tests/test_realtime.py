@@ -289,7 +289,8 @@ def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> None:
     assert len(held.ms) == said["record"]["frames"] == said["frames"]["received"] + said["frames"]["sent"]
     n_dem = read_log(record).channels["n_dem"]
     assert n_dem.values.max() > 80.0
-    again = ended(start("run", "--bus", "lockstep", "--inputs", str(record), "--seed", "5", "--duration", str(said["ticks"] / 1000), "--json", "-"))
+    same = ("--seed", "5", "--duration", str(said["ticks"] / 1000))
+    again = ended(start("run", "--bus", "lockstep", "--inputs", str(record), *same, "--json", "-"))
     assert again[0] == 0, again
     repeated = json.loads(again[1])
     assert repeated["same"] and repeated["compared"] == said["frames"]["sent"]
@@ -312,7 +313,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Folder with a real-time run in which things happened: a stall of 0.4 s, the ECU gone before the end; and what was said of it."""
     folder = tmp_path_factory.mktemp("recorded")
     bus = f"local:recorded{os.getpid()}"
-    run = start("run", "--bus", bus, "--record", str(folder / "run.log"), "--json", str(folder / "run.json"), "--live", "--limit-late-us", "1e5")
+    told = ("--record", str(folder / "run.log"), "--json", str(folder / "run.json"))
+    run = start("run", "--bus", bus, *told, "--live", "--limit-late-us", "1e5")
     ecu = start("ecu", "--bus", bus, "--profile", "staircase", "--wait", "60", "--timeout", "0.3", "--json", str(folder / "ecu.json"))
     assert run.stderr is not None
     while "RUN" not in (line := run.stderr.readline()):
@@ -374,22 +376,22 @@ def test_a_lost_demand_frame_changes_the_run(recorded: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".mf4", ".parquet"])
 def test_a_lockstep_run_is_recorded_and_repeats(suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"run{suffix}"
-    args = ["run", "--bus", "lockstep", "--profile", "slam", "--duration", "4", "--seed", "2"]
+    args = ["run", "--bus", "lockstep", "--profile", "slam", "--duration", "4.001", "--seed", "2"]
     assert main([*args, "--record", str(file), "--quiet", "--json", str(tmp_path / "a.json")]) == 0
     assert main([*args, "--quiet", "--json", str(tmp_path / "b.json")]) == 0
     a, b = (json.loads((tmp_path / f"{x}.json").read_text()) for x in "ab")
     assert a["state_hash"] == b["state_hash"] and a["mode"] == "RUN" and a["counts"]["good"] >= 395
-    again = ["run", "--bus", "lockstep", "--inputs", str(file), "--duration", "4"]
+    again = ["run", "--bus", "lockstep", "--inputs", str(file), "--duration", "4.001"]
     assert main([*again, "--seed", "2", "--quiet", "--json", str(tmp_path / "c.json")]) == 0
     c = json.loads((tmp_path / "c.json").read_text())
-    assert c["same"] and c["compared"] == a["record"]["frames"] - a["frames"]["received"] and c["state_hash"] == a["state_hash"]
+    assert c["same"] and c["compared"] == a["record"]["sent"] and c["state_hash"] == a["state_hash"]
     assert main([*again, "--seed", "3", "--quiet"]) == 1
 
 
 def test_a_recorded_run_is_a_log_for_replay(tmp_path: Path) -> None:
     file = tmp_path / "run.parquet"
     assert main(["run", "--bus", "lockstep", "--profile", "step", "--record", str(file), "--quiet"]) == 0
-    assert main(["replay", str(file), "--quiet", "--json", str(tmp_path / "r.json"), "--tolerance", "x_lvdt=0.2", "--tolerance", "vigv=0.2"]) == 0
+    assert main(["replay", str(file), "--quiet", "--json", str(tmp_path / "r.json"), "--tolerance", "vigv=0.2"]) == 0
     signals = {s["signal"] for s in json.loads((tmp_path / "r.json").read_text())["signals"] if s["reference"] == "measured"}
     assert {"x_dem", "x_lvdt", "i_cmd", "vigv"} <= signals
 
@@ -426,7 +428,7 @@ def test_priority_that_is_not_allowed_is_one_line(own_bus: str) -> None:
     else:
         command = COMMAND
     args = ["run", "--bus", own_bus, "--duration", "1", "--realtime-priority", "50"]
-    done = subprocess.run([*command, *args], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*command, *args], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode == 0:
         pytest.skip("this user may use SCHED_FIFO")
     assert done.returncode == 2

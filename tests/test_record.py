@@ -210,7 +210,8 @@ def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> N
         print(recorder._process.pid, flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120)
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120, check=False)
     assert done.returncode == -signal.SIGKILL
     pid, end = int(done.stdout), time.monotonic() + 20
     while Path(f"/proc/{pid}").exists() and Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z" and time.monotonic() < end:
@@ -254,6 +255,6 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
 def test_vaneloop_record_says_what_it_did_and_ends_by_itself(tmp_path: Path) -> None:
     file = tmp_path / "run.log"
     command = [*COMMAND, "record", str(file), "--bus", f"local:quiet{os.getpid()}", "--duration", "0.3", "--json", "-"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0
     assert json.loads(done.stdout)["frames"] == 0
