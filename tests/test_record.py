@@ -241,9 +241,9 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
             p.kill()
         time.sleep(0.3)
         started[-1].send_signal(signal.SIGINT)
-    said = started[-1].communicate(timeout=30)[0]
+    said = started[-1].communicate(timeout=60)[0]
     for p in started:
-        p.wait(timeout=30)
+        p.wait(timeout=60)
     for file in files:
         held = read_record(file).rows[:, 1].tolist()
         assert held == list(range(len(held))), file.suffix
