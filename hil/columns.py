@@ -20,7 +20,7 @@ def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none
     out_rows  int64[m], out float64[m]: the frames that have a value, and raw * scale + offset
     """
     mask = np.uint64(0xFFFFFFFFFFFFFFFF) >> np.uint64(64 - bits)
-    top = np.uint64(1) << np.uint64(bits - 1)
+    half = np.int64(1) << np.int64(bits - 1)
     n, missing = 0, 0
     for i in range(rows.shape[0]):
         r = rows[i]
@@ -31,8 +31,9 @@ def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none
             w = ((w >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)) | ((w & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8))
             w = ((w >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)) | ((w & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16))
             w = (w >> np.uint64(32)) | (w << np.uint64(32))
-        w = (w >> np.uint64(shift)) & mask
-        raw = np.int64((w ^ top) - top) if signed else np.int64(w)
+        raw = np.int64((w >> np.uint64(shift)) & mask)
+        if signed and raw >= half:
+            raw = raw - half - half
         if raw == none:
             missing += 1
             continue

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 
 from controller import MODES, load_calibration
@@ -468,6 +469,8 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(f"--stroke-limit (={args.stroke_limit:g}) must be above 0, at most 1000 mm")
         limits[2] = args.stroke_limit * 1e-3
     recovery = round(args.recovery * 1e3)
+    if not any(Path(numba.config.CACHE_DIR).rglob("fuzz._watched_ticks*.nbi")):  # type: ignore[attr-defined]
+        cli.say(args, "compiling the simulator for this machine (once, about 20 s) ...")
     if args.replay:
         attack = read_attack(args.replay)
         claim, tick, took = run_attack(attack, limits, recovery)
@@ -480,12 +483,12 @@ def command(args: argparse.Namespace) -> int:
         campaign = fuzz(args.frames, args.seed, limits=limits, recovery=recovery, progress=progress)
     _tell(args, campaign)
     if campaign.failure is not None:
+        n = len(campaign.failure.attack.at)
+        cli.say(args, f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}")
         try:
             write_attack(args.out, campaign.failure.attack)
         except OSError as e:
             raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
-        n = len(campaign.failure.attack.at)
-        cli.say(args, f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}")
     return 0 if campaign.failure is None else 1
 
 
@@ -509,6 +512,7 @@ def _tell(args: argparse.Namespace, c: Campaign) -> None:
             "elapsed_s": c.elapsed_s, "held": f is None, "longest_recovery_s": c.longest_recovery_s, "transitions": transitions,
             "seconds_in_mode": {name: c.ticks_in[i] * 1e-3 for i, name in enumerate(MODES)},
             "kinds": dict(zip(KINDS, c.kinds.tolist(), strict=True)), "verdicts": c.verdicts,
-            "failure": None if f is None else {"claim": f.claim, "t": f.tick * 1e-3, "episode": f.episode, "frames": len(f.attack.at)},
+            "failure": None if f is None
+            else {"claim": f.claim, "t": f.tick * 1e-3, "episode": f.episode, "frames": len(f.attack.at), "log": args.out},
         },
     )  # fmt: skip
