@@ -432,12 +432,13 @@ def _aligned(stroke: Channel, angle: Channel, stage: str, source: str) -> tuple[
 def _without_spikes(x: Array) -> Array:
     """The stroke without leaps of one to three samples, which no actuator makes: they would reset the play that tells branches apart.
 
-    A leap is 0.3 mm off the median of the seven samples around it and off both lines, through the two samples before and the two after
-    it; the corner of a ramp lies on one of them.
+    A leap is 0.3 mm and more than a usual step off the median of the seven samples around it and off both lines, through the two samples
+    before and the two after it; the corner of a ramp lies on one of them.
     """
     from scipy.ndimage import median_filter
 
-    far = np.abs(x - median_filter(x, 7, mode="nearest")) > 0.3
+    least = 0.3 + float(np.quantile(np.abs(np.diff(x)), 0.8))
+    far = np.abs(x - median_filter(x, 7, mode="nearest")) > least
     good = np.flatnonzero(~far)
     if good.size < 4:
         return x
@@ -445,11 +446,10 @@ def _without_spikes(x: Array) -> Array:
     i = np.clip(np.searchsorted(good, at), 2, good.size - 2)
     off = np.ones(at.size, bool)
     for a, b in ((good[i - 2], good[i - 1]), (good[i + 1], good[i])):  # the nearest sound samples before, and after
-        off &= np.abs(x[at] - (x[b] + (x[b] - x[a]) / (b - a) * (at - b))) > 0.3
-    x = x.copy()
-    keep = np.setdiff1d(np.arange(x.size), at[off])
-    x[at[off]] = np.interp(at[off], keep, x[keep])
-    return x
+        off &= np.abs(x[at] - (x[b] + (x[b] - x[a]) / (b - a) * (at - b))) > least
+    sound = np.ones(x.size, bool)
+    sound[at[off]] = False
+    return np.interp(np.arange(x.size), np.flatnonzero(sound), x[sound])
 
 
 def _raster_noise(x: Array) -> float:
@@ -590,7 +590,8 @@ def _fit(t: Array, x: Array, r: Array, s: Array, v: Array, branch: NDArray[np.in
         n = on.size // size * size
         group = [a[:n].reshape(-1, size) for a in (ton, xon, ron, son, von, d)]
         same = (np.abs(group[5].mean(axis=1)) == 1.0) & (np.ptp(group[0], axis=1) < 5.0 * size * float(np.median(np.diff(ton))))
-        ton, xon, ron, son, von, d = (np.median(a[same], axis=1) for a in group)
+        ton, xon, son, von, d = (a[same].mean(axis=1) for a in (*group[:2], *group[3:]))
+        ron = np.median(group[2][same], axis=1)
     covered = {side: (float(xon[d == side].min()), float(xon[d == side].max())) for side in (1, -1)}
     knots = np.linspace(xon.min(), xon.max(), max(3, int(round(np.ptp(xon) / KNOT)) + 1))
     m = knots.size

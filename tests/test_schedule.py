@@ -147,13 +147,14 @@ def test_one_noisy_loop_gives_width_lengths_and_both_curves():
         ({"points": [1.0, 47.0, 1.0, 47.0, 1.0], "noise": 0.15}, 0.1),
         ({"points": [1.0, 47.0, 1.0, 47.0, 1.0, 47.0, 1.0], "drift": 1.0}, 0.08),
         ({"points": [1.0, 47.0, 1.0, 47.0, 1.0], "dt": 0.01, "spikes": 100}, 0.05),
+        ({"points": [1.0, 47.0, 1.0], "dt": 1.0}, 0.1),
         ({"points": [20.0, 30.0, 20.0, 30.0, 20.0]}, 0.05),
         ({"points": [5.0, 20.0, 12.0, 30.0, 22.0, 45.0, 33.0, 40.0, 20.0, 28.0, 5.0, 9.0, 3.0]}, 0.06),
         ({"points": [1.0, 47.0, 1.0, 47.0, 1.0], "dither": 0.3, "rate": 1.0}, 0.06),
         ({"points": [1.0, 47.0, 1.0], "stage": "vgv1"}, 0.06),
         ({"points": [1.0, 47.0, 1.0], "stage": "vgv2"}, 0.06),
     ],
-    ids=["noise x5", "drift of 1 deg", "spikes", "partial loop", "nested loops", "dither", "vgv1", "vgv2"],
+    ids=["noise x5", "drift of 1 deg", "spikes", "1 Hz", "partial loop", "nested loops", "dither", "vgv1", "vgv2"],
 )
 def test_the_curves_hold_under(what, limit):
     m = measured(**what)
