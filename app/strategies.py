@@ -8,7 +8,10 @@ fail in the middle of the run, in several ways, and the strategy that uses them 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -368,21 +371,28 @@ def command(args: argparse.Namespace) -> int:
     rows = scenarios(args.play, args.growth, args.noise, args.dither)
     warm_up(lambda text: cli.say(args, text))
     at = moment(n_dem)
-    outcomes: Outcomes = {}
     failures: list[tuple[Failure, Outcome]] = []
     work = len(rows) * len(STRATEGIES) + (len(FAILURES) if at is not None else 0)
     with cli.progress_bar(args, f"{work} runs of {len(n_dem) * 1e-2:,.0f} s") as progress:
-        for row in rows:
-            for strategy, calibration in calibrations.items():
-                outcomes[row.name, strategy] = run(row, n_dem, calibration, args.seed, base=plant)
+        done = 0
+
+        def counted(results: Iterator[Any]) -> Iterator[Any]:
+            nonlocal done
+            for result in results:
+                done += 1
                 if progress is not None:
-                    progress(len(outcomes) / work)
+                    progress(done / work)
+                yield result
+
         last, adaptive = rows[-1], calibrations["adaptive"]
-        for name in FAILURES if at is not None else ():
-            healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
-            failures.append(failing(name, at, healthy, dual, last, n_dem, adaptive, args.seed, plant))  # type: ignore[arg-type]
-            if progress is not None:
-                progress((len(outcomes) + len(failures)) / work)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            pairs = [(row, strategy) for row in rows for strategy in STRATEGIES]
+            all_runs = pool.map(lambda p: run(p[0], n_dem, calibrations[p[1]], args.seed, base=plant), pairs)
+            outcomes = {(o.scenario, o.strategy): o for o in counted(all_runs)}
+            if at is not None:
+                healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
+                again = pool.map(lambda name: failing(name, at, healthy, dual, last, n_dem, adaptive, args.seed, plant), FAILURES)
+                failures = list(counted(again))
     best = min(STRATEGIES, key=lambda s: outcomes[last.name, s].figures["vigv"]["mean_abs"] or 0.0)
     goals = _goals(rows, outcomes, [f for f, _ in failures], best)
     _print(args, n_dem, outcomes, [f for f, _ in failures], goals)

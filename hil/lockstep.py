@@ -44,7 +44,7 @@ from controller.firmware import (
     X_DEM,
 )
 from plant import Plant, build_plant, chain
-from plant.compiled import compiled, in_place
+from plant.compiled import compiled_free, in_place
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 
 __all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "flashed", "lockstep", "move", "sense", "spoil", "warm_up"]
@@ -127,7 +127,7 @@ def move(k, s, p, i_cmd, n_dem, n_r, p_s, t_oil):
     chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)
 
 
-@compiled
+@compiled_free
 def advance(k0, ticks, stimulus, noise, sigma, inputs, z, calibration, s, p, mean, every, out, snapshots, pots):
     """Advance the loop by ``ticks`` ticks from tick ``k0``.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numba
 from numba import njit
 
-__all__ = ["cache_folder", "compiled", "in_place", "inlined", "is_cached"]
+__all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached"]
 
 KEPT = 6
 _PACKAGES = ("controller", "plant", "hil", "discrepancy")
@@ -56,6 +56,8 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_folder)  # type: ignore[attr-defined]
 
 compiled = njit(cache=True, error_model="numpy")
+# The same for a loop that runs long on arrays of its own: several may run side by side in threads.
+compiled_free = njit(cache=True, error_model="numpy", nogil=True)
 # The same for functions that work in place on their caller's arrays and allocate nothing: without counting references to those arrays,
 # which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes an array does not compile under it.
 in_place = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]

@@ -877,12 +877,29 @@ def test_a_million_ticks_of_insane_inputs_break_no_invariant_and_leave_no_state_
     assert 0 < worst[0] <= RECOVERY
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_any_calibration_of_the_compensation_keeps_the_invariants_under_insane_inputs(seed):
+    """Observer, crossing and learning with values anywhere within their bounds, ends included."""
+    from controller.calibration import Adaptive, AngleTable, Inverse, Observer
+    from tables import Bound
+
+    rng, scalars = np.random.default_rng(seed), ADAPTIVE.k.copy()
+    for model in (Observer, Inverse, Adaptive, AngleTable):
+        for name, field in model.model_fields.items():
+            bound = next((m for m in field.metadata if isinstance(m, Bound)), None)
+            if name in fw.SCALARS and bound is not None and name not in ("pot_low", "pot_high"):
+                value = rng.choice([bound.low, bound.high, rng.uniform(bound.low, bound.high), bound.low + 0.01 * (bound.high - bound.low)])
+                scalars[fw.SCALARS.index(name)] = np.deg2rad(value) if bound.unit.startswith("deg") else value
+    seen, worst = np.zeros((5, 5), dtype=np.int64), np.zeros(1, dtype=np.int64)
+    assert campaign(100 + seed, 200_000, ADAPTIVE._replace(k=scalars), seen, 20, worst) == (OK, -1)
+
+
 @settings(max_examples=100)
-@given(st.lists(st.tuples(*[st.floats(width=64)] * N_INPUTS), min_size=1, max_size=40))
-def test_any_floats_at_all_keep_state_finite_and_outputs_within_limits(rows):
+@given(st.lists(st.tuples(*[st.floats(width=64)] * N_INPUTS), min_size=1, max_size=40), st.sampled_from([CAL, SINGLE, INVERSE, ADAPTIVE]))
+def test_any_floats_at_all_keep_state_finite_and_outputs_within_limits(rows, cal):
     z = new_state()
     for row in rows:
-        tick(np.array(row), z, CAL)
+        tick(np.array(row), z, cal)
         assert np.isfinite(z).all() and abs(z[fw.I_CMD]) <= k("current_limit")
         assert k("stroke_min") <= z[fw.X_DEM] <= k("stroke_max") and z[fw.MODE] in range(5)
 
@@ -900,6 +917,9 @@ def mixed_inputs(n=6000, seed=11):
     rows[wild, fw.IN_N_DEM] = rng.choice(INSANE, wild.sum())
     rows[rng.random(n) < 0.002, fw.IN_REJECTED] = 2.0
     rows[:, fw.IN_X_LVDT] += rng.normal(0.0, 5e-6, n)
+    vigv = np.interp(rows[:, fw.IN_N_DEM], CAL.table[0], np.interp(CAL.table[3], *CAL.angles[:2]))
+    rows[:, fw.IN_VIGV : fw.IN_VGV2 + 1] = vigv[:, None] * [1.0, 0.69, 0.53] + rng.normal(0.0, 5e-4, (n, 3))
+    rows[rng.random(n) < 0.01, fw.IN_VIGV] = np.nan
     return rows
 
 
@@ -923,20 +943,21 @@ def test_same_inputs_and_state_give_the_same_bits_and_nothing_else_changes():
 SCRIPT = """
 import hashlib, warnings
 warnings.simplefilter("ignore")
-from tests.test_controller import Rig, mixed_inputs
-print(hashlib.sha256(Rig().play(mixed_inputs()).tobytes()).hexdigest())
+from tests.test_controller import ADAPTIVE, CAL, Rig, mixed_inputs
+for cal in (CAL, ADAPTIVE):
+    print(hashlib.sha256(Rig(cal).play(mixed_inputs()).tobytes()).hexdigest())
 """
 
 
 def test_compiled_and_interpreted_firmware_agree_bit_for_bit():
     import hashlib
 
-    states = Rig().play(mixed_inputs())
-    assert len(set(states[:, fw.MODE])) == 5  # the run goes through every mode
+    runs = [Rig(cal).play(mixed_inputs()) for cal in (CAL, ADAPTIVE)]
+    assert all(len(set(states[:, fw.MODE])) == 5 for states in runs)  # the run goes through every mode
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}
     run = subprocess.run([sys.executable, "-c", SCRIPT], check=False, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr
-    assert run.stdout.strip() == hashlib.sha256(states.tobytes()).hexdigest()
+    assert run.stdout.split() == [hashlib.sha256(states.tobytes()).hexdigest() for states in runs]
 
 
 def test_names_and_indices_of_inputs_scalars_states_and_faults_belong_together():
