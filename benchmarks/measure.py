@@ -266,6 +266,26 @@ def against_least_squares() -> Iterator[Row]:
     yield Row("diagnose, 200 s, two effects", f"{took:.1f} s", note="two processes")
 
 
+def strategies() -> Iterator[Row]:
+    """``vaneloop strategies``: the best strategy against dual, on the machine with everything wrong."""
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder, "answer.json")
+        wall, _ = _wall([*_vaneloop(), "strategies", "--json", str(answer)])
+        j = json.loads(answer.read_text(encoding="utf-8"))
+    last = j["rows"][-1]["scenario"]
+    dual, best = (next(r for r in j["rows"] if r["scenario"] == last and r["strategy"] == s) for s in ("dual", j["best"]))
+    a, b = best["vigv"]["mean_abs"], dual["vigv"]["mean_abs"]
+    yield Row(f"VIGV error, {j['best']} and dual, {last}", f"{a:.3f} deg", f"{b:.3f} deg", b / a, "at least 3", b / a >= 3.0)
+    a, b = best["travel_mm"], dual["travel_mm"]
+    yield Row("travel of the actuator, the same", f"{a:,.0f} mm", f"{b:,.0f} mm", a / b, "<= 1.15", a / b <= 1.15)
+    step = max(f["step"] for f in j["failures"])
+    yield Row("largest step, potentiometers failing", f"{step:.3f} deg", target="<= 0.2 deg", held=step <= 0.2)
+    held = sum(g["held"] for g in j["goals"])
+    note = f"{len(j['rows']) + len(j['failures'])} runs of {j['simulated_s']:,.0f} s"
+    yield Row("goals of vaneloop strategies", f"{held} of {len(j['goals'])}", target="all", held=held == len(j["goals"]), note=note)
+    yield Row("vaneloop strategies", f"{wall:.0f} s", note="wall clock")
+
+
 MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
     "the loop in C": against_c,
     "the loop in python-control": against_control,
@@ -275,4 +295,5 @@ MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
     "first run": first_run,
     "replay of a long log": long_replay,
     "the search for effects": against_least_squares,
+    "the control strategies": strategies,
 }

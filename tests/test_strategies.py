@@ -186,3 +186,26 @@ def test_bad_input_is_one_line_and_exit_code_2(words: list[str], said: str, caps
     assert main(["strategies", *words]) == 2
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1
+
+
+# ---- on a machine of other equations -----------------------------------------------------------------------------------------------
+
+
+def test_on_the_independent_rig_adaptive_is_three_times_better_than_dual_too() -> None:
+    """A specimen within its tolerances, worn by 0.8 deg and growing by 0.01 deg/K, simulated by the rig with equations of its own."""
+    from dataclasses import replace
+
+    from tests.firmware_on_rig import firmware
+    from tests.rig import Hidden, manoeuvre, simulate
+
+    degree = np.pi / 180.0
+    wear, growth = {"width": 0.8 * degree, "stage": 0}, {"coefficient": 0.01 * degree, "stage": 0}
+    hidden = [Hidden("linkage_backlash", wear), Hidden("thermal_growth", growth)]
+    schedules, mean, travel = build_plant().schedules, {}, {}
+    for strategy in ("dual", "adaptive"):
+        controller = replace(firmware(CALIBRATIONS[strategy]), vigv=fw.IN_VIGV)
+        r = simulate(manoeuvre(1, 300.0), controller, hidden, seed=1)
+        mean[strategy] = np.abs(np.rad2deg(r.truth["vane_0"]) - np.rad2deg(schedules.targets(r.truth["n"])[:, 0])).mean()
+        travel[strategy] = np.abs(np.diff(r.log["x_dem"])).sum()
+    assert mean["adaptive"] <= mean["dual"] / 3.0
+    assert travel["adaptive"] <= 1.15 * travel["dual"]

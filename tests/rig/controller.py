@@ -32,6 +32,7 @@ class Compiled:
     n_dem .. fresh  places in ``inputs``: %, %, m, 1 on a tick with a new frame
     i_cmd .. mode   places in ``state``: A, m, number of the mode
     current_limit   A
+    vigv            place in ``inputs`` of the first of three stem angles (rad); -1: it takes none
     change          (effect name, parameters) -> another Compiled with that error in it, or None where the rig is to do it from outside
     """
 
@@ -47,12 +48,13 @@ class Compiled:
     x_dem: int
     mode: int
     current_limit: float = 0.040
+    vigv: int = -1
     change: Callable[[str, dict[str, float]], Compiled | None] | None = None
 
     @property
     def slots(self) -> np.ndarray:
         """Places of the signals in the order the kernel wants them."""
-        return np.array([self.n_dem, self.n_r, self.x_lvdt, self.fresh, self.i_cmd, self.x_dem, self.mode])
+        return np.array([self.n_dem, self.n_r, self.x_lvdt, self.fresh, self.i_cmd, self.x_dem, self.mode, self.vigv])
 
 
 class Settings(NamedTuple):

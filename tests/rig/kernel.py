@@ -603,6 +603,10 @@ def run_compiled(
         inputs[slots[1]] = view[1]
         inputs[slots[2]] = view[2]
         inputs[slots[3]] = view[3]
+        if slots[7] >= 0:
+            sample = min(max((k - warm) // every, 0), len(pot_noise) - 1)  # one number for all ticks of a row: noisier than a real one
+            for j in range(3):
+                inputs[slots[7] + j] = read_pot(s, p, j, pot_noise[sample, j])
         tick(inputs, state, calibration)
         i = current(state[slots[4]], p, limit)
         if k == warm:
