@@ -22,6 +22,8 @@ from numba import njit
 
 # Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a tick.
 compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  # type: ignore[call-overload]
+# The strategies inverse and adaptive are not inlined: that would double the time that compiling takes, for all strategies.
+apart = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 
 # ---- inputs -------------------------------------------------------------------------------------------------------------------------
 INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2")
@@ -459,7 +461,7 @@ def schedule_step(z, k, table):
     z[X_TARGET] = min(max(target, k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@compiled
+@apart
 def observe_speed(z, k):
     """Rotor speed and its rate without the noise and the lag of a filter: one 10 ms step.
 
@@ -490,13 +492,19 @@ def observe_speed(z, k):
     z[SPEED] = min(max(z[SPEED], z[N_R] - k[OBSERVER_BAND]), z[N_R] + k[OBSERVER_BAND])
 
 
-@compiled
+@apart
+def angle_at(axis, row, angles, v):
+    """Look up ``angles``, see `look_up`."""
+    return look_up(axis, row, angles, v)
+
+
+@apart
 def scheduled_angle(table, angles, n):
     """Target (rad) of the VIGV at speed ``n`` (%)."""
-    return look_up(ANGLE_STROKE, ANGLE_VIGV, angles, look_up(ROW_SPEED, ROW_SINGLE, table, n))
+    return angle_at(ANGLE_STROKE, ANGLE_VIGV, angles, angle_at(ROW_SPEED, ROW_SINGLE, table, n))
 
 
-@compiled
+@apart
 def follow_play(z, stage, drive, width):
     """Where in its gap is a stage? One step of the play operator, with the ``drive`` angle and total ``width`` (rad).
 
@@ -516,7 +524,7 @@ def follow_play(z, stage, drive, width):
         z[learned + stage] = min(z[learned + stage], SEEN_AGAIN * WELL_KNOWN)
 
 
-@compiled
+@apart
 def inverse_step(z, k, table, angles):
     """Strategies `INVERSE` and `ADAPTIVE`: the stroke demand that brings the VIGV to its target through the play, one 10 ms step.
 
@@ -527,7 +535,7 @@ def inverse_step(z, k, table, angles):
     observe_speed(z, k)
     stroke = z[X_DEM] + max(z[X_SLOW] - z[X_DEM] - OVERSHOT, 0.0) + min(z[X_SLOW] - z[X_DEM] + OVERSHOT, 0.0)
     for stage in range(3):
-        drive = look_up(ANGLE_STROKE, ANGLE_VIGV + stage, angles, stroke)
+        drive = angle_at(ANGLE_STROKE, ANGLE_VIGV + stage, angles, stroke)
         extra = z[WIDTH_IN_USE] if stage == 0 else z[WIDTH + stage]
         follow_play(z, stage, drive, max(k[PLAY_VIGV + stage] + extra, 0.0))
     width = max(k[PLAY_VIGV] + z[WIDTH_IN_USE], 0.0)
@@ -549,11 +557,11 @@ def inverse_step(z, k, table, angles):
     step = min(step, SOFT_END * abs(left) + 1e-3)
     z[CROSSING] += min(max(left, -step), step)
     aim = target if side * (target - vane) > 0.0 else vane
-    stroke = look_up(ANGLE_VIGV, ANGLE_STROKE, angles, aim - z[OFFSET_IN_USE] + 0.5 * z[CROSSING] * width)
+    stroke = angle_at(ANGLE_VIGV, ANGLE_STROKE, angles, aim - z[OFFSET_IN_USE] + 0.5 * z[CROSSING] * width)
     z[X_TARGET] = min(max(stroke, k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@compiled
+@apart
 def filter_pots(z, k, inputs):
     """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts against it."""
     for stage in range(3):
@@ -567,7 +575,7 @@ def filter_pots(z, k, inputs):
             z[SUSPECT + stage] += SUSPICION * TICK / SLOW_TICK
 
 
-@compiled
+@apart
 def _judge_pot(z, k, stage, expected, plausible):
     """Is a potentiometer trusted? One 10 ms step.
 
@@ -594,7 +602,7 @@ def _judge_pot(z, k, stage, expected, plausible):
         z[LOWEST + stage] = z[HIGHEST + stage] = expected
 
 
-@compiled
+@apart
 def learn(z, k):
     """Learn offset and play of each stage from its potentiometer: one 10 ms step.
 
