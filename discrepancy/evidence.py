@@ -4,7 +4,7 @@ On real data no model reaches the sensor's noise: small effects that nobody mode
 in nats then "finds" everything, since the errors of a wrong model are large, correlated and alike from sample to sample. So a law must earn
 its place by what it does to the *held-out error itself*, block by block (blocks as in `discrepancy.fit`):
 
-- `LEAST_FALL`: the held-out sum of squares, beyond what the noise of the samples explains, falls by at least this share;
+- `LEAST_FALL`: the held-out sum of squares falls by at least this share;
 - `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of small motion,
   which is wrong by a constant that suits the large motions, counts as much as they do;
 - at least two blocks agree.
@@ -27,8 +27,7 @@ from discrepancy.stage import Array, Stage
 
 __all__ = ["LEAST_FALL", "Explorer", "diagnose_system", "extend_system", "noise_of_channel", "structure", "worth"]
 
-LEAST_FALL = 0.20  # share of the held-out sum of squares beyond the noise (10 % of the RMS) that a law must explain
-LEAST_RAW = 0.01  # share of the whole of it
+LEAST_FALL = 0.20  # share of the held-out sum of squares (10 % of the RMS) that a law must explain
 LEAST_HELP = 0.75  # share of the change over the blocks that is improvement
 AGREE = 0.05  # fall of a block's log mean square that counts as agreement
 PER_PARAMETER = 0.01  # log error that a parameter costs when sets are compared
@@ -44,7 +43,7 @@ STRUCTURE = 0.25  # share of the remaining error that the logged channels predic
 class Evidence:
     """What one fit gains on another, on held-out blocks.
 
-    fall   share of the sum of squares beyond the noise by which it falls; raw: share of all of it
+    fall   share of the sum of squares by which it falls
     help   share of the change, block by block, that is improvement
     agree  blocks that improve
     """
@@ -52,12 +51,11 @@ class Evidence:
     fall: float
     help: float
     agree: int
-    raw: float = 1.0
 
     @property
     def good(self) -> bool:
         """Whether it is enough."""
-        return self.fall >= LEAST_FALL and self.raw >= LEAST_RAW and self.help >= LEAST_HELP and self.agree >= 2
+        return self.fall >= LEAST_FALL and self.help >= LEAST_HELP and self.agree >= 2
 
 
 def _levels(judge: Judge, fit: Fit) -> tuple[Array, Array]:
@@ -69,13 +67,12 @@ def _levels(judge: Judge, fit: Fit) -> tuple[Array, Array]:
 
 def worth(judge: Judge, before: Fit, after: Fit) -> Evidence:
     """Evidence for ``after`` against ``before``."""
-    (a, m), (b, _) = _levels(judge, before), _levels(judge, after)
+    (a, _), (b, _) = _levels(judge, before), _levels(judge, after)
     r = np.log(a / b)
     change = float(np.abs(r).sum())
-    fall = float(a.sum() - b.sum())
-    excess = max(float(a.sum() - m.sum()), 1e-300)
+    fall = 1.0 - float(b.sum() / a.sum())
     helps = float(np.maximum(r, 0.0).sum()) / change if change > 0 else 0.0
-    return Evidence(fall / excess, helps, int(np.sum(r > AGREE * min(1.0, max(fall / float(a.sum()), 0.02)))), fall / float(a.sum()))
+    return Evidence(fall, helps, int(np.sum(r > AGREE)))
 
 
 def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
@@ -100,9 +97,9 @@ class _Judge(Judge):
 class Explorer:
     """Fits of one stage with sets of laws, each made once."""
 
-    def __init__(self, judge: _Judge, tick: Callable[[], None] | None = None):
-        """Fit the model as it is."""
-        self.judge, self.stage = judge, judge.stage
+    def __init__(self, judge: _Judge, tick: Callable[[], None] | None = None, guess: Array | None = None):
+        """Fit the model as it is; ``guess``: the user's own values of all parameters."""
+        self.judge, self.stage, self.guess = judge, judge.stage, guess
         self.tick = tick or (lambda: None)
         self.fits: dict[frozenset[str], Fit] = {}
         self.out: set[tuple[tuple[str, ...], str]] = set()  # what the screening left out
@@ -120,20 +117,21 @@ class Explorer:
                 break
         return fit
 
-    def add(self, fit: Fit, names: list[str], finished: int = FINISHED) -> list[Fit]:
+    def add(self, fit: Fit, names: list[str], finished: int = FINISHED, fitted: int = FITTED) -> list[Fit]:
         """Fits with one law more than ``fit``, best first; only the leading ones are finished."""
         names = [n for n in names if n not in fit.effects]
         known = [self.fits[key] for n in names if (key := frozenset((*fit.effects, n))) in self.fits]
         new = [n for n in names if frozenset((*fit.effects, n)) not in self.fits and (fit.effects, n) not in self.out]
         quick = []
         screened = self._screen(fit, new)
-        for name in list(screened)[FITTED:]:
+        for name in list(screened)[fitted:]:
             self.out.add((fit.effects, name))
-        for name in list(screened)[:FITTED]:
+        for name in list(screened)[:fitted]:
             effects = (*fit.effects, name)
-            best = min((self.judge.fit(effects, s, 3) for s in screened[name]), key=lambda f: float(f.cost.sum()))
-            quick.append(best)
+            quick.append(min((self.judge.fit(effects, s, 3) for s in screened[name]), key=lambda f: float(f.cost.sum())))
             self.tick()
+        if not fit.effects and self.guess is not None:
+            quick = self._from_guess(new, quick)
         quick.sort(key=lambda f: score(self.judge, f))
         for i, f in enumerate(quick):
             f = self._finish(f) if i < finished else f
@@ -141,6 +139,27 @@ class Explorer:
             known.append(f)
             self.tick()
         return sorted(known, key=lambda f: score(self.judge, f))
+
+    def _from_guess(self, names: list[str], quick: list[Fit]) -> list[Fit]:
+        """Fits that start where the user's own values stand: fitted without a gross law, a model may go where no law helps it any more."""
+        assert self.guess is not None
+        index, best = self.stage.index(), {f.effects[-1]: f for f in quick}
+        tries = []
+        for name in names:
+            for s in self.stage.effect(name).starts:
+                theta = self.guess.copy()
+                theta[index[name]] = s
+                tries.append((float(np.sum(self.judge.errors(theta[None]) ** 2)), len(tries), name, theta))
+        least: dict[str, tuple[float, int, str, Array]] = {}
+        for t in sorted(tries, key=lambda t: t[:2]):
+            least.setdefault(t[2], t)
+        for t in list(least.values())[:FINISHED]:
+            f = self._finish(self.judge.fit((t[2],), t[3], 6), 2)
+            if t[2] not in best or f.cost.sum() < best[t[2]].cost.sum():
+                best[t[2]] = f
+            self.out.discard(((), t[2]))
+            self.tick()
+        return list(best.values())
 
     def _screen(self, fit: Fit, names: list[str]) -> dict[str, list[Array]]:
         """Up to two starts for each law on top of ``fit``, the best after one linear refit of what is free already; best law first."""
@@ -192,16 +211,21 @@ class _Course:
 
 
 def diagnose_system(
-    stage: Stage, floor: Array, tick: Callable[[], None] | None = None, decide: Callable[[Array], float] | None = None
+    stage: Stage,
+    floor: Array,
+    tick: Callable[[], None] | None = None,
+    decide: Callable[[Array], float] | None = None,
+    guess: Array | None = None,
 ) -> tuple[StageDiagnosis, list[str]]:
     """Search all laws at all places of a user's model for what is missing; what was decided by other logs, in words.
 
     floor   RMS of the noise of every output, as far as its samples tell it
     decide  function from parameters to the mean log error on logs that were not fitted: it chooses among rivals that the fitted ones cannot
             tell apart, and nothing else
+    guess   the user's own values of all parameters
     """
     judge = _Judge(stage, floor)
-    explorer = Explorer(judge, tick)
+    explorer = Explorer(judge, tick, guess)
     names = [e.name for e in stage.effects]
     n = max(judge.n, 1)
 
@@ -293,11 +317,11 @@ def _prune(explorer: Explorer, fit: Fit) -> Fit:
 
 def _swap(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
     """Exchange one law for another where that is better: what was right first need not be right last."""
-    for _ in range(3):
+    for _ in range(2):
         best = fit
         for drop in fit.effects:
             rest = explorer.of(tuple(e for e in fit.effects if e != drop))
-            options = [f for f in explorer.add(rest, names, 4) if len(f.effects) == len(fit.effects)]
+            options = [f for f in explorer.add(rest, names, 3, 6) if len(f.effects) == len(fit.effects)]
             better = [f for f in options if score(explorer.judge, f) < score(explorer.judge, best) - 0.02]
             if better:
                 best = better[0]
@@ -320,7 +344,7 @@ def _name(explorer: Explorer, fit: Fit, names: list[str]) -> list[Found]:
     for name in fit.effects:
         rest = explorer.of(tuple(e for e in fit.effects if e != name))
         alternatives = {name: fit}
-        for f in explorer.add(rest, names, 4):
+        for f in explorer.add(rest, names, 3, 6):
             other = [e for e in f.effects if e not in rest.effects]
             if len(other) == 1 and other[0] != name:
                 alternatives[other[0]] = f
@@ -408,7 +432,13 @@ def structure(judge: Judge, fit: Fit) -> float:
 
 
 def noise_of_channel(y: Array) -> float:
-    """RMS of the noise of evenly sampled values, from their third differences over the quieter half of the stretches; 0 is possible."""
+    """RMS of the white noise that evenly sampled values can hold at most; 0 is possible.
+
+    The smaller of two bounds: third differences over the quieter half of the stretches (motion is smooth), and the quietest tenth of the
+    spectrum (white noise is everywhere).
+    """
+    from scipy.signal import welch
+
     y = y[np.isfinite(y)]
     if len(y) < 40:
         return 0.0
@@ -416,4 +446,6 @@ def noise_of_channel(y: Array) -> float:
     width = max(10, len(d) // 60)
     parts = d[: len(d) // width * width].reshape(-1, width)
     level = np.sort(np.sqrt(np.mean(parts**2, axis=1) / 20.0))
-    return float(np.median(level[: max(1, len(level) // 2)]))
+    smooth = float(np.median(level[: max(1, len(level) // 2)]))
+    _, power = welch(y, 1.0, nperseg=min(1024, len(y) // 4))
+    return min(smooth, float(np.sqrt(np.quantile(power[1:], 0.1) * 0.5)))

@@ -41,7 +41,7 @@ __all__ = [
 MEMORY = 4  # numbers that a law may remember
 PARAMETERS = 3  # most parameters of one law
 
-_jit = njit(cache=True, error_model="numpy")
+_jit = njit(cache=True, error_model="numpy", nogil=True)
 
 
 @dataclass(frozen=True)
@@ -368,8 +368,8 @@ def _dead_zone(z: Size) -> _Made:
 def _saturation(z: Size) -> _Made:
     r = z.high - z.low
     low, high = z.low - r, z.high + r
-    starts = [(low, z.high - part * r) for part in (0.03, 0.1, 0.25, 0.5)]
-    starts += [(z.low + part * r, high) for part in (0.03, 0.1, 0.25, 0.5)]
+    starts = [(low, z.high - part * r) for part in (0.002, 0.03, 0.1, 0.25, 0.5)]
+    starts += [(z.low + part * r, high) for part in (0.002, 0.03, 0.1, 0.25, 0.5)]
     starts += [(z.low + part * r, z.high - part * r) for part in (0.03, 0.1, 0.25, 0.4)]
     return (Parameter("low", low, z.unit, low, z.high), Parameter("high", high, z.unit, z.low, high)), tuple(starts)
 

@@ -220,7 +220,7 @@ def diagnose(
         by = other.figures(other.theta_from(bound, theta))
         return float(np.mean([np.log(np.maximum(v, 1e-300) / bound.noise()).mean() for v in by.values() if np.isfinite(v).all()] or [0.0]))
 
-    d, decided = diagnose_system(bound.thinned, bound.noise(), tick, on_test if other is not None else None)
+    d, decided = diagnose_system(bound.thinned, bound.noise(), tick, on_test if other is not None else None, bound.guess)
     answer = _finish("diagnose", bound, other, d, started)
     answer.notes += decided
     return answer

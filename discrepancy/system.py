@@ -18,6 +18,7 @@ import sys
 import traceback
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -441,7 +442,7 @@ class Bound:
             return space["run"]  # type: ignore[no-any-return]
 
         def jit(f: Any) -> Any:
-            return f if hasattr(f, "py_func") else njit(error_model="numpy")(f)
+            return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
 
         fast = build(jit)
         try:
@@ -546,7 +547,9 @@ class Bound:
         s = self.system
         out = np.empty((len(thetas), len(s.outputs), len(self.t)))
         n_p = len(s.parameters)
-        for i, theta in enumerate(thetas):
+
+        def one(i: int) -> None:
+            theta = thetas[i]
             active = self._active(theta)
             for log, at in enumerate(self.logs.values()):
                 if s.kind in ("static", "force"):
@@ -557,6 +560,12 @@ class Bound:
                         if which == log:
                             x0[m] = theta[n_p + k]
                     out[i, :, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
+        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
+            with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
+                list(pool.map(one, range(len(thetas))))
+        else:
+            for i in range(len(thetas)):
+                one(i)
         bad = ~np.isfinite(out)
         if bad.any():
             out[bad] = self.far
@@ -818,6 +827,12 @@ class Bound:
             s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t, self.measured,
             regimes=regimes, regime_units=units,
         )  # fmt: skip
+        self.guess = self.stage.neutral()
+        self.guess[: len(s.parameters)] = [p.value for p in s.parameters]
+        if self.like is None and not self.values and starts:
+            n_p = len(s.parameters)
+            self.guess[n_p : n_p + len(starts)] = [p.value for p in starts]
+            self._scan_starts(self.guess, list(range(n_p, n_p + len(starts))))
         # the search looks at fewer samples where there are many: neighbours say the same
         stride = max(1, len(self.t) // MOST_SAMPLES)
         self.thinned = Stage(
@@ -849,6 +864,7 @@ class Bound:
             trial[n_p : n_p + k] = z * size
             return np.where(use, self.run(trial[None])[0] - np.where(use, self.measured, 0.0), 0.0).ravel()
 
+        self._scan_starts(out, list(range(n_p, n_p + k)))
         first = out[n_p : n_p + k] / size
         out[n_p : n_p + k] = least_squares(error, first, diff_step=1e-3, max_nfev=30).x * size
         return out
@@ -917,7 +933,8 @@ class Bound:
             self._choose_steps(values)
         if not free:
             return values
-        size = np.array([max(abs(parameters[i].value), 0.0) or self._unit_size(parameters[i]) for i in free])
+        self._scan_starts(values, [i for i in free if parameters[i].name.startswith("start_")])
+        size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
         low = np.array([parameters[i].low for i in free])
         high = np.array([parameters[i].high for i in free])
         use = np.isfinite(self.measured)
@@ -935,6 +952,16 @@ class Bound:
         if self.system.kind in ("simulate", "closed_loop"):
             self._choose_steps(values)
         return values
+
+    def _scan_starts(self, theta: Array, columns: list[int]) -> None:
+        """Set unknown initial states in place to the best of some round sizes of the outputs, one after the other."""
+        good = self.measured[np.isfinite(self.measured)]
+        size = float(np.max(np.abs(good))) if len(good) else 1.0
+        for c in columns:
+            trials = np.repeat(theta[None], 11, axis=0)
+            trials[:, c] = size * np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, -0.1, -0.25, -0.5, -1.0, -2.0])
+            e = np.where(np.isfinite(self.measured), self.run(trials) - np.nan_to_num(self.measured), 0.0)
+            theta[c] = trials[int(np.argmin(np.sum(e**2, axis=(1, 2)))), c]
 
     def _unit_size(self, p: Parameter) -> float:
         if p.name.startswith("start_"):
