@@ -1,0 +1,186 @@
+"""The reusable laws: neutral parameters are an exact identity, and each law does what its name says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from discrepancy import laws
+from discrepancy.laws import FORCE_LAWS, PARAMETERS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+
+T = np.arange(0.0, 10.0, 0.01)
+U = 2.0 * np.sin(1.3 * T) + 0.4 * np.sin(9.0 * T)
+SIZE = Size(float(U.min()), float(U.max()), 2.0, 6.0, 0.01, 10.0, unit="V", force=3.0, speed=2.0, travel=2.0)
+
+
+def row(law: Law, values: tuple[float, ...]) -> np.ndarray:
+    out = np.zeros(PARAMETERS + 1)
+    out[: len(values)] = values
+    if law.constant:
+        out[len(values)] = law.constant(SIZE)
+    return out
+
+
+def signal(name: str, *values: float, u: np.ndarray = U) -> np.ndarray:
+    return laws.apply(SIGNAL_LAWS[name].code, T, u, row(SIGNAL_LAWS[name], values))
+
+
+def force(name: str, values: tuple[float, ...], x: np.ndarray, v: np.ndarray, gap: float = 0.0, asymmetry: float = 0.0) -> np.ndarray:
+    memory = np.zeros(laws.MEMORY)
+    law = FORCE_LAWS[name]
+    p = row(law, values)
+    return np.array([laws.force_of(law.code, v[k], x[k], k == 0, p, gap, asymmetry, 0.0, memory) for k in range(len(x))])
+
+
+ALL = [(family, law) for family, by in laws.LAWS.items() for law in by.values()]
+
+
+@pytest.mark.parametrize(("family", "law"), ALL, ids=[f"{f}-{x.name}" for f, x in ALL])
+def test_declared_parameters_hang_together(family: str, law: Law) -> None:
+    parameters, starts = law.make(SIZE)
+    assert 0 < len(parameters) <= PARAMETERS and starts
+    assert law.text
+    for p in parameters:
+        assert p.low <= p.value <= p.high and p.unit
+    for s in starts:
+        assert len(s) == len(parameters)
+        assert s != tuple(p.value for p in parameters)
+        assert all(p.low <= v <= p.high for p, v in zip(parameters, s, strict=True)), (law.name, s)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+@pytest.mark.parametrize(("family", "law"), ALL, ids=[f"{f}-{x.name}" for f, x in ALL])
+def test_bounds_follow_the_data_whatever_the_unit(family: str, law: Law, factor: float) -> None:
+    scaled = Size(SIZE.low * factor, SIZE.high * factor, 2.0 * factor, 6.0 * factor, 0.01, 10.0, force=3.0, speed=2.0, travel=2.0)
+    for p, q in zip(law.make(SIZE)[0], law.make(scaled)[0], strict=True):
+        assert q.low <= q.value <= q.high
+        if p.unit in ("V", "(V)/s") and p.high:
+            assert q.high / p.high == pytest.approx(factor)
+
+
+@pytest.mark.parametrize("name", SIGNAL_LAWS)
+def test_neutral_signal_law_is_an_exact_identity(name: str) -> None:
+    neutral = tuple(p.value for p in SIGNAL_LAWS[name].make(SIZE)[0])
+    np.testing.assert_array_equal(signal(name, *neutral), U)
+
+
+@pytest.mark.parametrize("name", FORCE_LAWS)
+def test_neutral_force_law_adds_nothing(name: str) -> None:
+    neutral = tuple(p.value for p in FORCE_LAWS[name].make(SIZE)[0])
+    assert not force(name, neutral, U, np.gradient(U, T)).any()
+
+
+@pytest.mark.parametrize("name", STATE_LAWS)
+def test_neutral_state_law_takes_nothing_off(name: str) -> None:
+    law = STATE_LAWS[name]
+    neutral = row(law, tuple(p.value for p in law.make(SIZE)[0]))
+    assert all(laws.state_rate(law.code, x, neutral) == 0.0 for x in (-1.0, 0.0, 0.7))
+
+
+def test_static_signal_laws() -> None:
+    u = np.array([-2.0, -0.3, 0.0, 0.3, 2.0])
+    t = np.arange(5.0)
+
+    def law(name: str, *values: float) -> list[float]:
+        return list(laws.apply(SIGNAL_LAWS[name].code, t, u, row(SIGNAL_LAWS[name], values)))
+
+    assert law("bias", 0.5) == [-1.5, 0.2, 0.5, 0.8, 2.5]
+    assert law("gain", 2.0) == [-4.0, -0.6, 0.0, 0.6, 4.0]
+    assert law("asymmetric_gain", 0.5) == [-1.0, -0.15, 0.0, pytest.approx(0.45), 3.0]
+    assert law("absolute_value", 1.0) == [2.0, 0.3, 0.0, 0.3, 2.0]
+    assert law("dead_zone", 0.5) == [-1.5, 0.0, 0.0, 0.0, 1.5]
+    assert law("saturation", -1.0, 1.5) == [-1.0, -0.3, 0.0, 0.3, 1.5]
+    assert law("cubic", 0.1) == pytest.approx([-2.8, -0.3027, 0.0, 0.3027, 2.8])
+    assert law("quantisation", 0.5) == [-2.0, -0.5, 0.0, 0.5, 2.0]
+    assert law("smooth_saturation", 1.0) == pytest.approx(np.tanh(u))
+    big = SIZE.greatest
+    assert law("square_root", 1.0) == pytest.approx(np.sign(u) * np.sqrt(np.abs(u) * big))
+
+
+def test_play_holds_its_width_and_is_rate_independent() -> None:
+    y = signal("play", 0.6)
+    assert np.max(np.abs(U - y)) == pytest.approx(0.3)
+    slow = laws.apply(SIGNAL_LAWS["play"].code, 7.0 * T, U, row(SIGNAL_LAWS["play"], (0.6,)))
+    np.testing.assert_array_equal(y, slow)
+
+
+def test_rate_limit_never_moves_faster_and_catches_up() -> None:
+    step = np.where(T > 1.0, 1.0, 0.0)
+    y = signal("rate_limit", 0.5, u=step)
+    assert np.max(np.abs(np.diff(y))) <= 0.5 * 0.01 + 1e-12
+    assert y[np.searchsorted(T, 2.0)] == pytest.approx(0.5, abs=0.01)
+    assert y[-1] == 1.0
+
+
+def test_lag_is_the_exact_first_order_answer() -> None:
+    ramp = 2.0 * T
+    y = signal("lag", 0.7, u=ramp)
+    np.testing.assert_allclose(y, 2.0 * (T - 0.7 * (1.0 - np.exp(-T / 0.7))), atol=1e-9)
+
+
+def test_second_order_lag_rings_at_its_frequency() -> None:
+    step = np.where(T >= 0.5, 1.0, 0.0)
+    y = signal("second_order_lag", 0.1, 0.2, u=step)
+    peak = 1.0 + np.exp(-np.pi * 0.2 / np.sqrt(1 - 0.04))
+    assert y.max() == pytest.approx(peak, abs=0.01)
+    assert T[int(np.argmax(y))] - 0.5 == pytest.approx(np.pi * 0.1 / np.sqrt(1 - 0.04), abs=0.015)
+
+
+def test_dead_time_shifts_and_changes_nothing_else() -> None:
+    y = signal("dead_time", 0.255)
+    np.testing.assert_allclose(y[26:], np.interp(T[26:] - 0.255, T, U), atol=1e-12)
+    assert np.all(y[:25] == U[0])
+
+
+def test_laws_look_at_no_later_sample() -> None:
+    late = U.copy()
+    late[600:] += 5.0
+    for name, law in SIGNAL_LAWS.items():
+        values = law.make(SIZE)[1][0]
+        np.testing.assert_array_equal(signal(name, *values)[:600], signal(name, *values, u=late)[:600])
+
+
+def test_friction_opposes_motion_and_differs_with_direction() -> None:
+    v = np.array([-2.0, -0.1, 0.0, 0.1, 2.0])
+    x = np.zeros(5)
+    assert list(force("coulomb", (3.0,), x, v)) == [-3.0, -3.0, 0.0, 3.0, 3.0]
+    assert list(force("coulomb", (3.0,), x, v, asymmetry=-0.2)) == pytest.approx([-3.6, -3.6, 0.0, 2.4, 2.4])
+    s = force("stribeck", (3.0, 1.0, 0.1), x, v)
+    assert s[4] == pytest.approx(3.0) and s[3] == pytest.approx(3.0 + np.exp(-1.0))
+    assert list(force("viscous", (3.0,), x, v)) == pytest.approx(3.0 * v)
+    assert list(force("quadratic_drag", (3.0,), x, v)) == pytest.approx(3.0 * v * np.abs(v))
+    assert list(force("force_offset", (-1.0,), x, v)) == [-1.0] * 5
+
+
+@pytest.mark.parametrize(("name", "values"), [("elastic_plastic", (50.0, 3.0)), ("bouc_wen", (50.0, 3.0, 2.0))])
+def test_hysteretic_friction(name: str, values: tuple[float, ...]) -> None:
+    x = np.concatenate([np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)])
+    v = np.gradient(x)
+    f = force(name, values, x, v)
+    assert f.max() == pytest.approx(3.0, rel=0.01) and f.min() == pytest.approx(-3.0, rel=0.01)
+    assert (f[1] - f[0]) / (x[1] - x[0]) == pytest.approx(50.0, rel=0.05)  # starts unloaded, at its stiffness
+    assert np.sum(0.5 * (f[1200:] + f[1199:-1]) * np.diff(x[1199:])) > 0.0  # takes energy
+    # lost motion: after a reversal the force stays zero over the gap
+    g = force(name, values, x, v, gap=0.5)
+    zero = np.abs(g[400:1200]) < 1e-6
+    assert np.ptp(x[400:1200][zero]) == pytest.approx(0.5, abs=0.02)
+    # rate-independent: the path counts, not the speed
+    np.testing.assert_array_equal(f, force(name, values, x, 3.0 * v))
+    h = force(name, values, x, v, asymmetry=0.25)
+    assert h.max() == pytest.approx(3.75, rel=0.01) and h.min() == pytest.approx(-2.25, rel=0.01)
+
+
+def test_springs_and_their_gap() -> None:
+    x = np.array([-2.0, -0.2, 0.0, 0.2, 2.0])
+    assert list(force("spring", (4.0,), x, x)) == pytest.approx(4.0 * x)
+    assert list(force("spring", (4.0,), x, x, gap=1.0)) == pytest.approx([-6.0, 0.0, 0.0, 0.0, 6.0])
+    assert list(force("cubic_spring", (4.0,), x, x)) == pytest.approx(4.0 * x**3)
+
+
+def test_state_laws() -> None:
+    rate = {n: [laws.state_rate(law.code, x, np.array([2.0, 0.0, 0.0, 0.0])) for x in (-4.0, 4.0)] for n, law in STATE_LAWS.items()}
+    assert rate["offset"] == [2.0, 2.0]
+    assert rate["leak"] == [-8.0, 8.0]
+    assert rate["square_root"] == [-4.0, 4.0]
+    assert rate["quadratic_drag"] == [-32.0, 32.0]
+    assert rate["cubic"] == [-128.0, 128.0]
