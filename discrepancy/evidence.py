@@ -144,7 +144,7 @@ class Explorer:
         """Fits that start where the user's own values stand: fitted without a gross law, a model may go where no law helps it any more."""
         assert self.guess is not None
         index, best = self.stage.index(), {f.effects[-1]: f for f in quick}
-        tries = []
+        tries: list[tuple[float, int, str, Array]] = []
         for name in names:
             for s in self.stage.effect(name).starts:
                 theta = self.guess.copy()
