@@ -2,7 +2,8 @@
 
 Engine, actuator and linkage of `plant.chain`, with the same functions and effects, on the log's own raster. Parameters and state are
 p[row, lane], s[row, lane]; a lane is one parameter set. A few lanes run one after the other, through the chain; more run in blocks, step by
-step together, so that the compiler can use vector instructions. Both ways agree to rounding. SI; times in s.
+step together, so that the compiler can use vector instructions. Both ways agree to rounding. A lane with an effect that the blocks do not
+call, as one just added to `plant.chain`, runs alone: right, but some five times slower. SI; times in s.
 
 The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps, dt)``.
 """
@@ -63,6 +64,9 @@ from plant.chain import (
 )
 from plant.compiled import inlined
 from plant.effects import (
+    EFFECTS,
+    NEUTRAL,
+    ROW,
     acceleration_limit_error,
     aero_load,
     crank_length_error,
@@ -85,6 +89,7 @@ from plant.effects import (
     valve_null_bias,
 )
 from plant.engine import engine_step
+from plant.layout import N_NOMINAL
 from plant.linkage import G_AX, G_AY, G_L, G_LB, G_LC, G_LD, G_LDP, G_LE, G_LX0, G_X1, G_Y1, N_CRANK, N_PER_STAGE, crank
 from plant.parameters import (
     ACCELERATION,
@@ -119,6 +124,16 @@ W = 8  # lanes in a block of the actuator: two vectors of four; more do not run 
 FEW = 2  # so few lanes or fewer are quicker one by one
 WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would be unrolled instead of vectorised
 SOME = 5  # so few lanes or fewer are quicker one by one there
+# effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
+ACTUATOR_BLOCKS = (
+    "aero_load", "end_stop_shift", "internal_leakage", "oil_compressibility", "oil_viscosity", "piston_friction", "piston_stiction",
+    "supply_pressure_droop", "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry", "valve_hysteresis", "valve_lag",
+    "valve_null_bias",
+)  # fmt: skip
+LINKAGE_BLOCKS = (
+    "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "pot_bias",
+    "pot_gain", "pot_lag", "ring_eccentricity", "thermal_growth",
+)  # fmt: skip
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
 # makes its block's scratch array: of constant width, so that the compiler sees the strides
@@ -152,8 +167,9 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
     # a block in which one lane carries a load computes it for all eight: those that do are put side by side
-    order = np.argsort(p[DRIVE_LOADED] != 0.0, kind="stable")
-    wide = _in_blocks(p.shape[1], W, FEW)
+    alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS)
+    order = np.lexsort((p[DRIVE_LOADED] != 0.0, alone))
+    wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
     if wide:
         _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[:wide])
     if wide < p.shape[1]:
@@ -170,11 +186,13 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
     reach = max(1, round(1e-2 / dt))  # samples over which the speed is taken: shorter, and the noise of the LVDT would come through its lag
     ahead, behind = np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1), np.maximum(np.arange(len(x_lvdt)) - reach, 0)
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
-    wide = _in_blocks(p.shape[1], WIDE, SOME)
+    alone = _elsewhere(p, ("linkage", "pot"), LINKAGE_BLOCKS)
+    order = np.argsort(alone, kind="stable")
+    wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     if wide:
-        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
+        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide])
     if wide < p.shape[1]:
-        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, wide)
+        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
 
 
 @_plain
@@ -204,6 +222,12 @@ def _in_blocks(lanes, width, few):
     """How many of the lanes run in blocks; the rest of at most ``few`` one by one."""
     rest = lanes % width
     return lanes - rest if rest <= few else lanes
+
+
+def _elsewhere(p, sites, called):
+    """Return bool[lane]: whether the lane has an effect of these ``sites`` that is not among the ``called`` ones."""
+    rows = [ROW[e.name] + i for e in EFFECTS.values() if e.site in sites and e.name not in called for i in range(len(e.parameters))]
+    return (p[rows] != np.array([[NEUTRAL[r - N_NOMINAL]] for r in rows]).reshape(-1, 1)).any(axis=0)
 
 
 @_plain
@@ -383,11 +407,11 @@ def _ramp_lag(tau, dt):
 
 
 @_plain
-def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first):
-    """The lanes from ``first`` on, one after the other."""
+def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
+    """These ``lanes``, one after the other."""
     g = GEOMETRY
     before = np.empty(3)
-    for j in range(first, p.shape[1]):
+    for j in lanes:
         late = max(p[LVDT_LAG, j], 0.0) + p[LVDT_LAG_ERROR, j]
         for m in range(len(x_lvdt)):
             x = true_stroke(x_lvdt[m] + late * speed[m], p, j, t_oil[m])
@@ -409,16 +433,16 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, first):
 
 
 @_plain
-def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
-    """The first ``lanes`` lanes, `WIDE` at a time."""
+def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
+    """The lanes of ``order``, `WIDE` at a time."""
     g = GEOMETRY
     b = np.empty((_N_LANE, WIDE))
     w = np.empty((3, _N_STAGE, WIDE))
-    for j0 in range(0, lanes, WIDE):
-        last = min(WIDE, lanes - j0)
+    for j0 in range(0, len(order), WIDE):
+        last = min(WIDE, len(order) - j0)
         rubbed = eccentric = False
         for j in range(WIDE):
-            q = j0 + min(j, last - 1)
+            q = order[j0 + min(j, last - 1)]
             b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
             b[_BEND, j], b[_PHASE, j] = p[LINKAGE_COMPLIANCE, q], p[RING_ECCENTRICITY + 3, q]
             b[_DISTANCE, j], b[_LATE, j] = p[LINKAGE_FRICTION + 3, q], max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
@@ -440,7 +464,7 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
                 eccentric |= w[k, _AMPLITUDE, j] != 0.0
         for m in range(len(x_lvdt)):
             for j in range(WIDE):
-                q = j0 + min(j, last - 1)
+                q = order[j0 + min(j, last - 1)]
                 b[_STROKE, j] = true_stroke(x_lvdt[m] + b[_LATE, j] * speed[m], p, q, t_oil[m])
             for j in range(WIDE):
                 b[_C, j], b[_D, j] = _crank(b[_STROKE, j], b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j])
@@ -471,9 +495,9 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
                     w[k, _POT, j] = w[k, _POT, j] if m == 0 else slow
                     w[k, _BEFORE, j] = vane
                 for j in range(last):
-                    out[m, k, j0 + j] = w[k, _POT, j]
+                    out[m, k, order[j0 + j]] = w[k, _POT, j]
         for j in range(last):
-            q = j0 + j
+            q = order[j0 + j]
             s[X, q] = b[_STROKE, j]
             for k in range(3):
                 s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q] = w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j]

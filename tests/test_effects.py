@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from controller import firmware as fw
 from controller import load_calibration, new_state
 from hil.lockstep import Stimulus, flashed, lockstep
-from plant import Model, build_plant, chain, load_model, write_model
+from plant import Model, build_plant, chain, load_model, stages, write_model
 from plant import effects as library
 from plant.effect import DEG, STAGES
 from plant.effects import (
@@ -405,6 +405,21 @@ def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
         alone, state = actuator_lanes([sets[j]], base, 600)
         assert np.array_equal(alone[:, 0], x[:, j]) and np.array_equal(state[:, 0], s[:, j])
         assert np.allclose(linkage_lanes([sets[j]], base, 600)[0][:, :, 0], vanes[:, :, j], rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("called, name, sizes", [
+    ("ACTUATOR_BLOCKS", "valve_null_bias", {"bias": -0.5}),
+    ("LINKAGE_BLOCKS", "linkage_wear", {"vgv1": 100.0}),
+])  # fmt: skip
+def test_an_effect_that_the_blocks_do_not_call_acts_all_the_same(called: str, name: str, sizes, monkeypatch) -> None:
+    sets = [{name: sizes} if j % 3 == 1 else {} for j in range(40)]
+    run = actuator_lanes if called == "ACTUATOR_BLOCKS" else linkage_lanes
+    known = run(sets, build_plant(), 600)[0]
+    monkeypatch.setattr(stages, called, tuple(n for n in getattr(stages, called) if n != name))
+    unknown = run(sets, build_plant(), 600)[0]
+    assert np.abs(known[..., 1] - known[..., 0]).max() > 1e-6 and np.allclose(unknown, known, rtol=0.0, atol=1e-12)
+    monkeypatch.setattr(stages, "_actuator_lanes" if run is actuator_lanes else "_linkage_lanes", lambda *a: None)
+    assert not np.allclose(run(sets, build_plant(), 600)[0][..., 1], known[..., 1])  # it was one by one indeed
 
 
 def test_series_are_the_c_librarys_to_the_last_places() -> None:
