@@ -945,20 +945,30 @@ def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
         raise InputError(f"{folder}: cannot be made ({e.strerror})") from None
     out = [folder / f"{name}.toml" for name in ("stroke_tables", "geometry", "schedules", "vane_angles")]
     write_stroke_tables(result.table, out[0], result.origin)
-    lines = ["# Linkage of the three stages, as measured and adjusted: vaneloop schedule.", ""]
+    write_geometry(result.geometry, out[1], "Linkage of the three stages, as measured and adjusted: vaneloop schedule.")
+    write_schedules(result.schedules, out[2])
+    write_vane_angles(vane_angle_table(result.geometry), result.geometry, out[3], result.origin)
+    return out
+
+
+def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the three stages.") -> None:
+    """Write a geometry as `plant.load_geometry` reads it, each number with its origin."""
+    lines = [f"# {words}", ""]
     for name in ("crank", *STAGES):
         lines.append(f"[{name}]")
-        for key, q in getattr(result.geometry, name):
+        for key, q in getattr(geometry, name):
             tolerance = f", tolerance = {q.tolerance!r}" if q.tolerance else ""
             lines.append(f'{key} = {{ value = {q.value!r}, unit = "{q.unit}"{tolerance}, origin = {_quoted(q.origin)} }}')
         lines.append("")
-    _write(out[1], "\n".join(lines))
+    _write(path, "\n".join(lines))
+
+
+def write_schedules(schedules: Schedules, path: str | Path) -> None:
+    """Write schedules as `plant.load_schedules` reads them."""
     lines = ["# Target vane angles over rotor speed.", ""]
-    for name, axis in result.schedules:
+    for name, axis in schedules:
         lines += [f"[{name}]", f'unit = "{axis.unit}"', f"origin = {_quoted(axis.origin)}", f"values = {axis.values!r}", ""]
-    _write(out[2], "\n".join(lines))
-    write_vane_angles(vane_angle_table(result.geometry), result.geometry, out[3], result.origin)
-    return out
+    _write(path, "\n".join(lines))
 
 
 LOOP_FIGURES = ("width", "width_sigma", "offset", "lb", "lc", "misfit", "noise", "drift", "lag", "extension_covered", "retraction_covered")

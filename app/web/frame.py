@@ -10,12 +10,13 @@ from typing import Any
 
 from nicegui import ui
 
+from app.web.charts import figure as figure_of
 from app.web.session import Session
 from hil.page import THEMES
 
-__all__ = ["PAGES", "Live", "card", "command_line", "complaint", "frame", "opened", "progress", "table", "tone"]
+__all__ = ["PAGES", "Live", "card", "command_line", "complaint", "figure_of", "frame", "opened", "progress", "table", "tone"]
 
-PAGES = (("/", "Missing physics"),)
+PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"))
 PRIMARY = "#1f6fc4"
 
 
@@ -76,11 +77,13 @@ class Live:
         """Call ``draw`` when one of ``sections`` has changed."""
         self.parts.append((draw, sections))
 
-    def part(self, draw: Callable[[], None], *sections: str, classes: str = "stackc") -> None:
-        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed."""
+    def part(self, draw: Callable[[], None], *sections: str, classes: str = "stackc", only: Callable[[], bool] = lambda: True) -> None:
+        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``only`` says so."""
         box = ui.element("div").classes(classes)
 
         def again() -> None:
+            if not only():
+                return
             box.clear()
             with box:
                 draw()

@@ -7,8 +7,8 @@ from typing import Any
 
 from nicegui import events, ui
 
-from app.web.charts import Chart, figure
-from app.web.frame import Live, card, command_line, complaint, dark, frame, opened, progress, table, tone
+from app.web.charts import Chart
+from app.web.frame import Live, card, command_line, complaint, dark, figure_of, frame, opened, progress, table, tone
 from app.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
 from discrepancy.locate import Regime
 from hil.logs import UNITS
@@ -17,7 +17,7 @@ from hil.page import Panel as PagePanel
 from hil.page import heat, number, overlay, waterfall
 from plant.effects import EFFECTS
 
-__all__ = ["build"]
+__all__ = ["build", "receive", "suffixes"]
 
 
 def build(session: Session, most: int) -> None:
@@ -29,6 +29,32 @@ def build(session: Session, most: int) -> None:
         page.where()
         page.what()
         page.next()
+
+
+def suffixes() -> str:
+    """What an upload accepts."""
+    return ",".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))
+
+
+async def receive(s: Session, e: events.UploadEventArguments, section: str) -> LogFile | None:
+    """Keep an uploaded file in the session's private folder; None, and a complaint, where it is of no kind that we know."""
+    name = safe_name(e.file.name)
+    if not name.lower().endswith((*LOG_SUFFIXES, *OTHER_SUFFIXES)):
+        s.errors[section] = (
+            f"{name}: suffix {name[name.rfind('.') :] if '.' in name else ''!r} is not a log's; allowed: {', '.join(LOG_SUFFIXES)}"
+        )
+        s.touch(section)
+        return None
+    folder = s.folder / f"upload{len(list(s.folder.glob('upload*'))) + 1}"
+    folder.mkdir(mode=0o700)
+    path = folder / name
+    await e.file.save(path)
+    path.chmod(0o600)
+    file = LogFile(path, name, name)
+    if name.lower().endswith(LOG_SUFFIXES):
+        s.files.append(file)
+    s.touch("files")
+    return file
 
 
 class _Page:
@@ -47,7 +73,7 @@ class _Page:
                         label="drop a log here, or press +", auto_upload=True, max_file_size=self.most, on_upload=self._uploaded,
                         on_rejected=self._rejected,
                     )  # fmt: skip
-                    self.upload.props(f'accept="{",".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))}" flat')
+                    self.upload.props(f'accept="{suffixes()}" flat')
                     self.live.part(self._choose, "files", "log")
                     self.live.part(self._about, "log", "jobs")
                 with ui.element("div").classes("stackc"):
@@ -70,24 +96,10 @@ class _Page:
         ui.select(options, value=at, label="or choose one", on_change=chosen).props("outlined dense options-dense").classes("w-full choose")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
-        s = self.s
-        name = safe_name(e.file.name)
-        if not name.lower().endswith((*LOG_SUFFIXES, *OTHER_SUFFIXES)):
-            allowed = ", ".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))
-            s.errors["log"] = f"{name}: suffix {'.' + name.rpartition('.')[2]!r} is not a log's; allowed: {allowed}"
-            s.touch("log")
-            return
-        folder = s.folder / f"upload{len(list(s.folder.glob('upload*'))) + 1}"
-        folder.mkdir(mode=0o700)
-        path = folder / name
-        await e.file.save(path)
-        path.chmod(0o600)
-        file = LogFile(path, name, name)
-        if name.lower().endswith(LOG_SUFFIXES):
-            s.files.append(file)
-        s.choose(file)
-        s.touch("files")
+        file = await receive(self.s, e, "log")
         self.upload.reset()
+        if file is not None:
+            self.s.choose(file)
 
     def _rejected(self) -> None:
         limit = f"{self.most / 2**20:.0f} MB"
@@ -252,7 +264,7 @@ class _Page:
         ]
         names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
         f = heat(cells, [str(i + 1) for i in range(width)], names, "noise floors", "an eighth of the samples each, lowest to highest", "")
-        figure(f, dark(self.s), height=90 + 27 * max(3, len(names)))
+        figure_of(f, dark(self.s), height=90 + 27 * max(3, len(names)))
         ui.label(f"Worst: {mine[0].worst()}.").classes("note")
 
     # ---- 3: what
@@ -378,7 +390,7 @@ class _Page:
                     f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
                 )
                 ui.label("noise floors, held out").classes("l")
-        figure(waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250)
+        figure_of(waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250)
 
     def _sliders(self) -> None:
         s = self.s
@@ -447,7 +459,7 @@ class _Page:
         if e is not None:
             ui.label(e["text"])
             lines = [PageLine("n_dem", e["t"], e["n_dem"], "target")]
-            figure(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
+            figure_of(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
         command_line(s.command("experiment", "--out", "next_demand.csv"))
 
     def _save(self) -> None:

@@ -20,7 +20,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import app as pages
 from nicegui import ui
 
-from app.web import missing
+from app.web import missing, schedule
 from app.web.charts import Curves, view
 from app.web.guard import Guard
 from app.web.session import LOG_SUFFIXES, LogFile, Session
@@ -90,6 +90,10 @@ def _serve(sock: socket.socket, folder: Path, token: str | None, most: int, read
     @ui.page("/", title="VaneLoop: missing physics")
     def _missing() -> None:
         missing.build(sessions.get(pages.storage.browser["id"]), most)
+
+    @ui.page("/schedule", title="VaneLoop: schedule")
+    def _schedule() -> None:
+        schedule.build(sessions.get(pages.storage.browser["id"]), most)
 
     @pages.get("/curves/{name}")
     async def _curves(name: str, request: Request, n: int = 1000) -> Response:

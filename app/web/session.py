@@ -80,7 +80,7 @@ class Session:
     """State of the pages of one browser. ``versions`` count what has changed, section by section."""
 
     def __init__(self, number: str, folder: Path, files: list[LogFile]):
-        self.number, self.folder, self.files = number, folder, files
+        self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
         folder.mkdir(mode=0o700, parents=True)
         self.versions: dict[str, int] = {}
         self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
@@ -111,7 +111,7 @@ class Session:
         self.experiment: dict[str, Any] | None = None
         self.experiment_done = False
         self._hand_wanted = False
-        self.saved = {}
+        self.saved = {k: v for k, v in self.saved.items() if k.startswith(("schedule-", "entered-", "run-"))}
 
     # ---- housekeeping
 
@@ -140,7 +140,8 @@ class Session:
 
     def clean(self, text: str) -> str:
         """Name files as the user does, not by their private folder."""
-        for f in [x for x in (self.choice.file, self.choice.dbc, self.choice.model) if x is not None]:
+        beside = [x for x in (self.choice.dbc, self.choice.model) if x is not None]
+        for f in [*self.files, *beside]:
             text = text.replace(str(f.path), f.name)
         return text.replace(str(self.folder) + "/", "")
 

@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-__all__ = ["TASKS"]
+__all__ = ["STEPS", "TASKS"]
 
 Progress = Callable[[float | None, str], None]
 MOST_MEMORY = 0.75  # of the machine's
@@ -234,8 +234,63 @@ def command(progress: Progress, words: list[str]) -> dict[str, Any]:
     return {"code": code, "text": said.getvalue()}
 
 
+def engine_part(progress: Progress, path: str) -> tuple[str, Any]:
+    """Read geometry or schedules: which of them the file is, and its content."""
+    from plant import load_geometry, load_schedules
+    from tables import InputError
+
+    try:
+        return "geometry", load_geometry(path)
+    except InputError as no_geometry:
+        try:
+            return "schedules", load_schedules(path)
+        except InputError as no_schedules:
+            looks = "speed" in Path(path).read_bytes()[:200_000].decode("utf-8", "replace").split("[vigv]")[0]
+            raise (no_schedules if looks else no_geometry) from None
+
+
+STEPS = ("mechanism", "stroke", "links", "loop", "tables")  # of the schedule page
+
+
+def schedule_step(progress: Progress, step: str, words: list[str], out: str, command: str) -> Any:
+    """One step of the scheduling method, by the functions of ``vaneloop schedule``."""
+    import numpy as np
+
+    from app.schedule_page import NAMES, schedule_page
+    from app.scheduling import STROKE_LIMITS, ScheduleOptions, schedule, stroke_tables, table_speeds, write_tables
+    from hil.logs import read_log
+    from plant import load_geometry, load_schedules
+    from plant.geometry import vane_angles
+    from plant.linkage import STAGES
+    from plant.spatial import plane_joints
+
+    args = parsed("schedule", words)
+    progress(None, "reading")
+    geometry, schedules = load_geometry(args.geometry), load_schedules(args.schedules)
+    if step == "mechanism":
+        strokes = np.linspace(*STROKE_LIMITS, 97)
+        angles = np.rad2deg(vane_angles(strokes * 1e-3, geometry))
+        stages = []
+        for k, name in enumerate(STAGES):
+            joints = [list(plane_joints(geometry, name, x * 1e-3).values()) for x in strokes]
+            places = [[[round(p.real * 1e3, 3), round(p.imag * 1e3, 3)] for p in j] for j in joints]
+            radius = float(getattr(geometry, name).ld.value)
+            stages.append({"key": name, "name": NAMES[name], "joints": places, "radius": radius, "angles": angles[:, k].tolist()})
+        return {"strokes": strokes.tolist(), "stages": stages}
+    if step == "stroke":
+        speed = table_speeds(schedules)
+        return {"speed": speed, "table": stroke_tables(geometry, schedules, speed)}
+    options = ScheduleOptions(args.step, args.lb_range, args.lc_range, ("lb", "lc"), args.criterion, args.limit)
+    log = read_log(args.log, require=("x_lvdt", "vigv")) if args.log else None
+    result = schedule(geometry, schedules, log, options, lambda f: progress(f, "scheduling"))
+    if step != "tables":
+        return result
+    files = [str(f) for f in write_tables(result, out)]
+    return {"result": result, "files": [*files, str(schedule_page(result, Path(out) / "schedule.html", command))]}
+
+
 TASKS: dict[str, Callable[..., Any]] = {
-    **{f.__name__: f for f in (offers, preview, compare, diagnose, refit, hand, experiment, report, command)},
+    **{f.__name__: f for f in (offers, preview, compare, diagnose, refit, hand, experiment, report, command, engine_part, schedule_step)},
     "ahead": refit,  # the same, before the user asks for it
 }
 
