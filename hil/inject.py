@@ -75,7 +75,7 @@ SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES
 # ---- lockstep: controller, ECU and bus in simulated time ----------------------------------------------------------------------------
 
 
-class _Machine:
+class MachineChange:
     """What a `Machine` action does to the plant, undone at its end."""
 
     def __init__(self, action: Machine, node: Node):
@@ -112,7 +112,7 @@ class _Machine:
             derive(self.arrays.p, chain.TICK / chain.SUBSTEPS, chain.TICK)
 
 
-class _Disturber:
+class Disturber:
     """What happens to the bus itself: error frames with a chance, nodes in bus-off."""
 
     def __init__(self, actions: Sequence[Action], wire: Any, places: dict[str, int]):
@@ -140,7 +140,7 @@ class _Disturber:
                 node[w.TO_RECOVER] = w.RECOVER if k == end else 1 << 40
 
 
-def _sender(action: Action) -> str:
+def sender_of(action: Action) -> str:
     """Return the node whose frames the action works on."""
     return next(who for who, names in SENDER.items() if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names)
 
@@ -162,17 +162,17 @@ def _lockstep(
     ticks = round(scenario.duration * 1000.0)
     of = {kind: [a for a in scenario.inject if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
     chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
-    gateways = [Gateway([a for a in of[OnFrame] if _sender(a) == who], c) for who, c in zip(("ECU", "VGV"), chance, strict=False)]
+    gateways = [Gateway([a for a in of[OnFrame] if sender_of(a) == who], c) for who, c in zip(("ECU", "VGV"), chance, strict=False)]
     recorded: list[tuple[int, int, int]] = []
     keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
     intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
-    machines = [_Machine(a, node) for a in of[Machine]]  # type: ignore[arg-type]
+    machines = [MachineChange(a, node) for a in of[Machine]]  # type: ignore[arg-type]
     channel = Channel(seed=scenario.seed)
     wire, join = channel.wire, channel.join
     places = {"ECU": join(), "VGV": join()}
     outside = [join() for _ in intruders]
     ears = join(silent=True) if keep else -1
-    disturber = _Disturber(of[OnBus], wire, places)
+    disturber = Disturber(of[OnBus], wire, places)
     rows = np.zeros((256, 2), np.int64)
 
     z, s, a = node.arrays.z, node.arrays.s, node.arrays

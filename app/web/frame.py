@@ -16,7 +16,7 @@ from hil.page import THEMES
 
 __all__ = ["PAGES", "Live", "card", "command_line", "complaint", "figure_of", "frame", "opened", "progress", "table", "tone"]
 
-PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"))
+PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
 PRIMARY = "#1f6fc4"
 
 

@@ -50,6 +50,7 @@ class Worker:
     def __init__(self, module: str = "app.web.worker", changed: Callable[[], None] | None = None):
         self.module = module
         self.changed = changed or (lambda: None)
+        self.news: Callable[[Any], None] | None = None  # takes what a task that runs on sends
         self.jobs: dict[int, Job] = {}
         self.process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
@@ -83,6 +84,12 @@ class Worker:
             self._end(job.number, WorkError("the worker process has ended"))
         return await job.future
 
+    def tell(self, **content: Any) -> None:
+        """Say something to the task that is running; it is short and never waits long."""
+        if self._connection is not None:
+            with contextlib.suppress(OSError):
+                self._connection.send((0, "tell", content))
+
     def stop(self) -> None:
         """End the process and everything that it started; whoever waits for an answer gets Cancelled."""
         process, self.process = self.process, None
@@ -113,9 +120,12 @@ class Worker:
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(self._lost, process)
 
-    def _progress(self, number: int, fraction: float | None, text: str) -> None:
+    def _progress(self, number: int, fraction: float | None, text: Any) -> None:
         job = self.jobs.get(number)
-        if job is not None:
+        if job is not None and not isinstance(text, str):
+            if self.news is not None:
+                self.news(text)
+        elif job is not None:
             job.fraction, job.text = fraction, text or job.text
             self.changed()
 

@@ -20,7 +20,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import app as pages
 from nicegui import ui
 
-from app.web import missing, schedule
+from app.web import missing, run, schedule
 from app.web.charts import Curves, view
 from app.web.guard import Guard
 from app.web.session import LOG_SUFFIXES, LogFile, Session
@@ -94,6 +94,10 @@ def _serve(sock: socket.socket, folder: Path, token: str | None, most: int, read
     @ui.page("/schedule", title="VaneLoop: schedule")
     def _schedule() -> None:
         schedule.build(sessions.get(pages.storage.browser["id"]), most)
+
+    @ui.page("/run", title="VaneLoop: run")
+    def _run() -> None:
+        run.build(sessions.get(pages.storage.browser["id"]), most)
 
     @pages.get("/curves/{name}")
     async def _curves(name: str, request: Request, n: int = 1000) -> Response:

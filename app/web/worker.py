@@ -23,7 +23,7 @@ from typing import Any
 
 __all__ = ["STEPS", "TASKS"]
 
-Progress = Callable[[float | None, str], None]
+Progress = Callable[[float | None, Any], None]
 MOST_MEMORY = 0.75  # of the machine's
 LEAST_MEMORY = 4 << 30  # bytes; compiled code reserves address space of its own
 
@@ -305,37 +305,47 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def main(fd: int) -> None:
-    """Answer questions until the server is gone."""
+INBOX: queue.Queue[dict[str, Any]] = queue.Queue()  # what the server tells a task that is running
+
+
+def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> None:
+    """Answer questions with ``tasks`` until the server is gone."""
     connection = Connection(fd)
     _limit_memory()
-    os.nice(5)  # the page answers first
     questions: queue.Queue[Any] = queue.Queue()
 
     def listen() -> None:
         try:
             while True:
-                questions.put(connection.recv())
+                number, name, arguments = connection.recv()
+                if name == "tell":
+                    INBOX.put(arguments)
+                else:
+                    questions.put((number, name, arguments))
         except (EOFError, OSError):
             os.killpg(os.getpgrp(), signal.SIGKILL)  # the server is gone, and so is whatever this process has started
 
     threading.Thread(target=listen, daemon=True).start()
+    sending = threading.Lock()
     while True:
         number, name, arguments = questions.get()
         last = 0.0
 
-        def progress(fraction: float | None, text: str, number: int = number) -> None:
+        def progress(fraction: float | None, text: Any, number: int = number) -> None:
+            """Tell the page: a fraction and words, or any news of a task that runs on."""
             nonlocal last
             now = time.monotonic()
             if fraction is None or fraction in (0.0, 1.0) or now - last > 0.05:
                 last = now
-                connection.send(("progress", number, (fraction, text)))
+                with sending:
+                    connection.send(("progress", number, (fraction, text)))
 
         try:
-            answer = ("done", number, TASKS[name](progress, **arguments))
+            answer = ("done", number, tasks[name](progress, **arguments))
         except BaseException as e:
             answer = ("failed", number, _line(e))
-        connection.send(answer)
+        with sending:
+            connection.send(answer)
 
 
 def _line(e: BaseException) -> str:
@@ -354,4 +364,5 @@ def _line(e: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    os.nice(5)  # the page answers first
+    main(int(sys.argv[1]), TASKS)

@@ -1,0 +1,477 @@
+"""Page 3, Run: the loop live. Demand, strip charts, lamps, the bus's trace, faults on purpose, lateness, and a record for page 1."""
+
+from __future__ import annotations
+
+import shlex
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from hil.ecu import BUILTIN
+from nicegui import events, ui
+
+from app.web.charts import Chart, Curves, Panel, Trace
+from app.web.frame import Live, card, command_line, complaint, dark, figure_of, frame
+from app.web.jobs import Cancelled, Worker, WorkError
+from app.web.loop import COLUMNS
+from app.web.session import LogFile, Session
+from controller import FAULTS, MODES
+from hil.frames import IDENT_MASK, NAMES
+from hil.page import bars
+from hil.scenario import library, load_scenario
+
+__all__ = ["build"]
+
+KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
+SHOWN = 30.0  # s in the strip charts
+TRACED = 2000  # frames kept for the trace
+TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
+STRIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
+    ("speed [%]", "%", (("n_dem", "target"), ("n_r", "measured"))),
+    ("stroke [mm]", "mm", (("x_dem", "target"), ("x_lvdt", "measured"))),
+    ("current [mA]", "mA", (("i_cmd", "model"),)),
+    ("vanes [deg]", "deg", (("vigv", "measured"), ("vgv1", "model"), ("vgv2", "target"))),
+)
+
+
+@dataclass
+class Loop:
+    """The loop that runs, or ran last, in one session."""
+
+    session: Session
+    bus: str = "lockstep"
+    speed: float = 1.0
+    demand: float = 70.0
+    profile: str | None = None
+    seed: int | None = 1
+    record: bool = True
+    running: bool = False
+    rows: np.ndarray = field(default_factory=lambda: np.empty((0, len(COLUMNS))))
+    filled: int = 0
+    trace: deque[tuple[float, int, int, dict[str, float]]] = field(default_factory=lambda: deque(maxlen=TRACED))
+    status: dict[str, Any] = field(default_factory=dict)
+    late: dict[str, Any] = field(default_factory=dict)
+    recorded: LogFile | None = None
+    events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
+    workers: dict[str, Worker] = field(default_factory=dict)
+    runs: int = 0
+
+    # ---- begin and end
+
+    def start(self) -> None:
+        """Start as the page says."""
+        if self.running:
+            return
+        s = self.session
+        self.running, self.filled, self.status, self.late = True, 0, {}, {}
+        self.rows = np.empty((KEPT, len(COLUMNS)))
+        self.trace.clear()
+        self.events.clear()
+        self.runs += 1
+        s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
+        s.touch("loop")
+
+    def _worker(self, name: str) -> Worker:
+        w = self.workers.get(name)
+        if w is None:
+            w = self.workers[name] = Worker("app.web.loop", changed=lambda: None)
+            w.news = self._news
+            self.session.extra.setdefault("closers", []).append(w.stop)
+        return w
+
+    def _record_path(self) -> str | None:
+        return str(self.session.folder / f"run{self.runs}.log") if self.record else None
+
+    async def _in_lockstep(self) -> None:
+        record = self._record_path()
+        try:
+            await self._worker("loop").call(
+                "lockstep", "running", demand=self.demand, speed=self.speed, record=record, seed=self.seed, profile=self.profile
+            )
+        finally:
+            self._ended(record)
+
+    async def _in_real_time(self) -> None:
+        import asyncio
+
+        record = self._record_path()
+        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name}"
+        listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
+        calls = [
+            listener.call("listen", "running", bus=bus),
+            controller.call("node", "running", bus=bus, record=record, seed=self.seed),
+            engine.call("ecu", "running", bus=bus, demand=self.demand, profile=self.profile),
+        ]
+        tasks = [asyncio.ensure_future(c) for c in calls]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+            for t in done:
+                t.result()
+            self.late = {**self.late, **tasks[1].result()}
+        except (WorkError, Cancelled):
+            for w in (listener, controller, engine):
+                w.stop()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            raise
+        finally:
+            self._ended(record)
+
+    def _ended(self, record: str | None) -> None:
+        self.running = False
+        path = self.session.folder / f"run{self.runs}.log"
+        if record is not None and path.is_file() and path.stat().st_size:
+            self.recorded = LogFile(path, f"recorded: {path.name}", path.name)
+            self.session.files.append(self.recorded)
+            self.session.saved[f"run-{path.name}"] = path
+            self.session.touch("files")
+        self.session.touch("loop", "run")
+
+    def stop(self) -> None:
+        """Ask it to end; the record is complete then."""
+        for w in self.workers.values():
+            if w.jobs:
+                w.tell(stop=True)
+
+    # ---- while it runs
+
+    def tell(self, **content: Any) -> None:
+        """Say something to whoever it concerns."""
+        for name, w in self.workers.items():
+            if w.jobs and name != "listen":
+                w.tell(**content)
+
+    def inject(self, name: str) -> None:
+        """Start a scenario of the library now."""
+        if self.bus == "lockstep":
+            self.tell(inject=name)
+        else:
+            self.session.do("inject", self._inject_outside(name))
+        self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
+        self.session.touch("events")
+
+    async def _inject_outside(self, name: str) -> None:
+        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name}"
+        w = Worker()
+        self.session.extra.setdefault("closers", []).append(w.stop)
+        try:
+            answer = await w.call("command", f"injecting {name}", words=["inject", name, "--bus", bus])
+            self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
+        finally:
+            w.stop()
+            self.session.touch("events")
+
+    def now(self) -> float:
+        """Time of the latest row, s."""
+        return float(self.rows[self.filled - 1, 0]) if self.filled else 0.0
+
+    def latest(self, name: str) -> float:
+        """Return the latest value of a column; NaN before the first."""
+        return float(self.rows[self.filled - 1, COLUMNS.index(name)]) if self.filled else float("nan")
+
+    def _news(self, news: dict[str, Any]) -> None:
+        if "late" in news:
+            self.late = news
+            return
+        rows = news.pop("rows")[-KEPT:]
+        over = self.filled + len(rows) - KEPT
+        if over > 0:
+            drop = max(over, KEPT // 10)
+            self.rows[: self.filled - drop] = self.rows[drop : self.filled].copy()
+            self.filled = max(0, self.filled - drop)
+        self.rows[self.filled : self.filled + len(rows)] = rows
+        self.filled += len(rows)
+        self.trace.extend(news.pop("trace"))
+        self.status = news
+        self._draw()
+
+    def _draw(self) -> None:
+        rows = self.rows[: self.filled]
+        if not len(rows):
+            self.session.curves["run"] = Curves()
+            return
+        rows = rows[np.searchsorted(rows[:, 0], rows[-1, 0] - SHOWN) :].copy()
+        keep = np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])
+        rows = rows[keep]
+        t = rows[:, 0]
+        panels = [
+            Panel(title, unit, t, [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines], height=120)
+            for title, unit, lines in STRIPS
+        ]
+        self.session.curves["run"] = Curves(panels, "run")
+
+
+def build(session: Session, most: int) -> None:
+    """Draw the page."""
+    if "loop" not in session.extra:
+        session.extra["loop"] = Loop(session)
+    with frame(session, "/run"):
+        page = _Page(session, Live(session))
+        page.controls()
+        with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
+            page.strips()
+            page.inject()
+        with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
+            page.trace()
+            page.lateness()
+
+
+class _Page:
+    def __init__(self, session: Session, live: Live):
+        self.s, self.live = session, live
+        self.loop: Loop = session.extra["loop"]
+
+    # ---- start, stop, demand
+
+    def controls(self) -> None:
+        """Bus, speed, start and stop; demand; the commands."""
+        with card("1  The loop", "Controller with its plant, the engine's ECU, and the CAN bus between them."):
+            self.live.part(self._start, "loop", "run", classes="rowc")
+            with ui.element("div").classes("rowc").style("margin-top:10px;width:100%;flex-wrap:nowrap"):
+                ui.label("speed demand").classes("soft").style("white-space:nowrap")
+                slider = (
+                    ui.slider(min=30, max=102, step=0.5, value=self.loop.demand)
+                    .props('aria-label="speed demand"')
+                    .style("flex:1;max-width:560px")
+                )
+                self.demand = ui.label(f"{self.loop.demand:.1f} %").classes("mono").style("width:70px")
+
+                def turned(e: events.GenericEventArguments) -> None:
+                    self.loop.demand, self.loop.profile = float(e.args), None
+                    self.demand.set_text(f"{self.loop.demand:.1f} %")
+                    self.loop.tell(demand=self.loop.demand)
+
+                slider.on("update:model-value", turned, throttle=0.05)
+
+                def chosen(e: events.ValueChangeEventArguments) -> None:
+                    self.loop.profile = e.value or None
+                    if e.value:
+                        self.loop.tell(profile=e.value)
+
+                options = {"": "by slider", **{n: f"{n}: {words}" for n, (words, _) in BUILTIN.items()}}
+                ui.select(options, value=self.loop.profile or "", label="or a profile", on_change=chosen).props(
+                    "outlined dense options-dense"
+                ).style("min-width:260px").classes("profile")
+
+                def ask(e: events.ValueChangeEventArguments) -> None:
+                    self.loop.tell(mode_request=int(e.value == "run"))
+
+                ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
+                    "dense unelevated no-caps padding='2px 10px'"
+                ).tooltip("mode that the ECU asks for")
+            self.live.part(self._commands, "loop", "run")
+
+    def _start(self) -> None:
+        lp = self.loop
+        if lp.running:
+            ui.button("Stop", icon="stop", on_click=lp.stop).props("unelevated color=negative padding='5px 18px'")
+        else:
+            ui.button("Start", icon="play_arrow", on_click=lp.start).props("unelevated padding='5px 18px'")
+        kinds = {"lockstep": "lockstep: simulated time", "local": "real time, embedded bus", "vcan0": "real time, vcan0"}
+
+        def join(e: events.ValueChangeEventArguments) -> None:
+            lp.bus = e.value
+            self.s.touch("loop")
+
+        bus = ui.select(kinds, value=lp.bus, on_change=join)
+        bus.props("outlined dense options-dense").style("min-width:220px").classes("bus")
+        if lp.running:
+            bus.disable()
+        if lp.bus == "lockstep":
+            speeds = {0.1: "0.1 x real time", 0.5: "0.5 x", 1.0: "1 x", 3.0: "3 x", 10.0: "10 x", 0.0: "as fast as it goes"}
+
+            def speed(e: events.ValueChangeEventArguments) -> None:
+                lp.speed = float(e.value)
+                lp.tell(speed=lp.speed)
+
+            ui.select(speeds, value=lp.speed, on_change=speed).props("outlined dense options-dense").style("min-width:150px").classes(
+                "pace"
+            )
+        noisy = ui.checkbox("noisy sensors", value=lp.seed is not None, on_change=lambda e: setattr(lp, "seed", 1 if e.value else None))
+        record = ui.checkbox("record", value=lp.record, on_change=lambda e: setattr(lp, "record", bool(e.value)))
+        if lp.running:
+            noisy.disable()
+            record.disable()
+        complaint(self.s, "run", "inject")
+        if lp.recorded is not None and not lp.running:
+            name = lp.recorded.path.name
+            ui.link(f"download {name}", f"/saved/run-{name}").props(f'download="{name}"').style("color:var(--measured)")
+
+            def find() -> None:
+                assert lp.recorded is not None
+                self.s.choose(lp.recorded)
+                ui.navigate.to("/")
+
+            ui.button("Open in missing physics", icon="arrow_forward", on_click=find).props("outline dense padding='4px 12px'").classes(
+                "open-record"
+            )
+
+    def _commands(self) -> None:
+        lp = self.loop
+        seed = ["--seed", str(lp.seed)] if lp.seed is not None else []
+        record = ["--record", "run.log"] if lp.record else []
+        if lp.bus == "lockstep":
+            command_line(shlex.join(["vaneloop", "run", "--bus", "lockstep", "--profile", lp.profile or "ramp", *seed, *record]))
+        else:
+            command_line(shlex.join(["vaneloop", "run", "--bus", lp.bus, *seed, *record]))
+            command_line(shlex.join(["vaneloop", "ecu", "--bus", lp.bus, *(["--profile", lp.profile] if lp.profile else [])]))
+
+    # ---- charts and lamps
+
+    def strips(self) -> None:
+        """Lamps, figures, strip charts."""
+        with card("2  Signals, as the bus has them"):
+            with ui.element("div").classes("rowc"):
+                self.lamps: dict[str, ui.element] = {}
+                for name in (*MODES, *FAULTS):
+                    with ui.element("span").classes("lamp").props(f'data-lamp="{name}"') as lamp:
+                        ui.element("i")
+                        ui.label(name if name in MODES else name.replace("_", " "))
+                    self.lamps[name] = lamp
+            with ui.element("div").classes("tiles").style("margin:8px 0"):
+                self.tiles: dict[str, ui.label] = {}
+                for name, words in (
+                    ("t", "time, s"),
+                    ("n_r", "speed, %"),
+                    ("x_lvdt", "stroke, mm"),
+                    ("vigv", "VIGV, deg"),
+                    ("p_s", "supply, MPa"),
+                    ("pace", "x real time"),
+                ):
+                    with ui.element("div").classes("tile"):
+                        self.tiles[name] = ui.label("-").classes("v")
+                        ui.label(words).classes("l")
+            Chart("run", live=8.0)
+            ui.timer(0.2, self._lamps)
+
+    def _lamps(self) -> None:
+        lp = self.loop
+        state, faults = lp.latest("state"), lp.latest("faults")
+        mode = MODES[int(state)] if state == state and 0 <= state < len(MODES) else ""
+        bits = int(faults) if faults == faults else 0
+        for name, lamp in self.lamps.items():
+            if name in MODES:
+                tone = TONES.get(name, "mid") if name == mode else ""
+            else:
+                tone = "bad" if (bits >> FAULTS.index(name)) & 1 else ""
+            wanted = f"lamp {tone}".strip()
+            if getattr(lamp, "shown", None) != wanted:
+                lamp.classes(replace=wanted)
+                lamp.shown = wanted  # type: ignore[attr-defined]
+        for name, tile in self.tiles.items():
+            v = lp.status.get("speed", 1.0 if lp.bus != "lockstep" and lp.running else float("nan")) if name == "pace" else lp.latest(name)
+            tile.set_text("-" if v != v else f"{v:.1f}" if name in ("t", "pace") else f"{v:.2f}")
+
+    # ---- injection
+
+    def inject(self) -> None:
+        """A button for every scenario of the library."""
+        with card("3  A bad day, on purpose"):
+            find = ui.input(placeholder="find a scenario").props('outlined dense clearable aria-label="find a scenario"').classes("w-full")
+            with ui.element("div").classes("effects").style("max-height:330px"):
+                boxes = []
+                for name in library():
+                    title = load_scenario(name).title
+                    with ui.element("div").style("padding:3px 0;border-bottom:1px solid var(--grid)") as box:
+                        ui.button(name, on_click=lambda name=name: self._begin(name)).props(
+                            "flat dense no-caps align=left padding='1px 6px'"
+                        ).tooltip(title)
+                        ui.label(title).classes("note").style("padding-left:6px;line-height:1.3")
+                    boxes.append((box, f"{name} {title}".lower()))
+
+            def search(e: events.ValueChangeEventArguments) -> None:
+                for box, text in boxes:
+                    box.set_visibility((e.value or "").lower() in text)
+
+            find.on_value_change(search)
+            self.live.part(self._events, "events", "loop")
+
+    def _begin(self, name: str) -> None:
+        if self.loop.running:
+            self.loop.inject(name)
+        else:
+            ui.notify("start the loop first")
+
+    def _events(self) -> None:
+        for text in self.loop.events:
+            ui.label(text).classes("small mono")
+        if self.loop.events:
+            last = self.loop.events[-1].split("  ", 1)[1].split(":")[0]
+            command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus]))
+
+    # ---- trace
+
+    def trace(self) -> None:
+        """Decoded frames, with a filter."""
+        with card("4  The bus"):
+            with ui.element("div").classes("rowc"):
+                words = ui.input(placeholder="filter: name, 0B0, signal").props('outlined dense clearable aria-label="filter of the trace"')
+                hold = ui.checkbox("hold")
+                self.counts = ui.label().classes("soft small")
+            box = ui.html("", sanitize=False).classes("trace w-full").props('role="log"')
+            seen = {"n": -1.0, "text": ""}
+
+            def show() -> None:
+                lp, text = self.loop, (words.value or "").lower()
+                s = lp.status
+                if hold.value or not s or (s.get("frames"), text) == (seen["n"], seen["text"]):
+                    return
+                seen["n"], seen["text"] = s.get("frames", 0), text
+                load = f", load {100 * s['load']:.0f} %" if "load" in s else ""
+                self.counts.set_text(f"{s.get('frames', 0):,} frames, {s.get('refused', 0):,} with a wrong CRC{load}")
+                lines = []
+                for t, head, data, values in reversed(lp.trace):
+                    line = _in_words(t, head, data, values)
+                    if not text or text in line.lower():
+                        lines.append(line)
+                        if len(lines) >= 60:
+                            break
+                import html
+
+                box.set_content(html.escape("\n".join(lines)))
+
+            ui.timer(0.25, show)
+
+    # ---- lateness
+
+    def lateness(self) -> None:
+        """Lateness of the ticks in real time."""
+        with card("5  Real time"):
+            ui.label("How late each 1 ms tick of the controller began.").classes("soft small")
+            holder = ui.element("div").classes("stackc")
+            seen: dict[str, Any] = {"ticks": None, "dark": None}
+
+            def show() -> None:
+                late = self.loop.late
+                figures = late.get("late")
+                key = (late.get("ticks", (figures or {}).get("ticks")), dark(self.s), self.loop.bus, bool(figures))
+                if key == seen["ticks"]:
+                    return
+                seen["ticks"] = key
+                holder.clear()
+                with holder:
+                    if not figures:
+                        ui.label(
+                            "Lockstep is never late; start it in real time to see." if self.loop.bus == "lockstep" else "Not started yet."
+                        ).classes("soft")
+                        return
+                    ui.label(
+                        ", ".join(
+                            f"{n} {figures[k]:.0f} us"
+                            for n, k in (("p50", "p50_us"), ("p99", "p99_us"), ("p99.9", "p999_us"), ("max", "max_us"))
+                        )
+                    ).classes("mono")
+                    names, counts = zip(*late["histogram"], strict=True)
+                    f = bars(list(names), {"ticks": [max(c, 0) for c in counts]}, "ticks")
+                    f["layout"]["yaxis"] = {**f["layout"].get("yaxis", {}), "type": "log"}
+                    figure_of(f, dark(self.s), 300)
+
+            ui.timer(0.5, show)
+
+
+def _in_words(t: float, head: int, data: int, values: dict[str, float]) -> str:
+    ident = head & IDENT_MASK
+    name = NAMES.get(ident, "?") if not head >> 29 & 7 else "error frame" if head >> 29 & 1 else "remote" if head >> 30 & 1 else "extended"
+    raw = (data & (1 << 64) - 1).to_bytes(8, "little")[: min((head >> 32) & 0xFF, 8)].hex(" ").upper()
+    said = "  ".join(f"{k} {v:.6g}" for k, v in values.items()) or ("WRONG CRC" if name in NAMES.values() else "")
+    return f"{t:10.3f}  {ident:03X}  {name:<11} {raw:<24} {said}"
