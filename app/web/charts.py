@@ -10,17 +10,16 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from nicegui.element import Element
-from nicegui.elements.plotly import Plotly
+from nicegui.elements import plotly as bundled
 from tsdownsample import MinMaxLTTBDownsampler
 
 from hil.page import THEMES, break_at_holes
 
-__all__ = ["Chart", "Curves", "Panel", "Trace", "figure", "painted", "view"]
+__all__ = ["Chart", "Curves", "Figure", "Panel", "Trace", "figure", "of_log", "painted", "view"]
 
 Array = np.ndarray
 MOST_POINTS = 4000  # a line and view, whatever the browser asks for
@@ -79,6 +78,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
 def _thin(t: Array, lines: Sequence[Array], n_out: int) -> tuple[Array, list[Array]]:
     """Points of all lines at the times that any of them needs."""
     if len(t) > n_out:
+        t = np.ascontiguousarray(t)
         share = max(100, n_out // max(1, len(lines)))
         keep = [MinMaxLTTBDownsampler().downsample(t, _whole(y), n_out=share) for y in lines]
         pick = np.unique(np.concatenate(keep).astype(np.int64))
@@ -120,6 +120,17 @@ class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):
         self.update()
 
 
+class Figure(Element, component="figure.js"):
+    """A figure in Plotly's JSON, drawn by the Plotly that NiceGUI bundles."""
+
+    needs = bundled.Plotly  # puts "nicegui-plotly" among the page's modules
+
+    def __init__(self, options: dict[str, Any]):
+        super().__init__()
+        self._props["options"] = options
+        self.classes("w-full")
+
+
 # ---- small figures ----------------------------------------------------------------------------------------------------------------------
 
 
@@ -137,7 +148,7 @@ def painted(x: Any, theme: Mapping[str, str]) -> Any:
     return x
 
 
-def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Plotly:
+def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
     """Show a figure of hil.page in the page's theme."""
     c = THEMES["dark" if dark else "light"]
     axis = {"gridcolor": c["grid"], "linecolor": c["muted"], "zerolinecolor": c["muted"], "tickcolor": c["muted"], "automargin": True}
@@ -156,10 +167,5 @@ def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Plotly:
     }
     if height is not None:
         layout["height"] = height
-    config = {"displayModeBar": False, "displaylogo": False, "plotlyServerURL": "", "responsive": True, "scrollZoom": False}
-    plot = Plotly({"data": painted(f["data"], c), "layout": layout, "config": config})
-    plot.classes("w-full")
-    return plot
-
-
-HERE = Path(__file__).resolve().parent
+    config = {"displayModeBar": False, "displaylogo": False, "plotlyServerURL": ""}
+    return Figure({"data": painted(f["data"], c), "layout": layout, "config": config})

@@ -21,6 +21,7 @@ __all__ = ["COLUMNS", "TASKS"]
 
 COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2", "p_s", "t_oil", "state", "faults")
 MOST_TRACE = 120  # frames of the trace sent at a time; the rest are counted only
+COMPILING = "loading the simulator (compiling it the first time takes about 20 s)"
 NEWS = 0.1  # s between two messages to the page
 
 
@@ -131,7 +132,10 @@ def lockstep(progress: Progress, demand: float, speed: float, record: str | None
     from hil.wire import BITS_PER_TICK, TX_N, put, run_wire, take
 
     typed = Typed(demand)
+    progress(None, COMPILING)
     node = Node(n_r=demand, seed=seed)
+    Node().tick(np.zeros((1, 2), np.int64), 0)
+    Ecu().tick(np.zeros((1, 2), np.int64), 0)
     ecu = EcuStation(typed, ecu=Ecu(n_dem=demand, seed=None if seed is None else seed + 1))
     channel = Channel(seed=seed or 0)
     wire = channel.wire
@@ -213,6 +217,7 @@ def node(progress: Progress, bus: str, record: str | None, seed: int | None) -> 
     """Controller and plant in real time, as ``vaneloop run`` does: lateness as it goes, until told to stop."""
     from hil.node import Node
 
+    progress(None, COMPILING)
     made = Node(seed=seed)
     return _in_real_time(progress, bus, made, record, None)
 

@@ -75,7 +75,7 @@ class Loop:
     def _worker(self, name: str) -> Worker:
         w = self.workers.get(name)
         if w is None:
-            w = self.workers[name] = Worker("app.web.loop", changed=lambda: None)
+            w = self.workers[name] = Worker("app.web.loop", changed=lambda: self.session.touch("loop-jobs"))
             w.news = self._news
             self.session.extra.setdefault("closers", []).append(w.stop)
         return w
@@ -259,6 +259,7 @@ class _Page:
                 ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
                     "dense unelevated no-caps padding='2px 10px'"
                 ).tooltip("mode that the ECU asks for")
+            self.live.part(self._waiting, "loop", "loop-jobs", "run")
             self.live.part(self._commands, "loop", "run")
 
     def _start(self) -> None:
@@ -305,6 +306,13 @@ class _Page:
             ui.button("Open in missing physics", icon="arrow_forward", on_click=find).props("outline dense padding='4px 12px'").classes(
                 "open-record"
             )
+
+    def _waiting(self) -> None:
+        if self.loop.running and not self.loop.filled:
+            for w in self.loop.workers.values():
+                for job in w.jobs.values():
+                    if job.text != "running":
+                        ui.label(f"{job.name}: {job.text} ...").classes("note")
 
     def _commands(self) -> None:
         lp = self.loop
