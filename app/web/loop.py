@@ -124,11 +124,10 @@ class _Injected:
 def lockstep(progress: Progress, demand: float, speed: float, record: str | None, seed: int | None, profile: str | None) -> dict[str, Any]:
     """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop."""
     from hil.ecu import EcuStation, Typed, builtin
-    from hil.realtime import packed
-    from hil.recorder import Recorder
-
     from hil.lockstep_bus import Channel
     from hil.node import Ecu, Node
+    from hil.realtime import packed
+    from hil.recorder import Recorder
     from hil.wire import BITS_PER_TICK, TX_N, put, run_wire, take
 
     typed = Typed(demand)
@@ -225,7 +224,6 @@ def node(progress: Progress, bus: str, record: str | None, seed: int | None) -> 
 def ecu(progress: Progress, bus: str, demand: float, profile: str | None) -> dict[str, Any]:
     """The ECU in real time, as ``vaneloop ecu`` does: the demand is told, until told to stop."""
     from hil.ecu import EcuStation, Typed
-
     from hil.node import Ecu
 
     typed = Typed(demand)
@@ -235,12 +233,11 @@ def ecu(progress: Progress, bus: str, demand: float, profile: str | None) -> dic
 def _in_real_time(progress: Progress, name: str, station: Any, record: str | None, typed: Any) -> dict[str, Any]:
     import threading
 
+    from app.station import ACCEPTED
+    from hil.bus import Port, open_bus
     from hil.ecu import builtin
     from hil.realtime import Stop, run_realtime, undisturbed
     from hil.recorder import RecorderProcess
-
-    from app.station import ACCEPTED
-    from hil.bus import Port, open_bus
 
     stop = Stop()
     station.tick(np.zeros((1, 2), np.int64), 0)  # compiled before the first deadline

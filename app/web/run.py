@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from hil.ecu import BUILTIN
 from nicegui import events, ui
 
 from app.web.charts import Chart, Curves, Panel, Trace
@@ -17,6 +16,7 @@ from app.web.jobs import Cancelled, Worker, WorkError
 from app.web.loop import COLUMNS
 from app.web.session import LogFile, Session
 from controller import FAULTS, MODES
+from hil.ecu import BUILTIN
 from hil.frames import IDENT_MASK, NAMES
 from hil.page import bars
 from hil.scenario import library, load_scenario
