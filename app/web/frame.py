@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
+from nicegui.element import Element
 
 from app.web.charts import figure as figure_of
 from app.web.session import Session
 from hil.page import THEMES
 
-__all__ = ["PAGES", "Live", "card", "command_line", "complaint", "figure_of", "frame", "opened", "progress", "table", "tone"]
+__all__ = ["PAGES", "Live", "card", "command_line", "figure_of", "frame", "opened", "table", "tone"]
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
 PRIMARY = "#1f6fc4"
@@ -64,43 +66,105 @@ def dark(session: Session) -> bool:
 
 
 class Live:
-    """Redraws parts of a page when what they show has changed: part -> sections of the session that it watches."""
+    """Redraws parts of a page when what they show has changed: part -> sections of the session that it watches.
+
+    A click on an element that has meanwhile been drawn anew is lost, so nothing is drawn anew for progress, and buttons stay.
+    """
 
     def __init__(self, session: Session):
         """Look ten times a second; nothing travels to the browser unless something changed."""
         self.session = session
-        self.parts: list[tuple[Callable[[], None], tuple[str, ...]]] = []
+        self.parts: list[tuple[Callable[[], None], tuple[str, ...], Element | None]] = []
         self.seen: dict[str, int] = dict(session.versions)
+        self.counted = time.monotonic()
         ui.timer(0.1, self.look)
 
-    def watch(self, draw: Callable[[], None], *sections: str) -> None:
-        """Call ``draw`` when one of ``sections`` has changed."""
-        self.parts.append((draw, sections))
+    def watch(self, draw: Callable[[], None], *sections: str, of: Element | None = None) -> None:
+        """Call ``draw`` when one of ``sections`` has changed, as long as the element that it is ``of`` is there."""
+        self.parts.append((draw, sections, of))
 
-    def part(self, draw: Callable[[], None], *sections: str, classes: str = "stackc", only: Callable[[], bool] = lambda: True) -> None:
-        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``only`` says so."""
+    def part(self, draw: Callable[[], None], *sections: str, shows: Callable[[], tuple[Any, ...]], classes: str = "stackc") -> None:
+        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``shows`` differs from before."""
         box = ui.element("div").classes(classes)
+        before = shows()
 
         def again() -> None:
-            if not only():
-                return
-            box.clear()
-            with box:
-                draw()
+            nonlocal before
+            now = shows()
+            if not _same(now, before):
+                before = now
+                box.clear()
+                with box:
+                    draw()
 
         with box:
             draw()
-        self.watch(again, *sections)
+        self.watch(again, *sections, of=box)
+
+    def shown(self, element: Element, when: Callable[[], bool], *sections: str) -> None:
+        """Show ``element`` only ``when`` that is so; it stays the same element."""
+
+        def show() -> None:
+            element.set_visibility(bool(when()))
+
+        show()
+        self.watch(show, *sections, of=element)
+
+    def complaint(self, *sections: str) -> None:
+        """Lines that the command line would print, where there are any."""
+
+        def draw() -> None:
+            for text in shows():
+                if text:
+                    ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props('role="alert"')
+
+        def shows() -> tuple[str, ...]:
+            return tuple(self.session.errors.get(s, "") for s in sections)
+
+        self.part(draw, *sections, shows=shows)
+
+    def progress(self, *names: str) -> None:
+        """A bar with what is being done in jobs of these names, and a button that stops it."""
+        with ui.element("div").classes("rowc").style("width:100%;flex-wrap:nowrap") as row:
+            with ui.element("div").classes("stackc").style("gap:3px"):
+                text = ui.label().classes("small soft")
+                bar = ui.linear_progress(0.0, show_value=False).props("rounded instant-feedback")
+            ui.button("Cancel", icon="close", on_click=lambda: self.session.stop(*names)).props("outline dense padding='2px 10px'").classes(
+                "cancel"
+            )
+
+        def show() -> None:
+            job = self.session.busy(*names)
+            row.set_visibility(job is not None and bool(job.text))
+            if job is not None:
+                share = f", {100 * job.fraction:.0f} %" if job.fraction is not None else ""
+                text.set_text(f"{job.text}{share} ({job.seconds:.0f} s)")
+                if (job.fraction is None) != ("indeterminate" in bar.props):
+                    bar.props(add="indeterminate") if job.fraction is None else bar.props(remove="indeterminate")
+                bar.set_value(round(job.fraction or 0.0, 3))
+
+        show()
+        self.watch(show, "jobs", of=row)
 
     def look(self) -> None:
         """Redraw what has changed."""
         now = dict(self.session.versions)
         changed = {k for k, v in now.items() if self.seen.get(k) != v}
         self.seen = now
+        if self.session.jobs and time.monotonic() - self.counted > 0.5:
+            self.counted = time.monotonic()
+            changed.add("jobs")  # the seconds go on
         if changed:
-            for draw, sections in self.parts:
-                if changed.intersection(sections):
+            self.parts = [p for p in self.parts if p[2] is None or not p[2].is_deleted]
+            for draw, sections, of in list(self.parts):
+                if changed.intersection(sections) and (of is None or not of.is_deleted):
                     draw()
+
+
+def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+    """Whether two answers of ``shows`` are one: plain values by value, anything else only as the same object."""
+    plain = (str, int, float, tuple)
+    return len(a) == len(b) and all(x is y or (isinstance(x, plain) and isinstance(y, plain) and x == y) for x, y in zip(a, b, strict=True))
 
 
 @contextmanager
@@ -111,29 +175,6 @@ def card(title: str, about: str = "") -> Iterator[None]:
         if about:
             ui.label(about).classes("soft small").style("margin:-4px 0 8px;max-width:110ch")
         yield
-
-
-def complaint(session: Session, *sections: str) -> None:
-    """Lines that the command line would print, where there are any."""
-    for s in sections:
-        if s in session.errors:
-            text = session.errors[s]
-            ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props('role="alert"')
-
-
-def progress(session: Session, *names: str) -> None:
-    """A bar with what is being done and a button that stops it."""
-    job = session.busy(*names)
-    if job is None or not job.text:
-        return
-    with ui.element("div").classes("rowc").style("width:100%;flex-wrap:nowrap"):
-        with ui.element("div").classes("stackc").style("gap:3px"):
-            share = f", {100 * job.fraction:.0f} %" if job.fraction is not None else ""
-            ui.label(f"{job.text}{share} ({job.seconds:.0f} s)").classes("small soft")
-            bar = ui.linear_progress(job.fraction or 0.0, show_value=False).props("rounded instant-feedback")
-            if job.fraction is None:
-                bar.props("indeterminate")
-        ui.button("Cancel", icon="close", on_click=session.stop).props("outline dense padding='2px 10px'").classes("cancel")
 
 
 def command_line(text: str, label: str = "the same as a command") -> None:

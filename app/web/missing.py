@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import events, ui
 
 from app.web.charts import Chart
-from app.web.frame import Live, card, command_line, complaint, dark, figure_of, frame, opened, progress, table, tone
+from app.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
 from app.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
 from discrepancy.locate import Regime
 from hil.logs import UNITS
@@ -61,6 +61,26 @@ class _Page:
     def __init__(self, session: Session, live: Live, most: int):
         self.s, self.live, self.most = session, live, most
         self.readout: ui.label | None = None
+        self.sliders: dict[tuple[str, str], tuple[ui.slider, ui.label]] = {}
+        self.switches: dict[str, tuple[ui.switch, ui.element]] = {}
+
+    def _stage_toggle(self, stages: list[str], props: str) -> None:
+        """Choose the stage shown; follows where it is chosen elsewhere."""
+        s = self.s
+
+        def chosen(e: events.ValueChangeEventArguments) -> None:
+            if e.value and e.value != s.stage:
+                s.show(e.value)
+
+        toggle = ui.toggle(stages, value=s.stage if s.stage in stages else None, on_change=chosen).props(
+            f"dense unelevated no-caps {props}"
+        )
+
+        def follow() -> None:
+            if s.stage in stages:
+                toggle.set_value(s.stage)
+
+        self.live.watch(follow, "compare", "diagnosis", "fit", of=toggle)
 
     # ---- 1: the log
 
@@ -74,11 +94,14 @@ class _Page:
                         on_rejected=self._rejected,
                     )  # fmt: skip
                     self.upload.props(f'accept="{suffixes()}" flat')
-                    self.live.part(self._choose, "files", "log")
-                    self.live.part(self._about, "log", "jobs")
+                    s = self.s
+                    self.live.part(self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file))
+                    self.live.complaint("log")
+                    self.live.progress("offers", "preview")
+                    self.live.part(self._about, "log", shows=lambda: (s.preview,))
                 with ui.element("div").classes("stackc"):
-                    self.live.part(self._channels, "log")
-            self.live.part(self._form, "log")
+                    self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
+            self.live.part(self._form, "log", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
                 chart = Chart("log")
             all_channels.props("dense")
@@ -108,8 +131,6 @@ class _Page:
 
     def _about(self) -> None:
         s = self.s
-        complaint(s, "log")
-        progress(s, "offers", "preview")
         if s.preview is not None:
             for note in s.preview["notes"][:6]:
                 ui.label(f"note: {note}").classes("note")
@@ -132,6 +153,10 @@ class _Page:
         absent = [n for n in UNITS if n not in s.preview["channels"]]
         if absent:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
+
+    def _form_shows(self) -> tuple[Any, ...]:
+        s, c = self.s, self.s.choice
+        return (c.file, c.dbc, c.model, tuple(s.offered), tuple(c.mapping.items()), tuple(c.units.items()), c.design_rpm, "log" in s.errors)
 
     def _form(self) -> None:
         s = self.s
@@ -185,18 +210,18 @@ class _Page:
 
     def where(self) -> None:
         """Errors stage by stage, and the failure map of one stage."""
+        s, live = self.s, self.live
         with card("2  Where does the model fail?"):
-            self.live.part(self._compared, "compare", "jobs")
-            self.live.part(self._map, "compare", "theme")
+            live.complaint("compare")
+            live.progress("compare")
+            hint = ui.label("Choose a log: each stage of the machine is then driven by its own logged inputs and compared.").classes("soft")
+            live.shown(hint, lambda: s.choice.file is None, "compare", "log")
+            live.part(self._compared, "compare", shows=lambda: (s.compared,))
 
     def _compared(self) -> None:
         s = self.s
-        complaint(s, "compare")
-        progress(s, "compare")
         c = s.compared
         if c is None:
-            if s.busy("compare") is None and "compare" not in s.errors:
-                ui.label("Choose a log: each stage of the machine is then driven by its own logged inputs and compared.").classes("soft")
             return
         worst = max(c["figures"], key=lambda f: f.rms / f.noise_floor)
         ratio = worst.rms / worst.noise_floor
@@ -206,46 +231,45 @@ class _Page:
         else:
             text = "Every stage agrees with its measurements to within the noise."
         ui.label(text).classes(f"verdict {'bad' if ratio > 2 else 'good' if ratio <= 1.2 else ''}")
-
-    def _map(self) -> None:
-        s = self.s
-        c = s.compared
-        if c is None:
-            return
         with ui.element("div").classes("half"):
             with ui.element("div").classes("stackc"):
-                rows = []
-                for f in c["figures"]:
-                    r = f.rms / f.noise_floor
-                    width = 100 * min(1.0, math.log10(max(r, 1.0)) / 2.2) + 2
-                    bar = f'<span class="bar {tone(r)}" style="width:{width:.0f}px"></span>'
-                    rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{r:.2f}", ("html", bar)])
-                for name, why in c["not_observed"].items():
-                    rows.append([name, f"not observed: {why}", "", "", "", "", ""])
-                table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
-                ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes(
-                    "note"
-                )
-                if c["loop"]:
-                    with opened(s, "The whole loop"):
-                        table(
-                            ["signal", "against", "RMS", "max", "unit"],
-                            [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in c["loop"]],
-                            numbers=(2, 3),
-                        )
-                elif c["loop_missing"]:
-                    ui.label(f"no whole loop: {s.clean(c['loop_missing'])}").classes("note")
-                command_line(s.command("compare"))
-                command_line(s.command("locate"))
+                self._figures(c)
             with ui.element("div").classes("stackc"):
                 stages = list(c["maps"])
                 if stages:
                     with ui.element("div").classes("rowc"):
                         ui.label("Failure map of").classes("soft")
-                        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props(
-                            "dense unelevated no-caps padding='2px 10px'"
-                        )
-                    self._heat(c["maps"].get(s.stage, []), c["onset"].get(s.stage))
+                        self._stage_toggle(stages, "padding='2px 10px'")
+                    self.live.part(self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s)))
+
+    def _figures(self, c: dict[str, Any]) -> None:
+        s = self.s
+        rows = []
+        for f in c["figures"]:
+            r = f.rms / f.noise_floor
+            width = 100 * min(1.0, math.log10(max(r, 1.0)) / 2.2) + 2
+            bar = f'<span class="bar {tone(r)}" style="width:{width:.0f}px"></span>'
+            rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{r:.2f}", ("html", bar)])
+        for name, why in c["not_observed"].items():
+            rows.append([name, f"not observed: {why}", "", "", "", "", ""])
+        table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
+        ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes("note")
+        if c["loop"]:
+            with opened(s, "The whole loop"):
+                table(
+                    ["signal", "against", "RMS", "max", "unit"],
+                    [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in c["loop"]],
+                    numbers=(2, 3),
+                )
+        elif c["loop_missing"]:
+            ui.label(f"no whole loop: {s.clean(c['loop_missing'])}").classes("note")
+        command_line(s.command("compare"))
+        command_line(s.command("locate"))
+
+    def _map(self) -> None:
+        c = self.s.compared
+        if c is not None:
+            self._heat(c["maps"].get(self.s.stage, []), c["onset"].get(self.s.stage))
 
     def _heat(self, found: list[Regime], onset: float | None) -> None:
         hot = [r for r in found if r.significant.any()]
@@ -271,21 +295,35 @@ class _Page:
 
     def what(self) -> None:
         """The search, switches of effects, waterfall, curves, sliders."""
+        s, live = self.s, self.live
         with card("3  What is missing?"):
-            self.live.part(self._search, "diagnosis", "compare", "jobs", "diagnose")
+            hint = ui.label("After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named.")
+            live.shown(hint.classes("soft"), lambda: s.compared is None, "compare", "log")
+            start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props("unelevated size=md")
+            ready = lambda: s.compared is not None and s.diagnosis is None and not s.working["diagnose"]  # noqa: E731
+            live.shown(start, ready, "compare", "log", "diagnosis", "diagnose", "jobs")
+            live.progress("diagnose")
+            live.complaint("diagnose")
+            live.part(self._verdict, "diagnosis", "compare", "log", shows=lambda: (s.compared, s.diagnosis))
             with ui.element("div").classes("two"):
                 with ui.element("div").classes("stackc"):
-                    self.live.part(self._effects, "diagnosis", "fit")
+                    live.part(self._stages, "diagnosis", shows=lambda: (s.diagnosis,))
+                    live.part(self._effects, "diagnosis", "compare", "fit", shows=lambda: (s.diagnosis, s.stage))
+                    live.watch(self._switched, "fit", "diagnosis")
                 with ui.element("div").classes("stackc"):
-                    self.live.part(self._fit_jobs, "jobs", "fit")
-                    self.live.part(self._fall, "fit", "diagnosis", "theme")
-                    self.live.part(self._sliders, "fit")
+                    live.complaint("fit", "hand")
+                    live.progress("refit")
+                    with ui.element("div").classes("stackc") as box:
+                        live.part(self._fall, "fit", "diagnosis", "compare", "theme", shows=lambda: (s.diagnosis, s.shown_fit(), dark(s)))
+                    stale = lambda: box.classes(**{"remove" if s.fitted() is s.shown_fit() else "add": "stale"})  # noqa: E731
+                    live.watch(stale, "fit", "diagnosis", "compare")
+                    live.part(self._sliders, "fit", "diagnosis", "compare", shows=lambda: (s.diagnosis, s.fitted()))
                     self.chart_title = ui.label().classes("soft small")
                     chart = Chart("stage")
             self._title()
-            self.live.watch(self._by_hand, "hand")
-            self.live.watch(self._title, "fit", "diagnosis", "compare", "hand")
-            self.live.watch(chart.refetch, "fit", "diagnosis", "compare", "hand")
+            live.watch(self._by_hand, "hand", "fit")
+            live.watch(self._title, "fit", "diagnosis", "compare", "hand")
+            live.watch(chart.refetch, "fit", "diagnosis", "compare", "hand")
 
     def _title(self) -> None:
         s = self.s
@@ -296,36 +334,35 @@ class _Page:
         )
         self.chart_title.set_text(text)
 
-    def _search(self) -> None:
+    def _verdict(self) -> None:
         s = self.s
         if s.compared is None:
-            ui.label(
-                "After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named."
-            ).classes("soft")
             return
-        if s.diagnosis is None:
-            job = s.busy("diagnose")
-            if job is None:
-                ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props("unelevated size=md")
-            progress(s, "diagnose")
-            complaint(s, "diagnose")
-            command_line(s.command("diagnose"))
-            return
-        j = s.diagnosis["json"]
-        tones = {"missing": "", "none": "good", "unknown": "bad"}
-        ui.label(s.diagnosis["verdict"]).classes(f"verdict {tones[j['verdict']]}")
-        for u in j["unknown"]:
-            near = f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
-            ui.label(f"What is left in the {u['stage']} stage: {u['shape']}.{near}").classes("note")
+        if s.diagnosis is not None:
+            j = s.diagnosis["json"]
+            tones = {"missing": "", "none": "good", "unknown": "bad"}
+            ui.label(s.diagnosis["verdict"]).classes(f"verdict {tones[j['verdict']]}")
+            for u in j["unknown"]:
+                near = f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
+                ui.label(f"What is left in the {u['stage']} stage: {u['shape']}.{near}").classes("note")
         command_line(s.command("diagnose"))
+
+    def _stages(self) -> None:
+        if self.s.diagnosis is not None:
+            self._stage_toggle([x.stage for x in self.s.diagnosis["diagnosis"].stages], "padding='2px 8px' size=sm")
+
+    def _switched(self) -> None:
+        """Switches and their marks as the session has them."""
+        on = self.s.chosen.get(self.s.stage, ())
+        for name, (switch, row) in self.switches.items():
+            if not switch.is_deleted:
+                switch.set_value(name in on)
+                row.classes(**{"add" if name in on else "remove": "on"})
 
     def _effects(self) -> None:
         s = self.s
         d = s.stage_diagnosis()
-        if s.diagnosis is None:
-            return
-        stages = {x.stage: f"{x.stage}" for x in s.diagnosis["diagnosis"].stages}
-        ui.toggle(stages, value=s.stage, on_change=lambda e: s.show(e.value)).props("dense unelevated no-caps padding='2px 8px' size=sm")
+        self.switches = {}
         if d is None:
             return
         found = {f.effect: f for f in d.effects}
@@ -335,10 +372,10 @@ class _Page:
         on = s.chosen.get(s.stage, ())
         with ui.element("div").classes("effects"):
             for name in s.effects():
-                with ui.element("div").classes("effect" + (" on" if name in on else "")).props(f'data-effect="{name}"'):
-                    ui.switch(value=name in on, on_change=lambda e, name=name: s.switch(name, bool(e.value))).props(
-                        f'dense aria-label="{name}"'
-                    )
+                with ui.element("div").classes("effect" + (" on" if name in on else "")).props(f'data-effect="{name}"') as row:
+                    switch = ui.switch(value=name in on, on_change=lambda e, name=name: self._switch(name, bool(e.value)))
+                    switch.props(f'dense aria-label="{name}"')
+                    self.switches[name] = switch, row
                     ui.label(name).classes("name")
                     c = gain.get(name)
                     share = 0.0 if c is None or c.nats <= 0 or top <= 0 else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
@@ -349,6 +386,10 @@ class _Page:
                     ):
                         ui.element("i").style(f"width:{100 * share:.0f}%")
                     ui.label(self._about_effect(name, found, named, c)).classes("about")
+
+    def _switch(self, name: str, on: bool) -> None:
+        if on != (name in self.s.chosen.get(self.s.stage, ())):
+            self.s.switch(name, on)
 
     def _about_effect(self, name: str, found: dict[str, Any], named: dict[str, str], c: Any) -> str:
         summary = EFFECTS[name].summary if name in EFFECTS else ""
@@ -365,13 +406,9 @@ class _Page:
             return f"Not observable in this log; needs: {c.reason}"
         return summary
 
-    def _fit_jobs(self) -> None:
-        complaint(self.s, "fit", "hand")
-        progress(self.s, "refit")
-
     def _fall(self) -> None:
         s = self.s
-        f = s.fitted()
+        f = s.shown_fit()
         if s.diagnosis is None or f is None:
             return
         r = f.result
@@ -395,18 +432,19 @@ class _Page:
     def _sliders(self) -> None:
         s = self.s
         f = s.fitted()
+        self.sliders = {}
         if s.diagnosis is None or f is None or not f.result.effects:
             return
         with opened(s, "Turn the parameters by hand").classes("by-hand"):
             with ui.element("div").classes("rowc"):
                 self.readout = ui.label().classes("mono hand-error")
                 ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
-            self._by_hand()
             now = s.values()
             with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"):
                 for e in f.result.effects:
                     for name, p in e.parameters.items():
                         self._slider(e.effect, name, float(p["value"]), str(p["unit"]), now[e.effect][name])
+            self._by_hand()
 
     def _by_hand(self) -> None:
         s, f = self.s, self.s.fitted()
@@ -414,6 +452,11 @@ class _Page:
             return
         left = [f"{o} {number(v, 4)} {u}" for (o, v), u in zip(s.hand_rms.items(), f.result.units, strict=False)]
         self.readout.set_text("error by hand: " + (", ".join(left) or "move a slider"))
+        if not s.hand:  # back to the fit
+            for (effect, name), value in ((k, s.values()[k[0]][k[1]]) for k in self.sliders):
+                slider, box = self.sliders[effect, name]
+                slider.set_value(value)
+                box.set_text(f"{value:.5g}")
 
     def _slider(self, effect: str, name: str, fitted: float, unit: str, now: float) -> None:
         p = EFFECTS[effect][name]
@@ -423,6 +466,7 @@ class _Page:
             ui.label(f"{effect}: {name} [{unit}], fitted {number(fitted, 4)}").classes("what soft")
             slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(f'dense aria-label="{effect} {name}"')
             box = ui.label(f"{now:.5g}").classes("mono")
+            self.sliders[effect, name] = slider, box
 
             def turned(e: events.GenericEventArguments) -> None:
                 value = float(e.args)
@@ -435,26 +479,48 @@ class _Page:
 
     def next(self) -> None:
         """The next experiment, and what can be saved."""
+        s, live = self.s, self.live
         with card("4  What next?"), ui.element("div").classes("half"):
             with ui.element("div").classes("stackc"):
-                self.live.part(self._experiment, "experiment", "diagnosis", "jobs", "theme")
+                ui.html("<h3>The next experiment</h3>", sanitize=False)
+                live.part(self._rivals, "diagnosis", "log", shows=lambda: (s.diagnosis,))
+                ask = ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props("outline dense padding='4px 14px'")
+                open_question = lambda: bool(self._pairs()) and not s.experiment_done and not s.working["experiment"]  # noqa: E731
+                live.shown(ask.classes("self-start"), open_question, "diagnosis", "experiment", "log", "jobs")
+                live.progress("experiment")
+                live.complaint("experiment")
+                live.part(self._experiment, "experiment", "diagnosis", "log", "theme", shows=lambda: (s.diagnosis, s.experiment, dark(s)))
             with ui.element("div").classes("stackc"):
-                self.live.part(self._save, "save", "diagnosis", "fit", "jobs")
+                ui.html("<h3>Save</h3>", sanitize=False)
+                hint = ui.label("The extended model (TOML, for --model), and the report (HTML).").classes("soft small")
+                live.shown(hint, lambda: s.diagnosis is None, "diagnosis", "log")
+                live.complaint("save")
+                live.progress("report", "command")
+                with ui.element("div").classes("rowc"):
+                    report = ui.button("Report", icon="description", on_click=s.save_report).props("outline dense padding='4px 14px'")
+                    model = ui.button("Extended model", icon="save", on_click=s.save_model).props("outline dense padding='4px 14px'")
+                live.shown(report, lambda: s.diagnosis is not None, "diagnosis", "log")
+                live.shown(model, lambda: s.diagnosis is not None and bool(s.all_chosen()), "diagnosis", "log", "fit")
+                live.part(self._saved, "save", "diagnosis", "log", shows=lambda: (s.diagnosis, tuple(s.saved)))
+                live.part(self._commands, "diagnosis", "log", "fit", shows=lambda: (s.diagnosis, tuple(s.all_chosen())))
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Effects and rivals that this log cannot tell apart."""
+        d = self.s.diagnosis
+        return [] if d is None else [(f.effect, r) for x in d["diagnosis"].stages for f in x.effects for r in f.rivals]
+
+    def _rivals(self) -> None:
+        if self.s.diagnosis is None:
+            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes("soft small")
+        elif self._pairs():
+            ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in self._pairs())).classes("small")
+        else:
+            ui.label("No rivals are left: this log needs no further experiment.").classes("soft small")
 
     def _experiment(self) -> None:
         s = self.s
-        ui.html("<h3>The next experiment</h3>", sanitize=False)
         if s.diagnosis is None:
-            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes("soft small")
             return
-        rivals = [(f.effect, r) for x in s.diagnosis["diagnosis"].stages for f in x.effects for r in f.rivals]
-        if not rivals:
-            ui.label("No rivals are left: this log needs no further experiment.").classes("soft small")
-        elif not s.experiment_done and s.busy("experiment") is None:
-            ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in rivals)).classes("small")
-            ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props("outline dense padding='4px 14px'")
-        progress(s, "experiment")
-        complaint(s, "experiment")
         e = s.experiment
         if e is not None:
             ui.label(e["text"])
@@ -462,18 +528,8 @@ class _Page:
             figure_of(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
         command_line(s.command("experiment", "--out", "next_demand.csv"))
 
-    def _save(self) -> None:
+    def _saved(self) -> None:
         s = self.s
-        ui.html("<h3>Save</h3>", sanitize=False)
-        if s.diagnosis is None:
-            ui.label("The extended model (TOML, for --model), and the report (HTML).").classes("soft small")
-            return
-        complaint(s, "save")
-        progress(s, "report", "command")
-        with ui.element("div").classes("rowc"):
-            ui.button("Report", icon="description", on_click=s.save_report).props("outline dense padding='4px 14px'")
-            if s.all_chosen():
-                ui.button("Extended model", icon="save", on_click=s.save_model).props("outline dense padding='4px 14px'")
         links = {"report": "diagnosis.html", "model": "extended.toml", "extended": "extended.html"}
         with ui.element("div").classes("rowc"):
             for key, name in links.items():
@@ -487,6 +543,10 @@ class _Page:
                     s.choose(LogFile(s.saved["model"], "extended.toml", "extended.toml"))
 
                 ui.button("Go on with this model", icon="arrow_forward", on_click=go_on).props("flat dense padding='2px 10px'")
-        command_line(s.command("diagnose", "--report", "diagnosis.html"))
-        if s.all_chosen():
-            command_line(s.command("extend", *s.extend_words()))
+
+    def _commands(self) -> None:
+        s = self.s
+        if s.diagnosis is not None:
+            command_line(s.command("diagnose", "--report", "diagnosis.html"))
+            if s.all_chosen():
+                command_line(s.command("extend", *s.extend_words()))

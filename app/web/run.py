@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import events, ui
 
 from app.web.charts import Chart, Curves, Panel, Trace
-from app.web.frame import Live, card, command_line, complaint, dark, figure_of, frame
+from app.web.frame import Live, card, command_line, dark, figure_of, frame
 from app.web.jobs import Cancelled, Worker, WorkError
 from app.web.loop import COLUMNS
 from app.web.session import LogFile, Session
@@ -226,7 +226,9 @@ class _Page:
     def controls(self) -> None:
         """Bus, speed, start and stop; demand; the commands."""
         with card("1  The loop", "Controller with its plant, the engine's ECU, and the CAN bus between them."):
-            self.live.part(self._start, "loop", "run", classes="rowc")
+            lp = self.loop
+            self.live.part(self._start, "loop", "run", shows=lambda: (lp.running, lp.bus, lp.recorded), classes="rowc")
+            self.live.complaint("run", "inject")
             with ui.element("div").classes("rowc").style("margin-top:10px;width:100%;flex-wrap:nowrap"):
                 ui.label("speed demand").classes("soft").style("white-space:nowrap")
                 slider = (
@@ -244,7 +246,7 @@ class _Page:
                 slider.on("update:model-value", turned, throttle=0.05)
 
                 def chosen(e: events.ValueChangeEventArguments) -> None:
-                    self.loop.profile = e.value or None
+                    self._set("profile", e.value or None)
                     if e.value:
                         self.loop.tell(profile=e.value)
 
@@ -259,8 +261,8 @@ class _Page:
                 ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
                     "dense unelevated no-caps padding='2px 10px'"
                 ).tooltip("mode that the ECU asks for")
-            self.live.part(self._waiting, "loop", "loop-jobs", "run")
-            self.live.part(self._commands, "loop", "run")
+            self.live.part(self._waiting, "loop", "loop-jobs", "run", shows=lambda: (" ".join(self._waits()),))
+            self.live.part(self._commands, "loop", "run", shows=lambda: (lp.bus, lp.seed is None, lp.record, lp.profile or ""))
 
     def _start(self) -> None:
         lp = self.loop
@@ -288,12 +290,11 @@ class _Page:
             ui.select(speeds, value=lp.speed, on_change=speed).props("outlined dense options-dense").style("min-width:150px").classes(
                 "pace"
             )
-        noisy = ui.checkbox("noisy sensors", value=lp.seed is not None, on_change=lambda e: setattr(lp, "seed", 1 if e.value else None))
-        record = ui.checkbox("record", value=lp.record, on_change=lambda e: setattr(lp, "record", bool(e.value)))
+        noisy = ui.checkbox("noisy sensors", value=lp.seed is not None, on_change=lambda e: self._set("seed", 1 if e.value else None))
+        record = ui.checkbox("record", value=lp.record, on_change=lambda e: self._set("record", bool(e.value)))
         if lp.running:
             noisy.disable()
             record.disable()
-        complaint(self.s, "run", "inject")
         if lp.recorded is not None and not lp.running:
             name = lp.recorded.path.name
             ui.link(f"download {name}", f"/saved/run-{name}").props(f'download="{name}"').style("color:var(--measured)")
@@ -307,12 +308,18 @@ class _Page:
                 "open-record"
             )
 
+    def _set(self, name: str, value: Any) -> None:
+        setattr(self.loop, name, value)
+        self.s.touch("loop")
+
+    def _waits(self) -> list[str]:
+        lp = self.loop
+        jobs = [j for w in lp.workers.values() for j in w.jobs.values()] if lp.running and not lp.filled else []
+        return [f"{j.name}: {j.text} ..." for j in jobs if j.text != "running"]
+
     def _waiting(self) -> None:
-        if self.loop.running and not self.loop.filled:
-            for w in self.loop.workers.values():
-                for job in w.jobs.values():
-                    if job.text != "running":
-                        ui.label(f"{job.name}: {job.text} ...").classes("note")
+        for line in self._waits():
+            ui.label(line).classes("note")
 
     def _commands(self) -> None:
         lp = self.loop
@@ -392,7 +399,7 @@ class _Page:
                     box.set_visibility((e.value or "").lower() in text)
 
             find.on_value_change(search)
-            self.live.part(self._events, "events", "loop")
+            self.live.part(self._events, "events", "loop", shows=lambda: (*self.loop.events, self.loop.bus))
 
     def _begin(self, name: str) -> None:
         if self.loop.running:

@@ -14,7 +14,7 @@ from nicegui.element import Element
 
 from app.schedule_page import NAMES, ROLES
 from app.scheduling import CRITERIA, STROKE_LIMITS, write_geometry, write_schedules
-from app.web.frame import Live, card, command_line, complaint, dark, figure_of, frame, opened, progress, table
+from app.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table
 from app.web.missing import receive, suffixes
 from app.web.session import LogFile, Session
 from app.web.worker import STEPS
@@ -39,6 +39,7 @@ class Plan:
     options: dict[str, Any] = field(default_factory=lambda: {"step": 0.5, "lb_range": 5.0, "lc_range": 5.0, "criterion": "rms"})
     stage: str = "vigv"
     done: dict[str, Any] = field(default_factory=dict)
+    loaded: int = 0  # times that a file has replaced numbers
 
     def words(self) -> list[str]:
         """Options of ``vaneloop schedule`` as the user would type them."""
@@ -71,6 +72,11 @@ class Editor(Element, component="editor.js"):
         self._props |= {"x": x, "y": y, "xtitle": "rotor speed [%]", "ytitle": "vane angle [deg]"}
         self.on("moved", lambda e: moved(int(e.args[0]), float(e.args[1])))
 
+    def put(self, y: list[float]) -> None:
+        """Show these values."""
+        self._props["y"] = y
+        self.update()
+
 
 def build(session: Session, most: int) -> None:
     """Draw the page."""
@@ -86,7 +92,6 @@ def build(session: Session, most: int) -> None:
 class _Page:
     def __init__(self, session: Session, live: Live, most: int):
         self.s, self.live, self.most = session, live, most
-        self.drawn: dict[str, tuple[int, bool]] = {}
 
     @property
     def plan(self) -> Plan:
@@ -106,9 +111,9 @@ class _Page:
             ui.element("div").classes("two"),
         ):
             with ui.element("div").classes("stackc"):
-                self.live.part(self._lengths, "plan")
+                self.live.part(self._lengths, "plan", shows=lambda: (self.plan, self.plan.loaded, self.plan.log, len(self.s.files)))
             with ui.element("div").classes("stackc"):
-                self.live.part(self._curve, "plan", "curve")
+                self.live.part(self._curve, "plan", "curve", shows=lambda: (self.plan, self.plan.loaded, self.plan.stage))
 
     def _number(self, section: str, key: str, label: str) -> None:
         q = getattr(getattr(self.plan.geometry, section), key)
@@ -189,6 +194,7 @@ class _Page:
     async def _read(self, file: LogFile) -> None:
         part, table_read = await self.s.bench.call("engine_part", "reading", path=str(file.path))
         setattr(self.plan, part, table_read)
+        self.plan.loaded += 1
         self._edited()
         self.s.touch("plan")
 
@@ -218,61 +224,81 @@ class _Page:
                 update={plan.stage: axis.model_copy(update={"values": values, "origin": "chosen: entered in the workbench"})}
             )
             self._edited()
-            self.s.touch("curve")
+            editor.put(values)
+            boxes[i].set_value(value)
 
         x, y = list(plan.schedules.speed.values), list(getattr(plan.schedules, plan.stage).values)
-        Editor(x, y, set_value)
+        boxes: list[ui.number] = []
+        editor = Editor(x, y, set_value)
         with opened(self.s, "As numbers"), ui.element("div").classes("numbers"):
             for i, (n, v) in enumerate(zip(x, y, strict=True)):
                 box = ui.number(f"at {n:g} %", value=v, format="%.5g").props("outlined dense")
                 box.on("blur", lambda _, i=i, box=box: set_value(i, float(box.value)) if box.value is not None else None)
+                boxes.append(box)
 
     # ---- the steps
 
     def steps(self) -> None:
         """One button a step, and what each gave."""
+        s, live = self.s, self.live
         with card("2  The steps"):
-            self.live.part(self._buttons, "steps", "plan", "jobs", "schedule")
+            with ui.element("div").classes("stepper"):
+                for i, (step, title) in enumerate(zip(STEPS, TITLES, strict=True)):
+                    button = ui.button(f"{i + 1}  {title}", on_click=lambda step=step: self._go(step))
+                    button.props("dense padding='5px 14px'")
+                    live.watch(partial(self._dress, button, step), "steps", "plan", "schedule")
+                    self._dress(button, step)
+            with ui.element("div").classes("rowc"):
+                self._options()
+            live.complaint("schedule")
+            live.progress("schedule_step", "engine_part")
+            live.part(self._links_entered, "steps", "plan", shows=lambda: (self.plan.edited and "entered-geometry.toml" in s.saved,))
+            live.part(self._command, "steps", "plan", shows=lambda: (" ".join(self.plan.words()),))
         for step, title in zip(STEPS, TITLES, strict=True):
-            self.live.part(partial(self._result, step, title), "steps", "theme", only=partial(self._changed, step))
+            live.part(partial(self._result, step, title), "steps", "theme", shows=partial(self._shows, step))
 
-    def _buttons(self) -> None:
-        s, plan = self.s, self.plan
-        with ui.element("div").classes("stepper"):
-            for i, (step, title) in enumerate(zip(STEPS, TITLES, strict=True)):
-                button = ui.button(f"{i + 1}  {title}", on_click=lambda step=step: s.do("schedule", self._run(step)))
-                button.props(f"{'outline' if step in plan.done else 'unelevated'} dense padding='5px 14px'")
-                if step in plan.done:
-                    button.props("icon-right=check")
-                if step == "loop" and plan.log is None:
-                    button.disable()
-                    button.tooltip("choose a hysteresis log first")
-        with ui.element("div").classes("rowc"):
+    def _go(self, step: str) -> None:
+        if not self.s.working["schedule"]:
+            self.s.do("schedule", self._run(step))
 
-            def option(key: str, label: str) -> None:
-                def changed(e: events.ValueChangeEventArguments) -> None:
-                    if e.value is not None and float(e.value) != plan.options[key]:
-                        plan.options[key] = float(e.value)
-                        plan.done = {k: v for k, v in plan.done.items() if k in ("mechanism", "stroke", "loop")}
+    def _dress(self, button: ui.button, step: str) -> None:
+        done = step in self.plan.done
+        button.props(add="outline icon-right=check" if done else "unelevated", remove="unelevated" if done else "outline icon-right")
+        button.set_enabled(not self.s.working["schedule"] and (step != "loop" or self.plan.log is not None))
 
-                ui.number(label, value=plan.options[key], on_change=changed).props("outlined dense").style("width:190px")
+    def _options(self) -> None:
+        plan = self.plan
 
-            option("step", "lengths change by [mm]")
-            option("lb_range", "largest change of Lb [mm]")
-            option("lc_range", "largest change of Lc [mm]")
-            ui.select(
-                {"rms": "best rms error", "max": "best largest error", "design": "best at 100 %"}, value=plan.options["criterion"],
-                on_change=lambda e: plan.options.__setitem__("criterion", e.value),
-            ).props("outlined dense options-dense").style("width:190px")  # fmt: skip
-            assert {"rms", "max", "design"} == set(CRITERIA)
-        complaint(s, "schedule")
-        progress(s, "schedule_step", "engine_part")
-        if plan.edited and "entered-geometry.toml" in s.saved:
+        def option(key: str, label: str) -> None:
+            def changed(e: events.ValueChangeEventArguments) -> None:
+                if e.value is not None and float(e.value) != self.plan.options[key]:
+                    self._option(key, float(e.value))
+
+            ui.number(label, value=plan.options[key], on_change=changed).props("outlined dense").style("width:190px")
+
+        option("step", "lengths change by [mm]")
+        option("lb_range", "largest change of Lb [mm]")
+        option("lc_range", "largest change of Lc [mm]")
+        ui.select(
+            {"rms": "best rms error", "max": "best largest error", "design": "best at 100 %"}, value=plan.options["criterion"],
+            on_change=lambda e: self._option("criterion", e.value),
+        ).props("outlined dense options-dense").style("width:190px")  # fmt: skip
+        assert {"rms", "max", "design"} == set(CRITERIA)
+
+    def _option(self, key: str, value: Any) -> None:
+        self.plan.options[key] = value
+        self.plan.done = {k: v for k, v in self.plan.done.items() if k in ("mechanism", "stroke", "loop")}
+        self.s.touch("steps")
+
+    def _links_entered(self) -> None:
+        if self.plan.edited and "entered-geometry.toml" in self.s.saved:
             with ui.element("div").classes("rowc"):
                 ui.label("the engine as entered:").classes("soft small")
                 for name in ("geometry.toml", "schedules.toml"):
                     ui.link(f"download {name}", f"/saved/entered-{name}").props(f'download="{name}"').style("color:var(--measured)")
-        command_line(shlex.join(["vaneloop", "schedule", *plan.words(), "--out", "engine/", "--report", "schedule.html"]))
+
+    def _command(self) -> None:
+        command_line(shlex.join(["vaneloop", "schedule", *self.plan.words(), "--out", "engine/", "--report", "schedule.html"]))
 
     async def _run(self, step: str) -> None:
         s, plan = self.s, self.plan
@@ -296,22 +322,23 @@ class _Page:
             words += ["--log", str(plan.log.path)]
         command = shlex.join(["vaneloop", "schedule", *plan.words(), "--report", "schedule.html"])
         out = str(s.folder / "tables")
-        s.touch("steps")
+        asked = plan.geometry, plan.schedules, plan.log, dict(o)
         s.saved |= {f"entered-{n}.toml": folder / f"{n}.toml" for n in ("geometry", "schedules")}
         answer = await s.bench.call("schedule_step", TITLES[STEPS.index(step)].lower(), step=step, words=words, out=out, command=command)
+        if any(a is not b for a, b in zip(asked[:3], (plan.geometry, plan.schedules, plan.log), strict=True)) or asked[3] != o:
+            return  # the engine has been changed meanwhile
         plan.done[step] = answer
         if step == "tables":
             s.saved |= {f"schedule-{Path(p).name}": Path(p) for p in answer["files"]}
         s.touch("steps")
 
     def _result(self, step: str, title: str) -> None:
-        self.drawn[step] = (id(self.plan.done.get(step)), dark(self.s))
         if step in self.plan.done:
             with card(f"Step {STEPS.index(step) + 1}: {title}"):
                 getattr(self, f"_{step}")(self.plan.done[step])
 
-    def _changed(self, step: str) -> bool:
-        return self.drawn.get(step) != (id(self.plan.done.get(step)), dark(self.s))
+    def _shows(self, step: str) -> tuple[Any, ...]:
+        return self.plan.done.get(step), dark(self.s)
 
     def _mechanism(self, r: dict[str, Any]) -> None:
         Mechanism(r)

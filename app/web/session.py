@@ -9,6 +9,7 @@ import asyncio
 import re
 import shlex
 import shutil
+from collections import Counter
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -66,7 +67,7 @@ class Choice:
         return out
 
 
-@dataclass
+@dataclass(eq=False)
 class Fitted:
     """One stage fitted with a set of effects."""
 
@@ -86,6 +87,7 @@ class Session:
         self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
         self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
         self.tasks: set[asyncio.Task[None]] = set()
+        self.working: Counter[str] = Counter()  # sections whose work has not ended
         self._fitting = asyncio.Lock()
         self.dark: bool | None = None
         self.errors: dict[str, str] = {}
@@ -105,6 +107,7 @@ class Session:
         self.diagnosis: dict[str, Any] | None = None
         self.stage: str = ""
         self.chosen: dict[str, tuple[str, ...]] = {}
+        self._last_fit: Fitted | None = None
         self.fits: dict[tuple[str, frozenset[str]], Fitted] = {}
         self.hand: dict[str, dict[str, float]] = {}
         self.hand_rms: dict[str, float] = {}
@@ -131,11 +134,16 @@ class Session:
                 self.errors[section] = self.clean(str(e))
             except Cancelled:
                 self.errors[section] = "stopped"
+
+        def ended(task: asyncio.Task[None]) -> None:
+            self.tasks.discard(task)
+            self.working[section] -= 1
             self.touch(section, "jobs")
 
         task = asyncio.get_running_loop().create_task(guarded())
         self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
+        self.working[section] += 1
+        task.add_done_callback(ended)
         self.touch(section)
 
     def clean(self, text: str) -> str:
@@ -220,7 +228,8 @@ class Session:
 
     def diagnose(self) -> None:
         """Search for missing effects."""
-        self.do("diagnose", self._diagnose())
+        if self.compared is not None and not self.working["diagnose"]:
+            self.do("diagnose", self._diagnose())
 
     async def _diagnose(self) -> None:
         words = self.choice.words(real=True)
@@ -301,6 +310,13 @@ class Session:
         """The fit of the effects that are switched on, if it is there."""
         return self.fits.get((self.stage, frozenset(self.chosen.get(self.stage, ()))))
 
+    def shown_fit(self) -> Fitted | None:
+        """The fit that the page shows: the one of the switches, or while that is being made the one before."""
+        f = self.fitted()
+        if f is not None or not self.working["fit"]:
+            self._last_fit = f
+        return self._last_fit if self._last_fit is not None and self._last_fit.result.stage == self.stage else f
+
     def values(self) -> dict[str, dict[str, float]]:
         """Parameters of the effects that are on: as fitted, or as set by hand."""
         f = self.fitted()
@@ -366,7 +382,8 @@ class Session:
 
     def recommend(self) -> None:
         """Look for the experiment that separates the rivals."""
-        self.do("experiment", self._recommend())
+        if self.diagnosis is not None and not self.working["experiment"]:
+            self.do("experiment", self._recommend())
 
     async def _recommend(self) -> None:
         assert self.diagnosis is not None
@@ -377,7 +394,8 @@ class Session:
 
     def save_report(self) -> None:
         """Write the report of the diagnosis."""
-        self.do("save", self._save_report())
+        if self.diagnosis is not None:
+            self.do("save", self._save_report())
 
     async def _save_report(self) -> None:
         assert self.diagnosis is not None
@@ -400,7 +418,8 @@ class Session:
 
     def save_model(self) -> None:
         """Run ``vaneloop extend`` with the effects that are switched on."""
-        self.do("save", self._save_model())
+        if self.all_chosen():
+            self.do("save", self._save_model())
 
     async def _save_model(self) -> None:
         words = ["extend", *self.choice.words(real=True), *self.extend_words()]
@@ -411,10 +430,10 @@ class Session:
         self.saved |= {"model": self.folder / "extended.toml", "extended": self.folder / "extended.html"}
         self.touch("save")
 
-    def stop(self) -> None:
-        """End whatever is being done, and its processes."""
+    def stop(self, *names: str) -> None:
+        """End jobs of these names (or of any) and whatever else their processes do."""
         for w in (self.search, self.bench):
-            if w.jobs:
+            if any(not names or j.name in names for j in w.jobs.values()):
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")
