@@ -297,8 +297,8 @@ class _Page:
         """The search, switches of effects, waterfall, curves, sliders."""
         s, live = self.s, self.live
         with card("3  What is missing?"):
-            hint = ui.label("After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named.")
-            live.shown(hint.classes("soft"), lambda: s.compared is None, "compare", "log")
+            words = "After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named."
+            live.shown(ui.label(words).classes("soft"), lambda: s.compared is None, "compare", "log")
             start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props("unelevated size=md")
             ready = lambda: s.compared is not None and s.diagnosis is None and not s.working["diagnose"]  # noqa: E731
             live.shown(start, ready, "compare", "log", "diagnosis", "diagnose", "jobs")
@@ -315,7 +315,10 @@ class _Page:
                     live.progress("refit")
                     with ui.element("div").classes("stackc") as box:
                         live.part(self._fall, "fit", "diagnosis", "compare", "theme", shows=lambda: (s.diagnosis, s.shown_fit(), dark(s)))
-                    stale = lambda: box.classes(**{"remove" if s.fitted() is s.shown_fit() else "add": "stale"})  # noqa: E731
+
+                    def stale() -> None:
+                        box.classes(**{"remove" if s.fitted() is s.shown_fit() else "add": "stale"})
+
                     live.watch(stale, "fit", "diagnosis", "compare")
                     live.part(self._sliders, "fit", "diagnosis", "compare", shows=lambda: (s.diagnosis, s.fitted()))
                     self.chart_title = ui.label().classes("soft small")
