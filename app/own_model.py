@@ -173,6 +173,8 @@ def _older(answer: Any) -> dict[str, Any]:
 
 def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
     """Print the answer."""
+    import numpy as np
+
     d = answer.diagnosis
     for note in answer.notes:
         cli.say(args, f"note: {note}")
@@ -184,6 +186,13 @@ def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
             figures = [f"{answer.logs[s][log][k]:.4g}" for s in steps]
             relative = f"{100 * answer.logs[steps[-1]][log][k] / answer._size(log, k):.3g} %"
             rows.append([log, "fitted" if log in fitted else "test", output, *figures, relative, d.units[k]])
+    together = answer.together()
+    for what, bound in (("fitted", answer.bound), ("test", answer.test)):
+        if bound is not None and len(bound.logs) > 1:
+            for k, output in enumerate(d.outputs):
+                figures = [f"{together[s][what][k]:.4g}" for s in steps]
+                relative = 100 * together[steps[-1]][what][k] / (float(np.sqrt(np.nanmean(bound.measured[k] ** 2))) or 1.0)
+                rows.append([f"all {len(bound.logs)} together", what, output, *figures, f"{relative:.3g} %", d.units[k]])
     heads = ["model", *(f"+ {s.split(' + ')[-1]}" for s in steps[1:])]
     cli.print_table(args, f"RMS error log by log ({answer.elapsed_s:.1f} s)", ["log", "", "signal", *heads, "of RMS", "unit"], rows)
     if verb in ("compare", "locate"):

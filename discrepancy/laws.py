@@ -25,6 +25,7 @@ from discrepancy.stage import Array, Parameter
 
 __all__ = [
     "FORCE_LAWS",
+    "HYSTERETIC",
     "LAWS",
     "MEMORY",
     "PARAMETERS",
@@ -34,6 +35,7 @@ __all__ = [
     "Size",
     "apply",
     "force_of",
+    "load",
     "state_rate",
     "transform",
 ]
@@ -297,6 +299,18 @@ def force_of(code: int, v: float, x: float, first: bool, p: Array, gap: float, a
     return 0.0
 
 
+@_jit
+def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: float, s: Array) -> float:
+    """Set up the memory of a hysteretic law so that at displacement ``x`` it carries the force ``held``, or its friction; return that."""
+    f = min(max(held, -p[1] * (1.0 - asymmetry)), p[1] * (1.0 + asymmetry))
+    side = 0.5 * gap if f > 0.0 else -0.5 * gap
+    if code == ELASTIC_PLASTIC:
+        s[0] = x - side - f / p[0]
+    else:
+        s[0], s[1], s[2] = f, x, side
+    return f
+
+
 # ---- laws of a state of first order -------------------------------------------------------------------------------------------------
 
 STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT = range(41, 48)
@@ -445,7 +459,7 @@ def _spring(z: Size) -> _Made:
 
 def _cubic_spring(z: Size) -> _Made:
     k = z.force / z.travel**3
-    return _one("stiffness", f"({z.force_unit})/({z.travel_unit})^3", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5)))
+    return _one("stiffness", f"({z.force_unit})/({z.travel_unit})^3", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5, 2.5, 10.0)))
 
 
 def _slider(z: Size) -> tuple[list[Parameter], list[tuple[float, float]]]:
@@ -580,4 +594,5 @@ LAWS: dict[str, dict[str, Law]] = {
     },
 }
 SIGNAL_LAWS, FORCE_LAWS, STATE_LAWS = LAWS["signal"], LAWS["force"], LAWS["state"]
+HYSTERETIC = (ELASTIC_PLASTIC, BOUC_WEN)  # carry a force at rest: where they start is unknown
 MODIFIERS = (BACKLASH_GAP, FRICTION_ASYMMETRY)  # add no force of their own: they change what the friction and spring laws add

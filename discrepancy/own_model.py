@@ -18,9 +18,10 @@ import numpy as np
 from discrepancy.diagnose import StageDiagnosis
 from discrepancy.evidence import diagnose_system, extend_system
 from discrepancy.fit import Judge
+from discrepancy.laws import HYSTERETIC
 from discrepancy.locate import Regime, Shape, onset, regimes, shape
 from discrepancy.stage import Array, StageError
-from discrepancy.system import Bound, Record, System
+from discrepancy.system import STARTS_LOADED, Bound, Record, System
 
 __all__ = ["Answer", "Model", "compare", "diagnose", "extend", "load_model", "locate", "write_model"]
 
@@ -110,6 +111,10 @@ class Answer:
                 }
                 for step, by in self.logs.items() for log, rms in by.items() for k in range(len(d.outputs))
             ],
+            "together": [
+                {"logs": what, "signal": d.outputs[k], "unit": d.units[k], "step": step, "rms": float(rms[k])}
+                for step, by in self.together().items() for what, rms in by.items() for k in range(len(d.outputs))
+            ],
             "ablation": [
                 {"effect": e, "log": log, "error_ratio": v, "helps": v < NO_HELP}
                 for e, by in self.ablation.items() for log, v in by.items()
@@ -119,6 +124,18 @@ class Answer:
         }  # fmt: skip
         if self.shapes:
             out["unknown"] = [{"stage": d.stage, "shape": "; ".join(s.text for s in self.shapes), "nearest_effects": []}]
+        return out
+
+    def together(self) -> dict[str, dict[str, Array]]:
+        """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test" -> RMS."""
+        out: dict[str, dict[str, Array]] = {}
+        for step, by in self.logs.items():
+            out[step] = {}
+            for what, bound in (("fitted", self.bound), ("test", self.test)):
+                if bound is not None:
+                    n = np.array([np.isfinite(bound.measured[:, at]).sum(axis=1) for at in bound.logs.values()])
+                    squares = np.array([np.where(np.isfinite(by[log]), by[log], 0.0) ** 2 for log in bound.logs])
+                    out[step][what] = np.sqrt((n * squares).sum(axis=0) / np.maximum(n.sum(axis=0), 1))
         return out
 
     def _size(self, log: str, k: int) -> float:
@@ -282,6 +299,7 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
             answer.notes.append(
                 f"{p.name}: not needed any more, set to 0 (it was {v0:.4g} {p.unit} while {', '.join(d.final.effects)} was missing)"
             )
+    answer.notes += _loaded(bound, judge, d)
     if d.verdict != "none" and d.excess > LEFT:
         answer.shapes = shape(judge, d.final)
     answer.regimes = regimes(judge, d.base, 2.0)
@@ -297,6 +315,32 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
     for f in d.effects:
         answer.model.effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items()}
     return answer
+
+
+def _loaded(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
+    """What it would change to start springs with the force that was measured at the start."""
+    codes = {q.effect: q.law.code for q in bound.placed}
+    springs = [e for e in (*d.final.effects, *bound.present) if codes[e] in HYSTERETIC]
+    if bound.system.kind != "force" or bound.loaded or not springs:
+        return []
+    held = [bound.held(k) for k in range(len(bound.logs))]
+    if max(np.abs(held)) < STARTS_LOADED * bound.noise_of_force:
+        return []
+    bound.loaded = True
+    other = judge.fit(d.final.effects, judge.fit(d.final.effects, d.final.theta, 12).theta, 12)
+    bound.loaded = False
+    before, after = (float(np.sqrt(f.cost.sum() / max(judge.n, 1)) * d.floor[0]) for f in (d.final, other))
+    unit = d.units[0]
+    names = [p.name for e in bound.stage.effects for p in e.parameters]
+    index, n = bound.stage.index(), len(bound.stage.parameters)
+    moved = [
+        f"{e.rpartition('.')[2]} {names[c - n]} {d.final.theta[c]:.4g} to {other.theta[c]:.4g}"
+        for e in d.final.effects for c in range(index[e].start, index[e].stop)
+        if abs(other.theta[c] - d.final.theta[c]) > 0.02 * abs(d.final.theta[c])
+    ]  # fmt: skip
+    text = f"{' and '.join(springs)} taken as unloaded at the start, where {held[0]:.3g} {unit} was measured; "
+    text += f'with start_force="measured" the error goes from {before:.4g} to {after:.4g} {unit}'
+    return [text + (f", {', '.join(moved)}" if moved else "")]
 
 
 def _seeded(bound: Bound, base: Array, final: Array, effects: tuple[str, ...]) -> Array:

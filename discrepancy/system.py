@@ -38,6 +38,7 @@ WIDE = 4.0  # half-width, in sizes of a parameter that the user calls unknown, o
 MOST_STEPS = 16
 MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
+STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differentiated log
 
 
@@ -67,6 +68,7 @@ class System:
     parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
     position, velocity   force: the channel of the displacement, and of its rate where it is measured too (else it is differentiated)
     cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the measured force
+    start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force "measured" there
     states      simulate: name -> unit, in the order in which the model returns their derivatives
     rates       simulate: velocity -> displacement, for states that are these; laws of friction then act on the velocity
     masses      simulate: velocity -> name of the parameter that divides forces there, so that laws there are in units of force
@@ -90,6 +92,7 @@ class System:
     position: str | None = None
     velocity: str | None = None
     cutoff: float | None = None
+    start_force: str = "unloaded"
     states: dict[str, str] = field(default_factory=dict)
     rates: dict[str, str] = field(default_factory=dict)
     masses: dict[str, str] = field(default_factory=dict)
@@ -161,6 +164,8 @@ class System:
                     )
         if self.between not in ("hold", "line"):
             raise wrong(f"between (={self.between!r}) must be 'hold' or 'line'")
+        if self.start_force not in ("unloaded", "measured"):
+            raise wrong(f"start_force (={self.start_force!r}) must be 'unloaded' or 'measured'")
         for what, size in (("window", self.window), ("cutoff", self.cutoff)):
             if size is not None and not (np.isfinite(size) and size > 0):
                 raise wrong(f"{what} (={size!r}) must be above 0")
@@ -245,7 +250,7 @@ class Bound:
         at = 0
         for r in self.records:
             name = r.name
-            while name in self.logs:
+            while name in self.logs or (like is not None and name in like.logs):
                 name += "'"
             self.logs[name] = slice(at, at + len(r.t))
             at += len(r.t)
@@ -571,6 +576,11 @@ class Bound:
             out[bad] = self.far
         return np.clip(out, -self.far, self.far)
 
+    def held(self, log: int) -> float:
+        """Measured force at the start of a log."""
+        y = self.records[log].columns[next(iter(self.system.outputs))][:5]
+        return float(np.median(y[np.isfinite(y)])) if np.isfinite(y).any() else 0.0
+
     def _algebraic(self, p: Array, log: int, active: list[tuple[_Placed, Array]]) -> Array:
         t, u = self.records[log].t, self.u[log]
         inputs = [(q, row) for q, row in active if q.place == "input"]
@@ -584,7 +594,15 @@ class Bound:
             gap = sum(row[0] for q, row in forces if q.law.code == laws.BACKLASH_GAP)
             asymmetry = sum(row[0] for q, row in forces if q.law.code == laws.FRICTION_ASYMMETRY)
             for q, row in forces:
-                y[0] += _force_record(q.law.code, u[1], u[0], row, gap, asymmetry, self.small)
+                if q.law.code not in laws.HYSTERETIC:
+                    y[0] += _forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, 0.0)
+            springs = [(q, row) for q, row in forces if q.law.code in laws.HYSTERETIC and row[1] > 0.0]
+            held = self.held(log) - y[0, 0] if self.loaded else 0.0
+            if not abs(held) > STARTS_LOADED * self.noise_of_force:
+                held = 0.0
+            total = sum(row[1] for _, row in springs)
+            parts = [_forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, held * row[1] / total) for q, row in springs]
+            y[0] += np.sum(parts, axis=0)
         if self.cutoff:
             y = np.array([_low_pass(t, row, self.cutoff) for row in y])
         for q, row in active:
@@ -769,6 +787,8 @@ class Bound:
         self.free_starts: list[tuple[int, int]] = []
         self.steps = 1
         self.small = 0.0
+        self.loaded = s.start_force == "measured"
+        self.noise_of_force = float(self.noise()[0]) if s.kind == "force" else 0.0
         if self.like is not None:
             self.steps, self.effects, self.placed, self.small = self.like.steps, self.like.effects, self.like.placed, self.like.small
             if hasattr(self.like, "smalls"):
@@ -1199,16 +1219,15 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
 """
 
 
-def _force_record(code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float) -> Array:
-    return _forces(code, np.ascontiguousarray(v), np.ascontiguousarray(x), row, gap, asymmetry, small)
-
-
 @laws._jit
-def _forces(code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float) -> Array:
+def _forces(code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float, held: float) -> Array:
+    """A law's force on a whole log; elements with a memory start with the force ``held``, in the middle of their gap where that is 0."""
     s = np.zeros(laws.MEMORY)
     out = np.empty(len(v))
     for k in range(len(v)):
         out[k] = laws.force_of(code, v[k], x[k], k == 0, row, gap, asymmetry, small, s)
+        if k == 0 and held != 0.0:
+            out[k] = laws.load(code, x[0], row, gap, asymmetry, held, s)
     return out
 
 
