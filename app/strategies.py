@@ -41,7 +41,8 @@ IDLE, FULL = 45.0, 100.0  # %
 SWING = 20.0  # s for which a dither keeps its frequency
 FREQUENCIES = (0.1, 0.2, 0.5, 1.0)  # Hz
 AFTER = 10.0  # s after a failure in which a step is looked for
-STEP_TIME = 0.1  # s: a change within this is a step
+STEP_TIME = 1.0  # s: a change within this is a step
+QUICK = 3.0  # %/s: a demand that moves faster moves the vanes
 GAIN, TRAVEL, STEP = 3.0, 1.15, 0.2  # goals: error of dual over best, travel of best over dual, deg
 EVERY = 10  # ticks between samples that are kept
 
@@ -244,48 +245,62 @@ def _figures(error: Array, n_r: Array) -> dict[str, float | None]:
 
 # ---- potentiometers that fail -------------------------------------------------------------------------------------------------------
 
-# name -> (share of the reading, offset in deg at once, in deg/s from then on); stuck: at the angle of that moment
-FAILURES: dict[str, tuple[float, float, float]] = {
-    "no signal": (1.0, np.nan, 0.0),
-    "out of range": (0.0, 120.0, 0.0),
-    "stuck": (0.0, np.nan, 0.0),
-    "jump of 2 deg": (1.0, 2.0, 0.0),
-    "jump of 0.3 deg": (1.0, 0.3, 0.0),
-    "drift of 0.05 deg/s": (1.0, 0.0, 0.05),
-    "drift of 0.005 deg/s": (1.0, 0.0, 0.005),
+# name -> (share of the reading, offset in deg at once, in deg/s from then on, noise in deg); stuck: at the angle of that moment
+FAILURES: dict[str, tuple[float, float, float, float]] = {
+    "no signal": (1.0, np.nan, 0.0, 0.0),
+    "out of range": (0.0, 120.0, 0.0, 0.0),
+    "stuck": (0.0, np.nan, 0.0, 0.0),
+    "jump of 2 deg": (1.0, 2.0, 0.0, 0.0),
+    "jump of 0.3 deg": (1.0, 0.3, 0.0, 0.0),
+    "noise of 1 deg": (1.0, 0.0, 0.0, 1.0),
+    "drift of 0.05 deg/s": (1.0, 0.0, 0.05, 0.0),
+    "drift of 0.005 deg/s": (1.0, 0.0, 0.005, 0.0),
+    "drift of -0.005 deg/s": (1.0, 0.0, -0.005, 0.0),
 }
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What followed a failure of all three potentiometers.
+    """What followed a failure of the potentiometers of ``stages``.
 
-    at      s
-    step    deg, VIGV: largest difference to the healthy run in the first 10 s, of the vane or of the angle that is aimed at; or largest
-            change of the compensation in use within 0.1 s at any later time
+    during  at rest or in motion: what the demand did at the time ``at`` (s)
+    step    deg, VIGV: what the failure changed within 1 s, in the first 10 s of the vane or of the angle that is aimed at (both against
+            the healthy run), or at any later time of the compensation in use
+    departure  deg, VIGV: largest difference to the healthy run in the first 10 s
     crossings  how often more than in the healthy run the stroke crossed the gap in the first 10 s (the vane stands meanwhile)
     mean_abs, mean_abs_dual  deg, VIGV's error from then on, of this run and of dual
     """
 
     failure: str
+    during: str
+    stages: tuple[str, ...]
     at: float
     step: float
+    departure: float
     crossings: int
     mean_abs: float
     mean_abs_dual: float
 
 
-def moment(n_dem: Array) -> int | None:
-    """Return the first sample after the middle at which the demand has stood at 99 % or more for 5 s and will for 10 s; None: nowhere."""
-    still = (np.abs(np.diff(n_dem, prepend=n_dem[0])) < 1e-9) & (n_dem >= 99.0)
-    length = np.convolve(still, np.ones(1500), "valid")
-    hits = np.flatnonzero(length[len(n_dem) // 2 :] >= 1500.0)
-    return int(hits[0]) + len(n_dem) // 2 + 500 if hits.size else None
+def moments(n_dem: Array) -> dict[str, int]:
+    """Samples after the middle at which to let the potentiometers fail: during -> sample; what the profile does not offer is left out.
+
+    at rest    the demand has stood at 99 % or more for 5 s and will for 10 s
+    in motion  the demand has moved faster than 3 %/s for 1 s, and 10 s are left
+    """
+    rate, half = np.abs(np.diff(n_dem, prepend=n_dem[0])) / 1e-2, len(n_dem) // 2
+
+    def first(ok: NDArray[np.bool_], length: int, after: int) -> int | None:
+        hits = np.flatnonzero(np.convolve(ok[half:], np.ones(length), "valid") > length - 0.5)
+        return int(hits[0]) + half + after if hits.size and int(hits[0]) + half + after + int(AFTER / 1e-2) < len(n_dem) else None
+
+    found = {"at rest": first((rate < 1e-7) & (n_dem >= 99.0), 1500, 500), "in motion": first(rate > QUICK, 100, 100)}
+    return {during: at for during, at in found.items() if at is not None}
 
 
 def failing(
     name: str,
-    at: int,
+    during: str,
     healthy: Outcome,
     dual: Outcome,
     scenario: Scenario,
@@ -293,26 +308,25 @@ def failing(
     calibration: Calibration,
     seed: int = 1,
     base: Plant | None = None,
+    stages: tuple[str, ...] = STAGES,
 ) -> tuple[Failure, Outcome]:
-    """Run a scenario again with the potentiometers failing from sample ``at`` (10 ms) on."""
-    share, offset, drift = FAILURES[name]
+    """Run a scenario again with the potentiometers of ``stages`` failing ``during`` one of the `moments`."""
+    at, lag = moments(n_dem)[during], int(STEP_TIME / 1e-2)
+    share, offset, drift, noise = FAILURES[name]
     pots = np.tile([1.0, 0.0], (len(n_dem), 3))
-    t = np.arange(len(n_dem) - at) * 1e-2
-    for k in range(3):
-        pots[at:, 2 * k] = share
-        pots[at:, 2 * k + 1] = np.deg2rad(healthy.vanes[at, k] if name == "stuck" else offset + drift * t)
+    t, rng = np.arange(len(n_dem) - at) * 1e-2, np.random.default_rng(seed)
+    for k in map(STAGES.index, stages):
+        wrong = healthy.vanes[at, k] if name == "stuck" else offset + drift * t + noise * rng.standard_normal(len(t))
+        pots[at:, 2 * k], pots[at:, 2 * k + 1] = share, np.deg2rad(wrong)
     out = run(scenario, n_dem, calibration, seed, pots, base)
     first = slice(at, at + int(AFTER / 1e-2))
-    lag = int(STEP_TIME / 1e-2)
+    changes = [(a - b)[first] for a, b in ((out.vanes[:, 0], healthy.vanes[:, 0]), (out.aim, healthy.aim))]
     compensation = np.abs(out.offset[at + lag :] - out.offset[at:-lag]) + 0.5 * np.abs(out.width[at + lag :] - out.width[at:-lag])
-    step = max(
-        float(np.abs(out.vanes[first, 0] - healthy.vanes[first, 0]).max()),
-        float(np.abs(out.aim[first] - healthy.aim[first]).max()),
-        float(compensation.max(initial=0.0)),
-    )
+    step = max(float(compensation.max()), *(float(np.abs(c[lag:] - c[:-lag]).max()) for c in changes))
+    departure = max(float(np.abs(c).max()) for c in changes)
     rest = [float(np.abs(o.errors[at:, 0]).mean()) for o in (out, dual)]
     crossings = [int(np.abs(np.diff(np.sign(o.side[first]))).sum() / 2) for o in (out, healthy)]
-    return Failure(name, at * 1e-2, step, max(crossings[0] - crossings[1], 0), rest[0], rest[1]), out
+    return Failure(name, during, stages, at * 1e-2, step, departure, max(crossings[0] - crossings[1], 0), *rest), out
 
 
 # ---- the command --------------------------------------------------------------------------------------------------------------------
@@ -370,9 +384,9 @@ def command(args: argparse.Namespace) -> int:
     n_dem = load_profile(args.profile, args.dwell)
     rows = scenarios(args.play, args.growth, args.noise, args.dither)
     warm_up(lambda text: cli.say(args, text))
-    at = moment(n_dem)
+    tried = [(name, during) for during in moments(n_dem) for name in FAILURES]
     failures: list[tuple[Failure, Outcome]] = []
-    work = len(rows) * len(STRATEGIES) + (len(FAILURES) if at is not None else 0)
+    work = len(rows) * len(STRATEGIES) + len(tried)
     with cli.progress_bar(args, f"{work} runs of {len(n_dem) * 1e-2:,.0f} s") as progress:
         done = 0
 
@@ -389,15 +403,15 @@ def command(args: argparse.Namespace) -> int:
             pairs = [(row, strategy) for row in rows for strategy in STRATEGIES]
             all_runs = pool.map(lambda p: run(p[0], n_dem, calibrations[p[1]], args.seed, base=plant), pairs)
             outcomes = {(o.scenario, o.strategy): o for o in counted(all_runs)}
-            if at is not None:
-                healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
-                again = pool.map(lambda name: failing(name, at, healthy, dual, last, n_dem, adaptive, args.seed, plant), FAILURES)
-                failures = list(counted(again))
+            healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
+            again = pool.map(lambda f: failing(f[0], f[1], healthy, dual, last, n_dem, adaptive, args.seed, plant), tried)
+            failures = list(counted(again))
     best = min(STRATEGIES, key=lambda s: outcomes[last.name, s].figures["vigv"]["mean_abs"] or 0.0)
     goals = _goals(rows, outcomes, [f for f, _ in failures], best)
     _print(args, n_dem, outcomes, [f for f, _ in failures], goals)
-    if at is None:
-        cli.say(args, "note: the profile never rests at 99 % or more for 15 s after its middle; failing potentiometers were not tried")
+    for during, words in _MOMENTS.items():
+        if not any(f.during == during for f, _ in failures):
+            cli.say(args, f"note: after its middle the profile never {words}; potentiometers failing then were not tried")
     missed = [g for g in goals if not g["held"]]
     for g in missed:
         cli.say(args, f"missed: {g['goal']}: {g['value']:.3g}, limit {g['limit']:.3g}")
@@ -433,10 +447,11 @@ def _goals(rows: tuple[Scenario, ...], outcomes: Outcomes, failures: list[Failur
             if a is not None and b is not None:
                 judge(f"{row.name}: VIGV {_WORDS[k]} of {best} (deg), at most dual's", a, b)
     for f in failures:
-        judge(f"potentiometers, {f.failure}: step (deg)", f.step, STEP)
+        judge(f"potentiometers, {f.failure}, {f.during}: step (deg)", f.step, STEP)
     return goals
 
 
+_MOMENTS = {"at rest": "rests at 99 % or more for 15 s", "in motion": "moves at more than 3 %/s for 1 s with 10 s left"}
 _WORDS = {"mean_abs": "mean", "max_abs": "maximum", "mean_abs_99_100": "mean at 99 to 100 %"}
 
 
@@ -449,9 +464,15 @@ def _print(args: argparse.Namespace, n_dem: Array, outcomes: Outcomes, failures:
     title = f"{len(n_dem) * 1e-2:,.0f} s under each strategy; error of the true angles, deg: mean, max, mean at 99 to 100 % speed"
     cli.print_table(args, title, ["machine", "strategy", *STAGES, "travel mm", "reversals", "current mA rms"], rows)
     if failures:
-        text = [[f.failure, f"{f.step:.3f}", f"{f.crossings}", f"{f.mean_abs:.3f}", f"{f.mean_abs_dual:.3f}"] for f in failures]
-        title = f"adaptive, all together, potentiometers failing from t = {failures[0].at:,.1f} s on"
-        cli.print_table(args, title, ["failure", "step deg", "crossings", "mean VIGV error since", "of dual"], text)
+        when = {f.during: f.at for f in failures}
+        text = [
+            [f.during if i == 0 or failures[i - 1].during != f.during else "", f.failure, f"{f.step:.3f}", f"{f.departure:.3f}",
+             f"{f.crossings}", f"{f.mean_abs:.3f}", f"{f.mean_abs_dual:.3f}"]
+            for i, f in enumerate(failures)
+        ]  # fmt: skip
+        title = "adaptive, all together, all potentiometers failing " + " or ".join(f"{d} at {at:,.1f} s" for d, at in when.items())
+        columns = ["", "failure", "within 1 s deg", "in 10 s deg", "crossings", "mean VIGV error since", "of dual"]
+        cli.print_table(args, title, columns, text)
     held = sum(g["held"] for g in goals)
     cli.say(args, f"goals held: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least {goals[0]['limit']:g})")
 
@@ -534,12 +555,13 @@ def report(
     if failures:
         page.section(
             "Potentiometers that fail",
-            "All three fail at once, in the middle of the run. The compensation stays as learned; nothing jumps. A drift slower than "
-            "what the casing may do cannot be told from growth: it is followed, slowly, up to the limit of the offset.",
+            "All three fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A drift slower than "
+            "what the casing may do cannot be told from growth: it is followed, slowly, up to the limit of the offset, and may leave "
+            "more error than dual has. Step: what the failure changes within 1 s.",
         )
         page.table(
-            ["failure", "step [deg]", "crossings of the gap", "mean VIGV error since [deg]", "of dual [deg]"],
-            [[f.failure, f.step, f.crossings, f.mean_abs, f.mean_abs_dual] for f, _ in failures],
+            ["when", "failure", "step [deg]", "in 10 s [deg]", "crossings of the gap", "mean VIGV error since [deg]", "of dual [deg]"],
+            [[f.during, f.failure, f.step, f.departure, f.crossings, f.mean_abs, f.mean_abs_dual] for f, _ in failures],
         )
         page.plot(
             overlay(
@@ -547,7 +569,7 @@ def report(
                     Panel(
                         "offset in use [deg]",
                         [Line("healthy", adaptive.t, adaptive.offset, "muted", 2.4)]
-                        + [Line(f.failure, o.t, o.offset, "other", shown=i < 4) for i, (f, o) in enumerate(failures)],
+                        + [Line(f"{f.failure}, {f.during}", o.t, o.offset, "other", shown=i < 4) for i, (f, o) in enumerate(failures)],
                     )
                 ]
             )

