@@ -171,7 +171,7 @@ def test_a_potentiometer_is_believed_only_after_it_followed_the_linkage() -> Non
 
 def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     page, answer = tmp_path / "s.html", tmp_path / "s.json"
-    assert main(["strategies", "--dwell", "0.1", "--report", str(page), "--json", str(answer)]) == 0
+    assert main(["strategies", "--dwell", "0.2", "--report", str(page), "--json", str(answer)]) == 0
     out = capsys.readouterr().out
     assert "all together" in out and "goals held" in out
     j = json.loads(answer.read_text(encoding="utf-8"))
@@ -179,7 +179,7 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     assert all(g["held"] for g in j["goals"])
     row = next(r for r in j["rows"] if r["scenario"] == "all together" and r["strategy"] == "dual")
     assert {"travel_mm", "demand_travel_mm", "reversals", "current_rms_ma", "faults", *st.STAGES} <= set(row)
-    again = st.run(ROWS["all together"], load_profile(dwells=0.1), CALIBRATIONS["dual"])
+    again = st.run(ROWS["all together"], load_profile(dwells=0.2), CALIBRATIONS["dual"])
     assert row["vigv"]["mean_abs"] == pytest.approx(again.figures["vigv"]["mean_abs"], rel=1e-9)
     text = page.read_text(encoding="utf-8")
     assert "What adaptive learns" in text and "<script src" not in text
