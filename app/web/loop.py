@@ -17,7 +17,7 @@ import numpy as np
 
 from app.web.worker import INBOX, Progress, main
 
-__all__ = ["COLUMNS", "TASKS"]
+__all__ = ["COLUMNS", "COMPILING", "TASKS"]
 
 COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2", "p_s", "t_oil", "state", "faults")
 MOST_TRACE = 120  # frames of the trace sent at a time; the rest are counted only
@@ -121,6 +121,27 @@ class _Injected:
             self.intruders.remove((place, intruder))
 
 
+def _compile() -> None:
+    from hil.lockstep_bus import Channel
+    from hil.node import Ecu, Node
+    from hil.wire import BITS_PER_TICK, put, run_wire, take
+
+    rows = np.zeros((1, 2), np.int64)
+    channel = Channel(seed=0)
+    place = channel.join()
+    for sender in (Node(), Ecu()):
+        for head, data in sender.tick(rows, 0).tolist():
+            put(channel.wire, place, head, data)
+    run_wire(channel.wire, BITS_PER_TICK, -1)
+    take(channel.wire, place, np.zeros((256, 2), np.int64))
+
+
+def ready(progress: Progress) -> None:
+    """Load and compile what a run needs."""
+    progress(None, COMPILING)
+    _compile()
+
+
 def lockstep(progress: Progress, demand: float, speed: float, record: str | None, seed: int | None, profile: str | None) -> dict[str, Any]:
     """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop."""
     from hil.ecu import EcuStation, Typed, builtin
@@ -132,9 +153,8 @@ def lockstep(progress: Progress, demand: float, speed: float, record: str | None
 
     typed = Typed(demand)
     progress(None, COMPILING)
+    _compile()
     node = Node(n_r=demand, seed=seed)
-    Node().tick(np.zeros((1, 2), np.int64), 0)
-    Ecu().tick(np.zeros((1, 2), np.int64), 0)
     ecu = EcuStation(typed, ecu=Ecu(n_dem=demand, seed=None if seed is None else seed + 1))
     channel = Channel(seed=seed or 0)
     wire = channel.wire
@@ -303,7 +323,7 @@ def listen(progress: Progress, bus: str) -> dict[str, Any]:
     return {"frames": heard.frames}
 
 
-TASKS = {f.__name__: f for f in (lockstep, node, ecu, listen)}
+TASKS = {f.__name__: f for f in (ready, lockstep, node, ecu, listen)}
 
 if __name__ == "__main__":
     if "--nice" in sys.argv:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import shlex
+import time
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ from nicegui import events, ui
 from app.web.charts import Chart, Curves, Panel, Trace
 from app.web.frame import Live, card, command_line, dark, figure_of, frame
 from app.web.jobs import Cancelled, Worker, WorkError
-from app.web.loop import COLUMNS
+from app.web.loop import COLUMNS, COMPILING
 from app.web.session import LogFile, Session
 from controller import FAULTS, MODES
 from hil.ecu import BUILTIN
@@ -25,6 +28,8 @@ __all__ = ["build"]
 
 KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
 SHOWN = 30.0  # s in the strip charts
+LIT = 1.5  # s that a lamp stays lit, so that what passes quickly is seen
+TRACE_LINES = 40
 TRACED = 2000  # frames kept for the trace
 TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
 STRIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
@@ -56,6 +61,7 @@ class Loop:
     events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
+    lit: dict[str, float] = field(default_factory=dict)  # lamp -> clock when it was last on
 
     # ---- begin and end
 
@@ -68,6 +74,7 @@ class Loop:
         self.rows = np.empty((KEPT, len(COLUMNS)))
         self.trace.clear()
         self.events.clear()
+        self.lit.clear()
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -79,6 +86,14 @@ class Loop:
             w.news = self._news
             self.session.extra.setdefault("closers", []).append(w.stop)
         return w
+
+    def warm(self) -> None:
+        """Load the simulator before it is asked for."""
+        if not self.workers:
+            self.session.do("warm", self._warm())
+
+    async def _warm(self) -> None:
+        await self._worker("loop").call("ready", COMPILING)
 
     def _record_path(self) -> str | None:
         return str(self.session.folder / f"run{self.runs}.log") if self.record else None
@@ -182,8 +197,20 @@ class Loop:
         self.rows[self.filled : self.filled + len(rows)] = rows
         self.filled += len(rows)
         self.trace.extend(news.pop("trace"))
+        self._light(rows)
         self.status = news
         self._draw()
+
+    def _light(self, rows: np.ndarray) -> None:
+        now = time.monotonic()
+        for mode in set(rows[:, COLUMNS.index("state")].tolist()):
+            if mode == mode and 0 <= mode < len(MODES):
+                self.lit[MODES[int(mode)]] = now
+        faults = rows[:, COLUMNS.index("faults")]
+        bits = int(np.bitwise_or.reduce(faults[np.isfinite(faults)].astype(np.int64), initial=0))
+        for i, fault in enumerate(FAULTS):
+            if bits >> i & 1:
+                self.lit[fault] = now
 
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
@@ -205,6 +232,7 @@ def build(session: Session, most: int) -> None:
     """Draw the page."""
     if "loop" not in session.extra:
         session.extra["loop"] = Loop(session)
+    session.extra["loop"].warm()
     with frame(session, "/run"):
         page = _Page(session, Live(session))
         page.controls()
@@ -220,6 +248,7 @@ class _Page:
     def __init__(self, session: Session, live: Live):
         self.s, self.live = session, live
         self.loop: Loop = session.extra["loop"]
+        self.traced: tuple[Any, str] = (None, "")
 
     # ---- start, stop, demand
 
@@ -357,18 +386,20 @@ class _Page:
                         self.tiles[name] = ui.label("-").classes("v")
                         ui.label(words).classes("l")
             Chart("run", live=8.0)
-            ui.timer(0.2, self._lamps)
+            ui.timer(0.3, self._shown)
+
+    def _shown(self) -> None:
+        """Lamps, figures and trace together: the browser goes through the page once for all of them."""
+        self._lamps()
+        self._trace()
 
     def _lamps(self) -> None:
         lp = self.loop
-        state, faults = lp.latest("state"), lp.latest("faults")
+        state, now = lp.latest("state"), time.monotonic()
         mode = MODES[int(state)] if state == state and 0 <= state < len(MODES) else ""
-        bits = int(faults) if faults == faults else 0
         for name, lamp in self.lamps.items():
-            if name in MODES:
-                tone = TONES.get(name, "mid") if name == mode else ""
-            else:
-                tone = "bad" if (bits >> FAULTS.index(name)) & 1 else ""
+            fresh = now - lp.lit.get(name, -LIT) < LIT or name == mode
+            tone = (TONES.get(name, "mid") if name in MODES else "bad") if fresh else ""
             wanted = f"lamp {tone}".strip()
             if getattr(lamp, "shown", None) != wanted:
                 lamp.classes(replace=wanted)
@@ -420,32 +451,25 @@ class _Page:
         """Decoded frames, with a filter."""
         with card("4  The bus"):
             with ui.element("div").classes("rowc"):
-                words = ui.input(placeholder="filter: name, 0B0, signal").props('outlined dense clearable aria-label="filter of the trace"')
-                hold = ui.checkbox("hold")
+                self.words = ui.input(placeholder="filter: name, 0B0, signal").props(
+                    'outlined dense clearable aria-label="filter of the trace"'
+                )
+                self.hold = ui.checkbox("hold")
                 self.counts = ui.label().classes("soft small")
-            box = ui.html("", sanitize=False).classes("trace w-full").props('role="log"')
-            seen = {"n": -1.0, "text": ""}
+            self.trace_box = ui.html("", sanitize=False).classes("trace w-full").props('role="log"')
 
-            def show() -> None:
-                lp, text = self.loop, (words.value or "").lower()
-                s = lp.status
-                if hold.value or not s or (s.get("frames"), text) == (seen["n"], seen["text"]):
-                    return
-                seen["n"], seen["text"] = s.get("frames", 0), text
-                load = f", load {100 * s['load']:.0f} %" if "load" in s else ""
-                self.counts.set_text(f"{s.get('frames', 0):,} frames, {s.get('refused', 0):,} with a wrong CRC{load}")
-                lines = []
-                for t, head, data, values in reversed(lp.trace):
-                    line = _in_words(t, head, data, values)
-                    if not text or text in line.lower():
-                        lines.append(line)
-                        if len(lines) >= 60:
-                            break
-                import html
-
-                box.set_content(html.escape("\n".join(lines)))
-
-            ui.timer(0.25, show)
+    def _trace(self) -> None:
+        lp, text = self.loop, (self.words.value or "").lower()
+        s = lp.status
+        now = s.get("frames"), text
+        if self.hold.value or not s or now == self.traced:
+            return
+        self.traced = now
+        load = f", load {100 * s['load']:.0f} %" if "load" in s else ""
+        self.counts.set_text(f"{s.get('frames', 0):,} frames, {s.get('refused', 0):,} with a wrong CRC{load}")
+        lines = (_in_words(*f) for f in reversed(lp.trace))
+        kept = islice((x for x in lines if not text or text in x.lower()), TRACE_LINES)
+        self.trace_box.set_content(html.escape("\n".join(kept)))
 
     # ---- lateness
 
