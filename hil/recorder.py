@@ -23,6 +23,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import select
 import struct
 import subprocess
@@ -74,7 +75,8 @@ class _Format(Protocol):
 
 class _Candump:
     def __init__(self, path: Path, channel: str):
-        self.fd, self.channel = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666), channel
+        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
+        self.channel = re.sub(r"\W", "-", channel)[:15] or "can0"  # a name of a network interface has 15 characters at most
 
     def append(self, frames: np.ndarray) -> None:
         text, lines = frames["data"].tobytes().hex().upper(), []

@@ -35,11 +35,11 @@ export default {
   },
   methods: {
     async beat() {
-      // a slow machine is asked less often: no more than a quarter of its time goes into drawing
+      // a slow machine is asked less often: a quarter of its time goes into drawing, down to one answer a second
       const began = performance.now();
       if (!document.hidden) await this.fetch();
       const drawn = await new Promise((done) => requestAnimationFrame(() => done(performance.now())));
-      if (!this.gone) this.timer = setTimeout(() => this.beat(), Math.max(1000 / this.live, 3 * (drawn - began)));
+      if (!this.gone) this.timer = setTimeout(() => this.beat(), Math.min(1000, Math.max(1000 / this.live, 3 * (drawn - began))));
     },
     width() { return Math.max(280, this.$el.clientWidth); },
     async fetch() {
@@ -114,8 +114,10 @@ export default {
       this.$refs.stack.replaceChildren();
       const colour = this.colours();
       const legend = new Map();
+      const first = this.head.panels.map((p) => p.lines.map((l) => l.name).join());
+      const own = new Set(first).size > 1; // panels of other lines: each tells its own
       this.plots = this.head.panels.map((panel, i) => {
-        panel.lines.forEach((l) => legend.set(l.name, l.role));
+        if (!own) panel.lines.forEach((l) => legend.set(l.name, l.role));
         const last = i === this.head.panels.length - 1;
         const axis = { stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, font: "12px system-ui, sans-serif" };
         const plot = new uPlot({
@@ -145,6 +147,17 @@ export default {
         plot.root.appendChild(readout);
         plot.readout = readout;
         this.handle(plot);
+        if (own && panel.lines.length > 1) {
+          const names = document.createElement("div");
+          names.className = "curves-own";
+          panel.lines.forEach((l) => {
+            const s = document.createElement("span");
+            s.style.color = colour(l.role);
+            s.textContent = l.name;
+            names.append(s);
+          });
+          plot.root.appendChild(names);
+        }
         return plot;
       });
       const names = [...legend].map(([name, role]) => {
@@ -164,6 +177,7 @@ export default {
     range(low, high, panel) {
       if (low === null || !isFinite(low)) return [-1, 1];
       if (panel.band) { low = Math.min(low, -1.1 * panel.band); high = Math.max(high, 1.1 * panel.band); }
+      if (high - low < panel.least) { const m = (low + high) / 2; low = m - panel.least / 2; high = m + panel.least / 2; }
       const more = 0.06 * (high - low) || Math.abs(high) * 0.01 || 1;
       return [low - more, high + more];
     },

@@ -37,7 +37,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Panel:
-    """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero."""
+    """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero. least: smallest height of the y axis."""
 
     title: str
     unit: str
@@ -45,6 +45,7 @@ class Panel:
     traces: Sequence[Trace]
     band: float | None = None
     height: int = 110
+    least: float = 0.0
 
 
 @dataclass
@@ -68,7 +69,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
         j = len(p.t) if end is None else min(len(p.t), int(np.searchsorted(p.t, end)) + 1)
         x, lines = _thin(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
         names = [{"name": t.name, "role": t.role, "width": t.width} for t in p.traces]
-        heads.append({"title": p.title, "unit": p.unit, "band": p.band, "height": p.height, "n": len(x), "lines": names})
+        heads.append({"title": p.title, "unit": p.unit, "band": p.band, "height": p.height, "least": p.least, "n": len(x), "lines": names})
         body += [np.ascontiguousarray(a, dtype="<f8").tobytes() for a in (x, *lines)]
     span = [low, high if high > low else low + 1.0] if np.isfinite(low) else [0.0, 1.0]
     head = json.dumps({"panels": heads, "span": span, "key": curves.key}).encode()

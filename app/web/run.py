@@ -32,11 +32,11 @@ LIT = 1.5  # s that a lamp stays lit, so that what passes quickly is seen
 TRACE_LINES = 40
 TRACED = 2000  # frames kept for the trace
 TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
-STRIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
-    ("speed [%]", "%", (("n_dem", "target"), ("n_r", "measured"))),
-    ("stroke [mm]", "mm", (("x_dem", "target"), ("x_lvdt", "measured"))),
-    ("current [mA]", "mA", (("i_cmd", "model"),)),
-    ("vanes [deg]", "deg", (("vigv", "measured"), ("vgv1", "model"), ("vgv2", "target"))),
+STRIPS: tuple[tuple[str, str, float, tuple[tuple[str, str], ...]], ...] = (  # title, unit, least height of the axis, lines
+    ("speed [%]", "%", 2.0, (("n_dem", "target"), ("n_r", "measured"))),
+    ("stroke [mm]", "mm", 0.5, (("x_dem", "target"), ("x_lvdt", "measured"))),
+    ("current [mA]", "mA", 2.0, (("i_cmd", "model"),)),
+    ("vanes [deg]", "deg", 1.0, (("vigv", "measured"), ("vgv1", "model"), ("vgv2", "target"))),
 )
 
 
@@ -111,7 +111,7 @@ class Loop:
         import asyncio
 
         record = self._record_path()
-        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name}"
+        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
         listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
         calls = [
             listener.call("listen", "running", bus=bus),
@@ -160,13 +160,13 @@ class Loop:
         """Start a scenario of the library now."""
         if self.bus == "lockstep":
             self.tell(inject=name)
+            self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
+            self.session.touch("events")
         else:
             self.session.do("inject", self._inject_outside(name))
-        self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
-        self.session.touch("events")
 
     async def _inject_outside(self, name: str) -> None:
-        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name}"
+        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
         w = Worker()
         self.session.extra.setdefault("closers", []).append(w.stop)
         try:
@@ -188,6 +188,7 @@ class Loop:
         if "late" in news:
             self.late = news
             return
+        first = not self.filled
         rows = news.pop("rows")[-KEPT:]
         over = self.filled + len(rows) - KEPT
         if over > 0:
@@ -198,6 +199,8 @@ class Loop:
         self.filled += len(rows)
         self.trace.extend(news.pop("trace"))
         self._light(rows)
+        if first and self.filled:
+            self.session.touch("loop")
         self.status = news
         self._draw()
 
@@ -222,8 +225,8 @@ class Loop:
         rows = rows[keep]
         t = rows[:, 0]
         panels = [
-            Panel(title, unit, t, [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines], height=120)
-            for title, unit, lines in STRIPS
+            Panel(title, unit, t, [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines], height=120, least=least)
+            for title, unit, least, lines in STRIPS
         ]
         self.session.curves["run"] = Curves(panels, "run")
 
