@@ -126,12 +126,13 @@ def command(args: argparse.Namespace) -> int:
             if typed is not None:
                 typed.complaint = ""
 
+        bus_watch, done = station.BusWatch(args, name, port), ecu.watcher(duration)
         cli.say(args, f"ECU on {name}, {args.profile or args.log or Typed.HELP}; Ctrl-C ends")
         try:
             with station.undisturbed(args) as notes:
                 report = run_realtime(
                     ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop, live=show if live.on else None,
-                    watch=ecu.watcher(duration),
+                    watch=lambda k: bus_watch(k) or done(k),
                 )  # fmt: skip
         finally:
             live.close()

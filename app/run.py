@@ -135,6 +135,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
                     report = run_realtime(
                         node, port, ticks=ticks, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
                         put=recorder.put if recorder is not None else None, live=show if live.on else None,
+                        watch=station.BusWatch(args, name, port),
                     )  # fmt: skip
             finally:
                 live.close()

@@ -15,8 +15,8 @@ from typing import Any
 from hil import cli
 
 __all__ = [
-    "ACCEPTED", "BUS_HELP", "Live", "add_realtime_options", "bus_name", "check_realtime_options", "check_seconds", "joined", "machine_of",
-    "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
+    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "bus_name", "check_realtime_options", "check_seconds", "joined",
+    "machine_of", "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
 ]  # fmt: skip
 
 # both nodes' acceptance filter: 0x0A0 to 0x0BF, so that a flood of other identifiers costs a tick nothing
@@ -171,6 +171,47 @@ class Live:
                 with contextlib.suppress(OSError):
                     os.write(2, b"\r" + b" " * self._width + b"\r")
             self.on = False
+
+
+class BusWatch:
+    """A line on standard error when the bus takes no more frames (interface down, bus-off, queue full), and one when it does again.
+
+    Called at every tick; frames are sent every tenth. Standard error may be slow, so the lines are written by threads.
+    """
+
+    CLEAN = 200  # ticks without a refusal: the bus is well again
+
+    def __init__(self, args: argparse.Namespace, name: str, port: Any):
+        self.quiet, self.name, self.port = args.quiet, name, port
+        self.bad, self.refused = self._bad(), port.refused
+        self.first = self.last = -1
+
+    def _bad(self) -> int:
+        return int(self.port.refused + self.port.errors)
+
+    def __call__(self, k: int) -> None:
+        """Look at the port after tick ``k``."""
+        bad = self._bad()
+        if bad != self.bad:
+            if self.first < 0:
+                self.first, self.refused = k, self.port.refused
+                self._say(f"{self.name}: {self._why()}; frames are neither sent nor heard, going on")
+            self.bad, self.last = bad, k
+        elif self.first >= 0 and k - self.last > self.CLEAN:
+            gone = self.port.refused - self.refused + 1
+            self._say(f"{self.name}: takes frames again after {(self.last - self.first + 1) * 1e-3:.1f} s; {gone:,} were not sent")
+            self.first = -1
+
+    def _why(self) -> str:
+        try:
+            up = int(Path(f"/sys/class/net/{self.name}/flags").read_text(), 16) & 1
+        except (OSError, ValueError):
+            return "does not take frames (gone, full or bus-off)"
+        return "does not take frames (full or bus-off)" if up else "is down"
+
+    def _say(self, text: str) -> None:
+        if not self.quiet:
+            threading.Thread(target=lambda: print(f"vaneloop: {text}", file=sys.stderr, flush=True), daemon=True).start()
 
 
 def realtime_json(report: Any) -> dict[str, Any]:
