@@ -127,12 +127,17 @@ def command(args: argparse.Namespace) -> int:
                 typed.complaint = ""
 
         bus_watch, done = station.BusWatch(args, name, port), ecu.watcher(duration)
+
+        def watch(k: int) -> str | None:
+            bus_watch(k)
+            return done(k)
+
         cli.say(args, f"ECU on {name}, {args.profile or args.log or Typed.HELP}; Ctrl-C ends")
         try:
             with station.undisturbed(args) as notes:
                 report = run_realtime(
                     ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop, live=show if live.on else None,
-                    watch=lambda k: bus_watch(k) or done(k),
+                    watch=watch,
                 )  # fmt: skip
         finally:
             live.close()

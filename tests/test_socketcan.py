@@ -23,11 +23,11 @@ import pytest
 
 from controller import MODES
 from tables import path as table_path
+from tests.test_realtime import ON_TIME_US, check_run_and_ecu, priority
 from tests.uml.run import INTERFACE
 
 pytestmark = pytest.mark.socketcan
 
-ON_TIME_US = 20_000.0  # a tick that is later than this may cost a frame its 50 ms
 STROKE, CURRENT = (0.5, 47.5), 40.0  # mm, mA: tables/calibration.toml
 RUN, DEGRADED = MODES.index("RUN"), MODES.index("DEGRADED")
 DBC = cantools.database.load_file(str(table_path("vgv.dbc")))
@@ -39,7 +39,7 @@ class Vaneloop:
     def __init__(self, folder: Path, *arguments: str):
         self.name = arguments[0]
         self.json_file, self.text_file = folder / f"{self.name}.json", folder / f"{self.name}.txt"
-        command = [sys.executable, "-m", "app.main", *arguments, "--bus", INTERFACE, "--json", str(self.json_file)]
+        command = [sys.executable, "-m", "app.main", *arguments, "--bus", INTERFACE, "--json", str(self.json_file), *priority()]
         with self.text_file.open("w") as text:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=text, stderr=text)
 
@@ -48,11 +48,11 @@ class Vaneloop:
         """What it has printed so far."""
         return self.text_file.read_text()
 
-    def end(self, timeout: float = 20.0) -> dict:
-        """Wait for its end, ask for it by Ctrl-C if it is not near, and return its JSON; it must end with exit code 0."""
-        if timeout <= 20.0 and self.process.poll() is None:
+    def end(self) -> dict:
+        """Ask it to end by Ctrl-C and return its JSON; it must end with exit code 0."""
+        if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
-        assert self.process.wait(timeout=timeout) == 0, f"{self.name}: exit {self.process.returncode}\n{self.text}"
+        assert self.process.wait(timeout=60.0) == 0, f"{self.name}: exit {self.process.returncode}\n{self.text}"
         return json.loads(self.json_file.read_text())
 
     def kill(self) -> None:
@@ -66,7 +66,9 @@ class Heard:
     """What candump heard from some moment on."""
 
     def __init__(self, log: Path):
-        lines = re.findall(r"\((\d+\.\d+)\) \S+ ([0-9A-F]+)#([0-9A-F]*)\b", log.read_text())
+        text = log.read_text()
+        lines = re.findall(r"\((\d+\.\d+)\) \S+ ([0-9A-F]+)#([0-9A-F]*)\b", text)
+        self.dropped = sum(int(n) for n in re.findall(r"DROPCOUNT: dropped (\d+)", text))
         self.t = np.array([float(t) for t, _, _ in lines])
         self.ident = np.array([int(i, 16) for _, i, _ in lines])
         self.data = [d for _, _, d in lines]
@@ -89,7 +91,7 @@ class Heard:
 def candump(folder: Path, name: str = "heard.log") -> Iterator[Path]:
     """Let candump write down what it hears."""
     log = folder / name
-    with log.open("w") as out, subprocess.Popen(["candump", "-L", INTERFACE], stdout=out) as process:
+    with log.open("w") as out, subprocess.Popen(["candump", "-L", "-d", "-r", "8000000", INTERFACE], stdout=out) as process:
         time.sleep(0.2)
         try:
             yield log
@@ -97,7 +99,7 @@ def candump(folder: Path, name: str = "heard.log") -> Iterator[Path]:
             process.terminate()
 
 
-def wait_for_run(seconds: float = 15.0) -> None:
+def wait_for_run(seconds: float = 60.0) -> None:
     """Wait until the controller has said RUN for half a second."""
     status, since = DBC.get_message_by_name("VGV_STATUS"), None
     with can.Bus(interface="socketcan", channel=INTERFACE, can_filters=[{"can_id": status.frame_id, "can_mask": 0x7FF}]) as bus:
@@ -123,9 +125,9 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Vaneloop, V
     """Controller and ECU as two processes; at the end Ctrl-C must end both cleanly."""
     folder = tmp_path_factory.mktemp("pair")
     run = Vaneloop(folder, "run")
-    ecu = Vaneloop(folder, "ecu", "--profile", "idle", "--duration", "600", "--wait", "60", "--timeout", "10")
+    ecu = Vaneloop(folder, "ecu", "--profile", "idle", "--duration", "3600", "--wait", "120", "--timeout", "10")
     try:
-        wait_for_run(60.0)
+        wait_for_run(120.0)
         yield run, ecu
         ecu.end()
         assert run.end()["ended"] is not None
@@ -139,39 +141,47 @@ def test_a_frame_passes_between_python_can_and_can_utils_both_ways() -> None:
         with subprocess.Popen(["candump", "-L", "-n", "1", f"{INTERFACE},123:7FF"], stdout=subprocess.PIPE, text=True) as foreign:
             time.sleep(0.3)
             bus.send(can.Message(arbitration_id=0x123, data=bytes(range(8)), is_extended_id=False))
-            seen, _ = foreign.communicate(timeout=10)
+            seen, _ = foreign.communicate(timeout=30)
         assert re.fullmatch(rf"\(\d+\.\d{{6}}\) {INTERFACE} 123#0001020304050607\n", seen)
-        subprocess.run(["cansend", INTERFACE, "0A0#DEADBEEF"], check=True, timeout=10)
+        subprocess.run(["cansend", INTERFACE, "0A0#DEADBEEF"], check=True, timeout=30)
         received = bus.recv(timeout=5.0)
     assert received is not None
     assert (received.arbitration_id, bytes(received.data)) == (0x0A0, bytes.fromhex("DEADBEEF"))
 
 
-def test_the_foreign_log_of_a_run_replays(tmp_path: Path) -> None:
-    """candump's log of two processes is a log for `vaneloop replay`, which finds the strokes, currents and angles again.
+@pytest.fixture(scope="module")
+def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, dict]:
+    """Controller and ECU as two processes for 60 s: candump's log, and what both said at their ends."""
+    folder = tmp_path_factory.mktemp("minute")
+    with candump(folder) as log:
+        result, said = check_run_and_ecu(INTERFACE, 60.0, folder)
+        time.sleep(0.5)
+    return log, result, said
+
+
+def test_controller_and_ecu_run_for_60_seconds(minute: tuple[Path, dict, dict]) -> None:
+    log, result, said = minute
+    heard = Heard(log)
+    heard.assert_safe()
+    n_dem = heard.signal("ECU_DEMAND", "n_dem")
+    assert len(heard.t) + heard.dropped == said["frames"]["sent"] + result["frames"]["sent"] and len(n_dem) >= 5_000
+    assert np.ptp(n_dem) > 10.0, "no manoeuvre"
+    assert result["counts"]["wrong_crc"] == 0
+
+
+def test_the_foreign_log_of_a_run_replays(minute: tuple[Path, dict, dict], tmp_path: Path) -> None:
+    """candump's log is a log for `vaneloop replay`, which finds the strokes and angles again.
 
     The replay knows neither the lateness of real ticks nor the bus: hence the tolerance, one frame (10 ms) and the latest tick at the
     fastest rise seen.
     """
-    with candump(tmp_path) as log:
-        run = Vaneloop(tmp_path, "run")
-        ecu = Vaneloop(tmp_path, "ecu", "--profile", "sine", "--duration", "15", "--wait", "60", "--timeout", "5")
-        try:
-            said = ecu.end(timeout=120.0)
-            result = run.end()
-        finally:
-            run.kill()
-            ecu.kill()
-    heard = Heard(log)
-    heard.assert_safe()
-    states, n_dem = heard.signal("VGV_STATUS", "state"), heard.signal("ECU_DEMAND", "n_dem")
-    assert len(n_dem) == said["frames"]["sent"] and len(n_dem) >= 1_500, "candump missed frames of the ECU"
-    assert np.ptp(n_dem) > 10.0, "no manoeuvre"
-    assert result["counts"]["wrong_crc"] == 0
+    log, result, said = minute
     replayed = tmp_path / "replay.json"
     subprocess.run([sys.executable, "-m", "hil.replay", str(log), "--quiet", "--json", str(replayed)], check=True, timeout=120)
     errors = {s["signal"]: s["rms"] for s in json.loads(replayed.read_text())["signals"] if s["reference"] == "measured"}
     assert {"x_dem", "x_lvdt", "vigv", "vgv1", "vgv2"} <= set(errors)
+    heard = Heard(log)
+    states = heard.signal("VGV_STATUS", "state")
     late = max(r["lateness"]["max_us"] for r in (said, result))
     first, last = np.flatnonzero(states == RUN)[[0, -1]]
     whole = (states[first : last + 1] == RUN).all()
@@ -186,7 +196,7 @@ def test_wrong_frames_by_cansend_are_refused_and_counted(pair, tmp_path: Path) -
     wait_for_run()
     with candump(tmp_path) as log:
         for _ in range(10):
-            subprocess.run(["cansend", INTERFACE, "0A0#0011223344556677"], check=True, timeout=10)
+            subprocess.run(["cansend", INTERFACE, "0A0#0011223344556677"], check=True, timeout=30)
         time.sleep(0.5)
         wait_for_run()
     heard = Heard(log)
@@ -207,32 +217,25 @@ def test_wrong_frames_by_cansend_are_refused_and_counted(pair, tmp_path: Path) -
 def test_the_controller_survives_floods_of_cangen(pair, tmp_path: Path, flood: list[str], degrades: bool) -> None:
     wait_for_run()
     with candump(tmp_path) as log:
-        subprocess.run(["cangen", INTERFACE, *flood], check=True, timeout=60)
+        subprocess.run(["cangen", INTERFACE, *flood], check=True, timeout=120)
         time.sleep(0.2)
         wait_for_run()
     heard = Heard(log)
     heard.assert_safe()
-    states = heard.signal("VGV_STATUS", "state")
-    assert states[-1] == RUN
     if degrades:
-        assert (states == DEGRADED).any(), "2,000 wrong frames in two seconds went unnoticed"
+        assert (heard.signal("VGV_STATUS", "state") == DEGRADED).any(), "2,000 wrong frames in two seconds went unnoticed"
 
 
 def test_the_controller_survives_old_frames_by_canplayer(pair, tmp_path: Path) -> None:
     wait_for_run()
-    with candump(tmp_path, "old.log") as old:
-        time.sleep(1.5)
-    demand = [line for line in old.read_text().splitlines(keepends=True) if " 0A0#" in line]
-    (tmp_path / "demand.log").write_text("".join(demand))
-    assert len(demand) > 100
+    with (tmp_path / "demand.log").open("w") as old:  # -n: the ECU's next 150 frames, however long a busy machine takes
+        subprocess.run(["candump", "-L", "-n", "150", f"{INTERFACE},0A0:7FF"], stdout=old, check=True, timeout=60)
     with candump(tmp_path) as log:
         subprocess.run(["canplayer", "-I", str(tmp_path / "demand.log"), "-l", "2"], check=True, timeout=30)
         wait_for_run()
     heard = Heard(log)
     heard.assert_safe()
-    states = heard.signal("VGV_STATUS", "state")
-    assert (states == DEGRADED).any(), "300 frames of a second sender went unnoticed"
-    assert states[-1] == RUN
+    assert (heard.signal("VGV_STATUS", "state") == DEGRADED).any(), "old frames of a second sender went unnoticed"
 
 
 def test_a_scenario_is_played_on_the_live_bus(pair, tmp_path: Path) -> None:
@@ -240,7 +243,7 @@ def test_a_scenario_is_played_on_the_live_bus(pair, tmp_path: Path) -> None:
     out = tmp_path / "inject.json"
     with candump(tmp_path) as log:
         command = [sys.executable, "-m", "hil.inject", "extended_lookalike", "--bus", INTERFACE, "--quiet", "--json", str(out)]
-        done = subprocess.run(command, check=False, timeout=60, capture_output=True, text=True)
+        done = subprocess.run(command, check=False, timeout=180, capture_output=True, text=True)
     assert done.returncode in (0, 1), done.stderr
     (scenario,) = json.loads(out.read_text())["scenarios"]
     seen = {e["expected"]: e["held"] for e in scenario["expectations"]}
@@ -258,9 +261,9 @@ def test_the_interface_goes_down_and_up(pair, tmp_path: Path) -> None:
         pytest.skip("setting an interface down needs root")
     wait_for_run()
     run, ecu = pair
-    subprocess.run(["ip", "link", "set", INTERFACE, "down"], check=True, timeout=10)
+    subprocess.run(["ip", "link", "set", INTERFACE, "down"], check=True, timeout=30)
     time.sleep(1.5)
-    subprocess.run(["ip", "link", "set", INTERFACE, "up"], check=True, timeout=10)
+    subprocess.run(["ip", "link", "set", INTERFACE, "up"], check=True, timeout=30)
     with candump(tmp_path) as log:
         wait_for_run()
     Heard(log).assert_safe()
