@@ -45,8 +45,9 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     one, two = result.links[1], result.links[2]
     design = int(np.argmin(np.abs(result.speed - DESIGN_SPEED)))
     verdict = "; ".join(
-        f"{NAMES[s.stage]}: error at 100 % speed {s.at_design['initial']:.2f} deg as first built, {s.at_design['built']:.2f} deg as it is, "
-        f"{s.at_design['adjusted']:.2f} deg adjusted (Lb {s.lb:g} mm, Lc {s.lc:g} mm)"
+        f"{NAMES[s.stage]} with Lb {s.lb:g} mm and Lc {s.lc:g} mm: {s.rms['adjusted']:.2f} deg rms ({s.rms['built']:.2f} as it is, "
+        f"{s.rms['initial']:.2f} as first built), {s.at_design['adjusted']:.2f} deg at 100 % speed ({s.at_design['built']:.2f} as it is, "
+        f"{s.at_design['initial']:.2f} as first built)"
         for s in (one, two)
     )
     page = Page("Stroke schedule and links", verdict + ".", subtitle="schedule", command=command, log=result.log)
@@ -115,7 +116,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
             rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *(f"{v:.3f}" for v in figures)])
         for name in ("extension", "retraction"):
             figures = (s.at_design[name], s.rms[name], s.largest[name])
-            rows.append([NAMES[s.stage], f"with play, {name}", "", "", *(f"{v:.3f}" for v in figures)])
+            rows.append([NAMES[s.stage], f"on the {name} curve", "", "", *(f"{v:.3f}" for v in figures)])
     page.table(columns, rows, "Errors of the mean curve, and on either branch with both stroke tables; rms and max over 40 to 102 % speed.")
 
     for name, m in result.loops.items():

@@ -807,6 +807,10 @@ def schedule(
             said.setdefault(note, []).append(name)
     notes += [f"{', '.join(names)}: {note}" for note, names in said.items()]
     speed = table_speeds(schedules)
+    works = (speed >= WORKING_SPEED[0]) & (speed <= WORKING_SPEED[1])
+    if not works.any():
+        low, high = WORKING_SPEED
+        raise InputError(f"schedules: vigv rises from {speed[0]:g} to {speed[-1]:g} % speed; it must reach into {low:g} to {high:g} %")
     if not speed[0] <= DESIGN_SPEED <= speed[-1]:
         nearest = speed[schedules_at_design(speed)]
         notes.append(f"the schedule's table runs from {speed[0]:g} to {speed[-1]:g} %: figures at 100 % speed are those at {nearest:g} %")
@@ -849,7 +853,6 @@ def schedule(
     except InputError:  # the arms as first built do not go with the new links
         machine = geometry_with(machine, {n: {"lb_initial": getattr(machine, n).lb.value} for n in STAGES})
     both = [_branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(STAGES)]
-    works = (speed >= WORKING_SPEED[0]) & (speed <= WORKING_SPEED[1])
     out = []
     for (name, built, d_lb, d_lc, initial, as_built, error), (up, down) in zip(links, both, strict=True):
         columns = {"initial": initial, "built": as_built, "adjusted": error, "extension": up, "retraction": down}

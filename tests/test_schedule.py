@@ -341,6 +341,14 @@ def test_a_vgv1_schedule_that_no_length_meets_names_speed_stroke_and_error(tmp_p
     assert "vgv1: no length meets the schedule at 1" in said and "stroke" in said and "deg remains" in said
 
 
+def test_speeds_as_shares_instead_of_per_cent_are_refused(tmp_path, capsys):
+    end = "98.0, 99.0, 100.0, 101.0, 102.0, 105.0]"
+    speeds = next(line for line in path("schedules.toml").read_text().splitlines() if line.endswith(end))[10:-1]
+    shares = ", ".join(f"{float(v) / 100:g}" for v in speeds.split(", "))
+    said = refused(["--schedules", edited("schedules.toml", tmp_path, speeds, shares)], capsys)
+    assert "vigv rises from 0.4 to 1.05 % speed; it must reach into 40 to 102 %" in said
+
+
 @pytest.mark.parametrize(
     ("argv", "says"),
     [

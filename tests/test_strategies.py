@@ -122,6 +122,17 @@ def test_a_dither_about_a_set_point_does_not_cross_the_gap(strategy: str, amplit
         assert np.abs(o.errors[500:, VIGV]).max() < 0.15
 
 
+@pytest.mark.parametrize(("hertz", "follows"), [(0.1, True), (0.2, True), (0.5, False), (1.0, False)])
+def test_a_wider_dither_is_followed_only_as_far_as_the_engine_follows(hertz: float, follows: bool) -> None:
+    """+-0.15 %: dual changes its curve at every swing, inverse crosses the gap where the vanes' own target goes to and fro."""
+    n = 99.5 + 0.15 * np.sin(2.0 * np.pi * hertz * np.arange(0.0, 60.0, 1e-2))
+    mine, dual = (st.run(st.Scenario("dither"), n, CALIBRATIONS[s]) for s in ("inverse", "dual"))
+    crossings = np.abs(np.diff(np.sign(mine.side[500:]))).sum() / 2.0
+    assert crossings == pytest.approx(2.0 * hertz * 55.0, abs=2.0) if follows else crossings == 0.0
+    assert np.abs(mine.errors[500:, VIGV]).max() < 0.06
+    assert dual.travel > 120.0 * hertz * 1.4 and mine.travel < dual.travel
+
+
 @pytest.mark.parametrize("back", [0.3, 1.0, 5.0, 20.0])
 def test_after_a_partial_reversal_the_vane_is_on_its_target(back: float) -> None:
     """Up, back by a part, and on: at each rest the error is at most the band, however small the reversal."""
