@@ -115,7 +115,7 @@ export default {
       const colour = this.colours();
       const legend = new Map();
       const first = this.head.panels.map((p) => p.lines.map((l) => l.name).join());
-      const own = new Set(first).size > 1; // panels of other lines: each tells its own
+      const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own
       this.plots = this.head.panels.map((panel, i) => {
         if (!own) panel.lines.forEach((l) => legend.set(l.name, l.role));
         const last = i === this.head.panels.length - 1;

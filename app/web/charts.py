@@ -1,6 +1,6 @@
 """Curves and figures of the pages: long time curves thinned on the server for the view that is asked for, small figures from Plotly.
 
-A view of n pixels gets about two points a pixel and line: the greatest and least of each stretch, chosen by tsdownsample's MinMaxLTTB, so
+A view of n pixels gets about two points a pixel and line: the greatest and least of each stretch, chosen by tsdownsample's MinMax, so
 that no spike is lost at any zoom. The browser draws them with uPlot (chart.js).
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from nicegui.element import Element
 from nicegui.elements import plotly as bundled
-from tsdownsample import MinMaxLTTBDownsampler
+from tsdownsample import MinMaxDownsampler
 
 from hil.page import THEMES, break_at_holes
 
@@ -80,8 +80,8 @@ def _thin(t: Array, lines: Sequence[Array], n_out: int) -> tuple[Array, list[Arr
     """Points of all lines at the times that any of them needs."""
     if len(t) > n_out:
         t = np.ascontiguousarray(t)
-        share = max(100, n_out // max(1, len(lines)))
-        keep = [MinMaxLTTBDownsampler().downsample(t, _whole(y), n_out=share) for y in lines]
+        share = max(100, n_out // max(1, len(lines))) // 2 * 2
+        keep = [MinMaxDownsampler().downsample(t, _whole(y), n_out=share) for y in lines]
         pick = np.unique(np.concatenate(keep).astype(np.int64))
         t, lines = t[pick], [y[pick] for y in lines]
     return t, list(lines)

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import hmac
+import ipaddress
 from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
@@ -17,7 +18,6 @@ from urllib.parse import parse_qs, urlsplit
 __all__ = ["COOKIE", "Guard", "is_loopback"]
 
 COOKIE = "vaneloop_token"
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
 HEADERS = (
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -39,7 +39,11 @@ App = Callable[[Message, Receive, Send], Awaitable[None]]
 
 def is_loopback(host: str) -> bool:
     """Whether ``host`` is this machine only."""
-    return host.strip("[]") in LOOPBACK or host.startswith("127.")
+    host = host.strip("[]").rstrip(".").lower()
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name, and be it 127.0.0.1.example.com
+        return False
 
 
 class _TooLarge(Exception):

@@ -101,7 +101,7 @@ class _Page:
                     self.live.part(self._about, "log", shows=lambda: (s.preview,))
                 with ui.element("div").classes("stackc"):
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
-            self.live.part(self._form, "log", shows=self._form_shows)
+            self.live.part(self._form, "log", "compare", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
                 chart = Chart("log")
             all_channels.props("dense")
@@ -154,17 +154,19 @@ class _Page:
         if absent:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
 
+    def _wrong(self) -> bool:
+        return any(self.s.errors.get(x, "stopped") != "stopped" for x in ("log", "compare"))
+
     def _form_shows(self) -> tuple[Any, ...]:
         s, c = self.s, self.s.choice
-        return (c.file, c.dbc, c.model, tuple(s.offered), tuple(c.mapping.items()), tuple(c.units.items()), c.design_rpm, "log" in s.errors)
+        return (c.file, c.dbc, c.model, tuple(s.offered), tuple(c.mapping.items()), tuple(c.units.items()), c.design_rpm, self._wrong())
 
     def _form(self) -> None:
         s = self.s
         if s.choice.file is None or not s.offered:
             return
         choice = s.choice
-        wrong = bool(s.errors.get("log"))
-        with opened(s, "Names and units", wrong).classes("names"):
+        with opened(s, "Names and units", self._wrong()).classes("names"):
             ui.label(
                 "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit that the log states."
             ).classes("soft small")
