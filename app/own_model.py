@@ -175,17 +175,20 @@ def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
     """Print the answer."""
     import numpy as np
 
+    from discrepancy.own_report import short_names
+
     d = answer.diagnosis
     for note in answer.notes:
         cli.say(args, f"note: {note}")
     steps = list(answer.logs)
     rows = []
     fitted = set(answer.bound.logs)
+    short = short_names(list(answer.logs[steps[0]]))
     for log in answer.logs[steps[0]]:
         for k, output in enumerate(d.outputs):
             figures = [f"{answer.logs[s][log][k]:.4g}" for s in steps]
             relative = f"{100 * answer.logs[steps[-1]][log][k] / answer._size(log, k):.3g} %"
-            rows.append([log, "fitted" if log in fitted else "test", output, *figures, relative, d.units[k]])
+            rows.append([short[log], "fitted" if log in fitted else "test", output, *figures, relative, d.units[k]])
     together = answer.together()
     for what, bound in (("fitted", answer.bound), ("test", answer.test)):
         if bound is not None and len(bound.logs) > 1:

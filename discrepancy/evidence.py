@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -204,10 +204,18 @@ class Explorer:
         return self.fits[key]
 
 
-@dataclass
-class _Course:
-    chosen: Fit
-    steps: list[tuple[str, float]] = field(default_factory=list)
+    def less(self, fit: Fit, drop: str) -> Fit:
+        """Fit without one law: the known one, or where the other parameters of ``fit`` lead, if that is better.
+
+        A law that changes nothing may have shown the way out of a local minimum; it must not take the credit.
+        """
+        known = self.of(tuple(e for e in fit.effects if e != drop))
+        theta = fit.theta.copy()
+        theta[self.stage.index()[drop]] = self.stage.neutral()[self.stage.index()[drop]]
+        other = self._finish(self.judge.fit(known.effects, theta, 12), 2)
+        if other.cost.sum() < 0.99 * known.cost.sum():
+            self.fits[frozenset(known.effects)] = known = other
+        return known
 
 
 def diagnose_system(
@@ -253,7 +261,7 @@ def diagnose_system(
             break
         current = best
         steps.append((" + ".join(current.effects), rms(current)))
-    current = _spare(judge, _swap(explorer, current, names))
+    current = _spare(judge, _simpler(explorer, _swap(explorer, current, names), names))
     explorer.fits[frozenset(current.effects)] = current
     effects = _name(explorer, current, names)
     decided = []
@@ -307,7 +315,7 @@ def _spare(judge: _Judge, fit: Fit) -> Fit:
 def _prune(explorer: Explorer, fit: Fit) -> Fit:
     """Drop laws that are not needed any more."""
     while len(fit.effects) > 1:
-        without = [explorer.of(tuple(e for e in fit.effects if e != drop)) for drop in fit.effects]
+        without = [explorer.less(fit, drop) for drop in fit.effects]
         spare = [f for f in without if not worth(explorer.judge, f, fit).good]
         if not spare:
             break
@@ -328,6 +336,20 @@ def _swap(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
         if best is fit:
             return fit
         fit = _prune(explorer, best)
+    return fit
+
+
+def _simpler(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
+    """Exchange a law of many parameters for two with fewer in all, where they do as well: a flexible law stands in for whatever bends."""
+    judge, stage = explorer.judge, explorer.stage
+    size = {e.name: len(e.parameters) for e in stage.effects}
+    for drop in [e for e in fit.effects if size[e] > 2]:
+        rest = explorer.of(tuple(e for e in fit.effects if e != drop))
+        one = [f for f in explorer.add(rest, names, 3, 6) if size[f.effects[-1]] == 1 and worth(judge, rest, f).good][:2]
+        two = [g for f in one for g in explorer.add(f, names, 3, 6) if size[g.effects[-1]] == 1 and worth(judge, f, g).good]
+        options = [f for f in (*one, *two) if score(judge, f) < score(judge, fit) + PER_PARAMETER]
+        if options:
+            fit = min(options, key=lambda f: score(judge, f))
     return fit
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from discrepancy.own_model import NO_HELP, Answer
 from hil.page import Line, Page, Panel, bars, heat, loop, number, overlay, ranking, waterfall
 
-__all__ = ["own_report"]
+__all__ = ["own_report", "short_names"]
 
 
 def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path:
@@ -43,12 +44,20 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         "only imitates what is missing makes some test log worse.",
     )
     fitted = set(b.logs)
+    short = short_names(list(answer.logs[steps[0]]))
     rows = []
     for name in answer.logs[steps[0]]:
         for i, output in enumerate(d.outputs):
             rows.append(
-                [name, "fitted" if name in fitted else "test", output, *(float(answer.logs[s][name][i]) for s in steps), d.units[i]]
+                [short[name], "fitted" if name in fitted else "test", output, *(float(answer.logs[s][name][i]) for s in steps), d.units[i]]
             )
+    together = answer.together()
+    for what, bound in (("fitted", b), ("test", answer.test)):
+        if bound is not None and len(bound.logs) > 1:
+            rows += [
+                [f"all {len(bound.logs)} together", what, o, *(float(together[s][what][i]) for s in steps), d.units[i]]
+                for i, o in enumerate(d.outputs)
+            ]
     heads = ["model", *(f"+ {s.split(' + ')[-1]}" for s in steps[1:])]
     page.table(["log", "", "signal", *heads, "unit"], rows)
     if answer.ablation:
@@ -57,15 +66,18 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         page.section(
             "Which law helps where", "Error with the law over error without it; 1: it does nothing there, above 1: it does harm there."
         )
-        page.table(["law", *logs], [[n, *(answer.ablation[n][x] for x in logs)] for n in names])
+        page.table(["law", *(short[x] for x in logs)], [[n, *(answer.ablation[n][x] for x in logs)] for n in names])
         page.plot(
-            bars(logs, {n: [answer.ablation[n][x] for x in logs] for n in names}, "error with the law / without", marks={"no help": 1.0}),
+            bars(
+                [short[x] for x in logs], {n: [answer.ablation[n][x] for x in logs] for n in names}, "error with the law / without",
+                marks={"no help": 1.0},
+            ),  # fmt: skip
             "Short bars help.",
         )
         for n in names:
             idle = [x for x in logs if answer.ablation[n][x] > NO_HELP]
             if idle:
-                page.text(f"{n} hardly helps, or does harm, on {', '.join(idle)}.")
+                page.text(f"{n} hardly helps, or does harm, on {', '.join(short[x] for x in idle)}.")
     if d.effects:
         page.section(
             "Laws found", "Parameters with their 90 % intervals. Rivals do as well on the fitted logs: another experiment must decide."
@@ -93,7 +105,7 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
             else waterfall([(n.split(" + ")[-1], v) for n, v in d.steps], "held-out error [noise of the samples]"),
             "How the held-out error falls as laws are added, in the order in which the search found them.",
         )
-        top = [c for c in d.candidates if c.nats > 0][:12]
+        top = [c for c in d.candidates if c.nats > 0.1][:12]
         if top:
             page.plot(
                 ranking(
@@ -113,6 +125,13 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         for n in answer.notes:
             page.text(n[0].upper() + n[1:] + ".")
     return page.write(path)
+
+
+def short_names(names: Sequence[str], width: int = 28) -> dict[str, str]:
+    """File names as they fit into tables and axes: their ends, without the suffix, where that keeps them apart."""
+    stems = {n: Path(n).stem if Path(n).suffix.lower() in (".csv", ".json", ".mat", ".parquet", ".mf4", ".txt") else n for n in names}
+    cut = {n: s if len(s) <= width else "…" + s[1 - width :] for n, s in stems.items()}
+    return next((d for d in (cut, stems) if len(set(d.values())) == len(names)), {n: n for n in names})
 
 
 def _pictures(page: Page, answer: Answer) -> None:

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import importlib.util
 import keyword
+import re
 import sys
+import textwrap
 import traceback
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
@@ -425,16 +427,19 @@ class Bound:
         from numba.core.errors import NumbaError
 
         s = self.system
-        source = _SOURCE.format(
-            x=", ".join(f"x[{i}]" for i in range(len(s.states))) + ",",
-            u=(", ".join(f"u[{i}]" for i in range(len(self.U._fields))) + ",") if s.inputs or s.commands else "0.0,",
-            p=(", ".join(f"p[{i}]" for i in range(len(s.parameters))) + ",") if s.parameters else "0.0,",
-            y=", ".join(f"y[{i}]" for i in range(len(s.outputs))) + ",",
-            r=(", ".join(f"r[{i}]" for i in range(len(self.in_names))) + ",") if self.in_names else "0.0,",
-            rates="\n    ".join(f"dx[{i}] = d" if self.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states))),
-            outs=self._output_source(),
-            control=self._control_source(),
-        )
+        rates = "\n".join(f"dx[{i}] = d" if self.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
+        u = (", ".join(f"u[{i}]" for i in range(len(self.U._fields))) + ",") if s.inputs or s.commands else "0.0,"
+        p = (", ".join(f"p[{i}]" for i in range(len(s.parameters))) + ",") if s.parameters else "0.0,"
+
+        def rhs(match: re.Match[str]) -> str:
+            indent, at, to = match.groups()
+            states = ", ".join(f"AT[{i}]" for i in range(len(s.states))) + ","
+            text = _RHS.format(x=states, u=u, p=p, rates=rates).strip()
+            text = re.sub(r"\bAT\b", at, re.sub(r"\bdx\b", to, text))
+            return textwrap.indent(text, indent)
+
+        source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
+        source = source.replace("{outs}", self._output_source()).replace("{control}", self._control_source())
 
         def build(jit: Callable[[Any], Any]) -> Callable[..., Any]:
             space: dict[str, Any] = {
@@ -446,10 +451,10 @@ class Bound:
             exec(compile(source, f"<{s.name}>", "exec"), space)
             return space["run"]  # type: ignore[no-any-return]
 
-        def jit(f: Any) -> Any:
+        def compiled(f: Any) -> Any:
             return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
 
-        fast = build(jit)
+        fast = build(compiled)
         try:
             self._try(fast)
         except NumbaError as e:
@@ -1079,7 +1084,8 @@ class Bound:
         units = {"time": "s"}
         u = np.concatenate(self.u, axis=1) if self.u[0].size else np.zeros((0, len(self.t)))
         names = self.in_names
-        all_units = {**s.inputs, "position": s.units.get("position", ""), "velocity": "", "acceleration": ""}
+        unit = s.units.get("position", "m")
+        all_units = {**s.inputs, "position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2"}
         for i, n in enumerate(names):
             if n == "acceleration" and not np.any(u[i]):
                 continue
@@ -1098,27 +1104,28 @@ class Bound:
         return out, units
 
 
-_SOURCE = """
-@jit
-def rhs(x, u, p, code, where, memory, rows, position, gap, asymmetry, small, mass, held, none, dx):
-    d = model(X({x}), U({u}), P({p}))
-    {rates}
+# what stands for "rhs x k": the derivative k at x. Written out in place, since handing fifteen arrays to a function costs more
+_RHS = """
+d = model(X({x}), U({u}), P({p}))
+{rates}
+if len(code) > 0:
     for i in range(len(code)):
         w = where[i]
         c = code[i]
         if c > 40:
             if c != STATE_LIMIT and c != STATE_RATE_LIMIT:
-                dx[w] -= state_rate(c, x[w], rows[i])
+                dx[w] -= state_rate(c, AT[w], rows[i])
         elif not memory[i]:
-            dx[w] -= force_of(c, x[w], x[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
-    for w in range(len(dx)):
+            dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
+    for w in range(m):
         dx[w] -= held[w]
     for i in range(len(code)):
         if code[i] == STATE_RATE_LIMIT:
             w = where[i]
             dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
+"""
 
-
+_SOURCE = """
 @jit
 def outputs(x, u, p, y):
     {outs}
@@ -1191,22 +1198,22 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * q / steps
-            rhs(x, u, p, code, where, memory, rows, position, gap, asymmetry, small, mass, held, none, k1)
+            rhs x k1
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 0.5) / steps
             for w in range(m):
                 z[w] = x[w] + 0.5 * h * k1[w]
-            rhs(z, u, p, code, where, memory, rows, position, gap, asymmetry, small, mass, held, none, k2)
+            rhs z k2
             for w in range(m):
                 z[w] = x[w] + 0.5 * h * k2[w]
-            rhs(z, u, p, code, where, memory, rows, position, gap, asymmetry, small, mass, held, none, k3)
+            rhs z k3
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 1.0) / steps
             for w in range(m):
                 z[w] = x[w] + h * k3[w]
-            rhs(z, u, p, code, where, memory, rows, position, gap, asymmetry, small, mass, held, none, k4)
+            rhs z k4
             for w in range(m):
                 x[w] += h / 6.0 * (k1[w] + 2.0 * k2[w] + 2.0 * k3[w] + k4[w])
             for i in range(len(code)):
