@@ -108,7 +108,7 @@ def command(args: argparse.Namespace) -> int:
     )  # fmt: skip
     duration = args.duration if args.duration is not None or demand is None else demand.duration
     complaint = ""
-    with stop_on_signals() as stop, station.joined(name, can_filters=station.ACCEPTED) as bus, _typing(args, typed):
+    with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus, _typing(args, typed):
         port = Port(bus)
         live = station.Live(args)
 

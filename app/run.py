@@ -117,7 +117,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
 
     node = _node(args)
     ticks = None if args.duration is None else round(args.duration * 1000)
-    with stop_on_signals() as stop, station.joined(name, can_filters=station.ACCEPTED) as bus:
+    with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus:
         port = Port(bus)
         live = station.Live(args)
 

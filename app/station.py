@@ -85,10 +85,12 @@ def bus_name(args: argparse.Namespace) -> str:
 
 
 @contextlib.contextmanager
-def joined(name: str, **options: Any) -> Iterator[Any]:
-    """Open the bus and leave it at the end."""
+def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[Any]:
+    """Open the bus and leave it at the end. The broker of an embedded bus works with this participant's real-time priority."""
     from hil.bus import open_bus
 
+    if name.partition(":")[0] == "local":
+        options["priority"] = priority or 0
     bus = open_bus(name, **options)
     try:
         yield bus

@@ -4,10 +4,11 @@ The first participant starts it (`hil.local_bus`); it ends a second after the la
 abstract Unix socket, ``@vaneloop-UID-NAME``, which the kernel frees with the process: there is no stale socket to clean up. Only processes
 of the same user (or root) are let in.
 
-Packets (SOCK_SEQPACKET keeps their borders): a participant greets with `HELLO` and a byte of flags, is greeted back, and sends frames of 16
-or 72 bytes (``struct can_frame``, ``struct canfd_frame``). It receives `PACKET`: number, time (ns since 1970), frame. A participant that
-does not read keeps up to `BACKLOG` frames; what is beyond is replaced, in its place in the order, by one error frame that says how many
-frames are gone. Nobody else waits for it.
+Packets (SOCK_SEQPACKET keeps their borders): a participant greets with `HELLO` and a byte (bit 0 `OWN`, above it its real-time priority),
+is greeted back, and sends frames of 16 or 72 bytes (``struct can_frame``, ``struct canfd_frame``). It receives `PACKET`: number, time (ns
+since 1970), frame. A participant that does not read keeps up to `BACKLOG` frames; what is beyond is replaced, in its place in the order,
+by one error frame that says how many frames are gone. Nobody else waits for it. The broker runs with the highest real-time priority of
+its participants: who must not be late must not wait for it either.
 
 Only the standard library is imported, and the file is run by its path, so that it starts in some tens of milliseconds.
 """
@@ -22,6 +23,7 @@ import struct
 import sys
 import time
 from collections import deque
+from collections.abc import Iterable
 
 HELLO = b"vaneloop bus 1"
 OWN = 1  # flag of the greeting: wants its own frames, too
@@ -62,6 +64,7 @@ class _Member:
         self.connection = connection
         self.greeted = False
         self.own = False
+        self.priority = 0
         self.waiting: deque[bytes | list[int]] = deque()  # packets, and [frames lost, number, time] where frames are gone
 
     def give(self, packet: bytes) -> None:
@@ -96,6 +99,13 @@ class _Member:
             waiting.popleft()
 
 
+def schedule(priorities: Iterable[int]) -> None:
+    """Run with the highest of the priorities (SCHED_FIFO; 0 is the ordinary scheduler) as far as this user may."""
+    highest = max(priorities, default=0)
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO if highest else os.SCHED_OTHER, os.sched_param(highest))
+
+
 def serve(listener: socket.socket, linger: float = LINGER) -> None:
     """Pass frames on until nobody has been there for ``linger`` seconds."""
     selector = selectors.DefaultSelector()
@@ -110,6 +120,8 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
             selector.unregister(member.connection)
             member.connection.close()
             alone_since = time.monotonic()
+            if member.priority:
+                schedule(m.priority for m in members.values())
 
     def read(member: _Member) -> None:
         nonlocal number
@@ -123,7 +135,8 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
             if not member.greeted:
                 if raw[:-1] != HELLO:
                     return leave(member)
-                member.greeted, member.own = True, bool(raw[-1] & OWN)
+                member.greeted, member.own, member.priority = True, bool(raw[-1] & OWN), raw[-1] >> 1
+                schedule(m.priority for m in members.values())
                 member.connection.send(HELLO)
                 continue
             if len(raw) not in (16, 72):
@@ -184,8 +197,8 @@ def main(name: str) -> int:
     if os.fork():
         os._exit(0)
     with contextlib.suppress(OSError, AttributeError):  # who starts it may be a real-time process bound to one core
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    schedule([])
     null = os.open(os.devnull, os.O_RDWR)
     for fd in (0, 1, 2):
         os.dup2(null, fd)

@@ -44,11 +44,20 @@ class LocalBus(can.BusABC):
     channel               name: letters, digits, ``_.-``, at most 60
     receive_own_messages  hear one's own frames, too (``is_rx`` is False on them)
     can_filters           as everywhere in python-can
+    priority              SCHED_FIFO priority of this participant, 0..99: the broker takes the highest, where it may
     lost                  frames that this reader was too slow for, in all
     restarts              how often the broker had to be started anew
     """
 
-    def __init__(self, channel: Any = DEFAULT, can_filters: Any = None, receive_own_messages: bool = False, fd: bool = True, **kwargs: Any):
+    def __init__(
+        self,
+        channel: Any = DEFAULT,
+        can_filters: Any = None,
+        receive_own_messages: bool = False,
+        fd: bool = True,
+        priority: int = 0,
+        **kwargs: Any,
+    ):
         name = str(channel)
         if not _NAME.match(name):
             raise can.CanInitializationError(f"channel (={name!r}) must be 1 to 60 letters, digits, '_', '.' or '-'")
@@ -56,7 +65,9 @@ class LocalBus(can.BusABC):
         self.channel_info = f"vaneloop embedded bus '{name}'"
         self.lost = 0
         self.restarts = 0
-        self._own = bool(receive_own_messages)
+        if not 0 <= int(priority) <= 99:
+            raise can.CanInitializationError(f"priority (={priority}) must be in [0, 99]")
+        self._greeting = broker.HELLO + bytes([int(priority) << 1 | (broker.OWN if receive_own_messages else 0)])
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._socket = self._join()
         super().__init__(channel=name, can_filters=can_filters, **kwargs)
@@ -72,7 +83,7 @@ class LocalBus(can.BusABC):
                 connection.connect(broker.address(self.channel))
                 if not broker.same_user(connection):
                     raise can.CanInitializationError(f"bus {self.channel}: another user has taken its address")
-                connection.send(broker.HELLO + bytes([broker.OWN if self._own else 0]))
+                connection.send(self._greeting)
                 if connection.recv(64) == broker.HELLO:
                     connection.setblocking(False)
                     return connection

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -277,6 +278,18 @@ class TestLocal(BusTests):
         while Path(f"/proc/{pid}").exists():
             assert time.monotonic() < deadline, "the broker stays"
             time.sleep(0.05)
+
+    def test_the_broker_has_the_highest_priority_of_its_participants(self, join: Join, name: str) -> None:
+        if resource.getrlimit(resource.RLIMIT_RTPRIO)[0] < 7 and os.geteuid() != 0:
+            pytest.skip("this user may not use SCHED_FIFO")
+        a = join()
+        pid = broker_of(name)
+        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
+        low, high = join(priority=3), join(priority=7)
+        assert (os.sched_getscheduler(pid), os.sched_getparam(pid).sched_priority) == (os.SCHED_FIFO, 7)
+        high.shutdown()
+        a.send(data_frame(1))
+        assert same(low.recv(2), data_frame(1)) and os.sched_getparam(pid).sched_priority == 3
 
     def test_a_killed_participant_leaves_the_others_undisturbed(self, join: Join, name: str) -> None:
         a, b = join(), join()
