@@ -35,7 +35,7 @@ def add_realtime_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--policy", choices=("catch-up", "skip"), default="catch-up", help="late ticks are caught up (default), or skipped and counted"
     )
-    group.add_argument("--spin-us", metavar="N", type=float, default=100.0, help="us before a deadline not slept but spun (default 100)")
+    group.add_argument("--spin-us", metavar="N", type=float, default=50.0, help="us before a deadline not slept but spun (default 50)")
 
 
 def check_realtime_options(args: argparse.Namespace) -> None:

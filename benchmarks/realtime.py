@@ -34,7 +34,7 @@ def conditions() -> Iterator[tuple[str, int, bool]]:
     """Give name, priority (0 = ordinary scheduler) and whether the other processor is loaded."""
     for priority, scheduler in ((PRIORITY, "SCHED_FIFO"), (0, "ordinary scheduler")):
         for loaded in (False, True):
-            yield f"{scheduler}, {'other core loaded' if loaded else 'idle'}", priority, loaded
+            yield f"{scheduler}, {'other core loaded' if loaded else 'no load added'}", priority, loaded
 
 
 @dataclass

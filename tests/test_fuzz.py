@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -149,6 +150,37 @@ def test_command_exits_1_on_a_failure_and_its_log_replays(tmp_path: Path, capsys
     assert "the stroke demand left its limits" in capsys.readouterr().out
     assert main(["fuzz", "--replay", str(log), "--stroke-limit", "30"]) == 1
     assert main(["fuzz", "--replay", str(log)]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("right", "wrong", "claim"),
+    [
+        ("z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:\n            mode = FAIL_SAFE",
+         "z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:\n            mode = STANDBY", "a mode transition that is not in the table"),
+        ("0.0 if trouble else z[RECOVER_TIMER] + TICK", "0.0 if trouble else z[RECOVER_TIMER]", "RUN did not come back on good frames"),
+    ],
+    ids=["leaves DEGRADED for STANDBY", "stays in FAIL_SAFE"],
+)  # fmt: skip
+def test_a_broken_controller_is_caught_and_its_shrunk_log_replays(right: str, wrong: str, claim: str, tmp_path: Path) -> None:
+    for package in ("app", "controller", "hil", "plant", "tables"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    firmware = tmp_path / "controller" / "firmware.py"
+    assert firmware.read_text().count(right) == 1
+    firmware.write_text(firmware.read_text().replace(right, wrong))
+
+    def broken(*options: str) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-m", "app.main", "fuzz", *options]
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+
+    found = broken("--frames", "100000", "--json", "answer.json", "--out", "failure.log")
+    assert found.returncode == 1 and claim in found.stdout, (found.stdout, found.stderr)
+    frames = json.loads((tmp_path / "answer.json").read_text())["failure"]["frames"]
+    again = broken("--replay", "failure.log")
+    assert again.returncode == 1 and claim in again.stdout
+    assert main(["fuzz", "--replay", str(tmp_path / "failure.log"), "--quiet"]) == 0, "the right controller survives it"
+    assert frames <= 10, frames
 
 
 @pytest.mark.parametrize(
