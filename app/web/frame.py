@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,7 @@ __all__ = ["PAGES", "Live", "card", "command_line", "figure_of", "frame", "opene
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
 PRIMARY = "#1f6fc4"
+OFTEN = 0.05  # s between two looks at what has changed
 
 
 def styles() -> str:
@@ -72,12 +74,23 @@ class Live:
     """
 
     def __init__(self, session: Session):
-        """Look ten times a second; nothing travels to the browser unless something changed."""
+        """Look soon after something has changed; nothing travels to the browser otherwise."""
         self.session = session
         self.parts: list[tuple[Callable[[], None], tuple[str, ...], Element | None]] = []
         self.seen: dict[str, int] = dict(session.versions)
         self.counted = time.monotonic()
-        ui.timer(0.1, self.look)
+        self.looked, self.soon = 0.0, False
+        self.client = ui.context.client
+        ui.timer(0.5, self.look)
+        session.lookers.append(self.wake)
+        self.client.on_delete(lambda: session.lookers.remove(self.wake))
+
+    def wake(self) -> None:
+        """Look as soon as what goes on now has ended, but not more often than ``OFTEN`` allows."""
+        if not self.soon:
+            self.soon = True
+            wait = max(0.0, self.looked + OFTEN - time.monotonic())
+            asyncio.get_running_loop().call_later(wait, self.look)
 
     def watch(self, draw: Callable[[], None], *sections: str, of: Element | None = None) -> None:
         """Call ``draw`` when one of ``sections`` has changed, as long as the element that it is ``of`` is there."""
@@ -148,6 +161,9 @@ class Live:
 
     def look(self) -> None:
         """Redraw what has changed."""
+        self.soon, self.looked = False, time.monotonic()
+        if self.client.is_deleted:
+            return
         now = dict(self.session.versions)
         changed = {k for k, v in now.items() if self.seen.get(k) != v}
         self.seen = now

@@ -19,6 +19,9 @@ from typing import Any
 __all__ = ["Cancelled", "Job", "WorkError", "Worker"]
 
 
+SHOWN = 0.3  # s between two steps of a bar
+
+
 class WorkError(Exception):
     """Work that failed: one line for the page."""
 
@@ -37,6 +40,7 @@ class Job:
     future: asyncio.Future[Any]
     fraction: float | None = None
     started: float = field(default_factory=time.monotonic)
+    told: float = 0.0  # when the page was last told of its progress
 
     @property
     def seconds(self) -> float:
@@ -126,8 +130,11 @@ class Worker:
             if self.news is not None:
                 self.news(text)
         elif job is not None:
+            now, other = time.monotonic(), bool(text) and text != job.text
             job.fraction, job.text = fraction, text or job.text
-            self.changed()
+            if other or now - job.told > SHOWN:  # the browser goes through its whole page for each change
+                job.told = now
+                self.changed()
 
     def _end(self, number: int, content: Any) -> None:
         job = self.jobs.pop(number, None)

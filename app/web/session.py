@@ -10,7 +10,7 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -84,6 +84,7 @@ class Session:
         self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
         folder.mkdir(mode=0o700, parents=True)
         self.versions: dict[str, int] = {}
+        self.lookers: list[Callable[[], None]] = []  # pages that want to know
         self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
         self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
         self.tasks: set[asyncio.Task[None]] = set()
@@ -122,6 +123,8 @@ class Session:
         """Say that these sections have changed."""
         for s in sections:
             self.versions[s] = self.versions.get(s, 0) + 1
+        for wake in self.lookers:
+            wake()
 
     def do(self, section: str, work: Coroutine[Any, Any, None]) -> None:
         """Run ``work`` beside the page; its complaint becomes the section's line."""

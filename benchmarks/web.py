@@ -1,0 +1,135 @@
+"""The workbench in a headless browser: its first page, a long log at every zoom, answers while a diagnosis runs."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measure import ROOT, Row
+
+__all__ = ["MEASUREMENTS"]
+
+REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
+PATIENCE = 240_000  # ms
+
+# One step on the chart of all channels: ms until the browser has drawn the moved view, and until the points of that view are there.
+STEP = """async ({dx, dy, at}) => {
+  const chart = document.querySelector('.curves'), over = chart.querySelector('.u-over'), box = over.getBoundingClientRect();
+  const answers = chart.dataset.answers, frame = () => new Promise(requestAnimationFrame), began = performance.now();
+  over.dispatchEvent(new WheelEvent('wheel', {deltaX: dx, deltaY: dy, clientX: box.left + at * box.width, clientY: box.top + 20,
+    bubbles: true, cancelable: true}));
+  await frame(); await frame();
+  const moved = performance.now() - began;
+  while (chart.dataset.answers === answers && performance.now() - began < 20000) await new Promise((r) => setTimeout(r, 1));
+  await frame();
+  return [moved, performance.now() - began, Number(chart.dataset.points)];
+}"""
+
+# A press on another stage: ms until the page shows that stage.
+PRESS = """async (name) => {
+  const button = [...document.querySelectorAll('.half .q-btn-toggle button')].find((b) => b.innerText.trim() === name);
+  const began = performance.now();
+  button.click();
+  while (![...document.querySelectorAll('.soft.small')].some((x) => x.innerText.startsWith('The ' + name)) &&
+         performance.now() - began < 20000) await new Promise((r) => setTimeout(r, 1));
+  return performance.now() - began;
+}"""
+
+
+def long_log(path: Path) -> None:
+    """The example again and again, as one log."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(ROOT / "examples" / "hidden_effect.parquet")
+    n = table.num_rows
+    columns = {name: np.tile(table[name].to_numpy(), REPEATS) for name in table.column_names}
+    columns["t"] = np.arange(n * REPEATS) * 0.01
+    pq.write_table(pa.table(columns), path)
+
+
+@contextlib.contextmanager
+def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
+    """A browser, and the address of ``vaneloop web``."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    if chromium is None:
+        raise RuntimeError("no chromium on this machine")
+    words = [sys.executable, "-m", "app.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder)]
+    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        with sync_playwright() as p:
+            browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            yield browser, url
+            browser.close()
+    finally:
+        server.terminate()
+        server.wait(60)
+
+
+def row(what: str, seconds: list[float], limit: float, note: str) -> Row:
+    """Median against ``limit``, the worst beside it."""
+    ours, worst = float(np.median(seconds)), max(seconds)
+    note = f"worst of {len(seconds)}: {worst * 1e3:,.0f} ms; {note}"
+    return Row(what, f"{ours * 1e3:,.0f} ms", f"limit {limit * 1e3:,.0f} ms", limit / ours, ">= 1", bool(ours <= limit), note)
+
+
+def web() -> Iterator[Row]:
+    """First page; zoom and pan of 3,000 s; answers while a diagnosis runs."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        long_log(folder / "long.parquet")
+        with workbench(folder) as (browser, url):
+            first = []
+            for k in range(6):
+                context = browser.new_context(viewport={"width": 1920, "height": 1000})
+                page = context.new_page()
+                page.set_default_timeout(PATIENCE)
+                began = time.perf_counter()
+                page.goto(url)
+                page.locator(".choose").click()
+                page.get_by_role("option", name="long.parquet").wait_for()
+                if k:  # the first one after the server's start loads modules
+                    first.append(time.perf_counter() - began)
+                if k < 5:
+                    context.close()
+            yield row("web: first page, until the list of logs is open", first, 2.0, "empty browser cache each time")
+
+            page.get_by_role("option", name="long.parquet").click()
+            page.get_by_text("All channels").click()
+            page.locator(".curves .uplot").first.wait_for()
+            page.get_by_role("button", name="Find the missing physics").wait_for()
+            time.sleep(3.0)
+            steps = [{"dx": 0, "dy": -400, "at": 0.4}] * 14 + [{"dx": 400, "dy": 0, "at": 0.5}] * 10
+            steps += [{"dx": 0, "dy": 400, "at": 0.6}] * 10
+            moved, fresh, points = map(list, zip(*(page.evaluate(STEP, s) for s in steps), strict=True))
+            note = f"3,000 s, 100 Hz, 11 signals and the time; {max(points):,.0f} points drawn at most"
+            yield row("web: zoom and pan, the view moves", [m / 1e3 for m in moved], 0.1, note)
+            yield row("web: zoom and pan, the points of the view are there", [f / 1e3 for f in fresh], 0.2, "thinned on the server")
+
+            page.get_by_role("button", name="Find the missing physics").click()
+            page.get_by_text("searching the library").wait_for()
+            answers = []
+            stages = ["demand", "servo", "engine", "linkage", "actuator"]
+            for k in range(20):
+                answers.append(page.evaluate(PRESS, stages[k % 5]) / 1e3)
+                time.sleep(0.3)
+            running = page.get_by_role("button", name="Cancel").first.is_visible()
+            zooms = [page.evaluate(STEP, s)[1] / 1e3 for s in steps[:10]]
+            yield row("web: another stage, while a diagnosis runs", answers, 0.2, "" if running else "THE DIAGNOSIS HAD ENDED")
+            yield row("web: zoom, while a diagnosis runs", zooms, 0.2, "until the points of the view are there")
+
+
+MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {"the workbench": web}
