@@ -169,7 +169,7 @@ class Explorer:
         e0, jac = judge.linearise(fit.theta, free)
         flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T
-        a += np.diag(1e-9 * np.maximum(np.diag(a), 1e-12))
+        a += np.diag(1e-9 * np.maximum(np.diag(a), 1e-3))
         out, level = {}, {}
         for name in names:
             costs: list[tuple[float, int, Array]] = []
@@ -210,9 +210,14 @@ class Explorer:
         A law that changes nothing may have shown the way out of a local minimum; it must not take the credit.
         """
         known = self.of(tuple(e for e in fit.effects if e != drop))
-        theta = fit.theta.copy()
-        theta[self.stage.index()[drop]] = self.stage.neutral()[self.stage.index()[drop]]
-        other = self._finish(self.judge.fit(known.effects, theta, 12), 2)
+        at = self.stage.index()[drop]
+        first, neutral = fit.theta[at], self.stage.neutral()[at]
+        theta = fit.theta
+        for share in (0.25, 0.5, 0.75, 1.0):  # by and by, so that the others can follow
+            theta = theta.copy()
+            theta[at] = first + share * (neutral - first)
+            theta = self.judge.fit(known.effects, theta, 5).theta
+        other = self._finish(self.judge.fit(known.effects, theta, 8), 2)
         if other.cost.sum() < 0.99 * known.cost.sum():
             self.fits[frozenset(known.effects)] = known = other
         return known
@@ -446,7 +451,7 @@ def structure(judge: Judge, fit: Fit) -> float:
             if not test.any() or train.sum() < 3 * x.shape[1]:
                 continue
             a = x[train].T @ x[train]
-            a += 1e-3 * np.diag(np.diag(a))
+            a += 1e-3 * np.diag(np.diag(a)) + 1e-9 * np.eye(len(a))
             c = np.linalg.solve(a, x[train].T @ e[k, train])
             total += float(np.sum(e[k, test] ** 2))
             left += float(np.sum((e[k, test] - x[test] @ c) ** 2))

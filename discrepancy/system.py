@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.core.errors import NumbaError
 
 from discrepancy import laws
 from discrepancy.laws import MEMORY, PARAMETERS, Law, Size
@@ -132,6 +133,10 @@ class System:
         for p in self.parameters:
             if not isinstance(p, Parameter):
                 raise wrong(f"parameters: {p!r} is not a Parameter; write Parameter(...) or unknown(...)")
+            for which in ("value", "low", "high", "tolerance"):
+                number = getattr(p, which)
+                if isinstance(number, bool) or not isinstance(number, int | float | np.floating | np.integer):
+                    raise wrong(f"parameter {p.name!r}: {which} (={number!r}) must be a number")
             if not p.name.isidentifier() or keyword.iskeyword(p.name) or p.name.startswith("_"):
                 raise wrong(f"parameter {p.name!r} must be a Python name")
             if not (np.isfinite(p.value) and p.low <= p.value <= p.high):
@@ -239,6 +244,8 @@ class Bound:
         self.present: dict[str, dict[str, float]]
         self.cutoff: float | None = None
         self.kernel: Callable[..., Any]
+        self.slow: Callable[..., Any]  # the same, not compiled
+        self.ready = like is not None  # the model ran with the user's own values
         self.single = self.single_out = self.single_control = False
         self.smalls: Array
         self.stage: Stage
@@ -374,8 +381,12 @@ class Bound:
         """Call a function of the user; its exception becomes one line."""
         try:
             return f(*args)
+        except StageError:
+            raise
         except Exception as e:
-            raise StageError(f"system {self.system.name!r}: {what} failed{_place(e)}: {type(e).__name__}: {e}") from None
+            fields = getattr(getattr(e, "obj", None), "_fields", None)
+            why = f"no {e.name!r} among {', '.join(fields)}" if isinstance(e, AttributeError) and fields else f"{type(e).__name__}: {e}"
+            raise StageError(f"system {self.system.name!r}: {what} failed{_place(e)}: {why}") from None
 
     def _flat(self, what: str, value: Any, n: int, of: str) -> list[float]:
         values = list(value) if isinstance(value, tuple | list | np.ndarray) and np.ndim(value) else [value]
@@ -386,6 +397,8 @@ class Bound:
                 raise StageError(
                     f"system {self.system.name!r}: {what} returned an array of shape {np.shape(v)} for {name}; a number is needed"
                 )
+            if isinstance(v, str | complex | np.complexfloating) or v is None:
+                raise StageError(f"system {self.system.name!r}: {what} returned {v!r} for {name} at the first sample; a number is needed")
             if not np.isfinite(v):
                 raise StageError(f"system {self.system.name!r}: {what} returned {v} for {name} at the first sample; it must be finite")
         return [float(v) for v in values]
@@ -398,7 +411,7 @@ class Bound:
             self._static(np.array([q.value for q in s.parameters]), self.u[0], 0, check=True)
             return
         if self.like is not None:
-            self.kernel = self.like.kernel
+            self.kernel, self.slow = self.like.kernel, self.like.slow
             self.single, self.single_out = self.like.single, self.like.single_out
             return
         x = self.X(*[self._first_state(0, n, 0.0) for n in s.states])
@@ -424,7 +437,6 @@ class Bound:
 
     def _kernel(self) -> Callable[..., Any]:
         from numba import njit
-        from numba.core.errors import NumbaError
 
         s = self.system
         rates = "\n".join(f"dx[{i}] = d" if self.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
@@ -454,17 +466,15 @@ class Bound:
         def compiled(f: Any) -> Any:
             return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
 
+        self.slow = build(lambda f: getattr(f, "py_func", f))
         fast = build(compiled)
         try:
             self._try(fast)
         except NumbaError as e:
             why = next((line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line), "")[:100]
             self.notes.append(f"system {s.name!r}: numba cannot compile the model ({why}); it runs as plain Python, some 100 times slower")
-            slow = build(lambda f: getattr(f, "py_func", f))
-            self._call("model", self._try, slow)
-            return slow
-        except Exception as e:
-            raise StageError(f"system {s.name!r}: the model failed{_place(e)}: {type(e).__name__}: {e}") from None
+            self._call("model", self._try, self.slow)
+            return self.slow
         return fast
 
     def _output_source(self) -> str:
@@ -563,7 +573,12 @@ class Bound:
             active = self._active(theta)
             for log, at in enumerate(self.logs.values()):
                 if s.kind in ("static", "force"):
-                    out[i, :, at] = self._algebraic(theta[:n_p], log, active)
+                    try:
+                        out[i, :, at] = self._algebraic(theta[:n_p], log, active)
+                    except StageError:
+                        if not self.ready:
+                            raise
+                        out[i, :, at] = np.nan
                 else:
                     x0 = np.array([self._first_state(log, m, 0.0) for m in s.states])
                     for k, (which, m) in enumerate(self.free_starts):
@@ -647,12 +662,22 @@ class Bound:
         e_rows = np.array([row for _, row in ends]).reshape(len(ends), PARAMETERS + 1)
         restart, at_restart = self._restarts(log, len(t))
         out = np.full((len(s.outputs), len(t)), np.nan)
-        with np.errstate(all="ignore"):
-            self.kernel(
-                t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory, rows, position, gap,
-                asymmetry, getattr(self, "smalls", np.zeros(n_states)), mass, steps, s.between == "line", loop, len(s.commands),
-                e_code, e_at, e_out, e_rows, out,
-            )  # fmt: skip
+        arguments = (
+            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory, rows, position, gap,
+            asymmetry, getattr(self, "smalls", np.zeros(n_states)), mass, steps, s.between == "line", loop, len(s.commands),
+            e_code, e_at, e_out, e_rows, out,
+        )  # fmt: skip
+        try:
+            with np.errstate(all="ignore"):
+                self.kernel(*arguments)
+        except NumbaError:
+            raise
+        except Exception as e:  # with the user's own values that is told; what a search tries may be far off
+            out[:] = np.nan
+            if not self.ready:
+                with np.errstate(all="ignore"):
+                    self._call("model", self.slow, *arguments)  # says in which line
+                raise StageError(f"system {s.name!r}: the model failed: {type(e).__name__}: {e}") from None
         if not loop:
             for q, row in active:
                 if q.place == "output":
@@ -813,6 +838,9 @@ class Bound:
                 else p
                 for p in (*s.parameters, *starts)
             ]
+            if s.kind in ("simulate", "closed_loop"):
+                self.run(np.array([[p.value for p in first]]))
+            self.ready = True
             fitted = self._prefit(first)
             if s.kind in ("simulate", "closed_loop"):
                 self._nominal_course(fitted)

@@ -1,0 +1,223 @@
+"""A user's own model: what its page teaches works as written, laws are found where they are, and mistakes are told in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.main import main
+from discrepancy import Parameter, Record, StageError, System, load_system, own_model, unknown
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_model.md"
+RNG = np.random.default_rng(3)
+T = np.arange(0.0, 40.0, 0.02)
+
+
+def wave(seed: int, t: np.ndarray = T) -> np.ndarray:
+    """A smooth random signal between about -2 and 2."""
+    rng = np.random.default_rng([5, seed])
+    return np.sum([rng.uniform(0.3, 0.7) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (0.05, 0.12, 0.31, 0.55, 0.83)], axis=0)
+
+
+def noise(n: int = len(T)) -> np.ndarray:
+    return RNG.standard_normal(n)
+
+
+def line(u: Any, p: Any) -> Any:
+    return p.gain * u.u + p.offset
+
+
+STRAIGHT = System(
+    "map", "static", line, outputs={"y": "V"}, inputs={"u": "V"}, parameters=[unknown("gain", 1.0, "-"), unknown("offset", 0.0, "V")]
+)
+
+
+def named(answer: own_model.Answer) -> list[str]:
+    return [f.effect for f in answer.diagnosis.effects]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page's files, written out, and its logs made."""
+    folder = tmp_path_factory.mktemp("page")
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S):
+        if name := re.match(r"# (\w+\.py)\n", block):
+            (folder / name[1]).write_text(block)
+    with pytest.MonkeyPatch.context() as m:
+        m.chdir(folder)
+        runpy.run_path("make_logs.py")
+    return folder
+
+
+def test_the_page_s_example_runs_as_it_is_written(page: Path) -> None:
+    words = [str(page / "tank.csv"), "--test", str(page / "other.csv"), "--system", str(page / "tank.py"), "--quiet"]
+    assert main(["diagnose", *words, "--json", str(page / "d.json"), "--report", str(page / "tank.html")]) == 1
+    data = json.loads((page / "d.json").read_text())
+    assert [e["effect"] for e in data["effects"]] == ["level.square_root"]
+    assert data["effects"][0]["parameters"]["coefficient"]["value"] == pytest.approx(0.15, rel=0.01)
+    own = {p["parameter"]: p["value"] for p in data["parameters"]}
+    assert own["inflow"] == pytest.approx(0.2, rel=0.01)
+    assert own["outflow"] == 0.0
+    test = [e["rms"] for e in data["logs"] if e["log"] == "other.csv"]
+    assert test[-1] < 0.06 < 5.0 < test[0]
+    assert "level.square_root" in (page / "tank.html").read_text(encoding="utf-8")
+    # the model with the law lacks nothing more
+    assert main(["extend", *words, "--effect", "level.square_root", "--out", str(page / "better.toml")]) in (0, 1)
+    assert main(["compare", *words, "--model", str(page / "better.toml"), "--json", str(page / "c.json")]) == 0
+    assert json.loads((page / "c.json").read_text())["signals"][0]["rms"] < 0.06
+
+
+@pytest.mark.parametrize("law", ["absolute_value", "saturation", "dead_time", "none"])
+def test_a_sensor_s_fault_is_named_and_a_sound_sensor_is_left_alone(law: str) -> None:
+    def record(seed: int) -> Record:
+        u = wave(seed)
+        y = 2.0 * u + 0.3
+        if law == "absolute_value":
+            y = np.abs(y)
+        elif law == "saturation":
+            y = np.minimum(y, 1.5)
+        elif law == "dead_time":
+            y = 2.0 * np.interp(T - 0.3, T, u) + 0.3
+        return Record(f"log {seed}", T, {"u": u, "y": y + 0.02 * noise() + 0.005 * np.sin(3.0 * u)})
+
+    answer = own_model.diagnose(STRAIGHT, [record(1)], [record(2)])
+    if law == "none":
+        assert answer.diagnosis.verdict == "none"
+        assert named(answer) == []
+    else:
+        assert [n.rpartition(".")[2] for n in named(answer)] == [law]
+        assert answer.together()[list(answer.logs)[-1]]["test"][0] < 0.05
+
+
+def test_friction_and_offset_are_found_from_measured_force() -> None:
+    t = np.arange(0.0, 20.0, 0.005)
+    x = 0.05 * np.cumsum(wave(4, t)) * 0.005
+    v, a = np.gradient(x, t), np.gradient(np.gradient(x, t), t)
+    f = 12.0 * a + 40.0 * v + 5.0 * np.sign(v) - 2.0 + 0.1 * noise(len(t))
+
+    def force(u: Any, p: Any) -> Any:
+        return p.mass * u.acceleration + p.viscous * u.velocity
+
+    s = System(
+        "axis", "force", force, outputs={"force": "N"}, position="x",
+        parameters=[unknown("mass", 5.0, "kg", low=0.0), unknown("viscous", 10.0, "N s/m", low=0.0)],
+    )  # fmt: skip
+    answer = own_model.diagnose(s, [Record("axis", t, {"x": x, "force": f})])
+    found = {e.effect: e.parameters for e in answer.diagnosis.effects}
+    assert float(str(found["force.coulomb"]["friction"]["value"])) == pytest.approx(5.0, rel=0.05)
+    # while it moves, a constant force and a friction that differs with the direction are the same
+    same = {"force.force_offset", "force.friction_asymmetry"}
+    (last,) = set(found) - {"force.coulomb"}
+    assert {last, *next(e.rivals for e in answer.diagnosis.effects if e.effect == last)} == same
+    ((_, value),) = found[last].items()
+    assert float(str(value["value"])) * (1.0 if last == "force.force_offset" else 5.0) == pytest.approx(-2.0, rel=0.05)
+
+
+def test_springs_may_start_with_the_measured_force() -> None:
+    x = 3.0 * np.sin(1.2 * T + 1.0)
+    s = np.empty(len(T))  # where the slider stands
+    place = x[0] - 0.9  # loaded at the start
+    for k, xk in enumerate(x):
+        place = min(max(place, xk - 1.0), xk + 1.0)
+        s[k] = place
+    log = Record("damper", T, {"x": x, "force": 4.0 * (x - s) + 0.01 * noise()})
+
+    def left(start: str) -> float:
+        system = System(
+            "damper", "force", lambda u, p: p.c * u.velocity, outputs={"force": "kN"}, position="x", cutoff=20.0, start_force=start,
+            parameters=[unknown("c", 0.1, "kN s/mm", low=0.0)], units={"position": "mm"},
+        )  # fmt: skip
+        answer = own_model.extend(system, [log], ["force.elastic_plastic"])
+        return float(answer.diagnosis.error_after[0])
+
+    assert left("measured") < 0.5 * left("unloaded")
+
+
+def test_samples_may_be_missing_and_times_uneven() -> None:
+    t = np.cumsum(0.02 * RNG.uniform(0.6, 1.4, 2000))
+    u = wave(7, t)
+    y = np.abs(2.0 * u + 0.3) + 0.02 * noise(2000)
+    y[RNG.random(2000) < 0.1] = np.nan
+    u[::37] = np.nan
+    answer = own_model.diagnose(STRAIGHT, [Record("gaps", t, {"u": u, "y": y})])
+    assert named(answer) == ["y.absolute_value"]
+    assert any("NaN filled" in n for n in answer.notes)
+
+
+def test_a_log_without_excitation_names_nothing() -> None:
+    log = Record("still", T, {"u": np.full(len(T), 1.5), "y": 3.0 + 0.02 * noise()})
+    assert named(own_model.diagnose(STRAIGHT, [log])) == []
+
+
+BASE = '''from discrepancy import Parameter, System, unknown
+
+def derivative(x, u, p):
+    return {body}
+
+system = System(name="tank", kind="simulate", model=derivative, inputs={{"pump": "V"}}, states={{"level": "cm"}}, outputs={{"level": "cm"}},
+    parameters=[{parameters}])
+'''
+GOOD = 'unknown("inflow", 0.1, "cm/(V s)", low=0.0), unknown("outflow", 0.01, "1/s", low=0.0)'
+RIGHT = "p.inflow * u.pump - p.outflow * x.level"
+
+
+@pytest.mark.parametrize(
+    ("body", "parameters", "said"),
+    [
+        ("1 / 0", GOOD, "failed at line 4 of bad.py: ZeroDivisionError"),
+        ("u.pumpp", GOOD, "failed at line 4 of bad.py: no 'pumpp' among pump"),
+        ('float("nan")', GOOD, "returned nan for level at the first sample"),
+        ("(1.0, 2.0)", GOOD, "returned 2 values; 1 are needed (level)"),
+        ('"much"', GOOD, "returned 'much' for level"),
+        ("1.0 +", GOOD, "bad.py: line 4: "),
+        (f"{RIGHT} + (undefined if u.pump > 5.0 else 0.0)", GOOD, "name 'undefined' is not defined"),
+        ("100.0 * x.level", GOOD, "leaves all bounds or turns NaN for level at t = "),
+        (RIGHT, 'unknown("inflow", -0.1, "", low=0.0)', "parameter inflow (=-0.1 ) must be in [0, inf]"),
+        (RIGHT, 'unknown("inflow", "0.1", "")', "value (='0.1') must be a number"),
+    ],
+)
+def test_a_mistake_in_the_model_is_told_in_one_line(
+    page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], body: str, parameters: str, said: str
+) -> None:
+    bad = tmp_path / "bad.py"
+    bad.write_text(BASE.format(body=body, parameters=parameters))
+    assert main(["compare", str(page / "tank.csv"), "--system", str(bad)]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_a_channel_that_the_log_lacks_is_named(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.py"
+    bad.write_text(BASE.replace('"pump"', '"pumpe"').format(body=RIGHT.replace("pump", "pumpe"), parameters=GOOD))
+    assert main(["compare", str(page / "tank.csv"), "--system", str(bad)]) == 2
+    assert "pumpe" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"kind": "dynamic"}, "kind (='dynamic') must be one of static, force, simulate, closed_loop"),
+        ({"outputs": {}}, "outputs is empty"),
+        ({"inputs": {"my input": "V"}}, "'my input' must be a Python name"),
+        ({"places": ["somewhere"]}, "'somewhere' is not known"),
+        ({"between": "spline"}, "between (='spline')"),
+        ({"start_force": "zero"}, "start_force (='zero')"),
+        ({"parameters": [Parameter("gain", 1.0, "-"), Parameter("gain", 2.0, "-")]}, "share a name"),
+    ],
+)
+def test_a_system_that_cannot_be_is_refused(change: dict[str, Any], said: str) -> None:
+    given: dict[str, Any] = {"kind": "static", "outputs": {"y": "V"}, "inputs": {"u": "V"}} | change
+    with pytest.raises(StageError, match=re.escape(said)):
+        System(name="map", model=line, **given)
+
+
+def test_shipped_examples_load() -> None:
+    for name in ("emps", "friction_damper", "micro_gas_turbine"):
+        assert load_system(PAGE.parent.parent / "examples" / f"{name}.py").parameters
