@@ -122,6 +122,8 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
             continue
+        if dt > 1.5 * RASTER:
+            stage.raster_error = _hidden_by_raster(stage, make(t[::2], _every_other(have), machine, cal, outputs, run[::2], present))
         least = LEAST_FLOOR[name]
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
@@ -168,6 +170,29 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
         i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
         fresh &= np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1])) < max(3.0 * step, 2.0 * dt)
     return t, columns, fresh, list(log.notes)
+
+
+def _every_other(columns: dict[str, Array]) -> dict[str, Array]:
+    """Every other row; of the current, which is a mean since the row before, the mean of two."""
+    out = {k: v[::2] for k, v in columns.items()}
+    if "i_cmd" in columns:
+        i = columns["i_cmd"]
+        out["i_cmd"] = np.concatenate([i[:1], 0.5 * (i[1:-1:2] + i[2::2])])
+    return out
+
+
+def _hidden_by_raster(stage: Stage, coarse: Stage) -> Array:
+    """RMS of what a slow raster hides: the difference that every other row makes to the nominal model, where it counts.
+
+    A corner of an input between two rows costs about as much as the corner that the doubled raster loses besides.
+    """
+    both = stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0]
+    both[~np.isfinite(coarse.measured)] = np.nan
+    if stage.window:
+        w = int(round(stage.window / (coarse.t[1] - coarse.t[0])))
+        both = both[:, : both.shape[1] // w * w].reshape(len(both), -1, w)
+        both = (both - both.mean(axis=2, keepdims=True)).reshape(len(both), -1)
+    return np.asarray(np.sqrt(np.nanmean(both**2, axis=1)))
 
 
 def _no_gap_in_window(t: Array, fresh: Array) -> Array:
