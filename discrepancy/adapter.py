@@ -14,7 +14,7 @@ errors of the nominal model, whose motion is mostly gone, and where the raster i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,7 +27,7 @@ from controller import firmware as fw
 from discrepancy.stage import Array, Effect, Parameter, Stage, noise_of
 from hil.figures import noise_floor
 from hil.lockstep import flashed
-from hil.logs import Log, LogError
+from hil.logs import Channel, Log, LogError
 from plant import Plant, build_plant, chain
 from plant.compiled import compiled
 from plant.effects import EFFECTS, ROW
@@ -143,6 +143,7 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
     dt = max(RASTER, round(float(np.median(steps)) / RASTER) * RASTER)
     start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
     end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    start += _to_frame(channels, start, dt)
     reference = max((c for c in channels.values()), key=lambda c: len(c.t))
     own = float(np.median(np.diff(reference.t)))
     phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
@@ -161,8 +162,8 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
             edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
             count = np.maximum(np.diff(edge), 1)
             columns[name] = np.diff(total[edge]) / count
-        elif uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state"):
-            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands hold their value
+        elif uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state") or _held(c, dt):
+            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames hold their value
             i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
             columns[name] = c.values[i]
         else:
@@ -170,6 +171,22 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
         i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
         fresh &= np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1])) < max(3.0 * step, 2.0 * dt)
     return t, columns, fresh, list(log.notes)
+
+
+def _held(c: Channel, dt: float) -> bool:
+    """Whether the channel is logged faster than the raster and yet holds its value for rows: it came in frames."""
+    return float(np.median(np.diff(c.t))) < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t)
+
+
+def _to_frame(channels: Mapping[str, Channel], start: float, dt: float) -> float:
+    """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames show it; else 0."""
+    for name in ("x_dem", "n_dem"):
+        if name in channels and _held(channels[name], dt):
+            c = channels[name]
+            turn = np.exp(2j * np.pi * (c.t[1:][np.diff(c.values) != 0.0] - start) / dt)
+            if len(turn) > 20 and abs(turn.mean()) > 0.5:
+                return float(np.angle(turn.mean()) / (2.0 * np.pi) % 1.0 * dt)
+    return 0.0
 
 
 def _every_other(columns: dict[str, Array]) -> dict[str, Array]:
