@@ -98,6 +98,12 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if name not in have:
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
+    unknown = 0.0
+    if dt < 1.5 * RASTER and {"x_dem", "x_lvdt", "i_cmd"} <= columns.keys():
+        unknown = _sampled_current(t, have, run, cal)
+        if unknown:
+            columns["i_cmd"] = have["i_cmd"]
+            notes.append(f"i_cmd: the tick's at each row, not the mean since the row before; the mean is worked out, to {unknown:.2g} mA")
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
@@ -123,7 +129,11 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
             continue
         if dt > 1.5 * RASTER:
-            stage.raster_error = _hidden_by_raster(stage, make(t[::2], _every_other(have), machine, cal, outputs, run[::2], present))
+            # a corner of an input between two rows costs about as much as the corners that the doubled raster loses besides
+            stage.raster_error = _difference(stage, make(t[::2], _every_other(have), machine, cal, outputs, run[::2], present))
+        if name == "actuator" and unknown:
+            noisy = have | {"i_cmd": have["i_cmd"] + unknown * np.random.default_rng(0).standard_normal(len(t))}
+            stage.raster_error = _difference(stage, make(t, noisy, machine, cal, outputs, run, present))
         least = LEAST_FLOOR[name]
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
@@ -198,18 +208,16 @@ def _every_other(columns: dict[str, Array]) -> dict[str, Array]:
     return out
 
 
-def _hidden_by_raster(stage: Stage, coarse: Stage) -> Array:
-    """RMS of what a slow raster hides: the difference that every other row makes to the nominal model, where it counts.
-
-    A corner of an input between two rows costs about as much as the corner that the doubled raster loses besides.
-    """
-    both = stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0]
-    both[~np.isfinite(coarse.measured)] = np.nan
+def _difference(stage: Stage, other: Stage) -> Array:
+    """RMS of the difference that other inputs, on the same raster or a whole multiple of it, make to the nominal model where it counts."""
+    step = round((other.t[1] - other.t[0]) / (stage.t[1] - stage.t[0]))
+    e = stage.run(stage.neutral()[None])[0][:, ::step] - other.run(other.neutral()[None])[0]
+    e[~np.isfinite(other.measured)] = np.nan
     if stage.window:
-        w = int(round(stage.window / (coarse.t[1] - coarse.t[0])))
-        both = both[:, : both.shape[1] // w * w].reshape(len(both), -1, w)
-        both = (both - both.mean(axis=2, keepdims=True)).reshape(len(both), -1)
-    return np.asarray(np.sqrt(np.nanmean(both**2, axis=1)))
+        w = int(round(stage.window / (other.t[1] - other.t[0])))
+        e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
+        e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
+    return np.asarray(np.sqrt(np.nanmean(e**2, axis=1)))
 
 
 def _no_gap_in_window(t: Array, fresh: Array) -> Array:
@@ -393,7 +401,7 @@ def _actuator(
         for b in begins:  # the spool and the lags come from another time
             keep[b : b + window] = False
         part = _actuator(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.noise = stage.floor, stage.noise
+        part.floor, part.noise, part.raster_error = stage.floor, stage.noise, stage.raster_error
         return part
 
     stage.excerpt = excerpt
@@ -434,7 +442,7 @@ def _linkage(
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
         part = _linkage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.noise = stage.floor, stage.noise
+        part.floor, part.noise, part.raster_error = stage.floor, stage.noise, stage.raster_error
         return part
 
     stage.excerpt = excerpt
@@ -446,12 +454,23 @@ def _crossed(x: Array) -> Array:
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
 
 
-def _servo(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
-) -> Stage:
-    parameters, effects, _, _ = _declared("servo", machine, present)
+@dataclass(frozen=True)
+class _Law:
+    """What the firmware's servo loop makes of logged stroke and demand, but for a constant of its integral: mA, on every row.
+
+    mean    of the ticks since the row before, up to and with the one at the row
+    sample  of the tick at the row
+    hidden  RMS of the mean that the stroke between two rows hides
+    """
+
+    mean: Array
+    sample: Array
+    hidden: float
+
+
+def _law(t: Array, c: dict[str, Array], cal: Calibration) -> _Law:
     x_dem, x = c["x_dem"], c["x_lvdt"]
-    kp, ki, kff, limit = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF, fw.CURRENT_LIMIT))  # A/m = mA/mm
+    kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
     before[0], two[:2] = x_dem[0], x_dem[0]
@@ -463,19 +482,53 @@ def _servo(
     error = (ramp - stroke) / 10.0
     rate = (9.0 * (before - two) + (x_dem - before)) / 10.0 / RASTER
     integral = np.cumsum(error) * RASTER
-    integral -= 0.5 * error * RASTER
+    now = before + (x_dem - before) / 10.0 - x
+    return _Law(
+        kp * error + ki * (integral - 0.5 * error * RASTER) + kff * rate,
+        kp * now + ki * integral + kff * (x_dem - before) / RASTER,
+        # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
+        float(np.std(kp * (stroke - straight) / 10.0)),
+    )
+
+
+def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration) -> float:
+    """Where the log's current is that of the tick at the row and not the mean since the row before, put the mean in its place.
+
+    The firmware's law on the logged stroke says which of the two it is, and what the nine other ticks added. Returns the RMS (mA) that the
+    mean is then unknown by, because nobody logged those ticks' noise; 0 where the log has the mean.
+    """
+    law = _law(t, c, cal)
+    width = int(round(WINDOW / RASTER))
+    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
+
+    def misfit(model: Array) -> float:
+        e = np.where(use, c["i_cmd"] - model, np.nan)[: len(t) // width * width].reshape(-1, width)
+        e = e[np.isfinite(e).all(axis=1)]
+        return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
+
+    if misfit(law.sample) >= 0.8 * misfit(law.mean):
+        return 0.0
+    c["i_cmd"] = c["i_cmd"] + (law.mean - law.sample)
+    return float(cal.k[fw.KP] * noise_floor(t, c["x_lvdt"]) * 0.3)  # nine of ten, uncorrelated
+
+
+def _servo(
+    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+) -> Stage:
+    parameters, effects, _, _ = _declared("servo", machine, present)
+    law = _law(t, c, cal)
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
-        i = factor * (kp * error + ki * integral + kff * rate)[None]
+        i = factor * law.mean[None]
         return i[:, None, :]
 
-    near = np.abs(c["i_cmd"]) < 0.9e3 * limit
+    near = np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT]
     stage = Stage(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
     # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
-    stage.raster_error = np.array([float(np.std(kp * (stroke - straight) / 10.0))])
+    stage.raster_error = np.array([law.hidden])
     return stage
 
 
