@@ -24,7 +24,8 @@ examples:
 
 exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profile separates them, 2 bad input"""
 
-SEPARATED = 12.0  # nats per rival that decide (as in the diagnosis)
+MOST_REPEATS = 4  # of a profile, where once does not decide
+MARGIN = 2.0  # times what decides: the machine is not the model, and its noise is another
 
 
 def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:
@@ -59,20 +60,23 @@ def _bank() -> dict[str, np.ndarray]:
         "small reversals about 80 %": _piecewise(small),
         "swept sine, 2 % about 82 %, 0.05 to 1.5 Hz": _sine(82.0, 2.0, 0.05, 1.5, 100.0),
         "swept sine, 6 % about 80 %, 0.02 to 0.5 Hz": _sine(80.0, 6.0, 0.02, 0.5, 100.0),
-        "dwells at 50, 80 and 99 %": _piecewise([(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99)]),
+        "dwells at 50, 80 and 99 %": _piecewise([(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99), (106, 50)]),
     }
 
 
 PROFILES = _bank()
 
 
-def divergence(profile: np.ndarray, truth: dict[str, dict[str, float]], stage: str, rival: str, named: str, seed: int = 1) -> float:
-    """Nats by which the effect ``named`` explains a simulated run better than ``rival`` does, both refitted, on this profile.
+def divergence(
+    profile: np.ndarray, truth: dict[str, dict[str, float]], stage: str, rival: str, named: str, seed: int = 1
+) -> tuple[float, float]:
+    """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this profile.
 
-    truth: effects of the simulated machine with their parameters (border units)
+    truth: effects of the simulated machine with their parameters (border units). Returns (nats, spreads), the two measures by which the
+    diagnosis decides.
     """
     from discrepancy.adapter import build_chain
-    from discrepancy.diagnose import Search
+    from discrepancy.diagnose import Search, correlation_of, gain
     from discrepancy.fit import Judge
     from discrepancy.workflow import floor_of
     from hil.lockstep import Stimulus, lockstep
@@ -85,12 +89,11 @@ def divergence(profile: np.ndarray, truth: dict[str, dict[str, float]], stage: s
     log = Log("simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")})
     chain = build_chain(log)
     if all(s.name != stage for s in chain.stages):
-        return 0.0
+        return 0.0, 0.0
     s = chain.stage(stage)
-    s.effects = tuple(e for e in s.effects if e.name in (rival, named))
     # only the two effects are needed: fewer columns, the same run
-    full, keep = chain.stage(stage).run, _columns(build_chain(log).stage(stage), (rival, named))
-    neutral = build_chain(log).stage(stage).neutral()
+    full, keep, neutral = s.run, _columns(s, (rival, named)), s.neutral()
+    s.effects = tuple(e for e in s.effects if e.name in (rival, named))
 
     def reduced(thetas: np.ndarray) -> np.ndarray:
         wide = np.repeat(neutral[None], len(thetas), axis=0)
@@ -98,8 +101,10 @@ def divergence(profile: np.ndarray, truth: dict[str, dict[str, float]], stage: s
         return full(wide)
 
     s.run = reduced
-    search = Search(Judge(s, floor_of(s)))
-    return 0.5 * float(search.single(rival).held_out.sum() - search.single(named).held_out.sum())
+    judge = Judge(s, floor_of(s))
+    search = Search(judge)
+    best, other = search.single(named), search.single(rival)
+    return gain(judge, other, best, correlation_of(judge, best))
 
 
 def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
@@ -114,8 +119,9 @@ def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
 def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     """Return the best profile for the rivals in a diagnosis, or None when there is nothing to separate.
 
-    ``score`` is the smallest divergence over all pairs, in nats.
+    ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
+    from discrepancy.diagnose import NATS, RIVAL_SPREADS
     from plant.effects import EFFECTS
 
     pairs = [(s.stage, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
@@ -123,26 +129,38 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
         return None
     table: list[dict[str, Any]] = []
     jobs = list(itertools.product(PROFILES.items(), pairs))
-    scores: dict[str, list[float]] = {name: [] for name in PROFILES}
+    scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
     for i, ((name, profile), (stage, f, rival)) in enumerate(jobs):
         known = [p.name for p in EFFECTS[f.effect].parameters]
         truth = {f.effect: {k: float(v["value"]) for k, v in f.parameters.items() if k in known}}
         scores[name].append(divergence(profile, truth, stage, rival, f.effect))
         if progress:
             progress((i + 1) / len(jobs))
-    for name, s in scores.items():
-        table.append({"profile": name, "nats": min(s), "by_pair": [[f.effect, r, v] for (_, f, r), v in zip(pairs, s, strict=True)]})
-    table.sort(key=lambda r: -r["nats"])
+    for name, found in scores.items():
+        # nats grow with the number of runs, spreads with its root; what decides in the diagnosis decides here, with a margin
+        nats, spreads = min(n for n, _ in found), min(s for _, s in found)
+        needed = max(MARGIN * NATS / max(nats, 1e-9), (MARGIN * RIVAL_SPREADS / max(spreads, 1e-9)) ** 2)
+        by_pair = [[f.effect, r, n] for (_, f, r), (n, _) in zip(pairs, found, strict=True)]
+        runs = int(np.ceil(needed)) if needed <= MOST_REPEATS else 0
+        table.append({"profile": name, "nats": nats, "repeats": runs, "needed": needed, "by_pair": by_pair})
+    table.sort(key=lambda r: r["needed"])
     best = table[0]
-    profile = PROFILES[best["profile"]]
-    separated = best["nats"] > SEPARATED
+    once = PROFILES[best["profile"]]
+    repeats = max(1, best["repeats"])
+    profile = np.tile(once, repeats)
+    separated = best["repeats"] > 0
     names = ", ".join(f"{f.effect} from {r}" for _, f, r in pairs)
-    text = f"To tell {names}: {best['profile']}, {len(profile) / 100:.0f} s; expected gain {best['nats']:.0f} nats for the closest pair."
+    often = "" if repeats == 1 else f", {repeats} times over"
+    gained = repeats * best["nats"]
+    text = f"To tell {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected gain {gained:.0f} nats for the closest pair."
     if not separated:
-        text = f"No profile of the bank separates {names}: they differ by {best['nats']:.1f} nats at best, {SEPARATED:g} are needed."
+        text = (
+            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: "
+            f"they differ by {best['nats']:.1f} nats a run at best, {MARGIN * NATS:g} are wanted."
+        )
     return {
-        "text": text, "profile": best["profile"], "score": best["nats"], "separates": separated, "t": np.arange(len(profile)) * 0.01,
-        "n_dem": profile, "table": table,
+        "text": text, "profile": best["profile"], "score": gained, "separates": separated, "repeats": repeats,
+        "t": np.arange(len(profile)) * 0.01, "n_dem": profile, "table": table,
     }  # fmt: skip
 
 
@@ -169,10 +187,10 @@ def command(args: argparse.Namespace) -> int:
         cli.say(args, "nothing to separate: the log leaves no rivals")
         cli.write_json(args, {"schema": 1, "log": args.log, "recommended": None, "profiles": []})
     else:
-        rows = [[r["profile"], f"{r['nats']:.1f}"] for r in e["table"]]
-        cli.print_table(args, "divergence of the closest pair of rivals after refit", ["profile", "nats"], rows)
+        rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
+        cli.print_table(args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows)
         cli.say(args, e["text"])
-        best = {"profile": e["profile"], "nats": e["score"], "separates": e["separates"], "text": e["text"]}
+        best = {"profile": e["profile"], "nats": e["score"], "repeats": e["repeats"], "separates": e["separates"], "text": e["text"]}
         cli.write_json(args, {"schema": 1, "log": args.log, "recommended": best, "profiles": e["table"]})
         if args.out:
             write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})

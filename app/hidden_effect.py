@@ -104,6 +104,8 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
     """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
     from dataclasses import replace
 
+    import numpy as np
+
     from app.experiment import recommend
     from discrepancy.workflow import diagnose, diagnosis_json
 
@@ -113,9 +115,8 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
     out = {"profile": e["profile"], "nats": e["score"], "separable": e["separates"], "resolved": False}
     if e["separates"]:
         n = len(e["n_dem"])
-        if n > len(test.n_dem):
-            return None  # oil and supply are drawn for the log's own length
-        again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], p_s=test.p_s[:n], t_oil=test.t_oil[:n]))
+        supply = {k: np.pad(v, (0, max(0, n - len(v))), mode="reflect")[:n] for k, v in (("p_s", test.p_s), ("t_oil", test.t_oil))}
+        again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], **supply))
         said = diagnosis_json(diagnose(again.stages, again.not_observed, workers=1), "")
         found = {x["effect"]: x["rivals"] for x in said["effects"]}
         out |= {"resolved": all(found.get(h.name) == [] for h in case["hidden"]), "named": found}

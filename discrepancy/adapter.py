@@ -51,6 +51,9 @@ FREE = {  # nominal parameters that a stage refits within their tolerance
 }
 LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
 
+# mm: what a valve and piston without mass and oil spring leave of one that has them. Seen on clean logs of the rig: 0.0007 to 0.0013
+QUASI_STATIC = 1.3e-3
+
 
 @dataclass
 class Chain:
@@ -98,12 +101,12 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if name not in have:
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
-    unknown = 0.0
     if dt < 1.5 * RASTER and {"x_dem", "x_lvdt", "i_cmd"} <= columns.keys():
-        unknown = _sampled_current(t, have, run, cal)
-        if unknown:
+        sampled = _sampled_current(t, have, run, cal)
+        if sampled:
             columns["i_cmd"] = have["i_cmd"]
-            notes.append(f"i_cmd: the tick's at each row, not the mean since the row before; the mean is worked out, to {unknown:.2g} mA")
+            notes.append("i_cmd: the tick's at each row, not the mean since the row before, which is worked out from stroke and demand")
+        have["ticks"], have["other_ticks"] = (_between_rows(t, have, run, cal, sampled, seed) for seed in (0, 1))
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
@@ -130,10 +133,9 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             continue
         if dt > 1.5 * RASTER:
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses besides
-            stage.raster_error = _difference(stage, make(t[::2], _every_other(have), machine, cal, outputs, run[::2], present))
-        if name == "actuator" and unknown:
-            noisy = have | {"i_cmd": have["i_cmd"] + unknown * np.random.default_rng(0).standard_normal(len(t))}
-            stage.raster_error = _difference(stage, make(t, noisy, machine, cal, outputs, run, present))
+            coarse = make(t[::2], _every_other(have), machine, cal, outputs, run[::2], present)
+            more = _rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
+            stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
@@ -185,7 +187,8 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
 
 def _held(c: Channel, dt: float) -> bool:
     """Whether the channel is logged faster than the raster and yet holds its value for rows: it came in frames."""
-    return float(np.median(np.diff(c.t))) < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t)
+    step = float(np.median(np.diff(c.t))) if len(c.t) > 1 else np.inf
+    return bool(step < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t))
 
 
 def _to_frame(channels: Mapping[str, Channel], start: float, dt: float) -> float:
@@ -208,13 +211,11 @@ def _every_other(columns: dict[str, Array]) -> dict[str, Array]:
     return out
 
 
-def _difference(stage: Stage, other: Stage) -> Array:
-    """RMS of the difference that other inputs, on the same raster or a whole multiple of it, make to the nominal model where it counts."""
-    step = round((other.t[1] - other.t[0]) / (stage.t[1] - stage.t[0]))
-    e = stage.run(stage.neutral()[None])[0][:, ::step] - other.run(other.neutral()[None])[0]
-    e[~np.isfinite(other.measured)] = np.nan
+def _rms(stage: Stage, difference: Array) -> Array:
+    """RMS of a difference of outputs where the stage counts them, its windows' constants free: float64[outputs]."""
+    e = np.where(np.isfinite(stage.measured), difference, np.nan)
     if stage.window:
-        w = int(round(stage.window / (other.t[1] - other.t[0])))
+        w = int(round(stage.window / (stage.t[1] - stage.t[0])))
         e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
         e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
     return np.asarray(np.sqrt(np.nanmean(e**2, axis=1)))
@@ -289,7 +290,7 @@ def _vane(name: str) -> str | None:
 
 
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
-FIXED_START = {"speed": 5.0, "distance": 0.3}  # of second parameters
+FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
 
@@ -304,7 +305,7 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
     if name == "end_stop_shift":
         return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
     second = [FIXED_START.get(p.name, p.value) for p in ps]
-    mains = [i for i, p in enumerate(ps) if p.name not in ("speed", "distance", "phase")]
+    mains = [i for i, p in enumerate(ps) if p.name not in ("speed", "distance", "phase", "spread")]
     out = []
     for size in SIZES if ps[mains[0]].value == 0.0 else range(len(FACTORS)):
         for sign in (1.0, -1.0):
@@ -375,12 +376,13 @@ def _actuator(
     parameters, effects, rows, si = _declared("actuator", machine, present)
     dt = float(t[1] - t[0])
     substeps = SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
-    i = np.ascontiguousarray(c["i_cmd"] * 1e-3)
+    i = np.ascontiguousarray(c.get("ticks", c["i_cmd"]) * 1e-3)
+    others = np.ascontiguousarray(c["other_ticks"] * 1e-3) if "other_ticks" in c else i
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
     x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
 
-    def simulate(thetas: Array, substeps: int = substeps) -> Array:
+    def simulate(thetas: Array, substeps: int = substeps, i: Array = i) -> Array:
         p = _lanes(machine, thetas, rows, si)
         derive(p, dt / substeps, dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
@@ -394,6 +396,14 @@ def _actuator(
     stage = Stage("actuator", outputs, ("mm",), parameters, effects, both, t, measured, window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, 4 * substeps)
     window = int(round(WINDOW / dt))
+
+    def hidden(theta: Array) -> Array:
+        return _rms(stage, simulate(theta[None])[0] - simulate(theta[None], i=others)[0])
+
+    stage.raster_error = np.array([QUASI_STATIC])
+    if others is not i:
+        stage.hidden = hidden
+        stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
 
     def excerpt(at: Array) -> Stage:
         begins = np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1)
@@ -454,50 +464,58 @@ def _crossed(x: Array) -> Array:
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
 
 
-@dataclass(frozen=True)
-class _Law:
-    """What the firmware's servo loop makes of logged stroke and demand, but for a constant of its integral: mA, on every row.
+def _law(t: Array, c: dict[str, Array], cal: Calibration) -> tuple[Array, float]:
+    """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
-    mean    of the ticks since the row before, up to and with the one at the row
-    sample  of the tick at the row
-    hidden  RMS of the mean that the stroke between two rows hides
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and the RMS of their mean that
+    the stroke between two rows hides.
     """
-
-    mean: Array
-    sample: Array
-    hidden: float
-
-
-def _law(t: Array, c: dict[str, Array], cal: Calibration) -> _Law:
     x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
     before[0], two[:2] = x_dem[0], x_dem[0]
-    ramp = sum(two + (before - two) * f / 10.0 for f in range(2, 11)) + before + (x_dem - before) / 10.0
-    curve = CubicSpline(t, x)
-    ticks = t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None]
-    stroke = curve(np.maximum(ticks, t[0])).sum(axis=1)
-    straight = np.interp(np.maximum(ticks, t[0]).ravel(), t, x).reshape(ticks.shape).sum(axis=1)
-    error = (ramp - stroke) / 10.0
-    rate = (9.0 * (before - two) + (x_dem - before)) / 10.0 / RASTER
-    integral = np.cumsum(error) * RASTER
-    now = before + (x_dem - before) / 10.0 - x
-    return _Law(
-        kp * error + ki * (integral - 0.5 * error * RASTER) + kff * rate,
-        kp * now + ki * integral + kff * (x_dem - before) / RASTER,
-        # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
-        float(np.std(kp * (stroke - straight) / 10.0)),
-    )
+    ramp = two[:, None] + (before - two)[:, None] * (np.arange(2, 12) / 10.0)[None]
+    ramp[:, -1] = before + (x_dem - before) / 10.0
+    rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
+    rate[:, -1] = (x_dem - before) / RASTER
+    when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
+    stroke = CubicSpline(t, x)(when)
+    straight = np.interp(when.ravel(), t, x).reshape(when.shape)
+    error = ramp - stroke
+    ticks = kp * error + ki * np.cumsum(error).reshape(error.shape) * chain.TICK + kff * rate
+    # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
+    return ticks, float(np.std(kp * (stroke - straight).mean(axis=1)))
 
 
-def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration) -> float:
+def _between_rows(t: Array, c: dict[str, Array], run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
+    """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
+
+    Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine ticks that nobody
+    logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap. Where the law does not hold (not in
+    mode RUN, at the current's limit) the current is the row's mean.
+
+    sampled  the row's mean was worked out from its last tick and the noisy stroke, and is unknown by the noise of about one tick:
+             ``seed`` 0 takes it as it is, any other adds such an error
+    """
+    rng = np.random.default_rng(seed)
+    size = cal.k[fw.KP] * noise_floor(t, c["x_lvdt"])
+    noise = rng.standard_normal((len(t), 10))
+    noise[:, -1] = 0.0
+    ticks = _law(t, c, cal)[0] + size * noise
+    ticks -= ticks.mean(axis=1, keepdims=True)
+    ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
+    if sampled and seed:
+        ticks += size * rng.standard_normal((len(t), 1))
+    return np.asarray(c["i_cmd"][:, None] + ticks)
+
+
+def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration) -> bool:
     """Where the log's current is that of the tick at the row and not the mean since the row before, put the mean in its place.
 
-    The firmware's law on the logged stroke says which of the two it is, and what the nine other ticks added. Returns the RMS (mA) that the
-    mean is then unknown by, because nobody logged those ticks' noise; 0 where the log has the mean.
+    The firmware's law on the logged stroke says which of the two it is, and what the nine other ticks added. Returns whether it was so.
     """
-    law = _law(t, c, cal)
+    ticks, _ = _law(t, c, cal)
     width = int(round(WINDOW / RASTER))
     use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
 
@@ -506,21 +524,23 @@ def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration
         e = e[np.isfinite(e).all(axis=1)]
         return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
 
-    if misfit(law.sample) >= 0.8 * misfit(law.mean):
-        return 0.0
-    c["i_cmd"] = c["i_cmd"] + (law.mean - law.sample)
-    return float(cal.k[fw.KP] * noise_floor(t, c["x_lvdt"]) * 0.3)  # nine of ten, uncorrelated
+    mean, sample = ticks.mean(axis=1), ticks[:, -1]
+    if misfit(sample) >= 0.8 * misfit(mean):
+        return False
+    c["i_cmd"] = c["i_cmd"] + (mean - sample)
+    return True
 
 
 def _servo(
     t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
-    law = _law(t, c, cal)
+    ticks, hidden = _law(t, c, cal)
+    mean = ticks.mean(axis=1)
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
-        i = factor * law.mean[None]
+        i = factor * mean[None]
         return i[:, None, :]
 
     near = np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT]
@@ -528,7 +548,9 @@ def _servo(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
     # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
-    stage.raster_error = np.array([law.hidden])
+    # the noise of nine ticks a row went through the integral, and the model's has that of the line between the rows instead
+    walk = cal.k[fw.KI] * chain.TICK * np.hypot(3.0, 6.0) * noise_floor(t, c["x_lvdt"]) * np.sqrt(WINDOW / RASTER / 6.0)
+    stage.raster_error = np.array([np.hypot(hidden, walk)])
     return stage
 
 

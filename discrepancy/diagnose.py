@@ -20,11 +20,26 @@ import numpy as np
 from discrepancy.fit import Fit, Judge, Task
 from discrepancy.stage import Array, Stage, noise_of
 
-__all__ = ["Candidate", "Found", "Search", "StageDiagnosis", "diagnose_stage", "found_of", "recalibrated", "rms_per_output"]
+__all__ = [
+    "NATS",
+    "RIVAL_SPREADS",
+    "Candidate",
+    "Found",
+    "Search",
+    "StageDiagnosis",
+    "correlation_of",
+    "diagnose_stage",
+    "found_of",
+    "gain",
+    "recalibrated",
+    "rms_per_output",
+]
 
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
+RIVAL_SPREADS = 1.0  # fall of the error by which one of two effects that both earn their place beats the other
+RIVAL_SHARE = 0.02  # and share of its own gain: the library's equations are not nature's
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
@@ -36,7 +51,7 @@ LEAST_SHARE = 0.15
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
-LEFT_FLOORS = 3.0  # noise floors that a named model may leave, whatever share of the excess it explains
+LEFT_FLOORS = 3.0  # noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
 
 
 @dataclass
@@ -248,6 +263,11 @@ def _correlation(judge: Judge, theta: Array) -> float:
     return worst
 
 
+def correlation_of(judge: Judge, fit: Fit) -> float:
+    """Return how many samples of the fit's error count as one observation."""
+    return min(_correlation(judge, fit.theta), 50.0)
+
+
 def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
     """Return (nats, spreads): what ``after`` gains over ``before`` on held-out blocks."""
     d = before.held_out - after.held_out
@@ -453,7 +473,15 @@ def _conclude(
     rms_before, rms_after = (float(np.sqrt(f.held_out.sum() / n)) for f in (base, current))
     excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
     limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
-    if rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms_after > LEFT_FLOORS):
+    floor = judge.floor
+    if rms_after > limit and current.effects and stage.hidden is not None:
+        # an effect may turn on what happens between two rows: nobody can come closer than that
+        reach = np.sqrt(np.mean(1.0 + (stage.hidden(current.theta) / floor) ** 2))
+        floor, rms_before, rms_after = floor * reach, rms_before / reach, rms_after / reach
+        excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
+    # each further effect is one more chance to imitate what the library does not have
+    left = 1.0 + (LEFT_FLOORS - 1.0) / max(len(current.effects), 1)
+    if rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms_after > left):
         verdict, effects = "unknown", []
     elif current.effects:
         verdict = "missing"
@@ -465,7 +493,7 @@ def _conclude(
         outputs=stage.outputs,
         units=stage.units,
         verdict=verdict,
-        floor=judge.floor,
+        floor=floor,
         base=base,
         final=current,
         error_before=before,
@@ -501,13 +529,13 @@ def _name(
         alternatives = {name: current}
         for f in search.best_of([(*rest, other) for other in near]):
             alternatives[next(e for e in f.effects if e not in rest)] = f
-        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation)]
         score = {}
         for m, f in alternatives.items():
             score[m] = -0.5 * f.held_out[blocks].sum(axis=1) / correlation
         table = np.array(list(score.values()))
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
-        weight = np.exp((table - table.max(axis=0)) / max(1.0, 0.02 * abs(nats)))  # equations are not nature's: 2 % of the gain is a tie
+        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation, nats)]
+        weight = np.exp((table - table.max(axis=0)) / max(1.0, RIVAL_SHARE * abs(nats)))
         share = (weight / weight.sum(axis=0)).mean(axis=1)
         out.append(Found(name, float(share[0]), _parameters(stage, current, name), rivals, nats))
     return out
@@ -529,10 +557,10 @@ def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
     return [Found(name, 1.0, _parameters(judge.stage, fit, name), [], 0.0) for name in effects]
 
 
-def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
-    """True when the log can tell that ``other`` explains it less well than ``best``."""
+def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, worth: float) -> bool:
+    """True when the log can tell that ``other`` explains it less well than ``best``, which gains ``worth`` nats by its effect."""
     nats, spreads = gain(judge, other, best, correlation)
-    return nats > NATS and spreads > SPREADS
+    return nats > max(NATS, RIVAL_SHARE * worth) and spreads > RIVAL_SPREADS
 
 
 def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:

@@ -68,6 +68,8 @@ class Stage:
               None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
+    hidden    function from one parameter set to the RMS of what the raster hides from each output with these parameters: an effect may
+              turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
     finer     ``run`` with a finer step of its own, for stages that have one: their difference is the numerical error
     noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
@@ -88,6 +90,7 @@ class Stage:
     regimes: Mapping[str, Array] = field(default_factory=dict)
     regime_units: Mapping[str, str] = field(default_factory=dict)
     raster_error: Array | None = None
+    hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None

@@ -130,7 +130,7 @@ CONTROLLER_GAIN_ERROR = ROW["controller_gain_error"]
 ROTOR_LAG_ERROR = ROW["rotor_lag_error"]
 ACCELERATION_LIMIT_ERROR = ROW["acceleration_limit_error"]
 VALVE_NULL_BIAS = ROW["valve_null_bias"]
-VALVE_HYSTERESIS = ROW["valve_hysteresis"]
+VALVE_HYSTERESIS = ROW["valve_hysteresis"]  # width, spread
 VALVE_LAG = ROW["valve_lag"]  # used through VALVE_SHARE
 VALVE_DEAD_BAND = ROW["valve_dead_band"]
 VALVE_GAIN_ASYMMETRY = ROW["valve_gain_asymmetry"]
@@ -243,7 +243,7 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
     """`drive_step` with every effect: what changes within the step is in `drive_substep`."""
     i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
     y1, y2, y3, y4 = s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j]
-    y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j])
+    y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j], p[VALVE_HYSTERESIS + 1, j])
     i = valve_hysteresis.mean(y1, y2, y3, y4)
     gain = oil_viscosity.step(p[FLOW_GAIN, j], t_oil, p[OIL_VISCOSITY, j])
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])

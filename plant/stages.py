@@ -148,7 +148,8 @@ def engine_run(n_dem, dt, p, s, out):
 def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, window=0, behind=chain.TICK):
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
-    i_cmd[k]          mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it
+    i_cmd[k]          mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it;
+                      or i_cmd[k, m], the current in each of the equal parts of that time
     behind            s: how much later than logged the current acts; that of the tick at sample k drives the next millisecond
     n_r, p_s, t_oil   %, Pa, degC; their mean over the step is used
     x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT saw it, so that
@@ -161,11 +162,14 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
         raise ValueError(f"window (={window}) needs x_lvdt")
     x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
     if window:
-        _rest(p, s, i_cmd[0], n_r[0])
+        _rest(p, s, np.mean(i_cmd[0]), n_r[0])
     h = dt / substeps
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
-    current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
+    if i_cmd.ndim == 1:
+        current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
+    else:
+        current = _late(i_cmd, dt, substeps, behind)
     # a block in which one lane carries a load computes it for all eight: those that do are put side by side
     alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS)
     order = np.lexsort((p[DRIVE_LOADED] != 0.0, alone))
@@ -216,6 +220,15 @@ def _currents(mean, dt, substeps, behind):
             out[k, m] = share * in_old + (1.0 - share) * in_own
         slope_before, before = slope, mean[k]
     return out
+
+
+def _late(parts, dt, substeps, behind):
+    """Currents (n, substeps) between the samples, from those of equal ``parts`` of the time between them that act ``behind`` later."""
+    n, many = parts.shape
+    edges = np.arange(n * many + 1) * (dt / many) + behind - dt
+    charge = np.concatenate([[0.0], np.cumsum(parts.ravel())]) * (dt / many)
+    at = np.arange(n * substeps + 1) * (dt / substeps) - dt
+    return np.diff(np.interp(at, edges, charge)).reshape(n, substeps) / (dt / substeps)
 
 
 def _in_blocks(lanes, width, few):
@@ -306,7 +319,7 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 (_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _H1, _H2, _H3, _H4) = range(13)
 (_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
 (_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
-(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _N_ROWS) = range(37, 42)
+(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _N_ROWS) = range(37, 43)
 
 
 @_plain
@@ -325,7 +338,7 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
             b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q]
             b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
-            b[_BIAS, j], b[_WIDTH, j] = p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q]
+            b[_BIAS, j], b[_WIDTH, j], b[_SPREAD, j] = p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q], p[VALVE_HYSTERESIS + 1, q]
             b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
             b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = p[VALVE_A11, q], p[VALVE_A12, q], p[VALVE_A21, q], p[VALVE_A22, q]
             b[_OVERLAP, j] = p[VALVE_DEAD_BAND, q] / p[RATED_CURRENT, q]
@@ -380,7 +393,7 @@ def _block_substep(b, i_cmd, p_s, h, loaded):
     """One plant step of every lane of the block."""
     for j in range(W):
         i = valve_null_bias.step(i_cmd, b[_BIAS, j])
-        y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j])
+        y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j])
         i = valve_hysteresis.mean(y1, y2, y3, y4)
         u, du, v, x, y, lagged, z, give, reading = chain.drive_substep(
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j],

@@ -2,10 +2,11 @@
 
 Equation, plays in parallel, with i the command and y the current that counts::
 
-    y_k <- min(max(y_k, i - w_k / 2), i + w_k / 2),   w_k = width (1/4, 3/4, 5/4, 7/4),   y = mean of y_k
+    y_k <- min(max(y_k, i - w_k / 2), i + w_k / 2),   w_k = width (1 + spread (-3/4, -1/4, 1/4, 3/4)),   y = mean of y_k
 
-Symbols: i, y (A), width total (A), of a loop over the whole range. Equal shares of plays from 0 to 2 width are
-Rayleigh's law of magnetisation: a small reversal shows little of the width and its loop is round.
+Symbols: i, y (A), width total (A), of a loop over the whole range; spread (-) of the plays' widths. At spread 1, equal
+shares of plays from 0 to 2 width are Rayleigh's law of magnetisation: a small reversal shows little of the width and
+its loop is round. At spread 0 all are one plain play: friction in the torque motor, a loose feedback spring.
 Limits: rate-independent; the same at every current (no saturation of the iron). Dither, which shrinks it in practice,
 counts as a smaller width. On a log of mean currents the turns between two samples are not seen.
 In a log: after a reversal of i_cmd the stroke's speed follows the current only in part until it has come back by
@@ -26,7 +27,10 @@ EFFECT = Effect(
     "valve_hysteresis",
     "valve",
     ("actuator",),
-    (Parameter("width", "mA", 0.0, 0.0, 20.0, "total width between rising and falling current"),),
+    (
+        Parameter("width", "mA", 0.0, 0.0, 20.0, "total width between rising and falling current"),
+        Parameter("spread", "-", 1.0, 0.0, 1.0, "1: magnetic, round loops; 0: one play, with corners"),
+    ),
     ("current_1", "current_2", "current_3", "current_4"),
     "the valve remembers where its current came from",
     "reversals of the current",
@@ -34,9 +38,10 @@ EFFECT = Effect(
 
 
 @compiled
-def step(y1, y2, y3, y4, i, width):
+def step(y1, y2, y3, y4, i, width, spread):
     """Return the four plays' currents (A) for the command ``i`` (A); what counts is their `mean`."""
-    a, b, c, d = 0.125 * width, 0.375 * width, 0.625 * width, 0.875 * width
+    half, far, near = 0.5 * width, 0.375 * width * spread, 0.125 * width * spread
+    a, b, c, d = half - far, half - near, half + near, half + far
     return (
         min(max(y1, i - a), i + a),
         min(max(y2, i - b), i + b),
