@@ -96,7 +96,7 @@ SIZES: dict[str, dict[str, float]] = {
     "acceleration_limit_error": {"limit": -2.0},
     "valve_null_bias": {"bias": 1.0},
     "valve_dead_band": {"half_width": 1.2},
-    "valve_hysteresis": {"width": 1.5},
+    "valve_hysteresis": {"width": 1.5, "spread": 0.7},
     "valve_flow_saturation": {"limit": 40.0},
     "valve_lag": {"time_constant": 0.01},
     "valve_gain_asymmetry": {"ratio": 1.2},
@@ -543,16 +543,19 @@ def test_dead_band_lets_its_own_current_pass_nothing() -> None:
 def test_valve_hysteresis_is_as_wide_as_it_says_and_keeps_less_of_small_turns() -> None:
     width = 2e-3
 
-    def height_at_zero(amplitude):
+    def height_at_zero(amplitude, spread=1.0):
         """Current (A) that counts at zero command, coming down from ``amplitude`` (A), after two rounds between +-amplitude."""
         plays = (0.0, 0.0, 0.0, 0.0)
         for i in amplitude * np.concatenate([np.sin(np.linspace(0.0, 4.0 * np.pi, 4001)), np.sin(np.linspace(0.0, np.pi, 1001))]):
-            plays = valve_hysteresis.step(*plays, i, width)
+            plays = valve_hysteresis.step(*plays, i, width, spread)
         return valve_hysteresis.mean(*plays)
 
     assert height_at_zero(0.02) == pytest.approx(0.5 * width)
     # Rayleigh: the remanence of a small loop grows with the square of its amplitude
     assert height_at_zero(0.1e-3) == pytest.approx(0.0, abs=1e-9) and height_at_zero(0.5e-3) < 0.12 * width
+    # one play: nothing below half its width, then all but that half
+    assert height_at_zero(0.02, 0.0) == pytest.approx(0.5 * width) and height_at_zero(0.99e-3, 0.0) == pytest.approx(0.0, abs=1e-12)
+    assert height_at_zero(1.5e-3, 0.0) == pytest.approx(0.5e-3)
 
 
 def test_flow_saturation_limits_the_speed_and_leaves_slower_motion_alone() -> None:

@@ -1,0 +1,96 @@
+"""Logs as loggers write them: slow, fast, begun anywhere, the current sampled or averaged. What the raster hides is not missing physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from discrepancy.adapter import Chain, build_chain
+from discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from hil.logs import Channel, Log
+from tests.firmware_on_rig import firmware
+from tests.rig import Hidden, manoeuvre, simulate
+
+
+def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
+    return dict(simulate(manoeuvre(seed, duration), firmware(), hidden, seed=seed, rate=rate).log)
+
+
+def chain_of(rows: dict[str, np.ndarray], which: slice = slice(None)) -> Chain:
+    t = rows["t"][which]
+    return build_chain(Log("rig", {k: Channel(t, v[which]) for k, v in rows.items() if k != "t"}))
+
+
+def said(chain: Chain, stage: str) -> StageDiagnosis:
+    s = chain.stage(stage)
+    assert s.floor is not None
+    return diagnose_stage(s, s.floor)
+
+
+@pytest.fixture(scope="module")
+def fast() -> dict[str, np.ndarray]:
+    return recorded([], 31, 1000)
+
+
+@pytest.mark.parametrize("begin", [0, 4, 9])
+def test_a_fast_log_is_put_on_the_controllers_frame_wherever_it_begins(fast: dict[str, np.ndarray], begin: int) -> None:
+    chain = chain_of(fast, slice(begin, None))
+    for name in ("demand", "servo", "actuator"):
+        assert said(chain, name).verdict == "none", name
+
+
+def test_a_current_sampled_at_the_rows_is_known_as_such_and_nothing_is_missing(fast: dict[str, np.ndarray]) -> None:
+    chain = chain_of(fast, slice(None, None, 10))
+    assert any("i_cmd: the tick's at each row" in n for n in chain.notes)
+    for name in ("demand", "servo", "actuator"):
+        assert said(chain, name).verdict == "none", name
+
+
+def test_a_mean_current_is_not_taken_for_a_sampled_one() -> None:
+    assert not any("i_cmd" in n for n in chain_of(recorded([], 32, 100, 60.0)).notes)
+
+
+def test_a_null_bias_is_found_in_a_log_of_sampled_current() -> None:
+    rows = recorded([Hidden("valve_null_bias", {"bias": 5e-4})], 33, 1000)
+    d = said(chain_of(rows, slice(None, None, 10)), "actuator")
+    assert [e.effect for e in d.effects] == ["valve_null_bias"]
+    assert float(d.effects[0].parameters["bias"]["value"]) == pytest.approx(0.5, abs=0.01)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stage", ["engine", "actuator", "linkage"])
+def test_a_log_of_ten_rows_a_second_lacks_nothing(stage: str) -> None:
+    assert said(chain_of(recorded([], 34, 10, 200.0)), stage).verdict == "none"
+
+
+def test_play_is_found_in_a_log_of_ten_rows_a_second() -> None:
+    d = said(chain_of(recorded([Hidden("linkage_backlash", {"stage": 0, "width": 0.01})], 35, 10, 200.0)), "linkage")
+    assert [e.effect for e in d.effects] == ["linkage_backlash"]
+    assert float(d.effects[0].parameters["vigv"]["value"]) == pytest.approx(np.rad2deg(0.01), rel=0.15)  # type: ignore[arg-type]
+
+
+def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> None:
+    chain = chain_of(recorded([Hidden("valve_hysteresis", {"width": 2e-3})], 36, 100))
+    d = said(chain, "actuator")
+    assert [e.effect for e in d.effects] == ["valve_hysteresis"]
+    assert float(d.effects[0].parameters["width"]["value"]) == pytest.approx(2.0, rel=0.15)  # type: ignore[arg-type]
+    # the floor given is what can be reached, far above the sensor's noise of 0.005 mm
+    assert d.floor[0] > 0.01 and d.error_after[0] < 1.5 * d.floor[0]
+
+
+def test_many_effects_that_leave_much_are_an_imitation() -> None:
+    """Three effects that bring an error from 6 to 2 floors: enough of it for one effect, not for three."""
+    from discrepancy import diagnose as search
+    from discrepancy.fit import Judge
+
+    stage = chain_of(recorded([], 37, 100, 60.0)).stage("engine")
+    assert stage.floor is not None
+    judge = Judge(stage, stage.floor)
+    base = judge.fit((), stage.neutral(), 2)
+    before, after = (replace(base, held_out=base.held_out * r**2 / (base.held_out.sum() / judge.n)) for r in (6.0, 2.0))
+
+    def verdict(*effects: str) -> str:
+        return search._conclude(judge, before, replace(after, effects=effects), [], [], 1.0, []).verdict
+
+    assert verdict("a") == "missing" and verdict("a", "b", "c") == "unknown"
