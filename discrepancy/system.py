@@ -1278,9 +1278,15 @@ def _low_pass(t: Array, x: Array, cutoff: float) -> Array:
 
 
 def _smoothed(t: Array, x: Array) -> Array:
-    """A measured displacement, smooth enough to be differentiated once."""
+    """A measured displacement, smooth enough to be differentiated once, with all that moves it."""
+    from scipy.signal import welch
+
     rate = 1.0 / float(np.median(np.diff(t)))
-    return _low_pass(t, x, 0.05 * rate)
+    y = np.where(np.isfinite(x), x, np.nanmean(x))
+    f, power = welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
+    total = np.cumsum(power)
+    highest = float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))])
+    return _low_pass(t, x, min(max(0.05 * rate, 1.5 * highest), 0.4 * rate))
 
 
 def _uses(f: Callable[..., Any], name: str) -> bool:
