@@ -122,7 +122,7 @@ def web() -> Iterator[Row]:
             page.get_by_role("button", name="Find the missing physics").click()
             page.get_by_text("searching the library").wait_for()
             answers = []
-            stages = ["demand", "servo", "engine", "linkage", "actuator"]
+            stages = ["servo", "engine", "linkage", "actuator", "demand"]
             for k in range(20):
                 answers.append(page.evaluate(PRESS, stages[k % 5]) / 1e3)
                 time.sleep(0.3)
