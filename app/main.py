@@ -59,11 +59,14 @@ def main(argv: list[str]) -> int:
     if name not in COMMANDS:
         print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(COMMANDS[name][0])
-    parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
-    module.add_options(parser)
-    args = parser.parse_args(argv[1:])
-    return cli.run(lambda: module.command(args))
+
+    def command() -> int:  # its imports take half a second, in which Ctrl-C may come, too
+        module = importlib.import_module(COMMANDS[name][0])
+        parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+        module.add_options(parser)
+        return module.command(parser.parse_args(argv[1:]))
+
+    return cli.run(command)
 
 
 def run() -> None:

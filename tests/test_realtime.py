@@ -276,6 +276,15 @@ def test_bad_input_is_one_line_and_exit_code_2(args: list[str], says: str, capsy
     assert err.count("\n") == 1 and says in err
 
 
+def test_ctrl_c_while_a_command_is_still_loading_is_one_word(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("app.main.importlib.import_module", interrupted)
+    assert main(["record", "x.log"]) == 130
+    assert capsys.readouterr().err == "stopped\n"
+
+
 # ---- commands -----------------------------------------------------------------------------------------------------------------------
 
 
