@@ -364,5 +364,5 @@ def _line(e: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    os.nice(5)  # the page answers first
+    os.nice(10)  # the page answers first
     main(int(sys.argv[1]), TASKS)
