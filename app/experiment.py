@@ -68,12 +68,20 @@ PROFILES = _bank()
 
 
 def divergence(
-    profile: np.ndarray, truth: dict[str, dict[str, float]], stage: str, rival: str, named: str, seed: int = 1
+    profile: np.ndarray,
+    truth: dict[str, dict[str, float]],
+    stage: str,
+    rival: str,
+    named: str,
+    beside: tuple[str, ...] = (),
+    seed: int = 1,
 ) -> tuple[float, float]:
     """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this profile.
 
-    truth: effects of the simulated machine with their parameters (border units). Returns (nats, spreads), the two measures by which the
-    diagnosis decides.
+    truth   effects of the simulated machine with their parameters (border units)
+    beside  other effects of the stage, refitted together with either
+
+    Returns (nats, spreads), the two measures by which the diagnosis decides.
     """
     from discrepancy.adapter import build_chain
     from discrepancy.diagnose import Search, correlation_of, gain
@@ -91,9 +99,10 @@ def divergence(
     if all(s.name != stage for s in chain.stages):
         return 0.0, 0.0
     s = chain.stage(stage)
-    # only the two effects are needed: fewer columns, the same run
-    full, keep, neutral = s.run, _columns(s, (rival, named)), s.neutral()
-    s.effects = tuple(e for e in s.effects if e.name in (rival, named))
+    # only these effects are needed: fewer columns, the same run
+    needed = (rival, named, *beside)
+    full, keep, neutral = s.run, _columns(s, needed), s.neutral()
+    s.effects = tuple(e for e in s.effects if e.name in needed)
 
     def reduced(thetas: np.ndarray) -> np.ndarray:
         wide = np.repeat(neutral[None], len(thetas), axis=0)
@@ -103,7 +112,7 @@ def divergence(
     s.run = reduced
     judge = Judge(s, floor_of(s))
     search = Search(judge)
-    best, other = search.single(named), search.single(rival)
+    best, other = (search.joined((*beside, name)) for name in (named, rival))
     return gain(judge, other, best, correlation_of(judge, best))
 
 
@@ -124,16 +133,19 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     from discrepancy.diagnose import NATS, RIVAL_SPREADS
     from plant.effects import EFFECTS
 
-    pairs = [(s.stage, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
+    pairs = [(s, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
     if not pairs:
         return None
     table: list[dict[str, Any]] = []
     jobs = list(itertools.product(PROFILES.items(), pairs))
     scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
-    for i, ((name, profile), (stage, f, rival)) in enumerate(jobs):
+    truth = {}  # an effect that shows in two stages was fitted in both; the first will do
+    for f in (f for s in d.stages for f in s.effects):
         known = [p.name for p in EFFECTS[f.effect].parameters]
-        truth = {f.effect: {k: float(v["value"]) for k, v in f.parameters.items() if k in known}}
-        scores[name].append(divergence(profile, truth, stage, rival, f.effect))
+        truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
+    for i, ((name, profile), (s, f, rival)) in enumerate(jobs):
+        beside = tuple(o.effect for o in s.effects if o.effect not in (f.effect, rival))
+        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside))
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():

@@ -119,7 +119,11 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
         again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], **supply))
         said = diagnosis_json(diagnose(again.stages, again.not_observed, workers=1), "")
         found = {x["effect"]: x["rivals"] for x in said["effects"]}
-        out |= {"resolved": all(found.get(h.name) == [] for h in case["hidden"]), "named": found}
+        # what both logs allow: the candidates for each effect of the first log that are candidates in the second
+        second = _all_named(said)
+        left = [{f.effect, *f.rivals} & second for s in d.stages for f in s.effects if f.rivals]
+        hidden = {h.name for h in case["hidden"]}
+        out |= {"resolved": all(len(c) == 1 and c <= hidden for c in left), "named": found}
     return out
 
 

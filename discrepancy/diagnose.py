@@ -39,7 +39,8 @@ NATS = 12.0  # gain that the best of a library of useless effects reaches in few
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 RIVAL_SPREADS = 1.0  # fall of the error by which one of two effects that both earn their place beats the other
-RIVAL_SHARE = 0.02  # and share of its own gain: the library's equations are not nature's
+RIVAL_SHARE = 0.25  # and share of what it leaves above the floor itself: the library's equations are not nature's
+SOFT = 0.02  # share of an effect's gain that counts as one nat in the probabilities, for the same reason
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
@@ -534,8 +535,8 @@ def _name(
             score[m] = -0.5 * f.held_out[blocks].sum(axis=1) / correlation
         table = np.array(list(score.values()))
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
-        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation, nats)]
-        weight = np.exp((table - table.max(axis=0)) / max(1.0, RIVAL_SHARE * abs(nats)))
+        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation)]
+        weight = np.exp((table - table.max(axis=0)) / max(1.0, SOFT * abs(nats)))
         share = (weight / weight.sum(axis=0)).mean(axis=1)
         out.append(Found(name, float(share[0]), _parameters(stage, current, name), rivals, nats))
     return out
@@ -557,10 +558,11 @@ def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
     return [Found(name, 1.0, _parameters(judge.stage, fit, name), [], 0.0) for name in effects]
 
 
-def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, worth: float) -> bool:
-    """True when the log can tell that ``other`` explains it less well than ``best``, which gains ``worth`` nats by its effect."""
+def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
+    """True when the log can tell that ``other`` explains it less well than ``best``."""
     nats, spreads = gain(judge, other, best, correlation)
-    return nats > max(NATS, RIVAL_SHARE * worth) and spreads > RIVAL_SPREADS
+    left = 0.5 * float(best.held_out.sum() - judge.n) / correlation
+    return nats > max(NATS, RIVAL_SHARE * left) and spreads > RIVAL_SPREADS
 
 
 def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
