@@ -139,7 +139,7 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     table: list[dict[str, Any]] = []
     jobs = list(itertools.product(PROFILES.items(), pairs))
     scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
-    truth = {}  # an effect that shows in two stages was fitted in both; the first will do
+    truth: dict[str, dict[str, float]] = {}  # an effect that shows in two stages was fitted in both; the first will do
     for f in (f for s in d.stages for f in s.effects):
         known = [p.name for p in EFFECTS[f.effect].parameters]
         truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
