@@ -20,6 +20,8 @@ __all__ = ["BUS_HELP", "Port", "open_bus"]
 BUS_HELP = "vcan0, can0, ...: SocketCAN; local[:NAME]: embedded bus between processes; lockstep: simulated time"
 _CAN_TYPE = "280"  # ARPHRD_CAN
 SO_RXQ_OVFL = 40  # the kernel tells how many frames it dropped
+SO_RCVBUFFORCE = 33  # as SO_RCVBUF, beyond the system's limit where the rights allow
+RECEIVE_BUFFER = 8 << 20  # bytes that the kernel may keep for a reader: about 10,000 frames, half a minute of this bus
 _NET = Path("/sys/class/net")
 
 
@@ -90,6 +92,10 @@ class Port:
         if not self._rows:
             self._socket: socket.socket = bus.socket
             self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+            try:
+                self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
+            except OSError:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # the kernel takes what it allows
             self._buffer = bytearray(72)
             self._words = np.frombuffer(self._buffer, "<i8")
 
