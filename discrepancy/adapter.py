@@ -102,11 +102,12 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
     if dt < 1.5 * RASTER and {"x_dem", "x_lvdt", "i_cmd"} <= columns.keys():
-        sampled = _sampled_current(t, have, run, cal)
+        law, _ = _law(t, have, cal)
+        sampled = _sampled_current(t, have, law, run, cal)
         if sampled:
             columns["i_cmd"] = have["i_cmd"]
             notes.append("i_cmd: the tick's at each row, not the mean since the row before, which is worked out from stroke and demand")
-        have["ticks"], have["other_ticks"] = (_between_rows(t, have, run, cal, sampled, seed) for seed in (0, 1))
+        have["ticks"], have["other_ticks"] = (_between_rows(t, have, law, run, cal, sampled, seed) for seed in (0, 1))
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
@@ -488,13 +489,14 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration) -> tuple[Array, float]
     return ticks, float(np.std(kp * (stroke - straight).mean(axis=1)))
 
 
-def _between_rows(t: Array, c: dict[str, Array], run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
+def _between_rows(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
     """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
 
     Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine ticks that nobody
     logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap. Where the law does not hold (not in
     mode RUN, at the current's limit) the current is the row's mean.
 
+    law      of `_law`
     sampled  the row's mean was worked out from its last tick and the noisy stroke, and is unknown by the noise of about one tick:
              ``seed`` 0 takes it as it is, any other adds such an error
     """
@@ -502,7 +504,7 @@ def _between_rows(t: Array, c: dict[str, Array], run: Array, cal: Calibration, s
     size = cal.k[fw.KP] * noise_floor(t, c["x_lvdt"])
     noise = rng.standard_normal((len(t), 10))
     noise[:, -1] = 0.0
-    ticks = _law(t, c, cal)[0] + size * noise
+    ticks = law + size * noise
     ticks -= ticks.mean(axis=1, keepdims=True)
     ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
     if sampled and seed:
@@ -510,12 +512,11 @@ def _between_rows(t: Array, c: dict[str, Array], run: Array, cal: Calibration, s
     return np.asarray(c["i_cmd"][:, None] + ticks)
 
 
-def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration) -> bool:
+def _sampled_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> bool:
     """Where the log's current is that of the tick at the row and not the mean since the row before, put the mean in its place.
 
-    The firmware's law on the logged stroke says which of the two it is, and what the nine other ticks added. Returns whether it was so.
+    The firmware's ``law`` on the logged stroke says which of the two it is, and what the nine other ticks added. Returns whether it was so.
     """
-    ticks, _ = _law(t, c, cal)
     width = int(round(WINDOW / RASTER))
     use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
 
@@ -524,7 +525,7 @@ def _sampled_current(t: Array, c: dict[str, Array], run: Array, cal: Calibration
         e = e[np.isfinite(e).all(axis=1)]
         return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
 
-    mean, sample = ticks.mean(axis=1), ticks[:, -1]
+    mean, sample = law.mean(axis=1), law[:, -1]
     if misfit(sample) >= 0.8 * misfit(mean):
         return False
     c["i_cmd"] = c["i_cmd"] + (mean - sample)
@@ -547,7 +548,6 @@ def _servo(
     stage = Stage(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
-    # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
     # the noise of nine ticks a row went through the integral, and the model's has that of the line between the rows instead
     walk = cal.k[fw.KI] * chain.TICK * np.hypot(3.0, 6.0) * noise_floor(t, c["x_lvdt"]) * np.sqrt(WINDOW / RASTER / 6.0)
     stage.raster_error = np.array([np.hypot(hidden, walk)])

@@ -245,9 +245,12 @@ class Search:
         return sorted(out, key=lambda f: float(f.held_out.sum()))
 
 
-def _correlation(judge: Judge, theta: Array) -> float:
-    """Variance inflation of a sum of the whitened errors: 1 + 2 sum of the autocorrelations up to the first that is not positive."""
-    e = judge.errors(theta[None])[0]
+def correlation_of(judge: Judge, fit: Fit) -> float:
+    """Return how many samples of the fit's error count as one observation, at most 50.
+
+    Variance inflation of a sum of the squared errors: 1 + 2 sum of the squared autocorrelations up to the first that is not positive.
+    """
+    e = judge.errors(fit.theta[None])[0]
     worst = 1.0
     for row in e:
         row = row - row.mean()
@@ -261,12 +264,7 @@ def _correlation(judge: Judge, theta: Array) -> float:
                 break
             total += 2.0 * rho * rho  # squares of errors are correlated by rho squared
         worst = max(worst, total)
-    return worst
-
-
-def correlation_of(judge: Judge, fit: Fit) -> float:
-    """Return how many samples of the fit's error count as one observation."""
-    return min(_correlation(judge, fit.theta), 50.0)
+    return min(worst, 50.0)
 
 
 def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
@@ -355,7 +353,7 @@ def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: St
     chosen, current = said.final.effects, nominal
     if chosen:
         current = judge.fit(chosen, said.final.theta, 8)
-    correlation = min(_correlation(judge, current.theta), 50.0)
+    correlation = correlation_of(judge, current)
     while chosen:
         rest = [tuple(c for c in chosen if c != name) for name in chosen]
         tasks = [judge.fitting(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) for r in rest if r]
@@ -409,7 +407,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
     names = [e.name for e in stage.effects]
     singles = dict.fromkeys(names, base) if search.quiet else search.singles(names)
     leader = min(singles.values(), key=lambda f: float(f.held_out.sum()), default=base)
-    correlation = min(_correlation(judge, leader.theta), 50.0)
+    correlation = correlation_of(judge, leader)
     for name in names:
         nats, spreads = gain(judge, base, singles[name], correlation)
         reason = ""
