@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from discrepancy.fit import Fit, Judge
 from discrepancy.stage import Array
 
-__all__ = ["Regime", "Shape", "onset", "regimes", "shape"]
+__all__ = ["Regime", "Shape", "bins_of", "onset", "regimes", "shape"]
 
 BINS = 8
 LEVEL = 0.01  # chance that any bin of any regime is called significant when nothing is missing
@@ -59,6 +60,16 @@ def _edges(values: Array) -> Array:
     edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
     edges[-1] += 1e-9 * max(1.0, abs(edges[-1]))
     return edges
+
+
+def bins_of(found: Sequence[Regime], figure: Callable[[Regime], Array]) -> tuple[list[list[float | None]], list[str], list[str]]:
+    """Lay out a failure map: ``figure`` of each condition's bins, None where 20 samples or fewer say it; names of bins; of conditions."""
+    width = max(len(figure(r)) for r in found)
+    values = [
+        [float(v) if n > 20 else None for v, n in zip(figure(r), r.samples, strict=True)] + [None] * (width - len(figure(r))) for r in found
+    ]
+    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in found]
+    return values, [f"bin {i + 1}" for i in range(width)], names
 
 
 def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:

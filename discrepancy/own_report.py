@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from discrepancy.locate import bins_of
 from discrepancy.own_model import NO_HELP, Answer
 from hil.page import Line, Page, Panel, bars, heat, loop, number, overlay, ranking, waterfall
 
@@ -178,13 +179,8 @@ def _map(page: Page, answer: Answer) -> None:
     page.section("Where the model as given fails")
     for output in dict.fromkeys(r.output for r in hot):
         mine = [r for r in hot if r.output == output]
-        width = max(len(r.rms) for r in mine)
-        values = [
-            [float(v) if n > 20 else None for v, n in zip(r.rms, r.samples, strict=True)] + [None] * (width - len(r.rms)) for r in mine
-        ]
-        names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
         worst = mine[0]
         page.plot(
-            heat(values, [f"bin {i + 1}" for i in range(width)], names, worst.unit, "from the lowest values to the highest", ""),
+            heat(*bins_of(mine, lambda r: r.rms), worst.unit, "from the lowest values to the highest", ""),
             f"RMS error of {output}. Worst: {worst.worst()}.",
         )

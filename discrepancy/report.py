@@ -10,7 +10,7 @@ import numpy as np
 from discrepancy.adapter import Chain
 from discrepancy.diagnose import StageDiagnosis
 from discrepancy.fit import Judge
-from discrepancy.locate import Regime, onset, regimes
+from discrepancy.locate import Regime, bins_of, onset, regimes
 from discrepancy.workflow import Diagnosis, StageFigures, floor_of
 from hil.page import Line, Page, Panel, heat, loop, number, overlay, ranking, waterfall
 
@@ -176,12 +176,7 @@ def _failure_map(page: Page, found: list[Regime], stage: str, start: float | Non
         return
     for output in dict.fromkeys(r.output for r in hot):
         mine = [r for r in hot if r.output == output]
-        width = max(len(r.ratio) for r in mine)
-        values = [
-            [float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * (width - len(r.ratio)) for r in mine
-        ]
-        names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
         page.plot(
-            heat(values, [f"bin {i + 1}" for i in range(width)], names, "noise floors", "from the lowest values to the highest", ""),
+            heat(*bins_of(mine, lambda r: r.ratio), "noise floors", "from the lowest values to the highest", ""),
             f"Where the {stage} stage fails: error of {output} in noise floors. Worst: {mine[0].worst()}.",
         )
