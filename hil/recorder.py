@@ -312,7 +312,9 @@ class _Parquet:
         self.fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         self.start: int | None = None
         self.groups: list[_Group] = []
-        self._write([], self.schema.empty_table(), 0)
+        all_kinds = np.zeros(len(self.messages), FRAME)  # loads, and on a new machine compiles, what an append needs before frames come
+        all_kinds["ident"], all_kinds["length"] = [m.ident for m in self.messages], 8
+        self._write([], self._rows(np.frombuffer(all_kinds.tobytes(), FRAME)).slice(0, 0), 0)
 
     def append(self, frames: np.ndarray) -> None:
         import pyarrow as pa
@@ -334,7 +336,7 @@ class _Parquet:
         ours = np.where(error | remote | fd, np.uint32(ERROR), ident)
         plain = canlog.Frames(np.zeros(n), ours, np.zeros(n, np.int32), frames["length"], np.ascontiguousarray(frames["data"][:, :8]))
         columns: dict[str, Any] = {
-            "t": (frames["ns"] - self.start) * 1e-9, "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
+            "t": (frames["ns"] - (self.start or 0)) * 1e-9, "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
             "id": ident & 0x1FFFFFFF, "extended": ident & EXTENDED != 0,
             "kind": np.select([error, remote, fd], ["error", "remote", "fd"], "data"), "tx": frames["tx"] != 0, "length": frames["length"],
             "bytes": [d[:k].tobytes() for d, k in zip(frames["data"], frames["length"].tolist(), strict=True)],

@@ -174,6 +174,27 @@ def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: 
     assert len(read_record(file).ms) == int(frames)
 
 
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str, tmp_path: Path) -> None:
+    """Else the first frames wait in memory for as long as imports take, and are lost with the process."""
+    frames = tmp_path / "frames"
+    frames.write_bytes(some_frames(200, 0).tobytes())
+    code = f"""
+        import sys
+        from pathlib import Path
+        from hil import columns
+        from hil.recorder import Recorder
+        loaded = lambda: {{*sys.modules, *((f, s) for f in ("cut", "wrong_crc") for s in map(str, getattr(columns, f).signatures))}}
+        recorder = Recorder({str(tmp_path / f"run{suffix}")!r})
+        before = loaded()
+        recorder.put(Path({str(frames)!r}).read_bytes())
+        recorder.flush()
+        print(sorted(map(str, loaded() - before)))
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == "[]"
+
+
 # ---- kill -9 ------------------------------------------------------------------------------------------------------------------------
 
 
