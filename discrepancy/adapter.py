@@ -21,6 +21,7 @@ from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
 from controller import firmware as fw
@@ -51,8 +52,9 @@ FREE = {  # nominal parameters that a stage refits within their tolerance
 }
 LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
 
-# mm: what a valve and piston without mass and oil spring leave of one that has them. Seen on clean logs of the rig: 0.0007 to 0.0013
-QUASI_STATIC = 1.3e-3
+
+# mm: what a valve and piston without mass and oil spring leave of one that has them; logs of the rig without noise leave 0.0004
+QUASI_STATIC = 4e-4
 
 
 @dataclass
@@ -102,12 +104,14 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
     if dt < 1.5 * RASTER and {"x_dem", "x_lvdt", "i_cmd"} <= columns.keys():
-        law, _ = _law(t, have, cal)
-        sampled = _sampled_current(t, have, law, run, cal)
-        if sampled:
+        law, _, size = _law(t, have, cal, machine)
+        what = _other_current(t, have, law, run, cal)
+        sampled = what == SAMPLED
+        if what:
+            notes.append(f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and demand")
             columns["i_cmd"] = have["i_cmd"]
-            notes.append("i_cmd: the tick's at each row, not the mean since the row before, which is worked out from stroke and demand")
-        have["ticks"], have["other_ticks"] = (_between_rows(t, have, law, run, cal, sampled, seed) for seed in (0, 1))
+            law, _, size = _law(t, have, cal, machine)
+        have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, sampled, seed) for seed in (0, 1))
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
@@ -465,13 +469,50 @@ def _crossed(x: Array) -> Array:
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
 
 
-def _law(t: Array, c: dict[str, Array], cal: Calibration) -> tuple[Array, float]:
+SMOOTH = (5, 9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
+SMOOTH_ORDER = 3
+
+
+def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> tuple[Array, float, int]:
+    """The stroke (mm) at the rows with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
+
+    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by leave-one-out errors. The
+    noise (mm) and that number of rows are returned too.
+    """
+    dt = float(t[1] - t[0])
+    p = machine.p.copy()
+    p[NAMES.index("actuator.stroke")] = 2e3  # the stops out of the way: a wrong null runs away in minutes
+    derive(p, dt / SUBSTEPS, dt)
+    s = np.zeros((chain.N_STATE, 1))
+    s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 1e3
+    out = np.empty((len(t), 1))
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    actuator_run(np.ascontiguousarray(c["i_cmd"] * 1e-3), n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]),
+                 dt, SUBSTEPS, p, s, out)  # fmt: skip
+    # the model's steps, calibrated: gain and lag of both directions, null
+    step = np.diff(out[:, 0], prepend=1e3) * 1e3
+    near = [np.roll(side, k) for side in (np.maximum(step, 0.0), np.minimum(step, 0.0)) for k in (-1, 0, 1)]
+    parts = np.column_stack([*near, np.ones(len(t))])
+    model = np.cumsum(parts @ np.linalg.lstsq(parts, np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0]), rcond=None)[0])
+    off = c["x_lvdt"] - model
+    tried = []
+    for rows in SMOOTH:
+        smooth, own = savgol_filter(off, rows, SMOOTH_ORDER), savgol_coeffs(rows, SMOOTH_ORDER)[rows // 2]
+        left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
+        tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
+    _, rows, size, smooth = min(tried, key=lambda x: x[0])
+    return model + smooth, min(noise_floor(t, off), size), rows
+
+
+def _law(t: Array, c: dict[str, Array], cal: Calibration, machine: Plant) -> tuple[Array, Array, float]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
-    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and the RMS of their mean that
-    the stroke between two rows hides.
+    At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off the stroke.
+
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; by how much their mean is off
+    because the stroke between two rows is not logged: that error drawn anew, float64[rows]; the current (mA) that the LVDT's noise makes.
     """
-    x_dem, x = c["x_dem"], c["x_lvdt"]
+    x_dem, x, (smooth, size, rows) = c["x_dem"], c["x_lvdt"], _without_noise(t, c, machine)
     kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
@@ -481,15 +522,23 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration) -> tuple[Array, float]
     rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
     rate[:, -1] = (x_dem - before) / RASTER
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
-    stroke = CubicSpline(t, x)(when)
-    straight = np.interp(when.ravel(), t, x).reshape(when.shape)
+    stroke = CubicSpline(t, smooth)(when)
+    straight = np.interp(when.ravel(), t, smooth).reshape(when.shape)
+    stroke[:, -1] = straight[:, -1] = x
     error = ramp - stroke
-    ticks = kp * error + ki * np.cumsum(error).reshape(error.shape) * chain.TICK + kff * rate
-    # the stroke between two rows is not logged: what a straight line and a cubic disagree by tells how well it is known
-    return ticks, float(np.std(kp * (stroke - straight).mean(axis=1)))
+
+    def loop(e: Array) -> Array:
+        return np.asarray(kp * e + ki * np.cumsum(e).reshape(e.shape) * chain.TICK)
+
+    # not known: the LVDT's noise in nine ticks, what smoothing lets through of it at the rows, and the way between them, which is known
+    # as well as a straight line and a cubic agree
+    noise = size * np.random.default_rng(0).standard_normal((len(t), 10))
+    off = CubicSpline(t, savgol_filter(noise[:, -1], rows, SMOOTH_ORDER))(when) - noise + (stroke - straight)
+    off[:, -1] = 0.0
+    return loop(error) + kff * rate, loop(off).mean(axis=1), kp * size
 
 
-def _between_rows(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
+def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
     """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
 
     Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine ticks that nobody
@@ -497,25 +546,29 @@ def _between_rows(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
     mode RUN, at the current's limit) the current is the row's mean.
 
     law      of `_law`
+    size     mA, RMS of the LVDT's noise in the current
     sampled  the row's mean was worked out from its last tick and the noisy stroke, and is unknown by the noise of about one tick:
              ``seed`` 0 takes it as it is, any other adds such an error
     """
     rng = np.random.default_rng(seed)
-    size = cal.k[fw.KP] * noise_floor(t, c["x_lvdt"])
-    noise = rng.standard_normal((len(t), 10))
+    noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
     ticks = law + size * noise
     ticks -= ticks.mean(axis=1, keepdims=True)
     ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
     if sampled and seed:
-        ticks += size * rng.standard_normal((len(t), 1))
+        ticks += size * rng.standard_normal((len(law), 1))
     return np.asarray(c["i_cmd"][:, None] + ticks)
 
 
-def _sampled_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> bool:
-    """Where the log's current is that of the tick at the row and not the mean since the row before, put the mean in its place.
+SAMPLED = "the current of the tick at each row"
+BEFORE = "the mean of the ten ticks before the row"
 
-    The firmware's ``law`` on the logged stroke says which of the two it is, and what the nine other ticks added. Returns whether it was so.
+
+def _other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> str:
+    """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that in its place.
+
+    The firmware's ``law`` on the logged stroke says which it is instead (`SAMPLED`, `BEFORE`; "": neither), and what the other ticks added.
     """
     width = int(round(WINDOW / RASTER))
     use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
@@ -525,18 +578,20 @@ def _sampled_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal:
         e = e[np.isfinite(e).all(axis=1)]
         return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
 
-    mean, sample = law.mean(axis=1), law[:, -1]
-    if misfit(sample) >= 0.8 * misfit(mean):
-        return False
-    c["i_cmd"] = c["i_cmd"] + (mean - sample)
-    return True
+    mean = law.mean(axis=1)
+    others = {SAMPLED: law[:, -1], BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
+    what = min(others, key=lambda k: misfit(others[k]))
+    if misfit(others[what]) >= 0.9 * misfit(mean):
+        return ""
+    c["i_cmd"] = c["i_cmd"] + (mean - others[what])
+    return what
 
 
 def _servo(
     t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
-    ticks, hidden = _law(t, c, cal)
+    ticks, hidden, _ = _law(t, c, cal, machine)
     mean = ticks.mean(axis=1)
 
     def simulate(thetas: Array) -> Array:
@@ -548,9 +603,8 @@ def _servo(
     stage = Stage(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
-    # the noise of nine ticks a row went through the integral, and the model's has that of the line between the rows instead
-    walk = cal.k[fw.KI] * chain.TICK * np.hypot(3.0, 6.0) * noise_floor(t, c["x_lvdt"]) * np.sqrt(WINDOW / RASTER / 6.0)
-    stage.raster_error = np.array([np.hypot(hidden, walk)])
+    # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
+    stage.raster_error = np.sqrt(np.maximum(_rms(stage, hidden) ** 2 - noise_floor(t, hidden) ** 2, 0.0))
     return stage
 
 

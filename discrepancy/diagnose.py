@@ -44,7 +44,7 @@ SOFT = 0.02  # share of an effect's gain that counts as one nat in the probabili
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
-FLOOR_KNOWN = 0.02  # relative error of a noise floor that was estimated from the log
+FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
 # Share of the excess over the floor that a further effect must explain (less is one effect patching another's equation), and that
 # a model of the right kind may leave (its equation is not nature's): what is left then would not have earned a further effect either.
