@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -103,15 +104,20 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if name not in have:
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
-    if dt < 1.5 * RASTER and {"x_dem", "x_lvdt", "i_cmd"} <= columns.keys():
-        law, _, size = _law(t, have, cal, machine)
-        what = _other_current(t, have, law, run, cal)
-        sampled = what == SAMPLED
-        if what:
-            notes.append(f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and demand")
-            columns["i_cmd"] = have["i_cmd"]
-            law, _, size = _law(t, have, cal, machine)
-        have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, sampled, seed) for seed in (0, 1))
+    if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
+        smooth = _without_noise(t, have, machine)
+        if "x_dem" in columns:
+            law, off = _law(t, have, cal, smooth)
+            what = _other_current(t, have, law, run, cal)
+            if what:
+                notes.append(f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and demand")
+                columns["i_cmd"] = have["i_cmd"]
+                smooth = _without_noise(t, have, machine)
+                law, off = _law(t, have, cal, smooth)
+            have["law"], have["law_error"] = law, off
+            size = cal.k[fw.KP] * smooth.noise
+            have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, what == SAMPLED, seed) for seed in (0, 1))
+        have["stroke"] = smooth.stroke
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), _demand),
@@ -428,7 +434,7 @@ def _linkage(
 ) -> Stage:
     parameters, effects, rows, si = _declared("linkage", machine, present)
     dt = float(t[1] - t[0])
-    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+    x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     t_oil = np.ascontiguousarray(c["t_oil"])
     which = [STAGES.index(o) for o in outputs]
@@ -473,11 +479,18 @@ SMOOTH = (5, 9, 15, 25, 41)  # rows over which the stroke's noise may be smoothe
 SMOOTH_ORDER = 3
 
 
-def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> tuple[Array, float, int]:
-    """The stroke (mm) at the rows with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
+class _Smooth(NamedTuple):
+    """Stroke (mm) at the rows with less of the LVDT's noise; that noise's RMS (mm); the rows over which it was smoothed."""
 
-    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by leave-one-out errors. The
-    noise (mm) and that number of rows are returned too.
+    stroke: Array
+    noise: float
+    rows: int
+
+
+def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
+    """The logged stroke with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
+
+    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by leave-one-out errors.
     """
     dt = float(t[1] - t[0])
     p = machine.p.copy()
@@ -501,18 +514,18 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> tuple[Array
         left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
     _, rows, size, smooth = min(tried, key=lambda x: x[0])
-    return model + smooth, min(noise_floor(t, off), size), rows
+    return _Smooth(model + smooth, min(noise_floor(t, off), size), rows)
 
 
-def _law(t: Array, c: dict[str, Array], cal: Calibration, machine: Plant) -> tuple[Array, Array, float]:
+def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tuple[Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off the stroke.
 
-    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; by how much their mean is off
-    because the stroke between two rows is not logged: that error drawn anew, float64[rows]; the current (mA) that the LVDT's noise makes.
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and by how much their mean is
+    off because the stroke between two rows is not logged: that error drawn anew, float64[rows].
     """
-    x_dem, x, (smooth, size, rows) = c["x_dem"], c["x_lvdt"], _without_noise(t, c, machine)
+    x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
@@ -522,8 +535,8 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, machine: Plant) -> tup
     rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
     rate[:, -1] = (x_dem - before) / RASTER
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
-    stroke = CubicSpline(t, smooth)(when)
-    straight = np.interp(when.ravel(), t, smooth).reshape(when.shape)
+    stroke = CubicSpline(t, smooth.stroke)(when)
+    straight = np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
     stroke[:, -1] = straight[:, -1] = x
     error = ramp - stroke
 
@@ -532,10 +545,10 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, machine: Plant) -> tup
 
     # not known: the LVDT's noise in nine ticks, what smoothing lets through of it at the rows, and the way between them, which is known
     # as well as a straight line and a cubic agree
-    noise = size * np.random.default_rng(0).standard_normal((len(t), 10))
-    off = CubicSpline(t, savgol_filter(noise[:, -1], rows, SMOOTH_ORDER))(when) - noise + (stroke - straight)
+    noise = smooth.noise * np.random.default_rng(0).standard_normal((len(t), 10))
+    off = CubicSpline(t, savgol_filter(noise[:, -1], smooth.rows, SMOOTH_ORDER))(when) - noise + (stroke - straight)
     off[:, -1] = 0.0
-    return loop(error) + kff * rate, loop(off).mean(axis=1), kp * size
+    return loop(error) + kff * rate, loop(off).mean(axis=1)
 
 
 def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
@@ -591,8 +604,7 @@ def _servo(
     t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
-    ticks, hidden, _ = _law(t, c, cal, machine)
-    mean = ticks.mean(axis=1)
+    mean, hidden = c["law"].mean(axis=1), c["law_error"]
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
