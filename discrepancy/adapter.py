@@ -475,16 +475,18 @@ def _crossed(x: Array) -> Array:
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
 
 
-SMOOTH = (5, 9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
+SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
 SMOOTH_ORDER = 3
+BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
 
 
 class _Smooth(NamedTuple):
-    """Stroke (mm) at the rows with less of the LVDT's noise; that noise's RMS (mm); the rows over which it was smoothed."""
+    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as smoothing makes."""
 
     stroke: Array
     noise: float
-    rows: int
+    left: Array
+    distortion: Array
 
 
 def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
@@ -502,10 +504,11 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     actuator_run(np.ascontiguousarray(c["i_cmd"] * 1e-3), n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]),
                  dt, SUBSTEPS, p, s, out)  # fmt: skip
-    # the model's steps, calibrated: gain and lag of both directions, null
+    # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lag, null
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
-    near = [np.roll(side, k) for side in (np.maximum(step, 0.0), np.minimum(step, 0.0)) for k in (-1, 0, 1)]
-    parts = np.column_stack([*near, np.ones(len(t))])
+    bends = [0.0, *np.quantile(np.abs(step), BENDS)]
+    sides = [np.maximum(side * step - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
+    parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [np.ones(len(t))])
     model = np.cumsum(parts @ np.linalg.lstsq(parts, np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0]), rcond=None)[0])
     off = c["x_lvdt"] - model
     tried = []
@@ -514,7 +517,9 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
         left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
     _, rows, size, smooth = min(tried, key=lambda x: x[0])
-    return _Smooth(model + smooth, min(noise_floor(t, off), size), rows)
+    noise = min(noise_floor(t, off), size)
+    left = savgol_filter(noise * np.random.default_rng(1).standard_normal(len(t)), rows, SMOOTH_ORDER)
+    return _Smooth(model + smooth, noise, left, smooth - savgol_filter(off, rows // 4 * 2 + 1, SMOOTH_ORDER))
 
 
 def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tuple[Array, Array]:
@@ -522,8 +527,8 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
 
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off the stroke.
 
-    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and by how much their mean is
-    off because the stroke between two rows is not logged: that error drawn anew, float64[rows].
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and a draw of how much
+    they are off because the stroke between two rows is not logged, of the same shape.
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
@@ -543,12 +548,12 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
     def loop(e: Array) -> Array:
         return np.asarray(kp * e + ki * np.cumsum(e).reshape(e.shape) * chain.TICK)
 
-    # not known: the LVDT's noise in nine ticks, what smoothing lets through of it at the rows, and the way between them, which is known
-    # as well as a straight line and a cubic agree
+    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, and the way between them, which is known as well as a
+    # straight line and a cubic agree
     noise = smooth.noise * np.random.default_rng(0).standard_normal((len(t), 10))
-    off = CubicSpline(t, savgol_filter(noise[:, -1], smooth.rows, SMOOTH_ORDER))(when) - noise + (stroke - straight)
+    off = CubicSpline(t, smooth.left + smooth.distortion)(when) - noise + (stroke - straight)
     off[:, -1] = 0.0
-    return loop(error) + kff * rate, loop(off).mean(axis=1)
+    return loop(error) + kff * rate, loop(off)
 
 
 def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
@@ -560,8 +565,8 @@ def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal:
 
     law      of `_law`
     size     mA, RMS of the LVDT's noise in the current
-    sampled  the row's mean was worked out from its last tick and the noisy stroke, and is unknown by the noise of about one tick:
-             ``seed`` 0 takes it as it is, any other adds such an error
+    sampled  the row's mean was worked out by the law from its last tick, and is unknown by the law's error and the noise of about one
+             tick: ``seed`` 0 takes it as it is, any other adds such an error
     """
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
@@ -570,7 +575,7 @@ def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal:
     ticks -= ticks.mean(axis=1, keepdims=True)
     ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
     if sampled and seed:
-        ticks += size * rng.standard_normal((len(law), 1))
+        ticks += (c["law_error"].mean(axis=1) - c["law_error"][:, -1] + size * rng.standard_normal(len(law)))[:, None]
     return np.asarray(c["i_cmd"][:, None] + ticks)
 
 
@@ -604,7 +609,7 @@ def _servo(
     t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
-    mean, hidden = c["law"].mean(axis=1), c["law_error"]
+    mean, hidden = c["law"].mean(axis=1), c["law_error"].mean(axis=1)
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
@@ -617,6 +622,7 @@ def _servo(
     )
     # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
     stage.raster_error = np.sqrt(np.maximum(_rms(stage, hidden) ** 2 - noise_floor(t, hidden) ** 2, 0.0))
+    stage.lost = hidden[None]
     return stage
 
 

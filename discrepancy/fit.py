@@ -109,6 +109,14 @@ class Judge:
         parts = [self._whiten(self.stage.run(thetas[i : i + MAX_SETS])) for i in range(0, len(thetas), MAX_SETS)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
+    def lost(self) -> Array:
+        """Squared error that the log's raster makes expect in each sample, whitened: float64[outputs, samples], 1 on average."""
+        if self.stage.lost is None:
+            return np.ones_like(self.measured)
+        squares = self._whiten(self.measured - self.stage.lost[None])[0] ** 2
+        mean = squares.sum(axis=1) / np.maximum(self.valid.sum(axis=1), 1)
+        return 1.0 + squares - mean[:, None]
+
     def _whiten(self, model: Array) -> Array:
         e = np.where(self.valid, self.measured - model, 0.0)
         e[~np.isfinite(e)] = 0.0

@@ -76,7 +76,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
     """Error of every output against every condition of the stage, most telling first."""
     from scipy.stats import norm
 
-    e = judge.errors(fit.theta[None])[0]
+    e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
     raw = []
     looks = 0
@@ -89,9 +89,9 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
             edges = _edges(values[use])
             bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
             n = np.bincount(bin_of, minlength=len(edges) - 1)
-            ms = np.bincount(bin_of, e[k, use] ** 2, minlength=len(edges) - 1) / np.maximum(n, 1)
+            ms, floor = (np.bincount(bin_of, x[k, use], minlength=len(edges) - 1) / np.maximum(n, 1) for x in (e**2, lost))
             looks += len(n)
-            raw.append((k, output, name, edges, n, ms))
+            raw.append((k, output, name, edges, n, ms / np.maximum(floor, 1.0)))
     out = []
     z_limit = norm.isf(LEVEL / max(looks, 1))
     for k, output, name, edges, n, ms in raw:

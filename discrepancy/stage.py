@@ -68,6 +68,7 @@ class Stage:
               None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
+    lost      one draw of the error that the raster causes in each output, float64[outputs, samples]: it need not be even; None: it is
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these parameters: an effect may
               turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
@@ -90,6 +91,7 @@ class Stage:
     regimes: Mapping[str, Array] = field(default_factory=dict)
     regime_units: Mapping[str, str] = field(default_factory=dict)
     raster_error: Array | None = None
+    lost: Array | None = None
     hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
     noise: Callable[[Array, Array], float] | None = None
