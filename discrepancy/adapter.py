@@ -114,9 +114,11 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = _without_noise(t, have, machine)
                 law, off = _law(t, have, cal, smooth)
-            have["law"], have["law_error"] = law, off
+            sampled = what == SAMPLED
+            have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
+            unknown = off.mean(axis=1) - off[:, -1] if sampled else None
             size = cal.k[fw.KP] * smooth.noise
-            have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, what == SAMPLED, seed) for seed in (0, 1))
+            have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1))
         have["stroke"] = smooth.stroke
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
@@ -556,7 +558,7 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
     return loop(error) + kff * rate, loop(off)
 
 
-def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, sampled: bool, seed: int) -> Array:
+def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, unknown: Array | None, seed: int) -> Array:
     """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
 
     Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine ticks that nobody
@@ -565,8 +567,8 @@ def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal:
 
     law      of `_law`
     size     mA, RMS of the LVDT's noise in the current
-    sampled  the row's mean was worked out by the law from its last tick, and is unknown by the law's error and the noise of about one
-             tick: ``seed`` 0 takes it as it is, any other adds such an error
+    unknown  mA, such an error as the law left in each row's mean, where that was worked out from its last tick; with the noise of about
+             one tick it is added for any ``seed`` but 0
     """
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
@@ -574,8 +576,8 @@ def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal:
     ticks = law + size * noise
     ticks -= ticks.mean(axis=1, keepdims=True)
     ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
-    if sampled and seed:
-        ticks += (c["law_error"].mean(axis=1) - c["law_error"][:, -1] + size * rng.standard_normal(len(law)))[:, None]
+    if unknown is not None and seed:
+        ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
     return np.asarray(c["i_cmd"][:, None] + ticks)
 
 
@@ -609,7 +611,7 @@ def _servo(
     t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
-    mean, hidden = c["law"].mean(axis=1), c["law_error"].mean(axis=1)
+    mean, hidden = c["law"].mean(axis=1), c["law_error"]
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
