@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from discrepancy import fit as fitting
 from discrepancy.diagnose import Search, diagnose_stage
-from discrepancy.fit import DIFFERENCE, Judge
+from discrepancy.fit import DIFFERENCE, Fit, Judge
 from discrepancy.stage import Stage
 
 __all__ = ["in_scipy", "ours"]
@@ -30,8 +30,8 @@ def _recorded() -> Iterator[list[Any]]:
     jobs: list[Any] = []
     fit, screen = fitting.Judge.fitting, Search._screen
 
-    def note_fit(self: Judge, effects: tuple[str, ...], start: np.ndarray, iterations: int = 12, weights: Any = None) -> Any:
-        jobs.append((self, effects, np.array(start), iterations))
+    def note_fit(self: Judge, effects: tuple[str, ...], start: Any, iterations: int = 12, weights: Any = None) -> Any:
+        jobs.append((self, effects, np.array(start.theta if isinstance(start, Fit) else start), iterations))
         return fit(self, effects, start, iterations, weights)
 
     def note_screen(self: Search) -> Any:

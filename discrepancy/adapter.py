@@ -35,7 +35,7 @@ from plant.compiled import compiled
 from plant.effects import EFFECTS, ROW
 from plant.linkage import STAGES
 from plant.parameters import NAMES, derive, nominal
-from plant.stages import actuator_run, engine_run, linkage_run
+from plant.stages import actuator_run, engine_run, linkage_run, step_currents
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
@@ -395,23 +395,25 @@ def _actuator(
     p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
     x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
 
-    def simulate(thetas: Array, substeps: int = substeps, i: Array = i) -> Array:
+    logged = step_currents(i, dt, substeps)
+
+    def simulate(thetas: Array, current: Array = logged) -> Array:
         p = _lanes(machine, thetas, rows, si)
-        derive(p, dt / substeps, dt)
+        derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[chain.X] = s[chain.X_LVDT] = x[0]
-        out = np.empty((len(t), len(thetas)))
-        actuator_run(i, n_r, p_s, t_oil, dt, substeps, p, s, out, x, int(round(WINDOW / dt)))
-        return out.T[:, None, :] * 1e3
+        out = np.empty((len(thetas), 1, len(t)))
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)))
+        out *= 1e3
+        return out
 
     measured = np.where(run, c["x_lvdt"], np.nan)[None]
-    both = partial(_on_two_cores, simulate, least=8)  # a block of lanes
-    stage = Stage("actuator", outputs, ("mm",), parameters, effects, both, t, measured, window=WINDOW)
-    stage.finer = lambda thetas: simulate(thetas, 4 * substeps)
+    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
+    stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
     window = int(round(WINDOW / dt))
 
     def hidden(theta: Array) -> Array:
-        return _rms(stage, simulate(theta[None])[0] - simulate(theta[None], i=others)[0])
+        return _rms(stage, simulate(theta[None])[0] - simulate(theta[None], step_currents(others, dt, substeps))[0])
 
     stage.raster_error = np.array([QUASI_STATIC])
     if others is not i:
@@ -504,8 +506,8 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 1e3
     out = np.empty((len(t), 1))
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
-    actuator_run(np.ascontiguousarray(c["i_cmd"] * 1e-3), n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]),
-                 dt, SUBSTEPS, p, s, out)  # fmt: skip
+    current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
+    actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out)
     # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lag, null
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
     bends = [0.0, *np.quantile(np.abs(step), BENDS)]

@@ -90,6 +90,7 @@ class Judge:
         if self.window_start is not None:
             self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
             self._lengths = np.diff(np.append(self.window_start, len(t)))
+        self._per_floor = self.valid / self.floor[:, None]
 
     def _scales(self) -> Array:
         """Size of a usual change of each parameter, for difference steps and damping."""
@@ -106,8 +107,10 @@ class Judge:
     def errors(self, thetas: Array) -> Array:
         """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""
         thetas = np.atleast_2d(thetas)
-        parts = [self._whiten(self.stage.run(thetas[i : i + MAX_SETS])) for i in range(0, len(thetas), MAX_SETS)]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        out = np.empty((len(thetas), *self.measured.shape))
+        for i in range(0, len(thetas), MAX_SETS):
+            self._whiten(self.stage.run(thetas[i : i + MAX_SETS]), out[i : i + MAX_SETS])
+        return out
 
     def lost(self) -> Array:
         """Squared error that the log's raster makes expect in each sample, whitened: float64[outputs, samples], 1 on average."""
@@ -117,14 +120,20 @@ class Judge:
         mean = squares.sum(axis=1) / np.maximum(self.valid.sum(axis=1), 1)
         return 1.0 + squares - mean[:, None]
 
-    def _whiten(self, model: Array) -> Array:
-        e = np.where(self.valid, self.measured - model, 0.0)
-        e[~np.isfinite(e)] = 0.0
-        if self.window_start is not None and self._counts is not None:
-            mean = np.add.reduceat(e, self.window_start, axis=2) / self._counts
-            e -= np.repeat(mean, self._lengths, axis=2)
-            e[:, ~self.valid] = 0.0
-        return e / self.floor[:, None]
+    def _whiten(self, model: Array, out: Array | None = None) -> Array:
+        """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the cache."""
+        out = np.empty(np.shape(model)) if out is None else out
+        for e, m in zip(out, model, strict=True):
+            np.subtract(self.measured, m, out=e)
+            with np.errstate(invalid="ignore", over="ignore"):
+                finite = np.isfinite(e.sum())  # tells it in one quick pass
+            if not finite:
+                e[~np.isfinite(e)] = 0.0
+            if self.window_start is not None and self._counts is not None:
+                e *= self.valid
+                e -= np.repeat(np.add.reduceat(e, self.window_start, axis=1) / self._counts, self._lengths, axis=1)
+            e *= self._per_floor
+        return out
 
     def block_costs(self, e: Array) -> Array:
         """Sum of squares per block: float64[sets, blocks]."""
@@ -147,10 +156,11 @@ class Judge:
         high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [p.high for e in s.effects for p in e.parameters]
         return np.array(low), np.array(high)
 
-    def fit(self, effects: tuple[str, ...], start: Array, iterations: int = 12, weights: Array | None = None) -> Fit:
+    def fit(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Fit:
         """Fit the nominal parameters and those of ``effects`` from ``start``.
 
-        weights: of every block, default 1; 0 leaves a block out
+        start    parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
+        weights  of every block, default 1; 0 leaves a block out
         """
         return self.together([self.fitting(effects, start, iterations, weights)])[0]
 
@@ -185,11 +195,16 @@ class Judge:
                 at += len(thetas)
         return answers
 
-    def fitting(self, effects: tuple[str, ...], start: Array, iterations: int = 12, weights: Array | None = None) -> Task[Fit]:
+    def fitting(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Task[Fit]:
         """`fit` as a task for `together`."""
         s = self.stage
         free = self.columns(effects)
         low, high = self.bounds()
+        linear: tuple[Array, Array, Array] | None = None  # costs, gradients and normals of the blocks at theta
+        if isinstance(start, Fit):
+            if start.effects == effects:
+                linear = start.cost, start.gradients, start.normals
+            start = start.theta
         theta = np.clip(np.array(start, dtype=float), low, high)
         nominal = s.neutral()
         n_nominal = len(s.parameters)
@@ -198,7 +213,6 @@ class Judge:
         prior = np.array([3.0 / tolerance[c] ** 2 if c < n_nominal else 0.0 for c in free])
         scale = self.scale[free]
         block_weights = np.ones(self.n_blocks) if weights is None else weights
-        per_sample = np.repeat(np.sqrt(block_weights), np.diff(np.append(self.block_start, len(s.t))))
 
         def total(cost: Array, thetas: Array) -> Array:
             return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
@@ -207,21 +221,18 @@ class Judge:
         best: float | None = None
         known: Array | None = None  # errors at theta
         for _ in range(iterations):
-            thetas, derivative = self._differences(theta, free, scale, high, known)
-            e, jac = derivative((yield thetas))
-            here = float(total(self.block_costs(e[None]), theta[None])[0])
+            if linear is None:
+                thetas, derivative = self._differences(theta, free, scale, high, known)
+                linear = self._blocks(*derivative((yield thetas)))
+            cost, gradients, normals = linear
+            here = float(total(cost[None], theta[None])[0])
             if best is not None and best - here < 0.2 * len(free) and best >= here:
-                best = here
                 break
             best = here
             if len(free) == 0:
                 break
-            if weights is not None:
-                e, jac = e * per_sample, jac * per_sample
-            j2, r2 = jac.reshape(len(free), e.size), e.reshape(-1)
-            a = j2 @ j2.T + np.diag(prior * scale**2)
-            g = j2 @ r2 - prior * scale * (theta[free] - nominal[free])
-            del e, jac, j2, r2  # other tasks need the memory while this one waits
+            a = np.tensordot(block_weights, normals, 1) + np.diag(prior * scale**2)
+            g = block_weights @ gradients - prior * scale * (theta[free] - nominal[free])
             trials = []
             for factor in (0.01, 1.0, 300.0):
                 lam = damping * factor
@@ -235,12 +246,23 @@ class Judge:
             k = int(np.argmin(costs))
             if not costs[k] < here:
                 break
-            damping, theta, known = max(trials[k][0], 1e-9), thetas[k], errors[k].copy()
+            damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
             if here - costs[k] < 0.2 * max(1, len(free)):
                 break
-        thetas, derivative = self._differences(theta, free, scale, high, known)
-        e, jac = derivative((yield thetas))
-        return self._finish(effects, theta, free, prior, scale, nominal, low, high, e, jac)
+        if linear is None:
+            thetas, derivative = self._differences(theta, free, scale, high, known)
+            linear = self._blocks(*derivative((yield thetas)))
+        return self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear)
+
+    def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
+        """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives (`linearise`)."""
+        rows = np.concatenate([e[None], jac])
+        ends = np.append(self.block_start[1:], e.shape[1])
+        grams = np.zeros((self.n_blocks, len(rows), len(rows)))
+        for gram, i, j in zip(grams, self.block_start, ends, strict=True):
+            for o in range(len(e)):
+                gram += rows[:, o, i:j] @ rows[:, o, i:j].T
+        return grams[:, 0, 0], grams[:, 1:, 0], grams[:, 1:, 1:]
 
     def linearise(self, theta: Array, free: Array) -> tuple[Array, Array]:
         """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs, samples)."""
@@ -285,16 +307,9 @@ class Judge:
 
     def _finish(
         self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array,
-        e: Array, jac: Array,
+        cost: Array, gradients: Array, normals: Array,
     ) -> Fit:  # fmt: skip
         k = len(free)
-        cost = self.block_costs(e[None])[0]
-        gradients = np.empty((self.n_blocks, k))
-        normals = np.empty((self.n_blocks, k, k))
-        ends = np.append(self.block_start[1:], e.shape[1])
-        for b, (i, j) in enumerate(zip(self.block_start, ends, strict=True)):
-            jb, eb = jac[:, :, i:j].reshape(k, e[:, i:j].size), e[:, i:j].reshape(-1)
-            gradients[b], normals[b] = jb @ eb, jb @ jb.T
         # parameters at a bound do not move
         scaled_prior = prior * scale**2
         pinned = (theta[free] <= low[free]) | (theta[free] >= high[free])
@@ -306,10 +321,8 @@ class Judge:
             # at the solution the blocks' pulls and the prior's cancel; what is left of the pull is rounding and bounds
             pull = gm.sum(axis=0) - pm * ((theta[free] - nominal[free]) / scale)[move]
             total = nm.sum(axis=0) + np.diag(pm)
-            without = np.empty_like(gm)
-            for b in range(self.n_blocks):
-                a = total - nm[b] + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
-                without[b] = np.linalg.solve(a, pull - gm[b])
+            a = total - nm + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
+            without = np.linalg.solve(a, (pull - gm)[:, :, None])[:, :, 0]
             held = self._held_out(cost, theta, free, scale, low, high, move, gradients, normals)
             centre = without.mean(axis=0)
             spread = np.zeros(k)
@@ -340,9 +353,6 @@ class Judge:
         total, pull = a.sum(axis=0), g.sum(axis=0)
         ridge = 1e-6 * np.diag(np.maximum(np.diag(total), 1e-12))
         columns, size = free[mine], scale[mine]
-        held = np.empty_like(cost)
-        for b in range(len(cost)):
-            step = np.linalg.solve(total - a[b] + ridge, pull - g[b])
-            step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
-            held[b] = cost[b] - 2.0 * step @ g[b] + step @ a[b] @ step
-        return held
+        step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
+        step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
+        return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))

@@ -111,6 +111,7 @@ __all__ = [
     "rotor_step",
     "sample_lvdt",
     "stem_angle",
+    "straight_reading",
     "true_stroke",
     "unloaded_ring_angle",
     "vane_step",
@@ -205,11 +206,12 @@ def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
 def drive_substep(
     u, du, v, x, y, lagged, z, give, reading,
     i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop, limit, leakage,
-    force, excess, stribeck, stiffness, compliance, drag, low, high, lvdt_factor, lvdt_share, dt, loaded,
+    force, excess, stribeck, stiffness, compliance, drag, low, high, lvdt_factor, lvdt_share, dt, loaded, lossy, sticky,
 ):  # fmt: skip
     """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
 
     loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
+    lossy   False leaves out droop and leakage, sticky: stiction, which take long: for lanes where these are neutral
     """
     lagged = valve_lag.step(lagged, i, share)
     u, du = valve_step(u, du, lagged / rated, a11, a12, a21, a22)
@@ -220,11 +222,13 @@ def drive_substep(
         p_load = (load + z) * per_area
         against = p_load if opening > 0.0 else -p_load
         v = opening * (gain * math.sqrt(max(0.0, (p_s - against) * per_p_ref)))
-        v = supply_pressure_droop.step(v, p_s - against, droop)
+        if lossy:
+            v = supply_pressure_droop.step(v, p_s - against, droop)
         v = valve_flow_saturation.step(v, limit)
-        v = internal_leakage.step(v, p_load, drag * per_area, leakage)
+        if lossy:
+            v = internal_leakage.step(v, p_load, drag * per_area, leakage)
         travel = 0.5 * (v_before + v) * dt
-        level = piston_stiction.step(force, v, excess, stribeck)
+        level = piston_stiction.step(force, v, excess, stribeck) if sticky else force
         z_before, give_before = z, give
         z = piston_friction.step(z, travel, level, stiffness)
         give = oil_compressibility.step(load, v, compliance, drag)
@@ -262,7 +266,7 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
             overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, p[SUPPLY_PRESSURE_DROOP, j],
             p[VALVE_FLOW_SATURATION, j], p[INTERNAL_LEAKAGE, j], p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
             stiffness, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j], low, high,
-            p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0,
+            p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True,
         )  # fmt: skip
     s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
@@ -273,9 +277,13 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
 def measured_stroke(x, p, j, t_oil):
     """Return what the LVDT makes of a resting stroke ``x`` (m): its effects without its lags."""
     x = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j])
-    x = lvdt_gain.step(x, p[LVDT_GAIN, j])
-    x = lvdt_thermal_drift.step(x, t_oil, p[LVDT_THERMAL_DRIFT, j])
-    return lvdt_bias.step(x, p[LVDT_BIAS, j])
+    return straight_reading(x, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
+
+
+@inlined
+def straight_reading(x, gain, drift, bias, t_oil):
+    """`measured_stroke` behind the windings' curve."""
+    return lvdt_bias.step(lvdt_thermal_drift.step(lvdt_gain.step(x, gain), t_oil, drift), bias)
 
 
 @in_place

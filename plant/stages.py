@@ -11,6 +11,8 @@ The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numba import njit
@@ -33,7 +35,11 @@ from plant.chain import (
     LINKAGE_COMPLIANCE,
     LINKAGE_FRICTION,
     LINKAGE_WEAR,
+    LVDT_BIAS,
+    LVDT_GAIN,
     LVDT_LAG_ERROR,
+    LVDT_NONLINEARITY,
+    LVDT_THERMAL_DRIFT,
     N_R,
     OIL_COMPRESSIBILITY,
     OIL_VISCOSITY,
@@ -76,6 +82,7 @@ from plant.effects import (
     linkage_compliance,
     linkage_friction,
     linkage_wear,
+    lvdt_nonlinearity,
     oil_compressibility,
     oil_viscosity,
     pot_bias,
@@ -118,10 +125,10 @@ from plant.parameters import (
 from plant.play import play_step
 from plant.series import arctangent, tangent
 
-__all__ = ["actuator_run", "engine_run", "linkage_run"]
+__all__ = ["actuator_run", "engine_run", "linkage_run", "step_currents"]
 
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
-FEW = 2  # so few lanes or fewer are quicker one by one
+FEW = 1  # so few lanes or fewer are quicker one by one
 WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would be unrolled instead of vectorised
 SOME = 5  # so few lanes or fewer are quicker one by one there
 # effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
@@ -145,13 +152,29 @@ def engine_run(n_dem, dt, p, s, out):
     _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
 
 
-def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, window=0, behind=chain.TICK):
+def step_currents(i_cmd, dt, substeps, behind=chain.TICK):
+    """Return the current (A) of every step of `actuator_run`, float64[n, substeps]: [k, m] in step m after sample k - 1.
+
+    i_cmd     [k]: mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it; or [k, m]:
+              the current in each of the equal parts of that time
+    behind    s: how much later than logged the current acts; that of the tick at sample k drives the next millisecond
+
+    No step leads to sample 0: its row is the mean, under which the valve rests there.
+    """
+    if i_cmd.ndim == 1:
+        out = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
+    else:
+        out = _late(i_cmd, dt, substeps, behind)
+    out[0] = np.mean(i_cmd[0])
+    return out
+
+
+def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0):
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
-    i_cmd[k]          mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it;
-                      or i_cmd[k, m], the current in each of the equal parts of that time
-    behind            s: how much later than logged the current acts; that of the tick at sample k drives the next millisecond
+    current           A in every step, of `step_currents`
     n_r, p_s, t_oil   %, Pa, degC; their mean over the step is used
+    out               quickest where a lane's samples lie side by side in memory
     x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT saw it, so that
                       a small error of speed does not carry it away; without them it starts from ``s`` and runs free
 
@@ -162,22 +185,27 @@ def actuator_run(i_cmd, n_r, p_s, t_oil, dt, substeps, p, s, out, x_lvdt=None, w
         raise ValueError(f"window (={window}) needs x_lvdt")
     x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
     if window:
-        _rest(p, s, np.mean(i_cmd[0]), n_r[0])
-    h = dt / substeps
+        _rest(p, s, current[0, 0], n_r[0])
+    h = dt / current.shape[1]
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
-    if i_cmd.ndim == 1:
-        current = _currents(np.ascontiguousarray(i_cmd), dt, substeps, behind)
-    else:
-        current = _late(i_cmd, dt, substeps, behind)
-    # a block in which one lane carries a load computes it for all eight: those that do are put side by side
+    # what one lane of a block needs is computed for all eight: those that need the same are put side by side
     alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS)
-    order = np.lexsort((p[DRIVE_LOADED] != 0.0, alone))
+    lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
+    order = np.lexsort((p[VALVE_HYSTERESIS] != 0.0, p[PISTON_STICTION] != 0.0, lossy, p[DRIVE_LOADED] != 0.0, alone))
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
-    if wide:
-        _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[:wide])
+    work = [(_actuator_blocks, order[j : min(j + W, wide)]) for j in range(0, wide, W)]
     if wide < p.shape[1]:
-        _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x, window, order[wide:])
+        work.append((_actuator_lanes, order[wide:]))
+
+    def run(part):
+        part[0](current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, part[1])
+
+    if len(work) == 1:
+        run(work[0])
+    else:  # compiled code needs no interpreter; the costly ones, which come last, begin first
+        with ThreadPoolExecutor(min(len(work), os.cpu_count() or 1)) as threads:
+            list(threads.map(run, work[::-1]))
 
 
 def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
@@ -291,7 +319,7 @@ def _between(a, k):
 
 @_plain
 def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lanes):
-    """These ``lanes``, one after the other; current[k, m] in step m after sample k - 1."""
+    """These ``lanes``, one after the other; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
     for j in lanes:
@@ -312,29 +340,35 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
                     s[X, j] += shift
                     s[X_LVDT, j] += shift
                     s[READING, j] += shift
-            out[k, j] = measured_stroke(s[READING, j], p, j, t_oil[k]) if effects else s[READING, j]
+            out[j, k] = measured_stroke(s[READING, j], p, j, t_oil[k]) if effects else s[READING, j]
 
 
 # rows of a block's scratch array: state, what the step needs, what the sample needs
 (_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _H1, _H2, _H3, _H4) = range(13)
 (_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
 (_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
-(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _N_ROWS) = range(37, 43)
+(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _FLOW, _VISCOSITY, _ASYMMETRY, _P_REF, _AERO) = range(37, 47)
+(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _N_ROWS) = range(47, 52)
 
 
 @_plain
 def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, order):
-    """The lanes of ``order``, eight at a time; current[k, m] in step m after sample k - 1."""
+    """The lanes of ``order``, eight at a time; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
     b = np.empty((_N_ROWS, W))
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
-        loaded = sensed = False
+        loaded = lossy = sticky = memory = viscous = sensed = curved = False
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
+            lossy |= p[SUPPLY_PRESSURE_DROOP, q] != 0.0 or p[INTERNAL_LEAKAGE, q] != 0.0
+            sticky |= p[PISTON_STICTION, q] != 0.0
+            memory |= p[VALVE_HYSTERESIS, q] != 0.0
+            viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
+            curved |= p[LVDT_NONLINEARITY, q] != 0.0
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
             b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q]
             b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
@@ -350,21 +384,40 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             b[_STIFFNESS, j] = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, q])
             b[_COMPLIANCE, j], b[_DRAG, j] = p[OIL_COMPRESSIBILITY, q], p[OIL_COMPRESSIBILITY + 1, q]
             b[_PER_P_REF, j], b[_PER_AREA, j] = 1.0 / p[P_REF, q], 1.0 / p[AREA, q]
+            b[_FLOW, j], b[_VISCOSITY, j], b[_ASYMMETRY, j] = p[FLOW_GAIN, q], p[OIL_VISCOSITY, q], p[VALVE_GAIN_ASYMMETRY, q]
+            b[_P_REF, j], b[_AERO, j] = p[P_REF, q], p[AERO_LOAD, q]
+            b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
         for k in range(n):
             if k > 0:
                 supply, warm, speed = _between(p_s, k), _between(t_oil, k), _between(n_r, k)
-                for j in range(W):
-                    q = order[j0 + min(j, last - 1)]
-                    gain = oil_viscosity.step(p[FLOW_GAIN, q], warm, p[OIL_VISCOSITY, q])
-                    b[_EXTENDING, j], b[_RETRACTING, j] = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, q])
-                    b[_ROOT, j] = speed_factor(supply, 0.0, p[P_REF, q])
-                    b[_LOAD, j] = aero_load.step(speed, p[AERO_LOAD, q])
+                if viscous or k == 1:
+                    for j in range(W):
+                        gain = oil_viscosity.step(b[_FLOW, j], warm, b[_VISCOSITY, j])
+                        b[_EXTENDING, j], b[_RETRACTING, j] = valve_gain_asymmetry.step(gain, b[_ASYMMETRY, j])
                 if loaded:
+                    for j in range(W):
+                        b[_LOAD, j] = aero_load.step(speed, b[_AERO, j])
+                else:
+                    for j in range(W):
+                        b[_ROOT, j] = speed_factor(supply, 0.0, b[_P_REF, j])
+                if loaded and (memory or (lossy and sticky)):
                     for m in range(substeps):
-                        _block_substep(b, current[k, m], supply, h, True)
+                        _block_substep(b, current[k, m], supply, h, True, True, True, True)
+                elif lossy:
+                    for m in range(substeps):
+                        _block_substep(b, current[k, m], supply, h, True, True, False, False)
+                elif sticky:
+                    for m in range(substeps):
+                        _block_substep(b, current[k, m], supply, h, True, False, True, False)
+                elif loaded:
+                    for m in range(substeps):
+                        _block_substep(b, current[k, m], supply, h, True, False, False, False)
+                elif memory:
+                    for m in range(substeps):
+                        _block_substep(b, current[k, m], supply, h, False, False, False, True)
                 else:
                     for m in range(substeps):
-                        _block_substep(b, current[k, m], supply, h, False)
+                        _block_substep(b, current[k, m], supply, h, False, False, False, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
                     x = true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k])
@@ -375,12 +428,17 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
                         b[_X, j] += shift
                         b[_Y, j] += shift
                         b[_READING, j] += shift
+            for j in range(W):
+                b[_LOGGED, j] = b[_READING, j]
+            if curved:
+                for j in range(last):
+                    q = order[j0 + j]
+                    b[_LOGGED, j] = lvdt_nonlinearity.step(b[_READING, j], p[STROKE, q], p[LVDT_NONLINEARITY, q])
             if sensed:
-                for j in range(last):
-                    out[k, order[j0 + j]] = measured_stroke(b[_READING, j], p, order[j0 + j], t_oil[k])
-            else:
-                for j in range(last):
-                    out[k, order[j0 + j]] = b[_READING, j]
+                for j in range(W):
+                    b[_LOGGED, j] = chain.straight_reading(b[_LOGGED, j], b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j], t_oil[k])
+            for j in range(last):
+                out[order[j0 + j], k] = b[_LOGGED, j]
         for j in range(last):
             q = order[j0 + j]
             s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j]
@@ -389,18 +447,20 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
 
 
 @inlined
-def _block_substep(b, i_cmd, p_s, h, loaded):
-    """One plant step of every lane of the block."""
+def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
+    """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see `chain.drive_substep`."""
     for j in range(W):
         i = valve_null_bias.step(i_cmd, b[_BIAS, j])
-        y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j])
-        i = valve_hysteresis.mean(y1, y2, y3, y4)
+        y1 = y2 = y3 = y4 = i
+        if memory:
+            y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j])
+            i = valve_hysteresis.mean(y1, y2, y3, y4)
         u, du, v, x, y, lagged, z, give, reading = chain.drive_substep(
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j],
             i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
             b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j], b[_DROOP, j],
             b[_LIMIT, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j], b[_COMPLIANCE, j], b[_DRAG, j],
-            b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded,
+            b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded, lossy, sticky,
         )  # fmt: skip
         b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = u, du, v, x, y
         b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = y1, y2, y3, y4

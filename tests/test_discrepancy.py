@@ -532,3 +532,22 @@ def test_fits_made_together_are_those_made_one_by_one() -> None:
         alone = judge.fit((name,), theta)
         np.testing.assert_array_equal(fit.theta, alone.theta)
         np.testing.assert_array_equal(fit.held_out, alone.held_out)
+
+
+def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_simulating_there_again() -> None:
+    stage = integrator(7, null_bias=0.3)
+    judge, name, calls = Judge(stage, FLOOR), LIBRARY[0].name, []
+    begin = stage.neutral()
+    begin[stage.index()[name]] = LIBRARY[0].starts[0]
+    quick, run = judge.fit((name,), begin, 1), stage.run
+    stage.run = lambda thetas: calls.append(len(thetas)) or run(thetas)
+    again = judge.fit((name,), quick.theta, 8)
+    simulated = sum(calls)
+    calls.clear()
+    on = judge.fit((name,), quick, 8)
+    assert sum(calls) == simulated - len(quick.free) - 1
+    np.testing.assert_allclose(on.theta, again.theta, rtol=1e-9)
+    np.testing.assert_allclose(on.held_out, again.held_out, rtol=1e-9)
+    calls.clear()
+    other = judge.fit((), quick, 8)  # of other effects: only its parameters count
+    assert calls and other.effects == ()

@@ -67,7 +67,7 @@ from plant.layout import GEOMETRY, N_NOMINAL
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
 from plant.series import arctangent, tangent
-from plant.stages import SOME, W, actuator_run, engine_run, linkage_run
+from plant.stages import SOME, W, actuator_run, engine_run, linkage_run, step_currents
 from tables import InputError
 from tests.conftest import ROOT
 
@@ -291,7 +291,7 @@ def actuator_lanes(sets, base, n=SAMPLES):
     p, s = lanes_of(sets, base)
     derive(p, 2e-3, 1e-2)
     out, c = np.empty((n, len(sets))), {k: v[:n] for k, v in log().items()}
-    actuator_run(c["i_cmd"], c["n_r"], c["p_s"], c["t_oil"], 1e-2, 5, p, s, out, c["x_lvdt"], 500)
+    actuator_run(step_currents(c["i_cmd"], 1e-2, 5), c["n_r"], c["p_s"], c["t_oil"], 1e-2, p, s, out, c["x_lvdt"], 500)
     return out, s
 
 
@@ -407,6 +407,35 @@ def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
         assert np.allclose(linkage_lanes([sets[j]], base, 600)[0][:, :, 0], vanes[:, :, j], rtol=0.0, atol=1e-14)
 
 
+# what a block of the actuator's lanes leaves out, by the effects that its lanes have
+KINDS = {
+    "nothing": (
+        {}, {"valve_dead_band": {"half_width": 0.5}}, {"lvdt_nonlinearity": {"amplitude": 0.1}},
+        {"oil_viscosity": {"coefficient": 3e-3}},
+    ),
+    "hysteresis": ({"valve_hysteresis": {"width": 1.0, "spread": 0.6}}, {"lvdt_gain": {"factor": 1.02}}),
+    "load": ({"aero_load": {"force": 3000.0}}, {"piston_friction": {"force": 900.0}}, {"oil_compressibility": {"compliance": 0.1}}),
+    "losses": ({"supply_pressure_droop": {"droop": 20.0}}, {"internal_leakage": {"coefficient": 2.0}}),
+    "stiction": ({"piston_stiction": {"excess": 1500.0, "speed": 5.0}}, {"piston_friction": {"force": 900.0}}),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_block_that_leaves_out_what_its_lanes_lack_gives_the_bits_of_the_whole(kind: str) -> None:
+    loads = kind in ("load", "losses", "stiction")
+    base = machine_with(aero_load={"force": 2000.0}) if loads else build_plant()
+    sets = [KINDS[kind][j % len(KINDS[kind])] for j in range(W)]
+    x, s = actuator_lanes(sets, base, 600)
+    for j, effects in enumerate(sets):
+        alone, state = actuator_lanes([effects], base, 600)
+        assert np.array_equal(alone[:, 0], x[:, j])
+        # where no effect acts, the short way of a lane alone leaves the effects' own state as it was
+        assert np.array_equal(state[: chain.X_LVDT + 1, 0], s[: chain.X_LVDT + 1, j])
+    everything = {name: sizes for k in KINDS.values() for effects in k for name, sizes in effects.items()}
+    whole, _ = actuator_lanes([*sets[:-1], everything if loads else KINDS["hysteresis"][0]], base, 600)
+    assert np.array_equal(whole[:, :-1], x[:, :-1])
+
+
 @pytest.mark.parametrize("called, name, sizes", [
     ("ACTUATOR_BLOCKS", "valve_null_bias", {"bias": -0.5}),
     ("LINKAGE_BLOCKS", "linkage_wear", {"vgv1": 100.0}),
@@ -436,7 +465,7 @@ def test_stages_alone_reproduce_the_closed_loop_that_made_the_log() -> None:
     x, n_r, t_oil = c["x_lvdt"] * 1e-3, c["n_r"], c["t_oil"]
     p, s, out = machine.p.copy(), machine.start(x[0], n_r[0]), np.empty((n, 1))
     derive(p, 2e-3, 1e-2)
-    actuator_run(c["i_cmd"] * 1e-3, n_r, c["p_s"] * 1e6, t_oil, 1e-2, 5, p, s, out, x, 100)
+    actuator_run(step_currents(c["i_cmd"] * 1e-3, 1e-2, 5), n_r, c["p_s"] * 1e6, t_oil, 1e-2, p, s, out, x, 100)
     error = (out[:, 0] - x).reshape(-1, 100)
     error -= error.mean(axis=1, keepdims=True)
     assert np.sqrt(np.mean(error**2)) < 0.7e-6  # one count of the LVDT is 0.76 um
@@ -701,7 +730,7 @@ def test_slow_raster_keeps_the_delay_of_the_lvdt() -> None:
         derive(p, 2e-3, 1e-2)
         out = np.empty((n, 1))
         s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 0.002
-        actuator_run(i, same, np.full(n, 21e6), same, 1e-2, 5, p, s, out)
+        actuator_run(step_currents(i, 1e-2, 5), same, np.full(n, 21e6), same, 1e-2, p, s, out)
         assert s[chain.X, 0] - out[-1, 0] == pytest.approx(0.015 * delay, rel=1e-3)
 
 
