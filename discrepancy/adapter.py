@@ -290,7 +290,7 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
     for e in EFFECTS.values():
         if stage not in e.stages or e.name in present:
             continue
-        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high, 0.0, _vane(p.name)) for p in e.parameters)
+        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high, 0.0, _vane(p.name), shape=p.name in SHAPES) for p in e.parameters)
         effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
         rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
         si += [p.si for p in e.parameters]
@@ -304,6 +304,7 @@ def _vane(name: str) -> str | None:
 
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
+SHAPES = (*FIXED_START, "phase")
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
 
@@ -318,7 +319,7 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
     if name == "end_stop_shift":
         return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
     second = [FIXED_START.get(p.name, p.value) for p in ps]
-    mains = [i for i, p in enumerate(ps) if p.name not in ("speed", "distance", "phase", "spread")]
+    mains = [i for i, p in enumerate(ps) if p.name not in SHAPES]
     out = []
     for size in SIZES if ps[mains[0]].value == 0.0 else range(len(FACTORS)):
         for sign in (1.0, -1.0):
@@ -696,7 +697,7 @@ def _demand(
     held = []
     for e in effects:
         if e.name == "frame_hold":
-            phase = Parameter("phase", 0.0, "-", 0.0, 1.0)
+            phase = Parameter("phase", 0.0, "-", 0.0, 1.0, shape=True)
             starts = tuple((s[0], k * RASTER / s[0]) for s in e.starts for k in range(max(1, round(s[0] / RASTER))))
             e = Effect(e.name, (*e.parameters, phase), starts, e.excites)
         held.append(e)

@@ -38,9 +38,9 @@ __all__ = [
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
-RIVAL_SPREADS = 1.0  # fall of the error by which one of two effects that both earn their place beats the other
+RIVAL_NATS = 3.0  # odds of 20 to 1, by which one of two effects that both earn their place beats the other
+RIVAL_SPREADS = 0.3  # and the fall of the error: more than an effect that is not there gains by the errors of form of a clean log
 RIVAL_SHARE = 0.25  # and share of what it leaves above the floor itself: the library's equations are not nature's
-SOFT = 0.02  # share of an effect's gain that counts as one nat in the probabilities, for the same reason
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
@@ -453,7 +453,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
                 chosen, current, pruned = rest, without, True
                 break
 
-    effects = _name(judge, search, chosen, current, candidates, correlation)
+    effects, current = _name(judge, search, chosen, current, candidates, correlation)
     return _conclude(judge, base, current, effects, candidates, correlation, steps)
 
 
@@ -516,28 +516,51 @@ def rms_per_output(judge: Judge, fit: Fit) -> Array:
 
 def _name(
     judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate], correlation: float
-) -> list[Found]:
-    """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters."""
-    stage = judge.stage
-    out = []
+) -> tuple[list[Found], Fit]:
+    """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters.
+
+    Of effects that do equally well the one that has less freedom to do so is named. Returns the fit with the effects named, too.
+    """
     rng = np.random.default_rng(0)
     blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
     near = [c.effect for c in candidates if c.effect not in chosen][:10]
+    said: dict[str, tuple[float, list[str], float]] = {}
     for name in chosen:
-        rest = tuple(c for c in chosen if c != name)
+        rest = tuple(c for c in current.effects if c != name)
         alternatives = {name: current}
-        for f in search.best_of([(*rest, other) for other in near]):
+        for f in search.best_of([(*rest, other) for other in near if other not in rest]):
             alternatives[next(e for e in f.effects if e not in rest)] = f
-        score = {}
-        for m, f in alternatives.items():
-            score[m] = -0.5 * f.held_out[blocks].sum(axis=1) / correlation
-        table = np.array(list(score.values()))
+        freedom = {m: _freedom(judge, f, correlation) for m, f in alternatives.items()}
+        best = min(alternatives, key=lambda m: 0.5 * float(alternatives[m].held_out.sum()) / correlation + freedom[m])
+        current = alternatives[best]
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
-        rivals = [m for m, f in alternatives.items() if m != name and not _worse(judge, f, current, correlation)]
-        weight = np.exp((table - table.max(axis=0)) / max(1.0, SOFT * abs(nats)))
-        share = (weight / weight.sum(axis=0)).mean(axis=1)
-        out.append(Found(name, float(share[0]), _parameters(stage, current, name), rivals, nats))
-    return out
+        freer = {m: freedom[m] - freedom[best] for m in alternatives}
+        rivals = [m for m, f in alternatives.items() if m != best and not _worse(judge, f, current, correlation, freer[m])]
+        table = np.array([-0.5 * f.held_out[blocks].sum(axis=1) / correlation for f in alternatives.values()])
+        soft = max(RIVAL_NATS, RIVAL_SHARE * _left(judge, current, correlation)) / RIVAL_NATS
+        weight = np.exp((table - table.max(axis=0)) / soft - np.array(list(freedom.values()))[:, None])
+        share = dict(zip(alternatives, (weight / weight.sum(axis=0)).mean(axis=1), strict=True))
+        said[best] = (float(share[best]), rivals, nats)
+    return [Found(m, p, _parameters(judge.stage, current, m), rivals, nats) for m, (p, rivals, nats) in said.items()], current
+
+
+def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
+    """How much more the fit's parameters could have been than the data let them be, in nats: 0.5 log det(data + prior) / det(prior).
+
+    The price of flexibility in the marginal likelihood by Laplace's method. A shape may be anywhere within its bounds; what is known of a
+    size beforehand counts as one observation. MacKay (1992), Bayesian interpolation; Kass and Wasserman (1995), unit information.
+    """
+    # parameters that stayed at neutral, such as those of the other two vanes, made nothing possible
+    columns = [judge.stage.all_parameters()[c] for c in fit.free]
+    neutral = np.array([p.value for p in columns])
+    shape = np.array([p.shape for p in columns], dtype=bool)
+    used = (fit.prior > 0.0) | shape | (neutral < fit.low) | (neutral > fit.high)
+    scale = judge.scale[fit.free]
+    width = np.array([min(p.high - p.low, 1e3 * s) for p, s in zip(columns, scale, strict=True)])
+    data = fit.normals.sum(axis=0) / correlation
+    one = np.maximum(np.diag(data) * correlation / max(judge.n, 1), 1e-12)
+    prior = np.where(fit.prior > 0.0, fit.prior * scale**2, np.where(shape, 12.0 * (scale / width) ** 2, one))[used]
+    return 0.5 * float(np.linalg.slogdet(data[np.ix_(used, used)] + np.diag(prior))[1] - np.log(prior).sum())
 
 
 def _parameters(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object]]:
@@ -556,11 +579,16 @@ def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
     return [Found(name, 1.0, _parameters(judge.stage, fit, name), [], 0.0) for name in effects]
 
 
-def _worse(judge: Judge, other: Fit, best: Fit, correlation: float) -> bool:
-    """True when the log can tell that ``other`` explains it less well than ``best``."""
+def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float) -> bool:
+    """True when the log can tell that ``other`` is not it: it explains less than ``best``, or no more though it is ``freer`` (nats)."""
     nats, spreads = gain(judge, other, best, correlation)
-    left = 0.5 * float(best.held_out.sum() - judge.n) / correlation
-    return nats > max(NATS, RIVAL_SHARE * left) and spreads > RIVAL_SPREADS
+    less = nats > max(RIVAL_NATS, RIVAL_SHARE * _left(judge, best, correlation)) and spreads > RIVAL_SPREADS
+    return less or min(nats, 0.0) + freer > RIVAL_NATS
+
+
+def _left(judge: Judge, fit: Fit, correlation: float) -> float:
+    """What the fit leaves above the noise floor, as well as that is known, in nats: its equations are not nature's."""
+    return 0.5 * (float(fit.held_out.sum()) - judge.n * (1.0 + FLOOR_KNOWN) ** 2) / correlation
 
 
 def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:

@@ -29,6 +29,7 @@ class Parameter:
     tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
     scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
+    shape      of an effect's parameter: it says how the effect acts, not how much, and has no neutral value of its own
     """
 
     name: str
@@ -39,6 +40,7 @@ class Parameter:
     tolerance: float = 0.0
     output: str | None = None
     scale: float = 0.0
+    shape: bool = False
 
 
 @dataclass(frozen=True)
