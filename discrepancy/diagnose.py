@@ -52,6 +52,7 @@ LEAST_SHARE = 0.15
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
+SCREENED = 32  # starts simulated at one time
 LEFT_FLOORS = 3.0  # noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
 
 
@@ -136,16 +137,12 @@ class Search:
         e0, jac = judge.linearise(self.base.theta, free)
         flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
-        costs = []
-        for i in range(0, len(thetas), 16):
-            errors = judge.errors(np.array(thetas[i : i + 16])).reshape(len(thetas[i : i + 16]), -1)
-            for r in errors:
-                fall = 0.0
-                if len(free):
-                    pull = flat @ r
-                    step = np.linalg.solve(a, pull)
-                    fall = float(2.0 * step @ pull - step @ a @ step)
-                costs.append(float(r @ r) - fall)
+        costs: list[float] = []
+        for i in range(0, len(thetas), SCREENED):
+            errors = judge.errors(np.array(thetas[i : i + SCREENED])).reshape(-1, e0.size)
+            pull = errors @ flat.T
+            step = np.linalg.solve(a, pull.T).T
+            costs += (np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ a) * step, axis=1)).tolist()
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         for name in dict.fromkeys(owner):
@@ -173,7 +170,7 @@ class Search:
                 fits.append((yield from self.judge.fitting((name,), start, 3)))
             best = min(fits, key=lambda f: float(f.cost.sum()))
             if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
-                best = yield from self.judge.fitting((name,), best.theta, 8)
+                best = yield from self.judge.fitting((name,), best, 8)
                 best = yield from self._refine(name, best)
             self.fits[key] = best
             self.tick()
@@ -232,7 +229,7 @@ class Search:
             self.fits[key] = yield from self.judge.fitting(tuple(effects), begins[int(np.argmin(costs))], 3)
             self.tick()
         if finished and key not in self.finished:
-            self.fits[key] = yield from self.judge.fitting(tuple(effects), self.fits[key].theta, 8)
+            self.fits[key] = yield from self.judge.fitting(tuple(effects), self.fits[key], 8)
             self.finished.add(key)
             self.tick()
         return self.fits[key]
@@ -258,8 +255,8 @@ def correlation_of(judge: Judge, fit: Fit) -> float:
         if power <= 0.0:
             continue
         total = 1.0
-        for lag in range(1, min(400, len(row) // 4)):
-            rho = float(row[:-lag] @ row[lag:]) / power
+        spectrum = np.fft.rfft(row, 2 * len(row))
+        for rho in np.fft.irfft(np.abs(spectrum) ** 2)[1 : min(400, len(row) // 4)] / power:
             if rho <= 0.05:
                 break
             total += 2.0 * rho * rho  # squares of errors are correlated by rho squared
