@@ -626,7 +626,8 @@ def _servo(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
     # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
-    stage.raster_error = np.sqrt(np.maximum(_rms(stage, hidden) ** 2 - noise_floor(t, hidden) ** 2, 0.0))
+    seen = min(noise_floor(t, hidden), noise_floor(t, stage.measured[0] - mean))
+    stage.raster_error = np.sqrt(np.maximum(_rms(stage, hidden) ** 2 - seen**2, 0.0))
     stage.lost = hidden[None]
     return stage
 
@@ -669,7 +670,6 @@ def _demand(
     _, effects, _, _ = _declared("demand", machine, present)
     n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
     starting = [float(np.interp(n_r[0], cal.table[0], cal.table[r])) * 1e3 for r in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)]
-    rising = abs(starting[0] - c["x_dem"][0]) <= abs(starting[1] - c["x_dem"][0])
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
 
     def value(theta: Array, name: str, neutral: float) -> float:
@@ -682,7 +682,9 @@ def _demand(
             factor = value(theta, "trend_threshold_error", 1.0)
             k[fw.TREND_RATE_ON] *= factor
             k[fw.TREND_CHANGE] *= factor
-            table[1:] += value(theta, "schedule_error", 0.0) * 1e-3
+            offset = value(theta, "schedule_error", 0.0)
+            table[1:] += offset * 1e-3
+            rising = abs(starting[0] + offset - c["x_dem"][0]) <= abs(starting[1] + offset - c["x_dem"][0])
             z = new_state()
             z[fw.DEMAND_SEEN] = 1.0
             z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if rising else (-1.0, 0.0)

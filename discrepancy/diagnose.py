@@ -31,8 +31,10 @@ __all__ = [
     "diagnose_stage",
     "found_of",
     "gain",
+    "parameters_of",
     "recalibrated",
     "rms_per_output",
+    "significant",
 ]
 
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
@@ -68,13 +70,14 @@ class Candidate:
 
 @dataclass
 class Found:
-    """An effect named as missing."""
+    """An effect named as missing; ``fits``: the stage's fit with it, and with each rival in its place."""
 
     effect: str
     probability: float
     parameters: dict[str, dict[str, object]]
     rivals: list[str]
     nats: float
+    fits: dict[str, Fit] = field(default_factory=dict, repr=False)
 
 
 @dataclass
@@ -234,6 +237,10 @@ class Search:
             self.tick()
         return self.fits[key]
 
+    def beside(self, rest: Sequence[str]) -> list[Fit]:
+        """Fits made with one effect more than ``rest``."""
+        return [f for key, f in self.fits.items() if len(key) == len(rest) + 1 and key.issuperset(rest)]
+
     def best_of(self, sets: Sequence[tuple[str, ...]]) -> list[Fit]:
         """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
         quick = self.judge.together([self._joined(s, False) for s in sets])
@@ -359,7 +366,7 @@ def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: St
         if not idle:
             break
         chosen, current = rest[idle[0]], without[idle[0]]
-    effects = [replace(f, parameters=_parameters(stage, current, f.effect)) for f in said.effects if f.effect in chosen]
+    effects = [replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen]
     steps = [("nominal", float(np.sqrt(nominal.held_out.sum() / max(judge.n, 1))))]
     if chosen:
         steps.append((" + ".join(chosen), float(np.sqrt(current.held_out.sum() / max(judge.n, 1)))))
@@ -450,7 +457,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
                 chosen, current, pruned = rest, without, True
                 break
 
-    effects, current = _name(judge, search, chosen, current, candidates, correlation)
+    effects, current = _name(judge, search, chosen, current, candidates)
     return _conclude(judge, base, current, effects, candidates, correlation, steps)
 
 
@@ -512,7 +519,7 @@ def rms_per_output(judge: Judge, fit: Fit) -> Array:
 
 
 def _name(
-    judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate], correlation: float
+    judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate]
 ) -> tuple[list[Found], Fit]:
     """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters.
 
@@ -520,11 +527,15 @@ def _name(
     """
     rng = np.random.default_rng(0)
     blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
-    near = [c.effect for c in candidates if c.effect not in chosen][:10]
-    said: dict[str, tuple[float, list[str], float]] = {}
+    leading = [c.effect for c in candidates if c.effect not in chosen][:10]
+    correlation = correlation_of(judge, current)
+    said: dict[str, tuple[float, list[str], float, dict[str, Fit]]] = {}
     for name in chosen:
         rest = tuple(c for c in current.effects if c != name)
         alternatives = {name: current}
+        # those that lead alone, and those that did best beside the rest, where that was tried
+        tried = sorted((f for f in search.beside(rest) if name not in f.effects), key=lambda f: float(f.held_out.sum()))[:5]
+        near = [*leading, *(m for f in tried for m in f.effects if m not in (*rest, *leading))]
         for f in search.best_of([(*rest, other) for other in near if other not in rest]):
             alternatives[next(e for e in f.effects if e not in rest)] = f
         freedom = {m: _freedom(judge, f, correlation) for m, f in alternatives.items()}
@@ -537,8 +548,9 @@ def _name(
         soft = max(RIVAL_NATS, RIVAL_SHARE * _left(judge, current, correlation)) / RIVAL_NATS
         weight = np.exp((table - table.max(axis=0)) / soft - np.array(list(freedom.values()))[:, None])
         share = dict(zip(alternatives, (weight / weight.sum(axis=0)).mean(axis=1), strict=True))
-        said[best] = (float(share[best]), rivals, nats)
-    return [Found(m, p, _parameters(judge.stage, current, m), rivals, nats) for m, (p, rivals, nats) in said.items()], current
+        said[best] = (float(share[best]), rivals, nats, {m: alternatives[m] for m in (best, *rivals)})
+    found = [Found(m, p, parameters_of(judge.stage, current, m), rivals, nats, fits) for m, (p, rivals, nats, fits) in said.items()]
+    return found, current
 
 
 def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
@@ -560,7 +572,7 @@ def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
     return 0.5 * float(np.linalg.slogdet(data[np.ix_(used, used)] + np.diag(prior))[1] - np.log(prior).sum())
 
 
-def _parameters(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object]]:
+def parameters_of(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object]]:
     """Fitted parameters of an effect with their 90 % intervals."""
     columns = stage.index()[name]
     out: dict[str, dict[str, object]] = {}
@@ -573,7 +585,7 @@ def _parameters(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object
 
 def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
     """Effects of a fit that was asked for: no rivals looked for, probability 1 by decree."""
-    return [Found(name, 1.0, _parameters(judge.stage, fit, name), [], 0.0) for name in effects]
+    return [Found(name, 1.0, parameters_of(judge.stage, fit, name), [], 0.0) for name in effects]
 
 
 def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float) -> bool:

@@ -7,12 +7,22 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from discrepancy.diagnose import Search, StageDiagnosis, diagnose_stage, found_of, recalibrated, rms_per_output
+from discrepancy.diagnose import (
+    Search,
+    StageDiagnosis,
+    correlation_of,
+    diagnose_stage,
+    found_of,
+    parameters_of,
+    recalibrated,
+    rms_per_output,
+    significant,
+)
 from discrepancy.fit import Fit, Judge
 from discrepancy.locate import Shape, shape
 from discrepancy.stage import Array, Stage, StageError, noise_of
@@ -96,10 +106,57 @@ def diagnose(
             if progress:
                 progress((n + 1) / len(order))
     results = [done[i][0] for i in range(len(_WORK))]
+    _agree({s.name: s for s in stages}, results)
     shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
     verdicts = {d.verdict for d in results}
     verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
     return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
+    """Let the stages settle each other's rivals: an effect that acts in two stages must do so in both by the same amount.
+
+    Among the rivals of one place those go that another stage contradicts; those stay alone that another stage names too.
+    """
+    for d in results:
+        for k, f in enumerate(d.effects):
+            if not f.rivals:
+                continue
+            options = [f.effect, *f.rivals]
+            elsewhere = {m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()] for m in options}
+            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])] or options
+            seconded = [m for m in left if any(m in (g.effect, *g.rivals) for o in elsewhere[m] for g in o.effects)]
+            left = seconded or left
+            if left == options:
+                continue
+            name, fit = left[0], f.fits[left[0]]
+            if name != f.effect:
+                judge = Judge(stages[d.stage], d.floor)
+                fit = judge.fit(fit.effects, fit.theta, 4)  # a long log's rivals were fitted to an excerpt
+                d.final, d.error_after = fit, rms_per_output(judge, fit)
+                d.recalibrated = recalibrated(stages[d.stage], fit)
+                for other in d.effects:
+                    if other is not f:
+                        other.parameters = parameters_of(stages[d.stage], fit, other.effect)
+            probability = f.probability if len(left) > 1 else 1.0
+            d.effects[k] = replace(
+                f, effect=name, rivals=left[1:], probability=probability, parameters=parameters_of(stages[d.stage], fit, name)
+            )
+
+
+def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str) -> bool:
+    """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too."""
+    stage = stages[other.stage]
+    mine, theirs = stages[d.stage].index()[effect], stage.index()[effect]
+    at = [int(np.flatnonzero(fit.free == c)[0]) for c in range(mine.start, mine.stop)]
+    size = np.clip(other.final.theta[theirs], fit.low[at], fit.high[at])
+    if np.array_equal(size, other.final.theta[theirs]):
+        return True
+    judge = Judge(stage, other.floor)
+    start = other.final.theta.copy()
+    start[theirs] = size
+    held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
+    return not significant(judge, held, other.final, correlation_of(judge, other.final))
 
 
 def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
