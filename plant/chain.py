@@ -164,7 +164,7 @@ POT_BIAS_ERROR = ROW["pot_bias"]
 # ---- and in s
 CURRENT = STATE_ROW["valve_hysteresis"]  # four of A: the valve's memory
 LAGGED = STATE_ROW["valve_lag"]  # A, behind the valve's lag
-FRICTION = STATE_ROW["piston_friction"]  # N
+FRICTION = STATE_ROW["piston_friction"]  # N: force, off centre
 GIVE = STATE_ROW["oil_compressibility"]  # m
 READING = STATE_ROW["lvdt_lag"]  # m, stroke behind both lags of the LVDT
 BRISTLE = STATE_ROW["linkage_friction"]  # three of -1..1
@@ -204,9 +204,9 @@ def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
 
 @inlined
 def drive_substep(
-    u, du, v, x, y, lagged, z, give, reading,
+    u, du, v, x, y, lagged, z, off, give, reading,
     i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop, limit, leakage,
-    force, excess, stribeck, stiffness, compliance, drag, low, high, lvdt_factor, lvdt_share, dt, loaded, lossy, sticky,
+    force, excess, stribeck, stiffness, compliance, drag, per_stroke, low, high, lvdt_factor, lvdt_share, dt, loaded, lossy, sticky,
 ):  # fmt: skip
     """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
 
@@ -230,16 +230,19 @@ def drive_substep(
         travel = 0.5 * (v_before + v) * dt
         level = piston_stiction.step(force, v, excess, stribeck) if sticky else force
         z_before, give_before = z, give
-        z = piston_friction.step(z, travel, level, stiffness)
+        r = piston_friction.off_middle(x, per_stroke)
+        k = 1.0 - r * r
+        z = piston_friction.step(z, travel, level, stiffness / k)
+        off, back = piston_friction.recentre(off, r * (z - z_before), abs(travel) * stiffness * (0.5 * per_area / p_s))
         give = oil_compressibility.step(load, v, compliance, drag)
-        travel += (give - give_before) - (z - z_before) / stiffness
+        travel += (give - give_before) - (k * (z - z_before) + r * back) / stiffness
     else:
         v = valve_flow_saturation.step(opening * (gain * root), limit)
         travel = 0.5 * (v_before + v) * dt
     x = min(max(x + travel, low), high)
     y += lvdt_factor * (x - y)
     reading = lvdt_lag.step(reading, y, lvdt_share)
-    return u, du, v, x, y, lagged, z, give, reading
+    return u, du, v, x, y, lagged, z, off, give, reading
 
 
 @in_place
@@ -258,19 +261,19 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
     per_p_ref, per_area = 1.0 / p[P_REF, j], 1.0 / p[AREA, j]
     stiffness = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, j])
     u, du, v, x, y = s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j]
-    lagged, z, give, reading = s[LAGGED, j], s[FRICTION, j], s[GIVE, j], s[READING, j]
+    lagged, z, off, give, reading = s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j]
     for _ in range(substeps):
-        u, du, v, x, y, lagged, z, give, reading = drive_substep(
-            u, du, v, x, y, lagged, z, give, reading,
+        u, du, v, x, y, lagged, z, off, give, reading = drive_substep(
+            u, du, v, x, y, lagged, z, off, give, reading,
             i, p[RATED_CURRENT, j], p[VALVE_SHARE, j], p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j], p[VALVE_A22, j],
             overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, p[SUPPLY_PRESSURE_DROOP, j],
             p[VALVE_FLOW_SATURATION, j], p[INTERNAL_LEAKAGE, j], p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
-            stiffness, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j], low, high,
+            stiffness, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j], 1.0 / p[STROKE, j], low, high,
             p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True,
         )  # fmt: skip
     s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
-    s[LAGGED, j], s[FRICTION, j], s[GIVE, j], s[READING, j] = lagged, z, give, reading
+    s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j] = lagged, z, off, give, reading
 
 
 @in_place

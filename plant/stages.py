@@ -348,7 +348,7 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 (_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
 (_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
 (_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _FLOW, _VISCOSITY, _ASYMMETRY, _P_REF, _AERO) = range(37, 47)
-(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _N_ROWS) = range(47, 52)
+(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _N_ROWS) = range(47, 54)
 
 
 @_plain
@@ -370,7 +370,8 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             curved |= p[LVDT_NONLINEARITY, q] != 0.0
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
-            b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q]
+            b[_LAGGED, j], b[_Z, j], b[_OFF, j] = s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q]
+            b[_GIVE, j], b[_READING, j] = s[GIVE, q], s[READING, q]
             b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
             b[_BIAS, j], b[_WIDTH, j], b[_SPREAD, j] = p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q], p[VALVE_HYSTERESIS + 1, q]
             b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
@@ -385,7 +386,7 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             b[_COMPLIANCE, j], b[_DRAG, j] = p[OIL_COMPRESSIBILITY, q], p[OIL_COMPRESSIBILITY + 1, q]
             b[_PER_P_REF, j], b[_PER_AREA, j] = 1.0 / p[P_REF, q], 1.0 / p[AREA, q]
             b[_FLOW, j], b[_VISCOSITY, j], b[_ASYMMETRY, j] = p[FLOW_GAIN, q], p[OIL_VISCOSITY, q], p[VALVE_GAIN_ASYMMETRY, q]
-            b[_P_REF, j], b[_AERO, j] = p[P_REF, q], p[AERO_LOAD, q]
+            b[_P_REF, j], b[_AERO, j], b[_PER_STROKE, j] = p[P_REF, q], p[AERO_LOAD, q], 1.0 / p[STROKE, q]
             b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
         for k in range(n):
             if k > 0:
@@ -442,7 +443,8 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
         for j in range(last):
             q = order[j0 + j]
             s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j]
-            s[LAGGED, q], s[FRICTION, q], s[GIVE, q], s[READING, q] = b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j]
+            s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q] = b[_LAGGED, j], b[_Z, j], b[_OFF, j]
+            s[GIVE, q], s[READING, q] = b[_GIVE, j], b[_READING, j]
             s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j]
 
 
@@ -455,16 +457,16 @@ def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
         if memory:
             y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j])
             i = valve_hysteresis.mean(y1, y2, y3, y4)
-        u, du, v, x, y, lagged, z, give, reading = chain.drive_substep(
-            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j],
+        u, du, v, x, y, lagged, z, off, give, reading = chain.drive_substep(
+            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j],
             i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
             b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j], b[_DROOP, j],
             b[_LIMIT, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j], b[_COMPLIANCE, j], b[_DRAG, j],
-            b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded, lossy, sticky,
+            b[_PER_STROKE, j], b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded, lossy, sticky,
         )  # fmt: skip
         b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = u, du, v, x, y
         b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = y1, y2, y3, y4
-        b[_LAGGED, j], b[_Z, j], b[_GIVE, j], b[_READING, j] = lagged, z, give, reading
+        b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j] = lagged, z, off, give, reading
 
 
 # ---- linkage ------------------------------------------------------------------------------------------------------------------------
