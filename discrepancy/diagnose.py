@@ -305,7 +305,7 @@ def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bo
 
 
 def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
-    """Search the stage's library for what is missing; see `_diagnose`.
+    """Search the stage's library for what is missing; see `_search`.
 
     floor  RMS of each output's error when nothing is missing
     keep   samples that count
@@ -386,19 +386,22 @@ def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable
 
     A gross effect makes the nominal model's error move so fast that it passes for noise.
     """
-    d = _diagnose(stage, floor, keep, tick)
-    for _ in range(2):
-        if stage.noise is None:
+    for attempt in range(3):
+        search, current, candidates, correlation, steps = _search(stage, floor, keep, tick)
+        if stage.noise is None or attempt == 2:
             break
-        lower = noise_of(stage, d.final.theta)
-        if not np.any(lower < 0.9 * d.floor):
+        lower = noise_of(stage, current.theta)
+        if not np.any(lower < 0.9 * floor):
             break
-        d = _diagnose(stage, np.minimum(lower, d.floor), keep, tick)
-    return d
+        floor = np.minimum(lower, floor)
+    effects, current = _name(search, current, candidates)
+    return _conclude(search.judge, search.base, current, effects, candidates, correlation, steps)
 
 
-def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
-    """Search the stage's library for what is missing."""
+def _search(
+    stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None
+) -> tuple[Search, Fit, list[Candidate], float, list[tuple[str, float]]]:
+    """Search the stage's library for what is missing: the search, the best model, all effects alone, correlation of errors, steps."""
     judge = Judge(stage, floor, keep)
     search = Search(judge, tick)
     base = search.base
@@ -457,8 +460,7 @@ def _diagnose(stage: Stage, floor: Array, keep: Array | None = None, tick: Calla
                 chosen, current, pruned = rest, without, True
                 break
 
-    effects, current = _name(judge, search, chosen, current, candidates)
-    return _conclude(judge, base, current, effects, candidates, correlation, steps)
+    return search, current, candidates, correlation, steps
 
 
 def _conclude(
@@ -518,13 +520,12 @@ def rms_per_output(judge: Judge, fit: Fit) -> Array:
     return np.sqrt(np.sum(e * e, axis=1) / counts) * inflation
 
 
-def _name(
-    judge: Judge, search: Search, chosen: tuple[str, ...], current: Fit, candidates: list[Candidate]
-) -> tuple[list[Found], Fit]:
-    """For each effect of the chosen set: which others would do as well in its place, how probable it is, its parameters.
+def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[list[Found], Fit]:
+    """For each effect of the model found: which others would do as well in its place, how probable it is, its parameters.
 
     Of effects that do equally well the one that has less freedom to do so is named. Returns the fit with the effects named, too.
     """
+    judge, chosen = search.judge, current.effects
     rng = np.random.default_rng(0)
     blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
     leading = [c.effect for c in candidates if c.effect not in chosen][:10]
