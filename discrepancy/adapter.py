@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
@@ -290,7 +291,10 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
     for e in EFFECTS.values():
         if stage not in e.stages or e.name in present:
             continue
-        ps = tuple(Parameter(p.name, p.neutral, p.unit, p.low, p.high, 0.0, _vane(p.name), shape=p.name in SHAPES) for p in e.parameters)
+        ps = tuple(
+            Parameter(p.name, p.neutral, p.unit, p.low, p.high, KNOWN.get(p.name, 0.0) * p.neutral, _vane(p.name), shape=p.name in SHAPES)
+            for p in e.parameters
+        )
         effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
         rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
         si += [p.si for p in e.parameters]
@@ -305,6 +309,7 @@ def _vane(name: str) -> str | None:
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
 SHAPES = (*FIXED_START, "phase")
+KNOWN = {"drag": 0.5}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
 
@@ -389,7 +394,8 @@ def _actuator(
 ) -> Stage:
     parameters, effects, rows, si = _declared("actuator", machine, present)
     dt = float(t[1] - t[0])
-    substeps = SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
+    # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
+    substeps = c["ticks"].shape[1] if "ticks" in c else SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
     i = np.ascontiguousarray(c.get("ticks", c["i_cmd"]) * 1e-3)
     others = np.ascontiguousarray(c["other_ticks"] * 1e-3) if "other_ticks" in c else i
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
@@ -576,12 +582,15 @@ def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal:
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
-    ticks = law + size * noise
-    ticks -= ticks.mean(axis=1, keepdims=True)
-    ticks[~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])] = 0.0
+    slow = uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH[-1])  # the integral's constant
+    ticks = law + slow[:, None] + size * noise
+    # the row's own tick is known; the others' noise was such that the mean comes out
+    ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
+    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])
+    ticks[alone] = c["i_cmd"][alone, None]
     if unknown is not None and seed:
         ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
-    return np.asarray(c["i_cmd"][:, None] + ticks)
+    return np.asarray(ticks)
 
 
 SAMPLED = "the current of the tick at each row"

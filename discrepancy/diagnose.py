@@ -140,11 +140,12 @@ class Search:
         e0, jac = judge.linearise(self.base.theta, free)
         flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
+        room = [(b[free] - self.base.theta[free]) / judge.scale[free] for b in judge.bounds()]
         costs: list[float] = []
         for i in range(0, len(thetas), SCREENED):
             errors = judge.errors(np.array(thetas[i : i + SCREENED])).reshape(-1, e0.size)
             pull = errors @ flat.T
-            step = np.linalg.solve(a, pull.T).T
+            step = np.clip(np.linalg.solve(a, pull.T).T, *room)  # nominal parameters stay within their tolerances
             costs += (np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ a) * step, axis=1)).tolist()
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
@@ -394,6 +395,11 @@ def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable
         if not np.any(lower < 0.9 * floor):
             break
         floor = np.minimum(lower, floor)
+    if stage.hidden is not None and current.effects:
+        # an effect may turn on what happens between two rows: nobody can come closer than that
+        reach = np.hypot(floor, stage.hidden(current.theta))
+        if np.any(reach > (1.0 + FLOOR_KNOWN) * floor):
+            search, current, candidates, correlation, steps = _search(stage, reach, keep, tick)
     effects, current = _name(search, current, candidates)
     return _conclude(search.judge, search.base, current, effects, candidates, correlation, steps)
 
@@ -478,12 +484,6 @@ def _conclude(
     rms_before, rms_after = (float(np.sqrt(f.held_out.sum() / n)) for f in (base, current))
     excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
     limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
-    floor = judge.floor
-    if rms_after > limit and current.effects and stage.hidden is not None:
-        # an effect may turn on what happens between two rows: nobody can come closer than that
-        reach = np.sqrt(np.mean(1.0 + (stage.hidden(current.theta) / floor) ** 2))
-        floor, rms_before, rms_after = floor * reach, rms_before / reach, rms_after / reach
-        excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
     # each further effect is one more chance to imitate what the library does not have
     left = 1.0 + (LEFT_FLOORS - 1.0) / max(len(current.effects), 1)
     if rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms_after > left):
@@ -498,7 +498,7 @@ def _conclude(
         outputs=stage.outputs,
         units=stage.units,
         verdict=verdict,
-        floor=floor,
+        floor=judge.floor,
         base=base,
         final=current,
         error_before=before,
@@ -533,6 +533,7 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
     said: dict[str, tuple[float, list[str], float, dict[str, Fit]]] = {}
     for name in chosen:
         rest = tuple(c for c in current.effects if c != name)
+        _widen_steps(judge, current, name, correlation)
         alternatives = {name: current}
         # those that lead alone, and those that did best beside the rest, where that was tried
         tried = sorted((f for f in search.beside(rest) if name not in f.effects), key=lambda f: float(f.held_out.sum()))[:5]
@@ -552,6 +553,24 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
         said[best] = (float(share[best]), rivals, nats, {m: alternatives[m] for m in (best, *rivals)})
     found = [Found(m, p, parameters_of(judge.stage, current, m), rivals, nats, fits) for m, (p, rivals, nats, fits) in said.items()]
     return found, current
+
+
+def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
+    """Give an effect that acts in steps (a threshold), whose slope is zero, the interval of sizes that are as good: 90 %, in the fit."""
+    column = judge.stage.index()[name].start
+    k = int(np.flatnonzero(fit.free == column)[0])
+    parameter, at = judge.stage.effect(name).parameters[0], float(fit.theta[column])
+    if fit.high[k] - fit.low[k] > 1e-9 * max(1.0, abs(at)) or not parameter.low < at < parameter.high:
+        return
+    away = np.geomspace(1e-5, 0.3, 25) * max(abs(at), 1e-3 * float(judge.scale[column]))
+    limits = []
+    for side in (-1.0, 1.0):
+        sizes = np.clip(at + side * away, parameter.low, parameter.high)
+        thetas = np.repeat(fit.theta[None], len(sizes), axis=0)
+        thetas[:, column] = sizes
+        worse = judge.block_costs(judge.errors(thetas)).sum(axis=1) > float(fit.cost.sum()) + 2.71 * correlation
+        limits.append(float(sizes[int(np.argmax(worse))] if worse.any() else sizes[-1]))
+    fit.low[k], fit.high[k] = limits
 
 
 def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:

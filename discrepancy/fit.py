@@ -208,10 +208,9 @@ class Judge:
             start = start.theta
         theta = np.clip(np.array(start, dtype=float), low, high)
         nominal = s.neutral()
-        n_nominal = len(s.parameters)
         tolerance = np.array([p.tolerance for p in s.all_parameters()])
         # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
-        prior = np.array([3.0 / tolerance[c] ** 2 if c < n_nominal else 0.0 for c in free])
+        prior = np.array([3.0 / tolerance[c] ** 2 if tolerance[c] > 0.0 else 0.0 for c in free])
         scale = self.scale[free]
         block_weights = np.ones(self.n_blocks) if weights is None else weights
 

@@ -26,7 +26,8 @@ class Parameter:
 
     value      nominal value of a stage's parameter, neutral value of an effect's
     low, high  physical bounds
-    tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted
+    tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted. Of an effect's parameter: how
+               well it is known beforehand; 0: not at all
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
     scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
     shape      of an effect's parameter: it says how the effect acts, not how much, and has no neutral value of its own
