@@ -9,6 +9,7 @@ import pytest
 
 from discrepancy.adapter import Chain, build_chain
 from discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from discrepancy.fit import Judge
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
@@ -50,6 +51,36 @@ def test_a_current_sampled_at_the_rows_is_known_as_such_and_nothing_is_missing(f
 
 def test_a_mean_current_is_not_taken_for_a_sampled_one() -> None:
     assert not any("i_cmd" in n for n in chain_of(recorded([], 32, 100, 60.0)).notes)
+
+
+def test_a_mean_of_the_ticks_before_the_row_is_known_as_such_and_nothing_is_missing() -> None:
+    chain = chain_of(dict(simulate(manoeuvre(37, 120.0), firmware(), [], seed=37, rate=100, mean_through=False).log))
+    assert any("the mean of the ten ticks before the row" in n for n in chain.notes)
+    for name in ("servo", "actuator"):
+        assert said(chain, name).verdict == "none", name
+
+
+@pytest.mark.parametrize("seed", [38, 39])
+def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -> None:
+    """The LVDT's noise is in the current too: a model driven by it must not be correlated with the noise that it has to explain."""
+    chain = chain_of(recorded([], seed, 100, 200.0))
+    for name, most in (("actuator", 0.02), ("servo", 0.15), ("linkage", 0.03)):
+        stage = chain.stage(name)
+        assert stage.floor is not None
+        judge = Judge(stage, stage.floor)
+        fit = judge.fit((), stage.neutral())
+        assert np.sqrt(fit.held_out.sum() / judge.n) == pytest.approx(1.0, abs=most), name
+        if name == "actuator":
+            start = fit.theta.copy()
+            start[stage.index()["oil_compressibility"].start] = 1.0
+            soft = judge.fit(("oil_compressibility",), start)
+            assert 0.5 * float(fit.held_out.sum() - soft.held_out.sum()) < 30.0  # nats; 350 with the noise in all ten ticks
+
+
+def test_a_dead_band_much_smaller_than_the_noise_in_the_current_is_found() -> None:
+    d = said(chain_of(recorded([Hidden("valve_dead_band", {"half_width": 1e-5})], 40, 100, 200.0)), "actuator")
+    assert [e.effect for e in d.effects] == ["valve_dead_band"]
+    assert float(d.effects[0].parameters["half_width"]["value"]) == pytest.approx(0.01, rel=0.1)  # type: ignore[arg-type]
 
 
 def test_a_null_bias_is_found_in_a_log_of_sampled_current() -> None:
