@@ -287,11 +287,15 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
     return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
 
 
-def _above_floor(judge: Judge, fit: Fit, correlation: float) -> bool:
-    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the floor's spread."""
+def _above_floor(judge: Judge, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
+    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the floor's spread.
+
+    known  relative error of the noise floor
+    """
     n, m = max(judge.n, 1), np.maximum(judge.samples, 1)
-    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(SPREADS * np.sqrt(correlation / (2.0 * n)), FLOOR_KNOWN)
-    blocks = np.sqrt(np.maximum(fit.held_out, 0.0) / m) > 1.0 + FLOOR_KNOWN + BLOCK_SPREADS * np.sqrt(correlation / (2.0 * m))
+    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(SPREADS * np.sqrt(correlation / (2.0 * n)), known)
+    errors = np.sqrt(np.maximum(fit.held_out, 0.0) / m / judge.expected())
+    blocks = errors > 1.0 + known + BLOCK_SPREADS * np.sqrt(correlation / (2.0 * m))
     return bool(whole or np.any(blocks & (m > 0.2 * m.max())))
 
 
@@ -399,15 +403,18 @@ def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable
         # an effect may turn on what happens between two rows: nobody can come closer than that
         reach = np.hypot(floor, stage.hidden(current.theta))
         if np.any(reach > (1.0 + FLOOR_KNOWN) * floor):
-            search, current, candidates, correlation, steps = _search(stage, reach, keep, tick)
+            search, current, candidates, correlation, steps = _search(stage, reach, keep, tick, TOLERATED - 1.0)
     effects, current = _name(search, current, candidates)
     return _conclude(search.judge, search.base, current, effects, candidates, correlation, steps)
 
 
 def _search(
-    stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None
+    stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None, known: float = FLOOR_KNOWN
 ) -> tuple[Search, Fit, list[Candidate], float, list[tuple[str, float]]]:
-    """Search the stage's library for what is missing: the search, the best model, all effects alone, correlation of errors, steps."""
+    """Search the stage's library for what is missing: the search, the best model, all effects alone, correlation of errors, steps.
+
+    known  relative error of the noise floor
+    """
     judge = Judge(stage, floor, keep)
     search = Search(judge, tick)
     base = search.base
@@ -432,7 +439,7 @@ def _search(
     chosen: tuple[str, ...] = ()
     current = base
     steps = [("nominal", rms(base))]
-    while len(chosen) < MOST and _above_floor(judge, current, correlation):
+    while len(chosen) < MOST and _above_floor(judge, current, correlation, known):
         options: list[Fit] = []
         if not chosen:
             options += list(singles.values())
@@ -444,14 +451,14 @@ def _search(
         ok = [f for f in options if significant(judge, current, f, correlation)]
         if not ok:
             break
-        # fewest effects first: a pair must be significantly better than the best single
+        # fewest effects first: a pair must be significantly better than the best single, and that above the floor
         ok.sort(key=lambda f: (len(f.effects), float(f.held_out.sum())))
         best = ok[0]
         for f in ok[1:]:
             if len(f.effects) == len(best.effects):
                 if f.held_out.sum() < best.held_out.sum():
                     best = f
-            elif significant(judge, best, f, correlation):
+            elif _above_floor(judge, best, correlation, known) and significant(judge, best, f, correlation):
                 best = f
         chosen, current = best.effects, best
         steps.append((" + ".join(chosen), rms(current)))

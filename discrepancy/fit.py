@@ -121,6 +121,13 @@ class Judge:
         mean = squares.sum(axis=1) / np.maximum(self.valid.sum(axis=1), 1)
         return 1.0 + squares - mean[:, None]
 
+    def expected(self) -> Array:
+        """Squared error that the log's raster makes expect in each block, whitened: float64[blocks], 1 on average."""
+        if self.stage.lost is None:
+            return np.ones(self.n_blocks)
+        lost = np.where(self.valid, self.lost(), 0.0).sum(axis=0)
+        return np.asarray(np.maximum(np.add.reduceat(lost, self.block_start) / np.maximum(self.samples, 1), 0.1))
+
     def _whiten(self, model: Array, out: Array | None = None) -> Array:
         """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the cache."""
         out = np.empty(np.shape(model)) if out is None else out
