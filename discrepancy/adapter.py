@@ -54,7 +54,6 @@ FREE = {  # nominal parameters that a stage refits within their tolerance
 }
 LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
 
-
 # mm: what a valve and piston without mass and oil spring leave of one that has them; logs of the rig without noise leave 0.0004
 QUASI_STATIC = 4e-4
 

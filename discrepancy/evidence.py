@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from discrepancy.diagnose import Candidate, Found, StageDiagnosis, parameters_of, recalibrated, rms_per_output
+from discrepancy.diagnose import Candidate, Found, StageDiagnosis, found_of, parameters_of, recalibrated, rms_per_output
 from discrepancy.fit import Fit, Judge
 from discrepancy.stage import Array, Stage
 
@@ -412,7 +412,7 @@ def extend_system(stage: Stage, floor: Array, wanted: tuple[str, ...]) -> StageD
         steps.append((f"+ {current.effects[-1]}", rms(current)))
     current = _spare(judge, current)
     before, after = (rms_per_output(judge, f) for f in (explorer.base, current))
-    found = [Found(name, 1.0, parameters_of(stage, current, name), [], 0.0) for name in current.effects]
+    found = found_of(judge, current, current.effects)
     return StageDiagnosis(
         stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if found else "none", floor=judge.floor,
         base=explorer.base, final=current, error_before=before, error_after=after, effects=found,

@@ -129,10 +129,11 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
             left = seconded or left
             if left == options:
                 continue
-            name, fit = left[0], f.fits[left[0]]
+            name, fit = left[0], d.final
             if name != f.effect:
+                beside = {g.effect: d.final for g in d.effects if g is not f}  # they may have changed since the rivals were fitted
                 judge = Judge(stages[d.stage], d.floor)
-                fit = judge.fit(fit.effects, fit.theta, 4)  # a long log's rivals were fitted to an excerpt
+                fit = _with(judge, {**beside, name: f.fits[name]})
                 d.final, d.error_after = fit, rms_per_output(judge, fit)
                 d.recalibrated = recalibrated(stages[d.stage], fit)
                 for other in d.effects:
@@ -142,6 +143,15 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
             d.effects[k] = replace(
                 f, effect=name, rivals=left[1:], probability=probability, parameters=parameters_of(stages[d.stage], fit, name)
             )
+
+
+def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
+    """Fit exactly these effects, each started from its size in the fit given; the last one's nominal parameters too."""
+    index, start = judge.stage.index(), judge.stage.neutral()
+    for name, fit in sources.items():
+        nominal = slice(len(judge.stage.parameters))
+        start[nominal], start[index[name]] = fit.theta[nominal], fit.theta[index[name]]
+    return judge.fit(tuple(sources), start, 4)
 
 
 def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str) -> bool:

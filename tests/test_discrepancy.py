@@ -551,3 +551,19 @@ def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_simulating_ther
     calls.clear()
     other = judge.fit((), quick, 8)  # of other effects: only its parameters count
     assert calls and other.effects == ()
+
+
+def test_stages_settle_two_places_of_rivals_in_one_stage() -> None:
+    """Twins that one stage cannot tell apart; the other stage, where they differ, lacks neither twin that came first."""
+    first, second = wave(31, 1.0, 0.05, 1.0), wave(32, 1.0, 0.05, 1.0)
+    row = (1.0, 1.0, 1.0)
+    twins = [linear("a", row, first), linear("a_twin", row, first), linear("b", row, second), linear("b_twin", row, second)]
+    here = gauges(twins, [0.0, 0.4, 0.0, 0.3])
+    there = replace(gauges([twins[0], twins[2]], [0.0, 0.0], seed=1), name="others")
+    alone = diagnose([here], workers=1).stages[0]
+    assert {frozenset((f.effect, *f.rivals)) for f in alone.effects} == {frozenset(("a", "a_twin")), frozenset(("b", "b_twin"))}
+    d = diagnose([here, there], workers=1).stages[0]
+    assert {f.effect: f.rivals for f in d.effects} == {"a_twin": [], "b_twin": []}
+    assert set(d.final.effects) == {"a_twin", "b_twin"}
+    sizes = {f.effect: float(f.parameters["size"]["value"]) for f in d.effects}  # type: ignore[arg-type]
+    assert sizes == pytest.approx({"a_twin": 0.4, "b_twin": 0.3}, rel=0.02)

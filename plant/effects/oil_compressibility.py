@@ -43,4 +43,3 @@ NOMINAL = 0.048 * (1.0 + 2.0 * DEAD) / (4.0 * 1.6e9 * 1.2e-3)  # m/N, see the do
 def step(force, v, compliance, drag):
     """Return by how far (m) the piston stands off the pushed way, under ``force`` (N, against extension) at ``v`` (m/s)."""
     return -((NOMINAL + compliance) * force + compliance * drag * v)
-
