@@ -2,12 +2,14 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can bench lint clean
+.PHONY: help demo test test-all test-can mutants bench lint clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
 SAY := printf '[vaneloop] %s\n'
 JOBS ?= 2
+# Why tests were skipped: pytest writes it there, and the last lines of `make test` say it.
+NOT_TESTED := out/not_tested.txt
 
 # An environment serves only the checkout that it was made in: a copied, moved or broken one is made anew.
 HOME_OF_VENV := $(VENV)/.made-in
@@ -27,17 +29,24 @@ demo: $(READY)  ## replay a recorded engine run and the long engine test; writes
 test: lint  ## lint, types, and every test but the slow ones
 	@$(need_chromium)
 	@$(SAY) 'pytest'
-	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow and not socketcan'
-	@$(PY) -m tests.uml.run
+	@mkdir -p out
+	@rm -f $(NOT_TESTED)
+	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow and not socketcan'
+	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
 
 test-all: lint  ## lint, types, and every test, with the slow campaigns
 	@$(need_chromium)
 	@$(SAY) 'pytest, with the slow campaigns'
-	@$(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
-	@$(PY) -m tests.uml.run
+	@mkdir -p out
+	@rm -f $(NOT_TESTED)
+	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
+	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
 
-test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, or that of user-mode Linux
-	@$(PY) -m tests.uml.run
+test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
+	@$(PY) -m tests.vcan.run
+
+mutants: $(READY)  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
+	@$(PY) -m tests.mutants $(MUTANTS)
 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)

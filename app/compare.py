@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict
 
 from app import own_model
 from app.common import chain_of
@@ -18,8 +17,8 @@ In closed loop the controller hides what the model lacks; stage by stage it cann
 noise floor.
 
 examples:
-  vaneloop compare run.csv
-  vaneloop compare run.csv --model with_dead_band.toml --tolerance vigv=0.2 --report compare.html
+  vaneloop compare examples/hidden_effect.parquet
+  vaneloop compare examples/hidden_effect.parquet --model with_dead_band.toml --tolerance vigv=0.2 --report compare.html
 
 exit codes: 0 agrees (or no tolerance given), 1 a tolerance is exceeded, 2 bad input"""
 
@@ -34,33 +33,37 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     if own_model.asked(args):
         return own_model.command(args, "compare")
-    from discrepancy.workflow import compare_stages
+    from discrepancy.report import compare_report, located_sentence
+    from discrepancy.workflow import locate_stages
     from hil.logs import LogError
 
     extra: dict[str, object] = {}
     report, args.report = args.report, None
     stages: list[dict[str, object]] = []
+    floors: dict[str, float] = {}
     try:
         chain = chain_of(args)
     except LogError as e:
         cli.say(args, f"note: no stage by stage comparison: {e}")
         extra["not_observed"] = {"all": str(e)}
     else:
-        figures = compare_stages(chain.stages)
-        stages = [{**asdict(f), "ratio": f.rms / f.noise_floor} for f in figures]
+        located = locate_stages(chain.stages)
+        figures = [f for x in located for f in x.signals]
+        stages = [f.json() for f in figures]
+        floors = {f.signal: f.noise_floor for f in figures}
         rows = [
-            [f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f"{f.rms / f.noise_floor:.2f}", f.unit, f"{f.samples:,}"]
-            for f in figures
-        ]
-        rows += [[name, "not observed: " + why, "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()]
-        columns = ["stage", "signal", "rms", "noise floor", "ratio", "unit", "samples"]
-        cli.print_table(args, "each stage on its own logged inputs", columns, rows)
+            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), f"{f.ratio:.2f}", f"{f.rms_as_given:.4g}", f.unit,
+             f"{f.samples:,}"] for f in figures
+        ]  # fmt: skip
+        rows += [[name, "not observed: " + why, "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()]
+        columns = ["stage", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
+        cli.print_table(args, "each stage on its own logged inputs, nominal parameters refitted within their tolerances", columns, rows)
+        cli.say(args, located_sentence(located))
         extra["not_observed"] = chain.not_observed
+        extra["verdict"] = "fails" if any(x.fails for x in located) else "agrees"
         if report:
-            from discrepancy.report import compare_report
-
             words = " ".join(["vaneloop compare", *sys.argv[2:]])
-            cli.say(args, f"page: {compare_report(figures, chain, report, words, args.log)}")
+            cli.say(args, f"page: {compare_report(located, chain, report, words, args.log)}")
             report = None
     args.report = report
-    return replay.command(args, {"stages": stages, **extra})
+    return replay.command(args, {"stages": stages, **extra}, floors)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from app.main import main as vaneloop
+from hil import cli
 
 __all__ = ["main"]
 
@@ -32,7 +33,7 @@ def _step(text: str, *argv: str, allowed: tuple[int, ...] = (0,)) -> None:
         sys.exit(code)
 
 
-def main() -> None:
+def main() -> int:
     """Run the demonstration; pages go to ./demo."""
     OUT.mkdir(exist_ok=True)
     example = os.path.relpath(ROOT / "examples" / "engine_run.blf")
@@ -69,7 +70,8 @@ def main() -> None:
     print("\npages to open in a browser:")
     for written in sorted(OUT.glob("*.html")):
         print(f"  {written}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(cli.run(main))

@@ -19,8 +19,8 @@ fitted, the leaders in pairs; what earns its place on data that it was not fitte
 rivals that this log cannot tell apart. Where the library does not suffice the answer is "unknown", with the shape of what is left.
 
 examples:
-  vaneloop diagnose run.csv --report diagnosis.html
-  vaneloop diagnose run.csv --model with_dead_band.toml --json -
+  vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
+  vaneloop diagnose examples/hidden_effect.parquet --model with_dead_band.toml --json -
 
 exit codes: 0 nothing is missing, 1 something is missing or unknown, 2 bad input"""
 
@@ -75,7 +75,10 @@ def show(args: argparse.Namespace, d: Any) -> None:
         for f in s.effects:
             values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
             rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
-            cli.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}")
+            cause = f"; this log cannot tell its cause from {' or '.join(f.inseparable)}" if f.inseparable else ""
+            cli.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}")
         for x in d.shapes.get(s.stage, []):
             cli.say(args, f"unknown in {s.stage}: {x.text}")
+        if s.verdict == "unknown" and s.nearest:
+            cli.say(args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}")
     cli.say(args, verdict_sentence(d))

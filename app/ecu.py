@@ -46,7 +46,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--wait", metavar="S", type=float, default=10.0, help="wait this long for the first VGV_STATUS (default 10)")
     parser.add_argument("--mode", choices=("run", "standby"), default="run", help="mode asked for with a profile or log (default run)")
+    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects of the engine")
     parser.add_argument("--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)")
+    cli.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
     station.add_realtime_options(parser)
     cli.add_output_options(parser)
     parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
@@ -55,21 +57,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
     """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed one."""
     from hil import ecu
-    from tables import InputError
+    from tables import InputError, load_toml
 
     if args.profile and args.log:
         raise InputError("--profile and --log exclude each other")
+    table = args.profile if args.profile and Path(args.profile).suffix.lower() not in ("", ".toml") else None
+    options = cli.log_options(args, table)
     if args.log:
-        from hil.logs import read_log
-
-        return ecu.demand_of_log(read_log(args.log))
+        return ecu.demand_of_log(cli.read_log_of(args))
     name = args.profile or default
     if name is None:
         return None
     if name in ecu.BUILTIN:
         return ecu.builtin(name)
     path = Path(name)
-    if name == "engine-test" or (path.suffix.lower() == ".toml" and path.is_file() and "speed" in ecu.read_toml(path)):
+    if name == "engine-test" or (path.suffix.lower() == ".toml" and path.is_file() and "speed" in load_toml(path)):
         import numpy as np
 
         from app.engine_test import load_profile
@@ -78,7 +80,7 @@ def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
     if not path.suffix:
         raise InputError(f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)")
-    return ecu.read_profile(path)
+    return ecu.read_profile(path, **options)
 
 
 def command(args: argparse.Namespace) -> int:
@@ -97,6 +99,7 @@ def command(args: argparse.Namespace) -> int:
     name = station.bus_name(args)
     if name.partition(":")[0] == "lockstep":
         raise InputError("--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own")
+    machine = station.machine_of(args)
     demand = demand_of(args)
     typed = Typed() if demand is None else None
     source: Any = typed if demand is None else demand
@@ -104,7 +107,7 @@ def command(args: argparse.Namespace) -> int:
     first = 60.0 if demand is None else float(demand.per_frame()[0, 0])
     ecu = EcuStation(
         source, timeout=args.timeout, wait=args.wait, mode_request=int(args.mode == "run"),
-        ecu=Ecu(n_dem=first, seed=args.seed),
+        ecu=Ecu(machine, n_dem=first, seed=args.seed),
     )  # fmt: skip
     duration = args.duration if args.duration is not None or demand is None else demand.duration
     complaint = ""
@@ -170,13 +173,20 @@ KEYS = {"\x1b[A": "+1", "\x1b[B": "-1", "\x1b[5~": "+5", "\x1b[6~": "-5", "+": "
 
 @contextlib.contextmanager
 def _typing(args: argparse.Namespace, typed: Any) -> Iterator[None]:
-    """Give what comes through standard input to ``typed``: keys of a terminal that is ours, lines otherwise."""
+    """Give what comes through standard input to ``typed``: keys of a terminal that is ours, lines otherwise.
+
+    A terminal that controls no process of ours (under an init, in a container) is read in lines, as a pipe is.
+    """
     if typed is None or sys.stdin is None or sys.stdin.closed:
         yield
         return
     fd = sys.stdin.fileno()
-    ours = os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
-    if os.isatty(fd) and not ours:  # started with &: the terminal is the shell's
+    try:
+        group = os.tcgetpgrp(fd)
+    except OSError:  # no terminal, or not the one that controls this process: nobody else's turn to read it
+        group = 0
+    ours = group == os.getpgrp()
+    if group and not ours:  # started with &: the terminal is the shell's
         yield
         return
     if not ours:

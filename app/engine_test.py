@@ -16,6 +16,7 @@ from controller import Calibration, load_calibration
 from hil import cli
 from hil.figures import error_figures
 from hil.lockstep import Stimulus, lockstep
+from hil.plausible import LONGEST
 from hil.replay import STATISTICS, ReplayResult, replay_json
 from hil.report import PAPER_TABLE_5
 from plant import Plant, build_plant
@@ -40,6 +41,9 @@ class EngineTestTable(Bounded):
         for key in ("rate", "dwell"):
             if len(getattr(self, key).values) != n:
                 raise ValueError(f"{key}.values has {len(getattr(self, key).values)} numbers; speed has {n}")
+        steps = np.abs(np.diff([self.start.value, *self.speed.values])) / np.array(self.rate.values)
+        if (lasts := float(steps.sum() + sum(self.dwell.values))) > LONGEST:
+            raise ValueError(f"rate and dwell make a test of {lasts:g} s; allowed: up to {LONGEST:g} s")
         return self
 
 
@@ -110,8 +114,8 @@ hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual
 examples:
   vaneloop engine-test --report engine_test.html
   vaneloop engine-test --strategy inverse --strategy adaptive
-  vaneloop engine-test --profile my_test.toml --seed 7 --json -
-  vaneloop engine-test --tables engine7/ --geometry engine7_as_built.toml
+  vaneloop engine-test --profile tables/engine_test.toml --seed 7 --json -
+  vaneloop engine-test --tables engine7/ --geometry engine7/geometry.toml
 
 exit codes: 0 the dual curves stay at or below the paper's figures, 1 they do not, 2 bad input"""
 

@@ -20,7 +20,7 @@ its fitted parameters on each of a bank of safe demand profiles; each rival is t
 even the best refit stays farthest from the truth separates them best.
 
 examples:
-  vaneloop experiment run.csv --out next_demand.csv --report experiment.html
+  vaneloop experiment examples/hidden_effect.parquet --out next_demand.csv --report experiment.html
 
 exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profile separates them, 2 bad input"""
 

@@ -21,10 +21,11 @@ Effects that --model brings along are fitted again together with the new ones. E
 not fitted to, beside the noise floor that no model can undercut.
 
 examples:
-  vaneloop extend run.csv --effect valve_dead_band --out with_dead_band.toml
-  vaneloop extend run.csv --model with_dead_band.toml --effect aero_load --out both.toml --report extended.html
+  vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
+  vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml --report extended.html
 
-exit codes: 0 each stage extended is at its noise floor (within 10 %), 1 an error remains, 2 bad input"""
+exit codes: 0 each stage extended is at its noise floor (within 10 %), 1 an error remains, or the effects
+bring the model no nearer to the log (nothing is written then), 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +43,8 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     if own_model.asked(args):
         return own_model.command(args, "extend")
-    from discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage
+    from discrepancy.locate import agrees
+    from discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage, no_better
     from plant import Model, load_model, write_model
     from plant.effects import EFFECTS
     from tables import InputError
@@ -76,6 +78,9 @@ def command(args: argparse.Namespace) -> int:
         else:
             carried[name] = before.effects[name]
     results = [extend_stage(chain.stage(s), tuple(names)) for s, names in by_stage.items()]
+    for text in filter(None, map(no_better, results)):
+        print(f"vaneloop extend: {args.log}: {text}; {args.out} is not written", file=sys.stderr)
+        return 1
     parameters, effects = dict(before.parameters), dict(carried)
     for r in results:
         for q in r.recalibrated:
@@ -108,7 +113,7 @@ def command(args: argparse.Namespace) -> int:
         from discrepancy.report import diagnosis_report
 
         cli.say(args, f"page: {diagnosis_report(d, chain, args.report, _words(), args.log)}")
-    return 0 if all(float((r.error_after / r.floor).max()) <= 1.1 for r in results) else 1
+    return 0 if all(agrees(e, f) for r in results for e, f in zip(r.error_after, r.floor, strict=True)) else 1
 
 
 def _words() -> str:

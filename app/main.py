@@ -42,7 +42,7 @@ first steps:
   vaneloop engine-test --report engine_test.html
   vaneloop replay LOG --report replay.html
 
-exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input"""
+exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop (VANELOOP_DEBUG=1 prints the traceback)"""
 
 
 def main(argv: list[str]) -> int:
@@ -59,14 +59,8 @@ def main(argv: list[str]) -> int:
     if name not in COMMANDS:
         print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
-
-    def command() -> int:  # its imports take half a second, in which Ctrl-C may come, too
-        module = importlib.import_module(COMMANDS[name][0])
-        parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
-        module.add_options(parser)
-        return module.command(parser.parse_args(argv[1:]))
-
-    return cli.run(command)
+    # a command's imports take half a second, in which Ctrl-C may come, too
+    return cli.start(f"vaneloop {name}", lambda: importlib.import_module(COMMANDS[name][0]), argv[1:])
 
 
 def run() -> None:

@@ -65,8 +65,7 @@ def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
     motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {c: "" for c in (system.velocity,) if c}
     signals = {**motion, **system.inputs, **system.outputs}
     log = read_log(
-        path, dbc=args.dbc, mapping=cli.pairs(args.map, "map"), units=cli.pairs(args.unit, "unit"), design_rpm=args.design_rpm,
-        require=[c for c in signals if c not in system.optional()], signals=signals,
+        path, **cli.log_options(args), require=[c for c in signals if c not in system.optional()], signals=signals,
     )  # fmt: skip
     for note in log.notes:
         cli.say(args, f"note: {name}: {note}")
@@ -96,7 +95,9 @@ def command(args: argparse.Namespace, verb: str) -> int:
 
 def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
     from discrepancy import own_model
-    from tables import InputError
+    from discrepancy.locate import agrees
+    from discrepancy.workflow import no_better
+    from tables import InputError, load_toml
 
     wanted: list[str] = []
     if verb == "extend":
@@ -106,6 +107,8 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
         out = Path(args.out)
         if out.is_dir() or not out.parent.is_dir():
             raise InputError(f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})")
+    if args.model:
+        load_toml(args.model)  # refuses what would take the parser gigabytes
     model = own_model.load_model(args.model, system) if args.model else None
     logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
     test = [_record(args, system, p) for group in args.test for p in group]
@@ -118,6 +121,9 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
             answer = own_model.diagnose(system, logs, test, model, progress)
     else:
         answer = own_model.extend(system, logs, wanted, test, model)
+    if verb == "extend" and (text := no_better(answer.diagnosis)):
+        print(f"vaneloop extend: {args.log}: {text}; {args.out} is not written", file=sys.stderr)
+        return 1
     _show(args, verb, answer)
     data = answer.json()
     data["log"] = args.log
@@ -137,10 +143,10 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
     if verb == "compare":
         return 0
     if verb == "locate":
-        return 1 if any(r.significant.any() for r in answer.regimes) else 0
+        return 1 if answer.located.fails else 0
     d = answer.diagnosis
     if verb == "extend":
-        return 0 if float((d.error_after / d.floor).max()) <= own_model.LEFT else 1
+        return 0 if all(map(agrees, d.error_after, d.floor)) else 1
     return 0 if d.verdict == "none" else 1
 
 
@@ -154,20 +160,8 @@ def _older(answer: Any) -> dict[str, Any]:
         }
         for k in range(len(d.outputs))
     ]  # fmt: skip
-    hot = [r for r in answer.regimes if r.significant.any()]
-    stage = {
-        "stage": d.stage, "fails": bool(hot), "onset_s": answer.onset,
-        "regimes": [
-            {
-                "signal": r.output, "unit": r.unit, "condition": r.condition, "condition_unit": r.condition_unit, "edges": r.edges,
-                "rms": r.rms, "noise_floors": r.ratio, "samples": r.samples, "significant": [bool(b) for b in r.significant],
-                "contrast": r.contrast,
-            }
-            for r in answer.regimes
-        ],
-    }  # fmt: skip
     if answer.verb == "locate":
-        return {"stages": [stage]}
+        return {"stages": [answer.located.json()]}
     return {"signals": signals}
 
 
@@ -175,6 +169,7 @@ def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
     """Print the answer."""
     import numpy as np
 
+    from app.common import say_located
     from discrepancy.own_report import short_names
 
     d = answer.diagnosis
@@ -200,12 +195,7 @@ def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
     cli.print_table(args, f"RMS error log by log ({answer.elapsed_s:.1f} s)", ["log", "", "signal", *heads, "of RMS", "unit"], rows)
     if verb in ("compare", "locate"):
         if verb == "locate":
-            hot = [r for r in answer.regimes if r.significant.any()]
-            cli.say(args, f"{d.stage}: " + ("agrees everywhere" if not hot else f"fails in {len(hot)} of {len(answer.regimes)} conditions"))
-            if answer.onset is not None:
-                cli.say(args, f"  begins at t = {answer.onset:.0f} s")
-            for r in hot[:6]:
-                cli.say(args, f"  {r.worst()}")
+            say_located(args, answer.located, 6)
         return
     for p in answer.parameters():
         cli.say(args, f"parameter {p['parameter']}: {p['value']:.5g} [{p['low']:.5g}, {p['high']:.5g}] {p['unit']}")

@@ -47,6 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--inputs", metavar="RECORD", help="repeat a recorded run with the frames it took; compare the frames it sent")
     group.add_argument("--profile", metavar="F", help="demand of the run's own ECU: as in vaneloop ecu (default: ramp)")
     group.add_argument("--log", metavar="F", help="demand of the run's own ECU from a log")
+    cli.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
     station.add_realtime_options(parser)
     cli.add_output_options(parser)
     parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
@@ -78,17 +79,29 @@ def command(args: argparse.Namespace) -> int:
         raise InputError("--limit-late-us is for real time; --bus lockstep is never late")
     if sum(bool(o) for o in (args.inputs, args.profile, args.log)) > 1:
         raise InputError("--inputs, --profile and --log exclude each other")
+    cli.log_options(args, args.profile)
     if not lockstep:
         return _in_real_time(args, name)
     return _repeat(args) if args.inputs else _in_lockstep(args)
 
 
-def _node(args: argparse.Namespace) -> Any:
+def _node(args: argparse.Namespace, machine: Any = None) -> Any:
     from hil.node import Node
 
-    machine = station.machine_of(args)
+    machine = machine or station.machine_of(args)
     station.warm_nodes(args)
     return Node(machine, n_r=args.start_speed, seed=args.seed)
+
+
+def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
+    """Say where the model's changed engine runs: in the ECU, which is another program here."""
+    from plant import build_plant
+    from plant.effects import rows_at
+    from plant.parameters import ACCELERATION, DECELERATION, LAG
+
+    rows = [LAG, ACCELERATION, DECELERATION, *rows_at("engine")]
+    if args.model and (machine.p[rows] != build_plant().p[rows]).any():
+        cli.say(args, f"note: the engine of {args.model} runs in the ECU: vaneloop ecu --bus {bus} --model {args.model}")
 
 
 def _node_json(node: Any) -> dict[str, Any]:
@@ -115,7 +128,9 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
     from hil.bus import Port
     from hil.realtime import Ticker, run_realtime, stop_on_signals
 
-    node = _node(args)
+    machine = station.machine_of(args)
+    node = _node(args, machine)
+    _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
     with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus:
         port = Port(bus)
@@ -195,8 +210,9 @@ def _in_lockstep(args: argparse.Namespace) -> int:
 
     demand = demand_of(args, default="ramp")
     profile = demand.per_frame()
-    node = _node(args)
-    ecu = Ecu(n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
+    machine = station.machine_of(args)
+    node = _node(args, machine)
+    ecu = Ecu(machine, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
     with cli.progress_bar(args, "lockstep") as progress:
         run = run_lockstep(
             profile[:, 0], profile[:, 1], vgv=node, ecu=ecu, duration=args.duration if args.duration is not None else demand.duration,
@@ -211,7 +227,7 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         # a frame is taken in the first tick that begins after its last bit; in which ticks frames were sent, the same ticks say again
         tick = -(-np.rint(run.t * BIT_RATE).astype(np.int64) // BITS_PER_TICK)
         taken = (run.rows[:, 0] & IDENT_MASK == ECU_DEMAND) & (tick < ticks)
-        again = _node(args)
+        again = _node(args, machine)
         at, sent = replay(again, tick[taken], run.rows[taken], ticks)
         if again.fingerprint() != node.fingerprint():
             raise RuntimeError("the run does not repeat with the frames that it took: a fault of vaneloop")
@@ -230,7 +246,7 @@ def _repeat(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from hil.frames import NAMES
+    from hil.frames import NAMES, noted
     from hil.node import replay
     from hil.recorder import read_record
     from tables import InputError
@@ -246,7 +262,8 @@ def _repeat(args: argparse.Namespace) -> int:
     last = int(tick[-1]) + 1
     ticks = last if args.duration is None else round(args.duration * 1000)  # a run ends up to 9 ticks after the last frame it sent
     started = time.perf_counter()
-    at, sent = replay(node, tick[taken], record.rows[taken], ticks)
+    received = noted(record.rows[taken])
+    at, sent = replay(node, tick[taken], received, ticks)
     wall = time.perf_counter() - started
     held = record.sent & (tick < ticks)
     was_at, was = tick[held], record.rows[held]
@@ -277,7 +294,7 @@ def _repeat(args: argparse.Namespace) -> int:
         "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "exceeded": exceeded,
     })  # fmt: skip
     if args.record:
-        _write_record(args, record.rows[taken], tick[taken], at, sent, int(start))
+        _write_record(args, received, tick[taken], at, sent, int(start))
     return 1 if exceeded else 0
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import Any
 
 from hil import cli
 
-__all__ = ["DESCRIPTION", "add_options", "command"]
+__all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
 DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links of VGV1 and
 VGV2 that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves, made into stroke tables.
@@ -17,8 +18,8 @@ any format that replay reads. Without a log the play is the geometry's own.
 
 examples:
   vaneloop schedule --report schedule.html
-  vaneloop schedule --geometry engine7.toml --schedules targets.toml --log loop.csv --out engine7/
-  vaneloop schedule --log loop.mf4 --map STROKE=x_lvdt --map IGV=vigv --step 0.25 --criterion max
+  vaneloop schedule --geometry tables/geometry.toml --schedules tables/schedules.toml --log LOOP.csv --out engine7/
+  vaneloop schedule --log LOOP.mf4 --map STROKE=x_lvdt --map IGV=vigv --step 0.25 --criterion max
   vaneloop engine-test --tables engine7/
 
 exit codes: 0 good, 2 bad input (a mechanism that cannot be assembled, a schedule that no length meets, a log without a loop)"""
@@ -48,20 +49,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="write stroke_tables, vane_angles, geometry, schedules .toml; --tables DIR loads it")
 
 
+def log_of(args: argparse.Namespace) -> Any:
+    """The measured loop that ``args`` name, or None."""
+    cli.log_options(args)
+    return None if args.log is None else cli.read_log_of(args, require=("x_lvdt", "vigv"))
+
+
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from app.scheduling import ScheduleOptions, result_json, schedule, write_tables
-    from hil.logs import read_log
     from plant import load_geometry, load_schedules
 
     adjust = () if args.adjust == "none" else tuple(a.strip() for a in args.adjust.split(","))
     options = ScheduleOptions(args.step, args.lb_range, args.lc_range, adjust, args.criterion, args.limit)
     options.check()
     geometry, schedules = load_geometry(args.geometry), load_schedules(args.schedules)
-    log = None
-    if args.log is not None:
-        mapping, units = cli.pairs(args.map, "map"), cli.pairs(args.unit, "unit")
-        log = read_log(args.log, dbc=args.dbc, mapping=mapping, units=units, design_rpm=args.design_rpm, require=("x_lvdt", "vigv"))
+    log = log_of(args)
     with cli.progress_bar(args, "scheduling") as progress:
         result = schedule(geometry, schedules, log, options, progress)
 

@@ -77,7 +77,7 @@ method and, where it is installed, by the multibody library Exudyn, as the paper
 
 examples:
   vaneloop spatial --report spatial.html
-  vaneloop spatial --geometry engine7.toml --offset 10
+  vaneloop spatial --geometry tables/geometry.toml --offset 10
 
 exit codes: 0 planar and spatial agree within --limit, 1 they do not, 2 bad input"""
 

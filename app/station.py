@@ -227,6 +227,8 @@ def realtime_json(report: Any) -> dict[str, Any]:
         "ticks": report.ticks,
         "missed": report.missed,
         "skipped": report.skipped,
+        "pauses": report.pauses,
+        "dropped": report.dropped,
         "wall_s": report.wall_s,
         "lateness": {
             **begin.figures(),
@@ -257,5 +259,7 @@ def print_lateness(args: argparse.Namespace, report: Any) -> None:
     when = datetime.fromtimestamp(report.started_ns * 1e-9 + worst.worst_tick * 1e-3).strftime("%H:%M:%S.%f")[:-3]
     cli.say(args, f"worst tick: {worst.worst_ns * 1e-3:,.1f} us late at t = {worst.worst_tick * 1e-3:.3f} s ({when})")
     cli.say(args, f"missed ticks (later than the next deadline): {report.missed:,} of {report.ticks:,}; skipped: {report.skipped:,}")
+    if report.pauses:
+        cli.say(args, f"stood still for 50 ms or more: {report.pauses:,} times; frames dropped for it: {report.dropped:,}")
     if report.missed and args.realtime_priority is None:
         cli.say(args, "other programs delayed it; --realtime-priority 50 (root or ulimit -r) keeps them from that")

@@ -6,14 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from controller import Calibration, load_calibration, new_inputs, new_state
+from controller import Calibration, load_calibration
 from controller.firmware import FAULT_BITS
 from hil.lockstep import COLUMNS, WARM_UP, Stimulus, advance
+from hil.tick import new_loop
 from plant import Plant, build_plant
 
 __all__ = ["COLUMNS", "OurLoop", "Setup", "profile", "troubled"]
 
-_SILENT, _POTS = np.zeros((1, 5)), np.empty((0, 6))
+_SILENT, _NO_SNAPSHOTS = np.zeros((1, 5)), np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -48,15 +49,13 @@ class OurLoop:
 
     def __init__(self, setup: Setup):
         self._setup = s = setup
-        self.state, self._inputs, self._mean = new_state(), new_inputs(), np.zeros(2)
-        self.plant_state = s.plant.start(stroke=s.stroke, n_r=s.stimulus.rows[0, 0])
+        n_dem, t_oil = s.stimulus.rows[0, 0], s.stimulus.rows[0, 3]
+        self._loop = new_loop(s.plant, s.calibration, n_engine=n_dem, n_r=n_dem, t_oil=t_oil, noisy=s.noisy)
         self._advance(-s.warm_up, s.warm_up, s.stimulus.rows[:1], _SILENT, np.empty((0, len(COLUMNS))))
-        self._mean[:] = 0.0
+        self._loop.mean[:] = 0.0
 
     def _advance(self, k0: int, ticks: int, rows: np.ndarray, noise: np.ndarray, out: np.ndarray) -> None:
-        s = self._setup
-        z, x, p, no_snapshots = self.state, self.plant_state, s.plant.p, np.empty((0, 0))
-        advance(k0, ticks, rows, noise, s.sigma, self._inputs, z, s.calibration, x, p, self._mean, s.every, out, no_snapshots, _POTS)
+        advance(k0, ticks, rows, noise, self._loop, self._setup.every, out, _NO_SNAPSHOTS)
 
     def advance(self, out: np.ndarray, noise: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Run the stimulus from its start into ``out`` (SI, a row every 10 ticks)."""
@@ -65,7 +64,7 @@ class OurLoop:
     @property
     def faults(self) -> int:
         """Fault bits that stand now."""
-        return int(self.state[FAULT_BITS])
+        return int(self._loop.z[FAULT_BITS])
 
 
 def profile(seconds: float) -> np.ndarray:

@@ -26,7 +26,7 @@ compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  
 apart = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 
 # ---- inputs -------------------------------------------------------------------------------------------------------------------------
-INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2")
+INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2", "pause")
 N_INPUTS = len(INPUTS)
 (
     IN_N_DEM,  # %, demand of the last good ECU frame
@@ -38,6 +38,7 @@ N_INPUTS = len(INPUTS)
     IN_VIGV,  # rad, vane angles as the stem potentiometers give them; NaN = not fitted
     IN_VGV1,
     IN_VGV2,
+    IN_PAUSE,  # s for which the controller stood still before this tick, as its supervisor says; 0 = it ran on time
 ) = range(N_INPUTS)
 
 # ---- strategies: how the stroke demand follows from the speed, docs/strategies.md ---------------------------------------------------
@@ -58,9 +59,10 @@ FAULTS = (
     "tracking",
     "current_saturated",
     "demand_range",
+    "paused",
 )
 N_FAULTS = len(FAULTS)
-(F_STALE, F_REJECTED, F_LVDT_RANGE, F_LVDT_RATE, F_LVDT_STUCK, F_TRACKING, F_SATURATED, F_DEMAND_RANGE) = range(N_FAULTS)
+(F_STALE, F_REJECTED, F_LVDT_RANGE, F_LVDT_RATE, F_LVDT_STUCK, F_TRACKING, F_SATURATED, F_DEMAND_RANGE, F_PAUSED) = range(N_FAULTS)
 
 # ---- calibration scalars ------------------------------------------------------------------------------------------------------------
 SCALARS = (
@@ -231,6 +233,7 @@ STATE = (
     "t_tracking",
     "t_saturated",
     "t_demand_range",
+    "t_paused",
     "x_servo",  # m, reference of the servo at this tick
     "run_request",  # 1 if the last good frame asked for RUN
     "trend_last",  # %, demand of the 10 ms step before
@@ -300,6 +303,7 @@ N_STATE = len(STATE)
     T_TRACKING,
     T_SATURATED,
     T_DEMAND_RANGE,
+    T_PAUSED,
     X_SERVO,
     RUN_REQUEST,
     TREND_LAST,
@@ -713,14 +717,15 @@ def _debounce(z, timer, bad, bit, rise, heal):
 
 
 @compiled
-def _condition_lvdt(z, k, x):
+def _condition_lvdt(z, k, x, pause):
     """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one.
 
     A sample is plausible if the piston can have come there from the last plausible one at ``lvdt_rate``, however long ago that was: a
-    spike costs one sample, a gap none after it, and a lasting step is refused until it is a fault.
+    spike costs one sample, a gap none after it, and a lasting step is refused until it is a fault. ``pause`` (s): time before this tick in
+    which no sample was taken.
     """
     in_range = k[LVDT_LOW] <= x <= k[LVDT_HIGH]  # False for NaN
-    z[X_REACH] = min(z[X_REACH] + k[LVDT_RATE] * TICK, FAR)
+    z[X_REACH] = min(z[X_REACH] + k[LVDT_RATE] * (TICK + pause), FAR)
     jump = in_range and abs(x - z[X_MEAS]) > z[X_REACH]
     if in_range and not jump:
         z[LVDT_GOOD] = 1.0
@@ -761,8 +766,8 @@ def _debounce_leaky(z, timer, bad, bit, rise, heal):
 
 
 @compiled
-def _monitor_demand(inputs, z, k):
-    """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too."""
+def _monitor_demand(inputs, z, k, pause):
+    """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too. It aged by ``pause`` (s), too."""
     n_dem, n_r, request = inputs[IN_N_DEM], inputs[IN_N_R], inputs[IN_MODE_REQUEST]
     fresh = inputs[IN_FRESH] > 0.5
     in_range = (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH]) and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH]) and 0.0 <= request <= 1.0  # not NaN
@@ -785,7 +790,7 @@ def _monitor_demand(inputs, z, k):
             z[TREND_TURN] = n_dem
             z[TREND_LAST] = n_dem
     else:
-        z[DEMAND_AGE] = min(z[DEMAND_AGE] + TICK, 1e6)
+        z[DEMAND_AGE] = min(z[DEMAND_AGE] + (TICK + pause), 1e6)
     _debounce(z, T_STALE, z[DEMAND_AGE] >= k[DEMAND_TIMEOUT] - HALF_TICK, F_STALE, TICK, k[RECOVER_TIME])
     _debounce(z, T_REJECTED, z[REJECT_BUCKET] >= k[DEMAND_REJECT_LIMIT], F_REJECTED, TICK, k[RECOVER_TIME])
     _debounce(z, T_DEMAND_RANGE, fresh and not in_range, F_DEMAND_RANGE, TICK, k[RECOVER_TIME])
@@ -794,6 +799,7 @@ def _monitor_demand(inputs, z, k):
 LVDT_MASK = (1 << F_LVDT_RANGE) | (1 << F_LVDT_RATE) | (1 << F_LVDT_STUCK)
 DEMAND_MASK = (1 << F_STALE) | (1 << F_REJECTED) | (1 << F_DEMAND_RANGE)
 SERVO_MASK = (1 << F_TRACKING) | (1 << F_SATURATED)
+STOP_MASK = LVDT_MASK | (1 << F_PAUSED)  # FAIL_SAFE at once
 
 
 @compiled
@@ -811,15 +817,15 @@ def _choose_mode(z, k):
     """Next mode. The transitions that can happen are listed in docs/controller.md; this is all of them."""
     mode = int(z[MODE])
     faults = int(z[FAULT_BITS])
-    lvdt_lost = (faults & LVDT_MASK) != 0
+    must_stop = (faults & STOP_MASK) != 0
     trouble = (faults & (DEMAND_MASK | SERVO_MASK)) != 0
     wants_run = z[RUN_REQUEST] == 1.0
     if mode == INIT:
-        if lvdt_lost:
+        if must_stop:
             mode = FAIL_SAFE
         elif z[TICKS] * TICK >= k[INIT_TIME] - HALF_TICK and z[LVDT_GOOD] == 1.0:
             mode = STANDBY
-    elif lvdt_lost:
+    elif must_stop:
         mode = FAIL_SAFE
         z[RECOVER_TIMER] = 0.0
     elif mode == STANDBY:
@@ -861,8 +867,10 @@ def tick(inputs, state, calibration):
     Invariants: ``state[I_CMD]`` within +-current_limit, ``state[X_DEM]`` within [stroke_min, stroke_max], mode one of `MODES`.
     """
     z, k = state, calibration.k
-    _condition_lvdt(z, k, inputs[IN_X_LVDT])
-    _monitor_demand(inputs, z, k)
+    pause = min(inputs[IN_PAUSE], 1e6) if inputs[IN_PAUSE] > 0.0 else 0.0  # not NaN
+    _condition_lvdt(z, k, inputs[IN_X_LVDT], pause)
+    _monitor_demand(inputs, z, k, pause)
+    _debounce(z, T_PAUSED, pause > 0.0, F_PAUSED, TICK, k[RECOVER_TIME])
     if k[STRATEGY] >= INVERSE:
         z[X_SLOW] += STROKE_SHARE * (z[X_MEAS] - z[X_SLOW])
     if k[STRATEGY] == ADAPTIVE:

@@ -14,6 +14,7 @@ errors of the nominal model, whose motion is mostly gone, and where the raster i
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -22,18 +23,19 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import binary_propagation, uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
 from controller import firmware as fw
 from discrepancy.stage import Array, Effect, Parameter, Stage, noise_of
 from hil.figures import noise_floor
-from hil.lockstep import flashed
 from hil.logs import Channel, Log, LogError
+from hil.tick import flashed
 from plant import Plant, build_plant, chain
 from plant.compiled import compiled
 from plant.effects import EFFECTS, ROW
+from plant.geometry import STANDS_FOR
 from plant.linkage import STAGES
 from plant.parameters import NAMES, derive, nominal
 from plant.stages import actuator_run, engine_run, linkage_run, step_currents
@@ -44,13 +46,18 @@ STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
 RASTER = 1e-2  # s
 WINDOW = 1.0  # s
 SUBSTEPS = 5  # of the actuator between two samples of 10 ms
+NEAR_STOP = 0.3  # mm, where a piston rests on its stop
 SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
 FREE = {  # nominal parameters that a stage refits within their tolerance
     "demand": (),
     "servo": (),
     "engine": ("engine.lag", "engine.acceleration", "engine.deceleration"),
     "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping", "sensors.lvdt_lag"),
-    "linkage": tuple(f"linkage.{s}_play" for s in STAGES) + tuple(f"sensors.{s}_bias" for s in STAGES),
+    "linkage": (
+        *(f"linkage.{s}_play" for s in STAGES),
+        *(f"sensors.{s}_bias" for s in STAGES),
+        *(f"linkage.{s}_{length}" for s in STAGES for length in STANDS_FOR),
+    ),
 }
 LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
 
@@ -87,32 +94,41 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
     """
     machine = plant or build_plant()
     cal = flashed(calibration or load_calibration(), machine)
-    t, columns, fresh, notes = _raster(log)
+    t, columns, fresh, lacking, notes = _raster(log)
     if len(t) < 500:
         raise LogError(
             f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to search for missing physics"
         )
     dt = float(t[1] - t[0])
-    usable = fresh & (t >= SETTLE) & _no_gap_in_window(t, fresh)
-    run = law_holds = machine_rows = usable
+    # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
+    fresh = ~binary_propagation(~fresh, mask=~fresh | lacking)
+    stretch = _stretches(fresh)
+    usable = fresh & (_since(t, stretch) >= SETTLE) & _no_gap_in_window(t, fresh)
+    run = law_holds = machine_rows = currents = usable
+    spell = machine_spell = stretch
     if "state" in columns:
         running = np.round(columns["state"]) == fw.RUN
         run = usable & running
-        law_holds = run & (t - np.maximum.accumulate(np.where(running, -np.inf, t)) >= SETTLE)  # back in RUN, it first catches up
+        spell = _stretches(fresh & running)  # nor is it known what a controller in another mode has made of the demand
+        law_holds = run & (_since(t, spell) >= SETTLE)  # back in RUN, it first catches up
         # the machine obeys its physics in any mode; where the controller mostly stood aside, that is all there is
         share = float(run.sum()) / max(float(usable.sum()), 1.0)
         machine_rows = run if share >= 0.5 else usable
+        machine_spell = spell if share >= 0.5 else stretch
+        currents = law_holds if share >= 0.5 else usable  # between two rows they follow from the firmware's law
         if share < 0.5:
             notes.append(f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes")
     supply = machine.table.supply
     filled = {"p_s": supply.pressure.value, "t_oil": supply.temperature.value}
-    have = dict(columns)
+    have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
+    have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
     for name, value in filled.items():
         if name not in have:
             have[name] = np.full(len(t), value)
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
-    if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
+    if {"x_lvdt", "i_cmd"} <= columns.keys():
         smooth = _without_noise(t, have, machine)
+    if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns:
             law, off = _law(t, have, cal, smooth)
             what = _other_current(t, have, law, run, cal)
@@ -146,7 +162,7 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         if name in ("servo", "demand") and dt > 1.5 * RASTER:
             absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
             continue
-        rows = law_holds if name in ("servo", "demand") else machine_rows
+        rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
         stage = make(t, have, machine, cal, outputs, rows, present)
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
@@ -158,6 +174,11 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             more = _rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]
+        if name == "actuator":
+            # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's motion, may be quieter
+            channel = noise_floor(t, stage.measured[0])
+            freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
+            stage.quiet = np.maximum([min(channel, freed)], least)
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
@@ -167,8 +188,8 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
 # ---- raster -------------------------------------------------------------------------------------------------------------------------
 
 
-def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
-    """All channels on one uniform raster; which samples are near measured ones; notes."""
+def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
+    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of its own; notes."""
     channels = log.channels
     steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
     if not steps:
@@ -181,7 +202,7 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
     own = float(np.median(np.diff(reference.t)))
     phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
     t = np.arange(max(1, int((end - start) / dt + 1e-6) + 1)) * dt
-    fresh = np.ones(len(t), dtype=bool)
+    fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
     columns = {}
     for name, c in channels.items():
         if len(c.t) < 2:
@@ -202,8 +223,10 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, list[str]]:
         else:
             columns[name] = np.interp(when, c.t, c.values)
         i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
-        fresh &= np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1])) < max(3.0 * step, 2.0 * dt)
-    return t, columns, fresh, list(log.notes)
+        away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
+        fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
+        missing |= away > 0.75 * max(step, dt)
+    return t, columns, fresh, missing, list(log.notes)
 
 
 def _held(c: Channel, dt: float) -> bool:
@@ -240,6 +263,24 @@ def _rms(stage: Stage, difference: Array) -> Array:
         e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
         e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
     return np.asarray(np.sqrt(np.nansum(e**2, axis=1) / np.maximum(np.isfinite(e).sum(axis=1), 1)))
+
+
+def _stretches(good: Array) -> Array:
+    """Number of the stretch of good rows that each row belongs to, from 0; a row that is not good belongs to the stretch before it."""
+    begins = good & ~np.concatenate([[False], good[:-1]])
+    begins[0] = False
+    return np.cumsum(begins)
+
+
+def _since(t: Array, stretch: Array) -> Array:
+    """Time since the first row of each row's stretch, s."""
+    return np.asarray(t - t[np.searchsorted(stretch, stretch)])
+
+
+def _pieces(stretch: Array) -> list[slice]:
+    """Rows of each stretch."""
+    edges = [0, *(np.flatnonzero(np.diff(stretch)) + 1).tolist(), len(stretch)]
+    return [slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
 def _no_gap_in_window(t: Array, fresh: Array) -> Array:
@@ -283,23 +324,28 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
     known = {n.name: n for n in nominal(machine.table, machine.geometry)}
     parameters, rows, si = [], [], []
     for name in FREE[stage]:
+        if name not in known:
+            continue
         n = known[name]
-        value = float(machine.p[NAMES.index(name), 0]) / n.si
+        value = float(machine.p[n.row, 0]) / n.si
         if name.endswith("_play"):
             # the play is known at the vane and used at the ring
-            factor = machine.p[NAMES.index(name), 0] / (n.value * n.si)
+            factor = machine.p[n.row, 0] / (n.value * n.si)
             parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, _vane(name)))
             si.append(n.si * factor)
         else:
             parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, _vane(name)))
             si.append(n.si)
-        rows.append(NAMES.index(name))
+        rows.append(n.row)
     effects = []
     for e in EFFECTS.values():
         if stage not in e.stages or e.name in present:
             continue
         ps = tuple(
-            Parameter(p.name, p.neutral, p.unit, p.low, p.high, KNOWN.get(p.name, 0.0) * p.neutral, _vane(p.name), shape=p.name in SHAPES)
+            Parameter(
+                p.name, p.neutral, p.unit, p.low, p.high, KNOWN.get(p.name, 0.0) * p.neutral, _vane(p.name), shape=p.name in SHAPES,
+                period=p.period,
+            )
             for p in e.parameters
         )
         effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
@@ -315,7 +361,7 @@ def _vane(name: str) -> str | None:
 
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
-SHAPES = (*FIXED_START, "phase")
+SHAPES = (*FIXED_START, "phase", "roundness")
 KNOWN = {"drag": 0.5}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
@@ -323,7 +369,8 @@ FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ...]:
     """Sizes from which a fit of the effect starts: small to gross, both signs where the bounds allow."""
     if name == "valve_flow_saturation":
-        return tuple((v,) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0))
+        # a sharp limit above all speeds of the log has no slope to follow, and one a tenth too low costs more than none
+        return (*((4.0 * 1.18**k, 0.0) for k in range(24)), *((v, 1.0) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0, 200.0)))
     if name in ("can_delay", "frame_hold"):
         return tuple((v,) for v in np.arange(0.01, 0.51, 0.01) if name != "frame_hold" or v > 0.015)
     if name == "trend_threshold_error":
@@ -384,13 +431,22 @@ def _engine(
     if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
         inner = int(round(dt / RASTER))
         n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+    pieces = _pieces(c["stretch"])
+    second = max(1, int(round(1.0 / dt)))
 
     def simulate(thetas: Array) -> Array:
         p = _lanes(machine, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
-        s[chain.N_R] = np.median(c["n_r"][:5])
         out = np.empty((len(n_dem), len(thetas)))
-        engine_run(n_dem, dt / inner, p, s, out)
+        for piece in pieces:
+            head = min(piece.start + second, piece.stop)
+            start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
+            # at its rate limit the engine never forgets how it began: the speed at the start is what suits the first second
+            for stop in (head, piece.stop):
+                inside = slice(piece.start * inner, stop * inner)
+                s[chain.N_R] = start
+                engine_run(n_dem[inside], dt / inner, p, s, out[inside])
+                start = start + np.mean(c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0)
         return out[::inner].T[:, None, :]
 
     return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])
@@ -411,7 +467,7 @@ def _actuator(
 
     logged = step_currents(i, dt, substeps)
 
-    def simulate(thetas: Array, current: Array = logged) -> Array:
+    def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil) -> Array:
         p = _lanes(machine, thetas, rows, si)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
@@ -421,9 +477,15 @@ def _actuator(
         out *= 1e3
         return out
 
+    # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no valve's curve tells
+    stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
+    leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
+    run = run & (leaning | ~_lately(leaning, WINDOW, dt))
     measured = np.where(run, c["x_lvdt"], np.nan)[None]
     stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
+    ageing = _like_time(t, t_oil)
+    stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
     window = int(round(WINDOW / dt))
 
     def hidden(theta: Array) -> Array:
@@ -440,7 +502,7 @@ def _actuator(
         for b in begins:  # the spool and the lags come from another time
             keep[b : b + window] = False
         part = _actuator(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.noise, part.raster_error = stage.floor, stage.noise, stage.raster_error
+        part.floor, part.quiet, part.noise, part.raster_error = stage.floor, stage.quiet, stage.noise, stage.raster_error
         return part
 
     stage.excerpt = excerpt
@@ -458,7 +520,7 @@ def _linkage(
     which = [STAGES.index(o) for o in outputs]
     first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in STAGES]
 
-    def simulate(thetas: Array) -> Array:
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
         p = _lanes(machine, thetas, rows, si)
         derive(p, dt, dt)
         start = machine.start(stroke=x[0], n_r=n_r[0])
@@ -468,24 +530,47 @@ def _linkage(
         linkage_run(x, n_r, t_oil, t, dt, p, s, out)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
-    # until the stroke has crossed the play twice over, nobody knows where in it the rings started
-    known = _crossed(c["x_lvdt"])
+    # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were left at full speed
+    # by a controller that had to catch up, which turns between two rows
+    first_spell, settled = c["machine_spell"] == c["machine_spell"][0], _since(t, c["machine_spell"]) >= SETTLE
+    known = np.zeros(len(t), dtype=bool)
+    for piece in _pieces(c["machine_spell"]):
+        counts = np.flatnonzero((first_spell | settled)[piece]) + piece.start
+        known[counts] = _crossed(c["x_lvdt"][counts])
     if known.any():
         run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
     both = partial(_on_two_cores, simulate, least=32)  # a block of lanes
     stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, both, t, measured)
+    ageing, warming = _like_time(t, t_oil), _like_temperature(t, t_oil)
+    stage.twins = {
+        "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
+        **{name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("thermal_growth", "lvdt_thermal_drift")},
+    }
 
     def excerpt(at: Array) -> Stage:
         keep = run[at]
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
         part = _linkage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.noise, part.raster_error = stage.floor, stage.noise, stage.raster_error
+        part.floor, part.quiet, part.noise, part.raster_error = stage.floor, stage.quiet, stage.noise, stage.raster_error
         return part
 
     stage.excerpt = excerpt
     return stage
+
+
+def _like_time(t: Array, t_oil: Array) -> Array:
+    """A temperature (degC) that goes straight with time, as far up or down as the oil's went."""
+    if np.ptp(t_oil) == 0.0:
+        return np.linspace(-0.5, 0.5, len(t)) + t_oil[0]
+    sign = 1.0 if np.corrcoef(t, t_oil)[0, 1] >= 0.0 else -1.0
+    return np.asarray(t_oil.mean() + sign * np.ptp(t_oil) * ((t - t[0]) / np.ptp(t) - 0.5))
+
+
+def _like_temperature(t: Array, t_oil: Array) -> Array:
+    """A time (s) that goes with the oil's temperature, over the same span; time itself where the temperature is not known to change."""
+    return t if np.ptp(t_oil) == 0.0 else np.asarray(t[0] + np.ptp(t) * (t_oil - t_oil.min()) / np.ptp(t_oil))
 
 
 def _crossed(x: Array) -> Array:
@@ -499,12 +584,16 @@ BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the c
 
 
 class _Smooth(NamedTuple):
-    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as smoothing makes."""
+    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as smoothing makes.
+
+    off: mm, the logged stroke less the fitted model's, whose motion is mostly gone.
+    """
 
     stroke: Array
     noise: float
     left: Array
     distortion: Array
+    off: Array
 
 
 def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
@@ -527,7 +616,10 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     bends = [0.0, *np.quantile(np.abs(step), BENDS)]
     sides = [np.maximum(side * step - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
     parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [np.ones(len(t))])
-    model = np.cumsum(parts @ np.linalg.lstsq(parts, np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0]), rcond=None)[0])
+    logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
+    whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
+    calibrated = parts @ np.linalg.lstsq(parts[whole], logged[whole], rcond=None)[0]
+    model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
     off = c["x_lvdt"] - model
     tried = []
     for rows in SMOOTH:
@@ -535,11 +627,11 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
         left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
     _, rows, size, smooth = min(tried, key=lambda x: x[0])
-    noise = min(noise_floor(t, off), size)
+    noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
     left = savgol_filter(noise * np.random.default_rng(1).standard_normal(len(t)), rows, SMOOTH_ORDER)
     distortion = smooth - savgol_filter(off, rows // 4 * 2 + 1, SMOOTH_ORDER)
     fast = np.abs(distortion) > 2.0 * noise  # rather noisy than wrong
-    return _Smooth(np.where(fast, c["x_lvdt"], model + smooth), noise, left, np.where(fast, off - smooth, distortion))
+    return _Smooth(np.where(fast, c["x_lvdt"], model + smooth), noise, left, np.where(fast, off - smooth, distortion), off)
 
 
 def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tuple[Array, Array]:
@@ -639,7 +731,9 @@ def _servo(
         i = factor * mean[None]
         return i[:, None, :]
 
-    near = np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT]
+    # at the limit the integral stands still: its constant is another one before and after
+    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.k[fw.CURRENT_LIMIT], np.ones(5), "same") > 0.5
+    near = _no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
     stage = Stage(
         "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
     )
@@ -651,23 +745,22 @@ def _servo(
 
 
 @compiled
-def _demand_run(t, n_dem, n_r, delay, hold, phase, k, table, z, out):
-    """The firmware's 10 ms part on logged frames: x_dem (m) of every frame."""
-    n = len(t)
+def _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, out):
+    """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every frame."""
     dt = t[1] - t[0]
-    for i in range(n):
+    for i in range(first, last):
         at = t[i]
         if hold > 0.0:
             at = np.floor((at - phase) / hold + 1e-9) * hold + phase
         at = (at - delay) / dt
-        j = min(max(int(np.floor(at + 1e-9)), 0), n - 1)
+        j = min(max(int(np.floor(at + 1e-9)), first), last - 1)
         w = min(max(at - j, 0.0), 1.0)
-        if w < 1e-6 or j == n - 1:
+        if w < 1e-6 or j == last - 1:
             a, b = n_dem[j], n_r[j]
         else:
             a = n_dem[j] + w * (n_dem[j + 1] - n_dem[j])
             b = n_r[j] + w * (n_r[j + 1] - n_r[j])
-        if i == 0:
+        if i == first:
             z[fw.TREND_N] = a
             z[fw.TREND_TURN] = a
             z[fw.TREND_LAST] = a
@@ -676,10 +769,42 @@ def _demand_run(t, n_dem, n_r, delay, hold, phase, k, table, z, out):
         z[fw.N_R] += (b - z[fw.N_R]) * fw.SLOW_TICK / (k[fw.SPEED_FILTER] + fw.SLOW_TICK)
         fw.trend_step(z, k, a)
         fw.schedule_step(z, k, table)
-        if i == 0:
+        if i == first:
             z[fw.X_DEM] = z[fw.X_TARGET]
         fw.move_demand(z, k, z[fw.X_TARGET], k[fw.STROKE_RATE])
         out[i] = z[fw.X_DEM]
+
+
+@compiled
+def _directions(n_dem, k, z, out):
+    """Direction of the demand's trend at each row, from the trend's state ``z``."""
+    for i in range(len(n_dem)):
+        fw.trend_step(z, k, n_dem[i])
+        out[i] = z[fw.DIRECTION]
+
+
+def _direction_known(n_dem: Array, cal: Calibration) -> Array:
+    """Rows at which the trend's direction does not turn on what the demand did before the first of them.
+
+    How far the demand had already come back then is not known: nothing, or nearly all that turns the direction. Where the two lead to
+    different directions, from either, the row does not count, nor those in which the curves blend.
+    """
+    known = np.ones(len(n_dem), dtype=bool)
+    for direction in (1.0, -1.0):
+        out = np.empty((2, len(n_dem)))
+        for back, row in zip((0.0, 0.999 * cal.k[fw.TREND_CHANGE]), out, strict=True):
+            z = new_state()
+            z[fw.TREND_N] = z[fw.TREND_LAST] = n_dem[0]
+            z[fw.TREND_TURN], z[fw.DIRECTION] = n_dem[0] + direction * back, direction
+            _directions(n_dem, cal.k, z, row)
+        known &= out[0] == out[1]
+    return known & ~_lately(~known, cal.k[fw.BLEND_TIME] + 0.1)
+
+
+def _lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
+    """Whether any of these rows, ``dt`` (s) apart, was less than some seconds ago."""
+    n = np.arange(len(rows))
+    return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -len(rows))) < seconds / dt)
 
 
 def _demand(
@@ -687,7 +812,9 @@ def _demand(
 ) -> Stage:
     _, effects, _, _ = _declared("demand", machine, present)
     n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
-    starting = [float(np.interp(n_r[0], cal.table[0], cal.table[r])) * 1e3 for r in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)]
+    pieces = _pieces(c["spell"])
+    run = run & np.concatenate([_direction_known(n_dem[piece], cal) for piece in pieces]) & ~_lately(c["missing"] > 0.0, 0.4)
+    measured = np.where(run, c["x_dem"], np.nan)
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
 
     def value(theta: Array, name: str, neutral: float) -> float:
@@ -695,6 +822,7 @@ def _demand(
 
     def simulate(thetas: Array) -> Array:
         out = np.empty((len(thetas), 1, len(t)))
+        other = np.empty(len(t))
         for i, theta in enumerate(thetas):
             k, table = cal.k.copy(), cal.table.copy()
             factor = value(theta, "trend_threshold_error", 1.0)
@@ -702,25 +830,33 @@ def _demand(
             k[fw.TREND_CHANGE] *= factor
             offset = value(theta, "schedule_error", 0.0)
             table[1:] += offset * 1e-3
-            rising = abs(starting[0] + offset - c["x_dem"][0]) <= abs(starting[1] + offset - c["x_dem"][0])
-            z = new_state()
-            z[fw.DEMAND_SEEN] = 1.0
-            z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if rising else (-1.0, 0.0)
             hold = value(theta, "frame_hold", float(machine.p[ROW["frame_hold"], 0]))
             phase = float(theta[at["frame_hold"] + 1]) * hold if hold > 0.0 and "frame_hold" in at else 0.0
-            _demand_run(
-                t, n_dem, n_r, value(theta, "can_delay", float(machine.p[ROW["can_delay"], 0])), hold, phase, k, table, z, out[i, 0]
-            )
+            delay = value(theta, "can_delay", float(machine.p[ROW["can_delay"], 0]))
+            for piece in pieces:
+                first, last = piece.start, piece.stop
+                curves = [float(np.interp(n_r[first], table[0], table[row])) * 1e3 for row in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)]
+                rising = abs(curves[0] - c["x_dem"][first]) <= abs(curves[1] - c["x_dem"][first])
+                # at the start of a log the demand stands on a curve; later both directions are tried
+                for x, up in ((out[i, 0], rising), (other, not rising)) if first else ((out[i, 0], rising),):
+                    z = new_state()
+                    z[fw.DEMAND_SEEN] = 1.0
+                    z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if up else (-1.0, 0.0)
+                    _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, x)
+                if first:
+                    one, two = (np.nansum((x[piece] * 1e3 - measured[piece]) ** 2) for x in (out[i, 0], other))
+                    if two < one:
+                        out[i, 0, piece] = other[piece]
         return out * 1e3
 
     # the hold's clock is not the log's: where it stands is a nuisance that is fitted with it
     held = []
     for e in effects:
         if e.name == "frame_hold":
-            phase = Parameter("phase", 0.0, "-", 0.0, 1.0, shape=True)
+            phase = Parameter("phase", 0.0, "-", 0.0, 1.0, shape=True, period=1.0)
             starts = tuple((s[0], k * RASTER / s[0]) for s in e.starts for k in range(max(1, round(s[0] / RASTER))))
             e = Effect(e.name, (*e.parameters, phase), starts, e.excites)
         held.append(e)
     effects = tuple(held)
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
-    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, np.where(run, c["x_dem"], np.nan)[None])
+    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, measured[None])

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from discrepancy.fit import Fit, Judge, Task
-from discrepancy.stage import Array, Stage, noise_of
+from discrepancy.fit import Fit, Judge, Task, bounded_step, recalibrate
+from discrepancy.stage import FLOOR_KNOWN, Array, Effect, Stage, noise_of, reach_of
 
 __all__ = [
     "NATS",
@@ -27,6 +27,8 @@ __all__ = [
     "Found",
     "Search",
     "StageDiagnosis",
+    "as_close",
+    "at_bound",
     "correlation_of",
     "diagnose_stage",
     "found_of",
@@ -42,19 +44,21 @@ SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 RIVAL_NATS = 3.0  # odds of 20 to 1, by which one of two effects that both earn their place beats the other
 RIVAL_SPREADS = 0.3  # and the fall of the error: more than an effect that is not there gains by the errors of form of a clean log
+CREDIBLE = 0.9  # an effect and its rivals have at least this probability together
 RIVAL_SHARE = 0.25  # and share of what it leaves above the floor itself: the library's equations are not nature's
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
-FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
 # Share of the excess over the floor that a further effect must explain (less is one effect patching another's equation), and that
 # a model of the right kind may leave (its equation is not nature's): what is left then would not have earned a further effect either.
 LEAST_SHARE = 0.15
+EXPLAINED = 0.5  # share of the excess over the floor that all effects named in a stage must explain together
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
 SCREENED = 32  # starts simulated at one time
+DIRECTIONS = 12  # from which a fit of an effect with a direction may start
 LEFT_FLOORS = 3.0  # noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
 
 
@@ -70,7 +74,13 @@ class Candidate:
 
 @dataclass
 class Found:
-    """An effect named as missing; ``fits``: the stage's fit with it, and with each rival in its place."""
+    """An effect named as missing.
+
+    fits         the stage's fit with it, and with each that was tried in its place
+    shares       the probability of each of these
+    inseparable  what this log cannot tell from what the effect turns on ("time", "oil temperature")
+    refused      why it comes nearest and yet is no answer; "": it is one
+    """
 
     effect: str
     probability: float
@@ -78,6 +88,9 @@ class Found:
     rivals: list[str]
     nats: float
     fits: dict[str, Fit] = field(default_factory=dict, repr=False)
+    shares: dict[str, float] = field(default_factory=dict, repr=False)
+    inseparable: list[str] = field(default_factory=list)
+    refused: str = ""
 
 
 @dataclass
@@ -99,6 +112,8 @@ class StageDiagnosis:
     correlation: float
     steps: list[tuple[str, float]] = field(default_factory=list)  # waterfall: what was added, whitened RMS after it
     excess: float = 1.0  # whitened RMS after the best model
+    nearest: list[str] = field(default_factory=list)  # where the verdict is unknown: the effects that come nearest
+    refused: list[str] = field(default_factory=list)  # and why they are no answer, in words
 
 
 class Search:
@@ -141,6 +156,11 @@ class Search:
         flat = jac.reshape(len(free), e0.size)
         a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
         room = [(b[free] - self.base.theta[free]) / judge.scale[free] for b in judge.bounds()]
+        if not self.quiet:
+            for e in stage.effects:
+                turned = self._turned(e, e0, jac)
+                thetas += turned
+                owner += [e.name] * len(turned)
         costs: list[float] = []
         for i in range(0, len(thetas), SCREENED):
             errors = judge.errors(np.array(thetas[i : i + SCREENED])).reshape(-1, e0.size)
@@ -158,6 +178,40 @@ class Search:
             self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
         return out
 
+    def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
+        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that are best there.
+
+        Size and direction are polar coordinates: from a wrong direction a fit comes to the right one by a long way round. In a fixed
+        direction the sizes act linearly near neutral, so that their best values follow from one simulation.
+
+        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
+        """
+        judge, at = self.judge, self.stage.index()[effect.name]
+        turning = [i for i, p in enumerate(effect.parameters) if p.period]
+        sizes = np.array([at.start + i for i, p in enumerate(effect.parameters) if not p.shape], dtype=int)
+        if not turning or len(turning) + len(sizes) < len(effect.parameters):
+            return []
+        p, (low, high) = effect.parameters[turning[0]], judge.bounds()
+        columns = np.concatenate([self.base.free, sizes])
+        scale = judge.scale[columns]
+        prior = np.concatenate([self.base.prior, np.zeros(len(sizes))]) * scale**2
+        thetas, asked, derivatives = [], [], []
+        for k in range(DIRECTIONS):
+            theta = self.base.theta.copy()
+            theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
+            moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
+            thetas.append(theta)
+            asked.append(moved)
+            derivatives.append(derivative)
+        errors = judge.errors(np.concatenate(asked))
+        for k, (theta, derivative) in enumerate(zip(thetas, derivatives, strict=True)):
+            own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
+            flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
+            a = flat @ flat.T + np.diag(prior + 1e-9)
+            step = bounded_step(a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale)
+            theta[columns] += step * scale
+        return thetas
+
     def single(self, name: str) -> Fit:
         """Fit with one effect, from its best starts."""
         return self.singles([name])[name]
@@ -172,20 +226,37 @@ class Search:
             fits = []
             for start in self.starts[name][:2]:
                 fits.append((yield from self.judge.fitting((name,), start, 3)))
-            best = min(fits, key=lambda f: float(f.cost.sum()))
+            best = min(fits, key=self.judge.total_of)
             if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
-                best = yield from self.judge.fitting((name,), best, 8)
+                turns = any(p.period for p in self.stage.effect(name).parameters)
+                best = yield from self.judge.fitting((name,), best, 30 if turns else 8)  # along a curve from direction to direction
                 best = yield from self._refine(name, best)
-            self.fits[key] = best
+            self.fits[key] = yield from self._no_worse(best)
             self.tick()
         return self.fits[key]
+
+    def _no_worse(self, fit: Fit) -> Task[Fit]:
+        """The fit, or a better one from the best fit of a part of its effects: with more effects a fit never ends higher.
+
+        A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher than it starts.
+        """
+        mine = frozenset(fit.effects)
+        parts = [f for key, f in self.fits.items() if key < mine]
+        part = min(parts, key=self.judge.total_of, default=None)
+        if part is None or self.judge.total_of(fit) <= self.judge.total_of(part):
+            return fit
+        again = yield from self.judge.fitting(fit.effects, part.theta, 8)
+        return min(again, fit, key=self.judge.total_of)
 
     def _refine(self, name: str, fit: Fit) -> Task[Fit]:
         """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no slope to follow."""
         starts = np.unique([s[0] for s in self.stage.effect(name).starts])
         column = self.stage.index()[name].start
         at = fit.theta[column]
-        if len(self.stage.effect(name).parameters) != 1 or np.min(np.abs(starts - at)) > 1e-9 * max(1.0, abs(at)):
+        parameters = self.stage.effect(name).parameters
+        if sum(not p.shape for p in parameters) != 1 or any(p.period for p in parameters):
+            return fit
+        if np.min(np.abs(starts - at)) > 1e-9 * max(1.0, abs(at)):
             return fit  # it moved away from its start: there is a slope
         i = int(np.argmin(np.abs(starts - at)))
         low, high = starts[max(i - 1, 0)], starts[min(i + 1, len(starts) - 1)]
@@ -229,13 +300,14 @@ class Search:
                 for other in effects[1:]:
                     theta[index[other]] = single[other][index[other]]
                 begins.append(theta)
-            costs = self.judge.block_costs((yield np.array(begins))).sum(axis=1)
+            costs = self.judge.totals((yield np.array(begins)), np.array(begins))
             self.fits[key] = yield from self.judge.fitting(tuple(effects), begins[int(np.argmin(costs))], 3)
             self.tick()
         if finished and key not in self.finished:
             self.fits[key] = yield from self.judge.fitting(tuple(effects), self.fits[key], 8)
             self.finished.add(key)
             self.tick()
+        self.fits[key] = yield from self._no_worse(self.fits[key])
         return self.fits[key]
 
     def beside(self, rest: Sequence[str]) -> list[Fit]:
@@ -323,7 +395,7 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
     if stage.excerpt is None or len(stage.t) < LONG:
         return _to_the_floor(stage, floor, keep, tick)
     judge = Judge(stage, floor, keep)
-    base = judge.fit((), stage.neutral(), 5)
+    base = recalibrate(judge)
     left = base
     for _ in range(2):
         at = _excerpt(judge, left)
@@ -362,6 +434,8 @@ def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: St
     chosen, current = said.final.effects, nominal
     if chosen:
         current = judge.fit(chosen, said.final.theta, 8)
+        if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
+            current = judge.fit(chosen, nominal.theta, 8)
     correlation = correlation_of(judge, current)
     while chosen:
         rest = [tuple(c for c in chosen if c != name) for name in chosen]
@@ -399,11 +473,9 @@ def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable
         if not np.any(lower < 0.9 * floor):
             break
         floor = np.minimum(lower, floor)
-    if stage.hidden is not None and current.effects:
-        # an effect may turn on what happens between two rows: nobody can come closer than that
-        reach = np.hypot(floor, stage.hidden(current.theta))
-        if np.any(reach > (1.0 + FLOOR_KNOWN) * floor):
-            search, current, candidates, correlation, steps = _search(stage, reach, keep, tick, TOLERATED - 1.0)
+    reach = reach_of(stage, floor, current.theta)  # nobody can come closer than that
+    if np.any(reach > floor):
+        search, current, candidates, correlation, steps = _search(stage, reach, keep, tick, TOLERATED - 1.0)
     effects, current = _name(search, current, candidates)
     return _conclude(search.judge, search.base, current, effects, candidates, correlation, steps)
 
@@ -485,21 +557,33 @@ def _conclude(
     correlation: float,
     steps: list[tuple[str, float]],
 ) -> StageDiagnosis:
-    """Give the verdict on the best model found."""
+    """Give the verdict on the best model found.
+
+    A name is only given where it explains the error: not by half, not with a size at the end of what is physically possible, and not
+    where the same law with another cause (`Stage.twins`) does clearly better.
+    """
     stage = judge.stage
     n = max(judge.n, 1)
+    leading = [c.effect for c in candidates if c.nats > NATS]
+    refused = {f.effect: f.refused or BOUND for f in effects if f.refused or at_bound(stage, current, f.effect)}
+    gained, excess = (base.held_out.sum() - f for f in (current.held_out.sum(), n * (1.0 + FLOOR_KNOWN) ** 2))
+    if current.effects and gained < EXPLAINED * excess:
+        refused = dict.fromkeys(current.effects, f"explains {max(gained, 0.0) / excess:.0%} of what exceeds the noise")
+        effects, current = [], base
     rms_before, rms_after = (float(np.sqrt(f.held_out.sum() / n)) for f in (base, current))
     excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
     limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
     # each further effect is one more chance to imitate what the library does not have
     left = 1.0 + (LEFT_FLOORS - 1.0) / max(len(current.effects), 1)
-    if rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or rms_after > left):
+    before, after = (rms_per_output(judge, f) for f in (base, current))
+    worst = max(rms_after, float(np.max(after / judge.floor)))  # no output is made up for by the others
+    too_much = rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or worst > left)
+    if too_much or (refused and current.effects):
         verdict, effects = "unknown", []
     elif current.effects:
         verdict = "missing"
     else:
         verdict = "none"
-    before, after = (rms_per_output(judge, f) for f in (base, current))
     return StageDiagnosis(
         stage=stage.name,
         outputs=stage.outputs,
@@ -516,7 +600,27 @@ def _conclude(
         correlation=correlation,
         steps=steps,
         excess=rms_after,
+        nearest=list(dict.fromkeys([*refused, *current.effects, *leading]))[:3] if verdict == "unknown" else [],
+        refused=[f"{name} {why}" for name, why in refused.items()] if verdict == "unknown" else [],
     )
+
+
+BOUND = "fits only at the end of its physical range"
+
+
+def as_close(judge: Judge, d: StageDiagnosis, fit: Fit) -> bool:
+    """Whether a fit comes as close to the floor as a stage's answer must."""
+    return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1))) <= max(TOLERATED, (1.0 + FLOOR_KNOWN) * d.excess)
+
+
+def at_bound(stage: Stage, fit: Fit, name: str) -> bool:
+    """Whether a size of the effect stands at a physical bound that is not its neutral value: the data would have it go on."""
+    columns = stage.index()[name]
+    for value, p in zip(fit.theta[columns], stage.effect(name).parameters, strict=True):
+        near = 1e-6 * (p.high - p.low) if np.isfinite(p.high - p.low) else 0.0
+        if not p.shape and abs(value - p.value) > near and (value <= p.low + near or value >= p.high - near):
+            return True
+    return False
 
 
 def rms_per_output(judge: Judge, fit: Fit) -> Array:
@@ -537,7 +641,7 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
     blocks = rng.integers(0, judge.n_blocks, (400, judge.n_blocks))
     leading = [c.effect for c in candidates if c.effect not in chosen][:10]
     correlation = correlation_of(judge, current)
-    said: dict[str, tuple[float, list[str], float, dict[str, Fit]]] = {}
+    said: dict[str, tuple[list[str], float, dict[str, Fit], dict[str, float]]] = {}
     for name in chosen:
         rest = tuple(c for c in current.effects if c != name)
         _widen_steps(judge, current, name, correlation)
@@ -548,18 +652,45 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
         for f in search.best_of([(*rest, other) for other in near if other not in rest]):
             alternatives[next(e for e in f.effects if e not in rest)] = f
         freedom = {m: _freedom(judge, f, correlation) for m, f in alternatives.items()}
-        best = min(alternatives, key=lambda m: 0.5 * float(alternatives[m].held_out.sum()) / correlation + freedom[m])
+        # differences are softened by what even the closest leaves; the price of freedom is not
+        closest = min(alternatives.values(), key=lambda f: float(f.held_out.sum()))
+        soft = max(RIVAL_NATS, RIVAL_SHARE * _left(judge, closest, correlation)) / RIVAL_NATS
+        score = {m: -0.5 * f.held_out / (correlation * soft) for m, f in alternatives.items()}
+        best, *others = sorted(alternatives, key=lambda m: freedom[m] - float(score[m].sum()))
+        if at_bound(judge.stage, alternatives[best], best):  # it gives way to one that does as well within
+            as_good = {m: not _worse(judge, alternatives[m], alternatives[best], correlation, freedom[m] - freedom[best]) for m in others}
+            best = next((m for m in others if as_good[m] and not at_bound(judge.stage, alternatives[m], m)), best)
+        alternatives = {m: f for m, f in alternatives.items() if m == best or not at_bound(judge.stage, f, m)}
         current = alternatives[best]
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
         freer = {m: freedom[m] - freedom[best] for m in alternatives}
         rivals = [m for m, f in alternatives.items() if m != best and not _worse(judge, f, current, correlation, freer[m])]
-        table = np.array([-0.5 * f.held_out[blocks].sum(axis=1) / correlation for f in alternatives.values()])
-        soft = max(RIVAL_NATS, RIVAL_SHARE * _left(judge, current, correlation)) / RIVAL_NATS
-        weight = np.exp((table - table.max(axis=0)) / soft - np.array(list(freedom.values()))[:, None])
-        share = dict(zip(alternatives, (weight / weight.sum(axis=0)).mean(axis=1), strict=True))
-        said[best] = (float(share[best]), rivals, nats, {m: alternatives[m] for m in (best, *rivals)})
-    found = [Found(m, p, parameters_of(judge.stage, current, m), rivals, nats, fits) for m, (p, rivals, nats, fits) in said.items()]
+        table = np.array([score[m][blocks].sum(axis=1) - freedom[m] for m in alternatives])
+        weight = np.exp(table - table.max(axis=0))
+        shares = dict(zip(alternatives, (weight / weight.sum(axis=0)).mean(axis=1).tolist(), strict=True))
+        said[best] = (with_rivals(best, rivals, shares), nats, alternatives, shares)
+    found = []
+    for m, (rivals, nats, tried_fits, shares) in said.items():
+        found.append(Found(m, shares[m], parameters_of(judge.stage, current, m), rivals, nats, tried_fits, shares))
+        if m in judge.stage.twins:
+            cause, run = judge.stage.twins[m]
+            twin = Judge(replace(judge.stage, run=run), judge.floor, judge.valid).fit(current.effects, current.theta, 8)
+            if significant(judge, current, twin, correlation):
+                found[-1] = replace(found[-1], refused=f"would have to turn on {cause}")
+            elif not _worse(judge, twin, current, correlation, 0.0):
+                found[-1] = replace(found[-1], inseparable=[cause])
     return found, current
+
+
+def with_rivals(best: str, rivals: list[str], shares: dict[str, float]) -> list[str]:
+    """The rivals of ``best``: those given, and others by probability until all together have `CREDIBLE` of it."""
+    out = list(rivals)
+    for m in sorted(shares, key=lambda m: -shares[m]):
+        if sum(shares[r] for r in (best, *out)) >= CREDIBLE * sum(shares.values()):
+            break
+        if m != best and m not in out:
+            out.append(m)
+    return out
 
 
 def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
@@ -594,7 +725,9 @@ def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
     scale = judge.scale[fit.free]
     width = np.array([min(p.high - p.low, 1e3 * s) for p, s in zip(columns, scale, strict=True)])
     data = fit.normals.sum(axis=0) / correlation
-    one = np.maximum(np.diag(data) * correlation / max(judge.n, 1), 1e-12)
+    # a size is known beforehand as well as one observation tells it, but not so well that the size found could not be
+    found = np.abs(fit.theta[fit.free] - neutral) / scale
+    one = np.minimum(np.maximum(np.diag(data) * correlation / max(judge.n, 1), 1e-12), 1.0 / np.maximum(found, 1e-9) ** 2)
     prior = np.where(fit.prior > 0.0, fit.prior * scale**2, np.where(shape, 12.0 * (scale / width) ** 2, one))[used]
     return 0.5 * float(np.linalg.slogdet(data[np.ix_(used, used)] + np.diag(prior))[1] - np.log(prior).sum())
 
@@ -605,7 +738,9 @@ def parameters_of(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, obje
     out: dict[str, dict[str, object]] = {}
     for i, p in zip(range(columns.start, columns.stop), stage.effect(name).parameters, strict=True):
         k = int(np.flatnonzero(fit.free == i)[0])
-        low, high = float(max(fit.low[k], p.low)), float(min(fit.high[k], p.high))
+        low, high = float(fit.low[k]), float(fit.high[k])
+        if not p.period:
+            low, high = max(low, p.low), min(high, p.high)
         out[p.name] = {"value": float(fit.theta[i]), "low": low, "high": high, "unit": p.unit}
     return out
 

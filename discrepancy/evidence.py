@@ -23,6 +23,7 @@ import numpy as np
 
 from discrepancy.diagnose import Candidate, Found, StageDiagnosis, found_of, parameters_of, recalibrated, rms_per_output
 from discrepancy.fit import Fit, Judge
+from discrepancy.locate import agrees
 from discrepancy.stage import Array, Stage
 
 __all__ = ["LEAST_FALL", "Explorer", "diagnose_system", "extend_system", "noise_of_channel", "structure", "worth"]
@@ -291,7 +292,7 @@ def diagnose_system(
     candidates.sort(key=lambda c: -c.nats)
     before, after = (rms_per_output(judge, f) for f in (base, current))
     share = structure(judge, current)
-    verdict = "missing" if effects else "unknown" if share > STRUCTURE and rms(current) > 1.1 else "none"
+    verdict = "missing" if effects else "unknown" if share > STRUCTURE and not agrees(rms(current), 1.0) else "none"
     d = StageDiagnosis(
         stage=stage.name, outputs=stage.outputs, units=stage.units, verdict=verdict, floor=judge.floor, base=base, final=current,
         error_before=before, error_after=after, effects=effects, recalibrated=recalibrated(stage, current), candidates=candidates,

@@ -18,7 +18,7 @@ import numpy as np
 
 from discrepancy.stage import Array, Stage
 
-__all__ = ["Fit", "Judge", "Task"]
+__all__ = ["Fit", "Judge", "Task", "bounded_step", "recalibrate"]
 
 Answer = TypeVar("Answer")
 Task = Generator[Array, Array, Answer]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
@@ -42,7 +42,7 @@ class Fit:
     free      columns of theta that were fitted
     cost      whitened sum of squares of every block, float64[blocks], with the parameters fitted to all blocks
     held_out  the same with the parameters fitted to the other blocks
-    low, high 90 % interval of each free parameter
+    low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the value is in
     """
 
     effects: tuple[str, ...]
@@ -158,11 +158,30 @@ class Judge:
         return np.array(free, dtype=int)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest value of every column; nominal parameters stay within their tolerance."""
+        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself has no bound."""
         s = self.stage
         low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [p.low for e in s.effects for p in e.parameters]
         high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [p.high for e in s.effects for p in e.parameters]
-        return np.array(low), np.array(high)
+        endless = np.array([p.period > 0.0 for p in s.all_parameters()], dtype=bool)
+        return np.where(endless, -np.inf, low), np.where(endless, np.inf, high)
+
+    def wrapped(self, theta: Array) -> Array:
+        """The same parameters, those that repeat themselves within one turn."""
+        for c, p in enumerate(self.stage.all_parameters()):
+            if p.period > 0.0:
+                theta[c] = p.wrapped(theta[c])
+        return theta
+
+    def totals(self, errors: Array, thetas: Array) -> Array:
+        """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior, float64[sets]."""
+        tolerance = np.array([p.tolerance for p in self.stage.all_parameters()])
+        prior = np.where(tolerance > 0.0, 3.0 / np.where(tolerance > 0.0, tolerance, 1.0) ** 2, 0.0)
+        prior = np.where(np.isfinite(prior), prior, 0.0)
+        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.neutral()) ** 2 @ prior)
+
+    def total_of(self, fit: Fit) -> float:
+        """What the fit has minimised."""
+        return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.neutral())[fit.free] ** 2))
 
     def fit(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Fit:
         """Fit the nominal parameters and those of ``effects`` from ``start``.
@@ -213,7 +232,7 @@ class Judge:
             if start.effects == effects:
                 linear = start.cost, start.gradients, start.normals
             start = start.theta
-        theta = np.clip(np.array(start, dtype=float), low, high)
+        theta = self.wrapped(np.clip(np.array(start, dtype=float), low, high))
         nominal = s.neutral()
         tolerance = np.array([p.tolerance for p in s.all_parameters()])
         # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
@@ -243,10 +262,11 @@ class Judge:
             trials = []
             for factor in (0.01, 1.0, 300.0):
                 lam = damping * factor
-                step = np.linalg.solve(a + lam * np.diag(np.maximum(np.diag(a), 1e-9)), g)
+                damped = a + lam * np.diag(np.maximum(np.diag(a), 1e-9))
+                step = bounded_step(damped, g, *((b[free] - theta[free]) / scale for b in (low, high)))
                 trial = theta.copy()
                 trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
-                trials.append((lam, trial))
+                trials.append((lam, self.wrapped(trial)))
             thetas = np.array([t for _, t in trials])
             errors = yield thetas
             costs = total(self.block_costs(errors), thetas)
@@ -342,6 +362,8 @@ class Judge:
             variance = np.zeros(k)
             variance[loose] = np.diag(np.linalg.pinv(info))
             half[move] = (1.645 * np.sqrt(np.maximum(variance, spread)) * scale)[move]
+            turn = np.array([p.period or np.inf for p in self.stage.all_parameters()])[free]
+            half = np.minimum(half, 0.5 * turn)
         return Fit(
             effects, theta, free, cost, np.maximum(held, cost * 0.5), gradients, normals, prior, theta[free] - half, theta[free] + half
         )
@@ -363,3 +385,27 @@ class Judge:
         step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
         step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
         return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))
+
+
+def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
+    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest is solved again.
+
+    A step that is only cut off at the bounds is no descent where parameters can stand in for each other.
+    """
+    step = np.zeros(len(g))
+    moves = np.ones(len(g), dtype=bool)
+    for _ in range(len(g)):
+        step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
+        beyond = moves & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        step[beyond] = np.clip(step[beyond], low[beyond], high[beyond])
+        moves &= ~beyond
+        if not moves.any():
+            break
+    return step
+
+
+def recalibrate(judge: Judge) -> Fit:
+    """The stage with nothing added, its nominal parameters refitted within their tolerances: what every verb starts from."""
+    return judge.fit((), judge.stage.neutral())

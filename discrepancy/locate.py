@@ -1,19 +1,62 @@
-"""Where does a stage fail, since when, and what is the shape of what no effect in the library explains?"""
+"""By how much does a stage fail, where, since when, and what is the shape of what no effect in the library explains?
+
+`locate` is the only place that says whether a stage agrees with its log: terminal, JSON, pages, workbench and users' own models draw it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from discrepancy.fit import Fit, Judge
-from discrepancy.stage import Array
+from discrepancy.diagnose import rms_per_output
+from discrepancy.fit import Fit, Judge, recalibrate
+from discrepancy.stage import Array, without_jumps
 
-__all__ = ["Regime", "Shape", "bins_of", "onset", "regimes", "shape"]
+__all__ = ["AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "bins_of", "locate", "onset", "regimes", "shape"]
 
+AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
+CORRELATION = 2.0  # samples that count as one where errors are looked at bin by bin: what clean logs show at most
 BINS = 8
 LEVEL = 0.01  # chance that any bin of any regime is called significant when nothing is missing
+
+
+def agrees(error: float, floor: float) -> bool:
+    """Whether an RMS error is no more than noise of this RMS."""
+    return bool(error <= AGREES * floor)
+
+
+@dataclass(frozen=True)
+class StageFigures:
+    """Error of one output of a stage driven by its own logged inputs, in its unit.
+
+    rms           with the stage's nominal parameters refitted within their tolerances
+    rms_as_given  with the parameters as they are
+    """
+
+    stage: str
+    signal: str
+    unit: str
+    rms: float
+    rms_as_given: float
+    noise_floor: float
+    samples: int
+
+    @property
+    def ratio(self) -> float:
+        """Error in noise floors."""
+        return self.rms / self.noise_floor
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the error is no more than noise."""
+        return agrees(self.rms, self.noise_floor)
+
+    def json(self) -> dict[str, Any]:
+        """The figures as the commands' JSON."""
+        return {**asdict(self), "ratio": self.ratio, "agrees": self.agrees}
 
 
 @dataclass(frozen=True)
@@ -49,6 +92,78 @@ class Regime:
         else:
             place = f"{self.condition} {low:.4g} to {high:.4g} {self.condition_unit}".rstrip()
         return f"{self.output}: {self.rms[b]:.3g} {self.unit} ({self.ratio[b]:.1f} noise floors) at {place}"
+
+    def json(self) -> dict[str, Any]:
+        """The condition as the commands' JSON."""
+        return {
+            "signal": self.output, "unit": self.unit, "condition": self.condition, "condition_unit": self.condition_unit,
+            "edges": self.edges, "rms": self.rms, "noise_floors": self.ratio, "samples": self.samples,
+            "significant": [bool(b) for b in self.significant], "contrast": self.contrast,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Located:
+    """What one stage says with nothing added: how large its error is, whether that is more than noise, under which conditions.
+
+    fit      the stage's nominal parameters, refitted within their tolerances; no effect
+    floor    noise floor of every output
+    signals  the error of every output
+    regimes  the error of every output against every condition, most telling first
+    onset    s, where the error begins inside the log; None: it does not
+    """
+
+    stage: str
+    fit: Fit
+    floor: Array
+    signals: tuple[StageFigures, ...]
+    regimes: tuple[Regime, ...]
+    onset: float | None
+
+    @property
+    def hot(self) -> list[Regime]:
+        """Conditions under which the error exceeds the noise."""
+        return [r for r in self.regimes if r.significant.any()]
+
+    @property
+    def fails(self) -> bool:
+        """Whether an output's error is more than noise, over the whole log or under any condition."""
+        return bool(self.hot) or not all(s.agrees for s in self.signals)
+
+    @property
+    def worst(self) -> StageFigures:
+        """The output with the greatest error in noise floors."""
+        return max(self.signals, key=lambda s: s.ratio)
+
+    def verdict(self) -> str:
+        """Whether it agrees or fails, in words."""
+        if not self.fails:
+            return "agrees everywhere"
+        where = f"{len(self.hot)} of {len(self.regimes)} conditions" if self.hot else "no single condition more than in others"
+        return f"fails in {where}: {self.worst.signal} at {self.worst.ratio:.2f} noise floors"
+
+    def json(self) -> dict[str, Any]:
+        """The stage as the JSON of ``vaneloop locate``."""
+        return {
+            "stage": self.stage, "fails": self.fails, "verdict": "fails" if self.fails else "agrees", "onset_s": self.onset,
+            "signals": [s.json() for s in self.signals], "regimes": [r.json() for r in self.regimes],
+        }  # fmt: skip
+
+
+def locate(judge: Judge, fit: Fit | None = None) -> Located:
+    """Where the stage fails with nothing added. ``fit``: its nominal parameters refitted, where that has been done (`recalibrate`)."""
+    stage = judge.stage
+    fit = fit or recalibrate(judge)
+    given = judge.errors(stage.neutral()[None])[0]
+    rms, n = rms_per_output(judge, fit), judge.valid.sum(axis=1)
+    as_given = np.sqrt(np.sum(given * given, axis=1) / np.maximum(n, 1)) * judge.floor
+    signals = tuple(
+        StageFigures(stage.name, signal, stage.units[k], float(rms[k]), float(as_given[k]), float(judge.floor[k]), int(n[k]))
+        for k, signal in enumerate(stage.outputs)
+    )
+    found = tuple(regimes(judge, fit, CORRELATION))
+    start = onset(judge, fit) if any(r.significant.any() for r in found) else None
+    return Located(stage.name, fit, judge.floor, signals, found, start)
 
 
 def _edges(values: Array) -> Array:
@@ -167,11 +282,19 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
     for o, output in enumerate(stage.outputs):
         valid = judge.valid[o].copy()
         y, unit, what = e[o].copy(), stage.units[o], f"error of {output}"
-        f, power = periodogram(np.where(valid, y, 0.0), 1.0 / dt)
+        # rates of the error with its jumps closed: one that drifts through a window is no sawtooth, and yet nothing is told at the
+        # windows' own rate, at which each of them starts alike
+        whole = without_jumps(stage, stage.measured[o] - stage.run(fit.theta[None])[0, o])
+        rate = np.diff(whole) / dt
+        f, power = periodogram(np.where(np.isfinite(rate), rate, 0.0), 1.0 / dt)
+        power[1:] /= (2.0 * np.sin(np.pi * f[1:] * dt) / dt) ** 2
+        resolution = max(0.05, 3.0 / (t[-1] - t[0]))
         keep = f > 0.7
+        if stage.window:
+            keep &= np.abs(f * stage.window - np.round(f * stage.window)) > resolution * stage.window
         if keep.any() and power[keep].max() > 0:
             peak = int(np.flatnonzero(keep)[np.argmax(power[keep])])
-            near = np.abs(f - f[peak]) < max(0.05, 3.0 / (t[-1] - t[0]))
+            near = np.abs(f - f[peak]) < resolution
             line = float(power[near].sum() * (f[1] - f[0]))
             background = float(np.median(power[keep])) * near.sum() * (f[1] - f[0])
             if line > 30.0 * background and line > 0.25 * float(np.mean(y[valid] ** 2)):

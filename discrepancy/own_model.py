@@ -19,13 +19,13 @@ from discrepancy.diagnose import StageDiagnosis
 from discrepancy.evidence import diagnose_system, extend_system
 from discrepancy.fit import Judge
 from discrepancy.laws import HYSTERETIC
-from discrepancy.locate import Regime, Shape, onset, regimes, shape
+from discrepancy.locate import Located, Shape, agrees, shape
+from discrepancy.locate import locate as where
 from discrepancy.stage import Array, StageError
 from discrepancy.system import STARTS_LOADED, Bound, Record, System
 
 __all__ = ["Answer", "Model", "compare", "diagnose", "extend", "load_model", "locate", "write_model"]
 
-LEFT = 1.1  # noise floors left from which the shape of what is left is told
 NO_HELP = 0.85  # error with a law over error without it, from which it hardly helps
 
 
@@ -43,6 +43,7 @@ class Model:
 class Answer:
     """What one verb found.
 
+    located   the model as given, with nothing added: how large its error is, and under which conditions
     logs      every log, fitted or test, with the error of each output after each step: step -> log -> RMS per output
     ablation  law -> log -> error with it over error without it (each refitted on the fitted logs), over all outputs
     """
@@ -51,9 +52,8 @@ class Answer:
     bound: Bound
     test: Bound | None
     diagnosis: StageDiagnosis
+    located: Located
     shapes: list[Shape] = field(default_factory=list)
-    regimes: list[Regime] = field(default_factory=list)
-    onset: float | None = None
     logs: dict[str, dict[str, Array]] = field(default_factory=dict)
     ablation: dict[str, dict[str, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -198,9 +198,11 @@ def compare(system: System, logs: Sequence[Record], test: Sequence[Record] = (),
         bound,
         other,
         d,
+        where(Judge(bound.thinned, d.floor), d.base),
         logs=_steps(bound, other, {"model": d.base.theta}),
         notes=bound.notes,
         elapsed_s=time.perf_counter() - started,
+        model=model or Model(),
     )
 
 
@@ -208,9 +210,6 @@ def locate(system: System, logs: Sequence[Record], test: Sequence[Record] = (), 
     """Where the model fails: under which logged conditions its error is largest, since when."""
     answer = compare(system, logs, test, model)
     answer.verb = "locate"
-    judge = Judge(answer.bound.thinned, answer.diagnosis.floor)
-    answer.regimes = regimes(judge, answer.diagnosis.base, 2.0)
-    answer.onset = onset(judge, answer.diagnosis.base) if any(r.significant.any() for r in answer.regimes) else None
     return answer
 
 
@@ -238,7 +237,7 @@ def diagnose(
         return float(np.mean([np.log(np.maximum(v, 1e-300) / bound.noise()).mean() for v in by.values() if np.isfinite(v).all()] or [0.0]))
 
     d, decided = diagnose_system(bound.thinned, bound.noise(), tick, on_test if other is not None else None, bound.guess)
-    answer = _finish("diagnose", bound, other, d, started)
+    answer = _finish("diagnose", bound, other, d, started, model or Model())
     answer.notes += decided
     return answer
 
@@ -264,10 +263,11 @@ def extend(
             )
             raise StageError(f"--effect {e!r}: not a law that system {system.name!r} can be given; {hint}")
     d = extend_system(bound.thinned, bound.noise(), tuple(dict.fromkeys(effects)))
-    return _finish("extend", bound, other, d, started, model)
+    return _finish("extend", bound, other, d, started, model or Model())
 
 
-def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, started: float, before: Model | None = None) -> Answer:
+def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, started: float, before: Model) -> Answer:
+    """What `diagnose` and `extend` answer; ``before``: the model that they started from."""
     judge = Judge(bound.thinned, d.floor)
     named = {"model": d.base.theta}
     # the waterfall log by log: laws in the order in which they came in, each step fitted
@@ -277,7 +277,7 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
         named[" + ".join(part.effects)] = theta = part.theta
     if d.final.effects:
         named[" + ".join(d.final.effects)] = d.final.theta
-    answer = Answer(verb, bound, other, d, logs=_steps(bound, other, named), notes=list(bound.notes))
+    answer = Answer(verb, bound, other, d, where(judge, d.base), logs=_steps(bound, other, named), notes=list(bound.notes))
     last = list(answer.logs.values())[-1]
     if len(d.final.effects) > 1:
         for name in d.final.effects:
@@ -300,12 +300,11 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
                 f"{p.name}: not needed any more, set to 0 (it was {v0:.4g} {p.unit} while {', '.join(d.final.effects)} was missing)"
             )
     answer.notes += _loaded(bound, judge, d)
-    if d.verdict != "none" and d.excess > LEFT:
+    if d.verdict != "none" and not agrees(d.excess, 1.0):
         answer.shapes = shape(judge, d.final)
-    answer.regimes = regimes(judge, d.base, 2.0)
     answer.elapsed_s = time.perf_counter() - started
-    m = before or Model()
-    answer.model = Model(bound.system.name, dict(m.parameters), {k: dict(v) for k, v in m.effects.items()}, list(m.history))
+    effects = {k: dict(v) for k, v in before.effects.items()}
+    answer.model = Model(bound.system.name, dict(before.parameters), effects, list(before.history))
     for p, v in zip(bound.stage.parameters, d.final.theta, strict=False):
         law, _, parameter = p.name.rpartition(".")
         if law:

@@ -173,7 +173,7 @@ def _pictures(page: Page, answer: Answer) -> None:
 
 
 def _map(page: Page, answer: Answer) -> None:
-    hot = [r for r in answer.regimes if r.significant.any()]
+    hot = answer.located.hot
     if not hot:
         return
     page.section("Where the model as given fails")

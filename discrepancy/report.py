@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from discrepancy.adapter import Chain
 from discrepancy.diagnose import StageDiagnosis
 from discrepancy.fit import Judge
-from discrepancy.locate import Regime, bins_of, onset, regimes
-from discrepancy.workflow import Diagnosis, StageFigures, floor_of
+from discrepancy.locate import Located, bins_of, locate
+from discrepancy.workflow import Diagnosis
 from hil.page import Line, Page, Panel, heat, loop, number, overlay, ranking, waterfall
 
-__all__ = ["compare_report", "diagnosis_report", "verdict_sentence"]
+__all__ = ["compare_report", "diagnosis_report", "located_sentence", "located_tone", "verdict_sentence"]
 
 
 def verdict_sentence(d: Diagnosis) -> str:
@@ -34,35 +35,44 @@ def verdict_sentence(d: Diagnosis) -> str:
     return text[0].upper() + text[1:] + "."
 
 
-def compare_report(figures: Sequence[StageFigures], chain: Chain, path: str | Path, command: str, log: str) -> Path:
+def located_sentence(located: Sequence[Located]) -> str:
+    """What all stages say together, in one sentence."""
+    failing = [x for x in located if x.fails]
+    if not failing:
+        return "Every stage agrees with its measurements to within the noise."
+    worst = max(failing, key=lambda x: x.worst.ratio)
+    s = worst.worst
+    others = [x.stage for x in failing if x is not worst]
+    also = f" {' and '.join(others)} {'fail' if len(others) > 1 else 'fails'} too." if others else ""
+    off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {number(s.ratio)} times its noise floor"
+    return f"The model fails most in the {worst.stage} stage: {off}.{also}"
+
+
+def located_tone(located: Sequence[Located]) -> Literal["good", "neutral", "bad"]:
+    """Whether that is good news."""
+    failing = [x.worst.ratio for x in located if x.fails]
+    return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
+
+
+def compare_report(located: Sequence[Located], chain: Chain, path: str | Path, command: str, log: str) -> Path:
     """Write the page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
-    worst = max(figures, key=lambda f: f.rms / f.noise_floor)
-    ratio = worst.rms / worst.noise_floor
-    verdict = (
-        f"The model fails most in the {worst.stage} stage: {worst.signal} is off by {number(worst.rms)} {worst.unit} RMS, "
-        f"{ratio:.1f} times its noise floor."
-        if ratio > 1.1
-        else "Every stage agrees with its measurements to within the noise."
-    )
-    page = Page(
-        f"Stages of {Path(log).name}", verdict, tone="bad" if ratio > 2 else "good" if ratio < 1.1 else "neutral", command=command, log=log
-    )
+    page = Page(f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log)
     page.section(
         "Stage by stage",
-        "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does in closed loop.",
+        "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does in closed loop. "
+        "Nominal parameters are refitted within their tolerances; beside it the error with the parameters as given.",
     )
-    rows = [[f.stage, f.signal, f.rms, f.noise_floor, f.rms / f.noise_floor, f.unit, f.samples] for f in figures]
-    rows += [[name, "not observed: " + why, None, None, None, "", None] for name, why in chain.not_observed.items()]
-    page.table(["stage", "signal", "RMS error", "noise floor", "ratio", "unit", "samples"], rows)
-    for stage in chain.stages:
-        judge = Judge(stage, floor_of(stage))
-        theta = stage.neutral()
-        _curves(page, judge, [("model", theta, "error")], f"{stage.name}: measured and model")
-        from discrepancy.fit import Fit
-
-        nothing = np.empty(0)
-        fit = Fit((), theta, nothing.astype(int), nothing, nothing, nothing, nothing, nothing, nothing, nothing)
-        _failure_map(page, regimes(judge, fit, 1.0), stage.name, onset(judge, fit))
+    rows: list[list[object]] = [
+        [x.stage, "fails" if x.fails else "agrees", f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit, f.samples]
+        for x in located for f in x.signals
+    ]  # fmt: skip
+    rows += [[name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in chain.not_observed.items()]
+    page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
+    for x in located:
+        page.text(f"{x.stage}: {x.verdict()}.")
+        judge = Judge(chain.stage(x.stage), x.floor)
+        _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
+        _failure_map(page, x)
     return page.write(path)
 
 
@@ -142,7 +152,7 @@ def _stage_story(page: Page, s: StageDiagnosis, chain: Chain) -> None:
     if s.final.effects:
         curves.append(("with " + " + ".join(s.final.effects), s.final.theta, "model"))
     _curves(page, judge, curves, f"{s.stage}: error before and after")
-    _failure_map(page, regimes(judge, s.base, s.correlation), s.stage, onset(judge, s.base))
+    _failure_map(page, locate(judge, s.base))
     top = [c for c in s.candidates if c.nats > 0][:12]
     if top:
         chosen = [f.effect for f in s.effects]
@@ -168,15 +178,12 @@ def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]],
     page.plot(overlay(panels), caption + ". The grey band is three noise floors to each side.")
 
 
-def _failure_map(page: Page, found: list[Regime], stage: str, start: float | None) -> None:
-    if start is not None:
-        page.text(f"The error of the {stage} stage begins at t = {start:.0f} s.")
-    hot = [r for r in found if r.significant.any()]
-    if not hot:
-        return
-    for output in dict.fromkeys(r.output for r in hot):
-        mine = [r for r in hot if r.output == output]
+def _failure_map(page: Page, located: Located) -> None:
+    if located.onset is not None:
+        page.text(f"The error of the {located.stage} stage begins at t = {located.onset:.0f} s.")
+    for output in dict.fromkeys(r.output for r in located.hot):
+        mine = [r for r in located.hot if r.output == output]
         page.plot(
             heat(*bins_of(mine, lambda r: r.ratio), "noise floors", "from the lowest values to the highest", ""),
-            f"Where the {stage} stage fails: error of {output} in noise floors. Worst: {mine[0].worst()}.",
+            f"Where the {located.stage} stage fails: error of {output} in noise floors. Worst: {mine[0].worst()}.",
         )

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["Effect", "Parameter", "Stage", "StageError", "noise_of"]
+__all__ = ["Effect", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
 
 Array = np.ndarray
+FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 
 
 class StageError(ValueError):
@@ -31,6 +32,7 @@ class Parameter:
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
     scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
     shape      of an effect's parameter: it says how the effect acts, not how much, and has no neutral value of its own
+    period     after which it repeats itself, as an angle does: ``low`` and ``high`` are where one turn is cut, no bounds. 0: it does not
     """
 
     name: str
@@ -42,6 +44,11 @@ class Parameter:
     output: str | None = None
     scale: float = 0.0
     shape: bool = False
+    period: float = 0.0
+
+    def wrapped(self, value: float) -> float:
+        """Return the same value within the turn that begins at ``low``; of a parameter without period, the value."""
+        return value if self.period == 0.0 else value - self.period * float(np.floor((value - self.low) / self.period))
 
 
 @dataclass(frozen=True)
@@ -75,9 +82,11 @@ class Stage:
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these parameters: an effect may
               turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
+    quiet     upper bounds on the RMS of the noise in each output that do not rest on this model, float64[outputs]; None: there are none
     finer     ``run`` with a finer step of its own, for stages that have one: their difference is the numerical error
     noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
               known, whose errors hold less of the machine's motion
+    twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of theirs)
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long log is searched on
               an excerpt, and the answer confirmed on the whole; None: always searched whole
     """
@@ -97,8 +106,10 @@ class Stage:
     lost: Array | None = None
     hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
+    quiet: Array | None = None
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None
+    twins: Mapping[str, tuple[str, Callable[[Array], Array]]] = field(default_factory=dict)
     excerpt: Callable[[Array], Stage] | None = None
 
     def __post_init__(self) -> None:
@@ -136,21 +147,42 @@ class Stage:
         return next(e for e in self.effects if e.name == name)
 
 
+KNOWN_TO = 0.05  # share by which two estimates of one noise differ on clean logs of some 100 s
+
+
+def reach_of(stage: Stage, floor: Array, theta: Array) -> Array:
+    """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make of what happens between two rows."""
+    if stage.hidden is None or np.array_equal(theta[len(stage.parameters) :], stage.neutral()[len(stage.parameters) :]):
+        return floor
+    reach = np.hypot(floor, stage.hidden(theta))
+    return np.where(reach > (1.0 + FLOOR_KNOWN) * floor, reach, floor)
+
+
+def without_jumps(stage: Stage, error: Array) -> Array:
+    """An output's error with the jumps closed that windows of a free constant make: the model starts anew in each."""
+    if not stage.window:
+        return error
+    w = ((stage.t - stage.t[0]) / stage.window + 1e-9).astype(int)
+    first = np.flatnonzero(np.diff(w, prepend=-1))[1:]
+    step = np.zeros(len(error))
+    step[first] = error[first] - error[first - 1]
+    if len(error) > 2:  # keep what the neighbours say the step would have been without a jump
+        step[first] -= 0.5 * (error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first])
+    return np.asarray(error - np.cumsum(np.where(np.isfinite(step), step, 0.0)))
+
+
 def noise_of(stage: Stage, theta: Array) -> Array:
     """Noise floor of every output: the noise in the error with parameters ``theta``, and what the raster hides.
 
+    The error of a model that lacks much moves, and motion can pass for noise: where ``stage.quiet`` is clearly less, that is the noise.
     Where windows have a free constant the model may jump from one to the next; the jumps are closed first, so that they are not noise.
     """
     assert stage.noise is not None
     out = []
     for error in stage.measured - stage.run(theta[None])[0]:
-        if stage.window:
-            w = ((stage.t - stage.t[0]) / stage.window + 1e-9).astype(int)
-            first = np.flatnonzero(np.diff(w, prepend=-1))[1:]
-            step = np.zeros(len(error))
-            step[first] = error[first] - error[first - 1]
-            if len(error) > 2:  # keep what the neighbours say the step would have been without a jump
-                step[first] -= 0.5 * (error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first])
-            error = error - np.cumsum(np.where(np.isfinite(step), step, 0.0))
+        error = without_jumps(stage, error)
         out.append(stage.noise(stage.t, error))
-    return np.array(out) if stage.raster_error is None else np.hypot(out, stage.raster_error)
+    noise = np.array(out)
+    if stage.quiet is not None:
+        noise = np.where(stage.quiet < (1.0 - KNOWN_TO) * noise, stage.quiet, noise)
+    return noise if stage.raster_error is None else np.hypot(noise, stage.raster_error)

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from discrepancy.diagnose import (
+    NATS,
     Search,
     StageDiagnosis,
+    as_close,
     correlation_of,
     diagnose_stage,
     found_of,
@@ -24,22 +26,13 @@ from discrepancy.diagnose import (
     significant,
 )
 from discrepancy.fit import Fit, Judge
-from discrepancy.locate import Shape, shape
-from discrepancy.stage import Array, Stage, StageError, noise_of
+from discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
+from discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
 
-__all__ = ["Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage"]
-
-
-@dataclass(frozen=True)
-class StageFigures:
-    """Error of one output of a stage driven by its own logged inputs."""
-
-    stage: str
-    signal: str
-    unit: str
-    rms: float
-    noise_floor: float
-    samples: int
+__all__ = [
+    "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage", "floor_of", "locate_stages",
+    "no_better",
+]  # fmt: skip
 
 
 @dataclass
@@ -54,17 +47,19 @@ class Diagnosis:
     notes: list[str] = field(default_factory=list)
 
 
-def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
-    """Error of every stage with its nominal parameters (nothing refitted), driven by its own logged inputs."""
+def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None] | None = None) -> list[Located]:
+    """Every stage with nothing added, driven by its own logged inputs: how large its error is, and under which conditions."""
     out = []
-    for stage in stages:
-        judge = Judge(stage, floor_of(stage))
-        e = judge.errors(stage.neutral()[None])[0]
-        for k, signal in enumerate(stage.outputs):
-            n = int(judge.valid[k].sum())
-            rms = float(np.sqrt(np.sum(e[k] ** 2) / max(n, 1)) * judge.floor[k])
-            out.append(StageFigures(stage.name, signal, stage.units[k], rms, float(judge.floor[k]), n))
+    for i, stage in enumerate(stages):
+        if progress:
+            progress(i / len(stages), stage.name)
+        out.append(locate(Judge(stage, floor_of(stage))))
     return out
+
+
+def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
+    """Error of every output of every stage, driven by its own logged inputs, with nothing added."""
+    return [figures for located in locate_stages(stages) for figures in located.signals]
 
 
 def floor_of(stage: Stage) -> Array:
@@ -74,14 +69,13 @@ def floor_of(stage: Stage) -> Array:
     return stage.floor
 
 
-REMAINDER = 1.1  # noise floors left by a named model from which the shape of what is left is told too
 _WORK: list[Stage] = []
 
 
 def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
     d = diagnose_stage(stage, floor_of(stage))
-    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" or d.excess > REMAINDER else []
+    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" or not agrees(d.excess, 1.0) else []
 
 
 def diagnose(
@@ -114,35 +108,54 @@ def diagnose(
 
 
 def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
-    """Let the stages settle each other's rivals: an effect that acts in two stages must do so in both by the same amount.
+    """Let the stages settle each other's answers: an effect that acts in two stages must do so in both by the same amount.
 
-    Among the rivals of one place those go that another stage contradicts; those stay alone that another stage names too.
+    Among an effect and its rivals those go that another stage contradicts; those stay alone that another stage names too. Where all of
+    them are contradicted, with any size near theirs, the next best of those that were tried takes the place if it explains as much;
+    else the stage's answer is "unknown".
     """
     for d in results:
+        judge = Judge(stages[d.stage], d.floor)
         for k, f in enumerate(d.effects):
-            if not f.rivals:
-                continue
+            elsewhere = {
+                m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()] for m in f.fits
+            }
             options = [f.effect, *f.rivals]
-            elsewhere = {m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()] for m in options}
-            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])] or options
+            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])]
+            if not left:
+                left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
+            beside = {g.effect: d.final for g in d.effects if g is not f}  # they may have changed since the rivals were fitted
+            refitted: dict[str, Fit] = {}
+            for m in () if left else sorted((m for m in f.shares if m not in options), key=lambda m: -f.shares[m]):
+                if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m]):
+                    refitted[m] = _with(judge, {**beside, m: f.fits[m]})  # where an excerpt was searched, to the whole log now
+                    if as_close(judge, d, refitted[m]):
+                        left = [m]
+                        break
+            if not left:
+                d.verdict, d.nearest, d.effects = "unknown", options[:3], []
+                d.refused = [f"{m} is contradicted by {elsewhere[m][0].stage}" for m in options if elsewhere[m]]
+                break
             seconded = [m for m in left if any(m in (g.effect, *g.rivals) for o in elsewhere[m] for g in o.effects)]
             left = seconded or left
             if left == options:
                 continue
             name, fit = left[0], d.final
             if name != f.effect:
-                beside = {g.effect: d.final for g in d.effects if g is not f}  # they may have changed since the rivals were fitted
-                judge = Judge(stages[d.stage], d.floor)
-                fit = _with(judge, {**beside, name: f.fits[name]})
+                fit = refitted.get(name) or _with(judge, {**beside, name: f.fits[name]})
                 d.final, d.error_after = fit, rms_per_output(judge, fit)
                 d.recalibrated = recalibrated(stages[d.stage], fit)
                 for other in d.effects:
                     if other is not f:
                         other.parameters = parameters_of(stages[d.stage], fit, other.effect)
-            probability = f.probability if len(left) > 1 else 1.0
+            shares = {m: f.shares.get(m, 1.0) for m in left}
             d.effects[k] = replace(
-                f, effect=name, rivals=left[1:], probability=probability, parameters=parameters_of(stages[d.stage], fit, name)
-            )
+                f, effect=name, rivals=left[1:], probability=shares[name] / max(sum(shares.values()), 1e-300),
+                parameters=parameters_of(stages[d.stage], fit, name),
+            )  # fmt: skip
+
+
+NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
 
 
 def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
@@ -154,19 +167,40 @@ def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
     return judge.fit(tuple(sources), start, 4)
 
 
-def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str) -> bool:
-    """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too."""
+def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str, near: float = 0.0) -> bool:
+    """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too.
+
+    near  share of its size by which the interval is widened
+    """
     stage = stages[other.stage]
     mine, theirs = stages[d.stage].index()[effect], stage.index()[effect]
     at = [int(np.flatnonzero(fit.free == c)[0]) for c in range(mine.start, mine.stop)]
-    size = np.clip(other.final.theta[theirs], fit.low[at], fit.high[at])
-    if np.array_equal(size, other.final.theta[theirs]):
+    there, turns = other.final.theta[theirs].copy(), [p.period for p in stage.effect(effect).parameters]
+    for i, turn in enumerate(turns):
+        if turn:
+            there[i] += turn * np.round((fit.theta[mine][i] - there[i]) / turn)
+    wider = near * np.abs(fit.theta[mine] - stages[d.stage].neutral()[mine])
+    size = np.clip(there, fit.low[at] - wider, fit.high[at] + wider)
+    if np.array_equal(size, there):
         return True
     judge = Judge(stage, other.floor)
     start = other.final.theta.copy()
     start[theirs] = size
     held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
     return not significant(judge, held, other.final, correlation_of(judge, other.final))
+
+
+def _one_by_one(
+    stage: Stage, floor: Array, effects: tuple[str, ...], tick: Callable[[], None] | None
+) -> tuple[Judge, Search, tuple[str, ...], list[Fit]]:
+    """Fits with no effect, one, two and so on up to all; the one that explains most first."""
+    judge = Judge(stage, floor)
+    search = Search(judge, tick)
+    search.singles(effects)
+    order: tuple[str, ...] = ()
+    while len(order) < len(effects):
+        order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
+    return judge, search, order, [search.base, *(search.joined(order[: k + 1]) for k in range(len(order)))]
 
 
 def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
@@ -179,21 +213,18 @@ def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None
         if all(e != x.name for x in stage.effects):
             raise StageError(f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}")
     floor = floor_of(stage)
-    for _ in range(3):
-        judge = Judge(stage, floor)
-        search = Search(judge, tick)
-        search.singles(effects)
-        order: tuple[str, ...] = ()
-        while len(order) < len(effects):  # the one that explains most first
-            order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
-        fits = [search.base, *(search.joined(order[: k + 1]) for k in range(len(order)))]
-        final = fits[-1]
-        if stage.noise is None:
+    for attempt in range(3):
+        judge, search, order, fits = _one_by_one(stage, floor, effects, tick)
+        if stage.noise is None or attempt == 2:
             break
-        lower = noise_of(stage, final.theta)
+        lower = noise_of(stage, fits[-1].theta)
         if not np.any(lower < 0.9 * floor):
             break
         floor = np.minimum(lower, floor)  # the nominal model's error held motion that passed for noise
+    reach = reach_of(stage, floor, fits[-1].theta)
+    if np.any(reach > floor):
+        judge, search, order, fits = _one_by_one(stage, reach, effects, tick)
+    final = fits[-1]
 
     def rms(fit: Fit) -> float:
         return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1)))
@@ -211,6 +242,19 @@ def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None
         base=search.base, final=final, error_before=before, error_after=after, effects=found, recalibrated=recalibrated(stage, final),
         candidates=[], correlation=1.0, steps=steps, excess=rms(final),
     )  # fmt: skip
+
+
+def no_better(r: StageDiagnosis) -> str | None:
+    """Say in one line that the effects of `extend_stage` or `extend_system` do not bring the model nearer to the log; None: they do.
+
+    Errors are held-out; on the data that it was fitted to, a model with more effects is never farther off.
+    """
+    before = r.steps[0][1]
+    if not r.final.effects or r.excess < before:
+        return None
+    on_bound = [f"{f.effect} {n}" for f in r.effects for n, p in f.parameters.items() if p["low"] == p["value"] == p["high"]]
+    why = f"; on a bound or neutral: {', '.join(on_bound)}" if on_bound else ""
+    return f"{r.stage}: {', '.join(r.final.effects)} takes the error from {before:.4g} to {r.excess:.4g} noise floors, no better{why}"
 
 
 def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
@@ -231,12 +275,16 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
             )
         for f in s.effects:
             effects.append(
-                {"effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals}
-            )
+                {
+                    "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals,
+                    "inseparable": f.inseparable,
+                }
+            )  # fmt: skip
         recalibrated += s.recalibrated
-        if s.verdict == "unknown" or s.excess > REMAINDER:
+        if s.verdict == "unknown" or not agrees(s.excess, 1.0):
             text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
-            leaning = [c.effect for c in s.candidates if c.nats > 12.0][:3]
+            text = "; ".join([text, *s.refused])
+            leaning = s.nearest or [c.effect for c in s.candidates if c.nats > NATS][:3]
             unknown.append({"stage": s.stage, "shape": text, "nearest_effects": leaning})
         unobservable += [{"effect": c.effect, "stage": s.stage, "needs": c.reason} for c in s.candidates if c.reason]
     for name, why in d.not_observed.items():

@@ -208,4 +208,6 @@ def main(name: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    from hil import cli
+
+    sys.exit(cli.run(lambda: main(sys.argv[1])))

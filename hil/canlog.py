@@ -15,6 +15,7 @@ import functools
 import re
 import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from hil import plausible
 from tables import InputError
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
 
 EXTENDED = 1 << 31  # flag in `Frames.ident`, as socketcan sets it
 DISORDER_S = 0.050  # loggers that merge several channels swap frames by a few ms; more is a clock that jumped
+MAX_DBC = 32 << 20  # bytes; the largest of whole vehicles have some ten MB
 MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
 
 
@@ -77,6 +80,12 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
         return t, slice(None)
     back = np.maximum.accumulate(t) - t
     worst = int(np.argmax(back))
+    if back[worst] > DISORDER_S and (wrong := plausible.out_of_order(t, DISORDER_S)) is not None:
+        first = int(np.argmax(wrong))
+        what = f"{int(np.count_nonzero(wrong)):,} of {t.size:,} frames"
+        notes.append(f"time: {what} have a wrong time stamp (first frame {first + 1}: {t[first]:.9g} s from the first): left out")
+        rows = np.flatnonzero(~wrong)
+        return t, rows[in_order(name, t[rows], notes)[1]]
     if back[worst] > DISORDER_S:
         limit = f"allowed: up to {DISORDER_S * 1e3:g} ms (sorted)"
         raise LogError(f"{name}: time runs backwards by {back[worst]:.6g} s at frame {worst + 1}; {limit}")
@@ -278,6 +287,8 @@ _CANDUMP = re.compile(
     rb"(?P<form>##(?P<flags>[0-9A-Fa-f])|#|\s+\[\s?\d{1,2}\]\s*)(?P<remote>R[0-9A-Fa-f]?|remote request)?"
     rb"(?P<d>(?: ?[0-9A-Fa-f]{2}){0,64})(?:_[0-9A-Fa-f])?(?:\s+[RTrt][xX]?)?[ \t]*\Z"
 )
+# `candump -d` says what the socket's queue could not hold
+_DROPCOUNT = re.compile(rb"^DROPCOUNT: dropped (?P<n>\d{1,10}) CAN frames? on '(?P<bus>[^'\n]{1,20})' socket", re.M)
 
 
 def read_candump(path: Path) -> Frames:
@@ -301,6 +312,10 @@ def read_candump(path: Path) -> Frames:
         data = lines.data(8 if m["form"] == b"#" else 64)
         parts.append((lines.start[right], lines.seconds(10**9)[right], ident[right], buses.setdefault(m["bus"], len(buses)), data[right]))
     notes = [f"{bad} lines are not candump lines: left out"] if bad else []
+    dropped: dict[bytes, int] = {}
+    for m in _DROPCOUNT.finditer(raw):
+        dropped[m["bus"]] = dropped.get(m["bus"], 0) + int(m["n"])
+    notes += [f"the logger dropped {n:,} frames of {bus.decode('ascii', 'replace')} (DROPCOUNT)" for bus, n in dropped.items()]
     if special:
         notes.append(f"{special} remote or error frames: left out")
     return _join(path, parts, "candump", "(1735329625.329586) can0 17C#0000000010000021", notes)
@@ -351,7 +366,7 @@ def read_asc(path: Path) -> Frames:
 
 _TRC_COLUMNS = {b"1.0": "OILD", b"1.1": "OdILD", b"1.2": "OBdILD", b"1.3": "OBdIRLD", b"2.0": "OTIdlD", b"2.1": "OTBIdRLD"}
 _TRC_WORD = {
-    "O": rb"(?P<s> *\d{1,12})(?:\.(?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
+    "O": rb"(?P<s> *\d{1,15})(?:\.(?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
     "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ \t]+RTR)", "l": rb"(?P<len>\d{1,2})",
 }  # fmt: skip
 
@@ -395,7 +410,7 @@ def _text_part(lines: _Lines, per_unit: int, extended: bool, bus: int, most: int
 
 _OBJECT = struct.Struct("<4sHHII")  # signature, header size, header version, size, type
 _CONTAINER, _CAN, _CAN2, _FD, _FD64 = 10, 1, 86, 100, 101
-_MOST = 1 << 31  # bytes of all containers together
+_MOST = 32 << 20, 50  # bytes of all containers together, and more for each byte of the file; frames that never change shrink 11-fold
 
 
 def read_blf(path: Path) -> Frames:
@@ -408,6 +423,7 @@ def read_blf(path: Path) -> Frames:
     if len(raw) < 144 or raw[:4] != b"LOGG":
         raise LogError(f"{path}: is not a BLF (it must begin with LOGG and a header of 144 bytes)")
     chunks, damaged, total = [], 0, 0
+    most = _MOST[0] + _MOST[1] * len(raw)
     at = min(max(int.from_bytes(raw[4:8], "little"), 144), len(raw))
     while at + 16 <= len(raw):
         signature, _, _, size, kind = _OBJECT.unpack_from(raw, at)
@@ -424,7 +440,7 @@ def read_blf(path: Path) -> Frames:
             if method == 2:
                 inflate = zlib.decompressobj()
                 try:  # deflate cannot shrink more than 1032-fold: a longer promise is a lie
-                    body = inflate.decompress(body, min(length, 1032 * len(body) + 1024) or 1)
+                    body = inflate.decompress(body, min(length, 1032 * len(body) + 1024, most - total + 1) or 1)
                 except zlib.error:
                     body = b""
                     damaged += 1
@@ -434,11 +450,12 @@ def read_blf(path: Path) -> Frames:
         elif kind != _CONTAINER:
             body = raw[at : at + size]
         total += len(body)
-        if total > _MOST:
-            raise LogError(f"{path}: holds more than {_MOST >> 20} MiB of objects; split it")
+        if total > most:
+            raise LogError(f"{path}: {len(raw):,} bytes unpack to more than {most:,}; allowed: {_MOST[1]} times as much, and {_MOST[0]:,}")
         chunks.append(body)
         at += size + size % 4
     stream = b"".join(chunks)
+    del chunks
     objects, more = _blf_objects(stream)
     notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
     parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
@@ -459,7 +476,7 @@ def read_blf(path: Path) -> Frames:
 def _blf_objects(stream: bytes) -> tuple[np.ndarray, int]:
     """Place, header version, size and type of each object, and how many damaged places were met."""
     unpack, find = _OBJECT.unpack_from, stream.find
-    found: list[tuple[int, int, int, int]] = []
+    found = array("q")
     at, damaged, end = 0, 0, len(stream)
     while at + 32 <= end:
         signature, _, version, size, kind = unpack(stream, at)
@@ -474,9 +491,9 @@ def _blf_objects(stream: bytes) -> tuple[np.ndarray, int]:
             damaged += 1
             at += 4
             continue
-        found.append((at, version, size, kind))
+        found.extend((at, version, size, kind))
         at += size
-    return np.array(found, np.int64).reshape(-1, 4), damaged
+    return np.frombuffer(found, np.int64).reshape(-1, 4), damaged
 
 
 def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple[np.ndarray, ...]]:
@@ -487,7 +504,8 @@ def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple
         if not len(these):
             continue
         width = header + need + (64 if kind == _FD64 else 0)
-        buf = np.frombuffer(stream + bytes(width), np.uint8)
+        # the last object may be shorter than the columns that are cut out of it
+        buf = np.frombuffer(stream if int(these[-1, 0]) + width <= len(stream) else stream + bytes(width), np.uint8)
         text = np.lib.stride_tricks.sliding_window_view(buf, width)[these[:, 0]]
 
         def number(at: int, size: int, text: np.ndarray = text) -> np.ndarray:
@@ -564,8 +582,9 @@ class Message:
 
 def load_dbc(path: Path) -> tuple[list[Message], list[str]]:
     """Messages of a database file and notes on what had to be left out of it."""
-    raw = read_bytes(path)
-    return _load_dbc(str(path), raw)
+    if (size := check_file(path)) > MAX_DBC:
+        raise LogError(f"{path}: {size:,} bytes; a database may have {MAX_DBC:,}")
+    return _load_dbc(str(path), read_bytes(path))
 
 
 @functools.lru_cache(maxsize=8)

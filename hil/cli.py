@@ -1,24 +1,29 @@
 """What every command line of ours shares: one-line errors, exit codes, log options, JSON, progress bar.
 
-Exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input. Only the standard library is imported here, so that help is quick.
+Exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop itself.
+Only the standard library is imported here, so that help is quick.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
 __all__ = [
+    "DEFECT",
     "Parser",
     "add_log_options",
     "add_output_options",
     "add_reading_options",
     "add_tables_option",
     "calibration_of",
+    "defect",
+    "log_options",
     "machine_of",
     "pairs",
     "print_table",
@@ -26,6 +31,7 @@ __all__ = [
     "read_log_of",
     "run",
     "say",
+    "start",
     "tables_of",
     "write_json",
 ]
@@ -116,32 +122,59 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
 
 
 def pairs(options: list[str], name: str, allowed: Callable[[str], bool] | None = None, known: str = "") -> dict[str, str]:
-    """Split ``a=b`` options into a dict. Raises InputError for anything else."""
+    """Split ``a=b`` options into a dict. Raises InputError for anything else, and for an ``a`` that is given two values."""
     from tables import InputError
 
-    out = {}
+    out: dict[str, str] = {}
     for option in options:
         key, eq, value = option.partition("=")
         if not (eq and key.strip() and value.strip()):
             raise InputError(f"--{name} {option!r} must look like NAME=value")
         if allowed is not None and not allowed(key.strip()):
             raise InputError(f"--{name} {option!r}: {key.strip()!r} is not known; allowed: {known}")
-        out[key.strip()] = value.strip()
+        before = out.setdefault(key.strip(), value.strip())
+        if before != value.strip():
+            raise InputError(f"--{name} {option!r}: {key.strip()!r} has been given {before!r} before; allowed: once")
     return out
 
 
+def _mapping(options: list[str]) -> dict[str, str]:
+    """``--map`` as name in the log -> signal; where a name serves several signals, signal -> name for all but the first."""
+    out: dict[str, str] = {}
+    for option in options:
+        for name, signal in pairs([option], "map").items():
+            pair = (name, signal) if out.get(name, signal) == signal else (signal, name)
+            if out.setdefault(*pair) != pair[1]:
+                pairs([f"{pair[0]}={out[pair[0]]}", "=".join(pair)], "map")  # says so
+    return out
+
+
+def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str, Any]:
+    """What the reading options say, as arguments of `hil.logs.read_log`; ``source`` is the file that they are for (default: the log).
+
+    Raises InputError for options without a file to read.
+    """
+    from tables import InputError
+
+    given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm}
+    if (source or args.log) is None and (idle := next((k for k, v in given.items() if v not in (None, [])), None)):
+        raise InputError(f"{idle} says how to read a log, but none is given (--log LOG)")
+    return {"dbc": args.dbc, "mapping": _mapping(args.map), "units": pairs(args.unit, "unit"), "design_rpm": args.design_rpm}
+
+
+CAN_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4")
+
+
 def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",)) -> Any:
-    """Read the log that ``args`` name."""
+    """Read the log that ``args`` name; tell before code is compiled for it."""
     from hil.logs import read_log
 
-    return read_log(
-        args.log,
-        dbc=args.dbc,
-        mapping=pairs(args.map, "map"),
-        units=pairs(args.unit, "unit"),
-        design_rpm=args.design_rpm,
-        require=require,
-    )
+    options = log_options(args)
+    if str(args.log).lower().endswith(CAN_SUFFIXES):
+        from hil.columns import warm_up
+
+        warm_up(lambda text: say(args, text))
+    return read_log(args.log, **options, require=require)
 
 
 def say(args: argparse.Namespace, text: str) -> None:
@@ -221,8 +254,23 @@ def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[floa
         yield lambda fraction: bar.update(task, completed=fraction)
 
 
+DEFECT = 70  # exit code of sysexits.h for an internal error
+
+
+def start(prog: str, load: Callable[[], Any], argv: list[str] | None = None) -> int:
+    """Run a command from its words; return the exit code. ``load`` returns its module: DESCRIPTION, ``add_options``, ``command``."""
+
+    def command() -> int:
+        module = load()
+        parser = Parser(prog=prog, description=module.DESCRIPTION)
+        module.add_options(parser)
+        return int(module.command(parser.parse_args(argv)))
+
+    return run(command)
+
+
 def run(command: Callable[[], int]) -> int:
-    """Call ``command``; turn what users can cause into one line on standard error and an exit code."""
+    """Call ``command``; turn what users can cause into one line on standard error and an exit code, and so a defect of ours (`defect`)."""
     try:
         return command()
     except KeyboardInterrupt:
@@ -235,6 +283,33 @@ def run(command: Callable[[], int]) -> int:
         from tables import InputError
 
         if not isinstance(e, InputError):
-            raise
+            print(f"vaneloop: {defect(e)}", file=sys.stderr)
+            return DEFECT
         print(f"vaneloop: {e}", file=sys.stderr)
         return 2
+
+
+def defect(e: BaseException) -> str:
+    """One line for an error that no input should cause. The traceback goes into a file, or to standard error with VANELOOP_DEBUG=1."""
+    import tempfile
+    import traceback
+    from pathlib import Path
+
+    if isinstance(e, MemoryError):
+        return "the machine's memory does not suffice for this"
+    lines = "".join(traceback.format_exception(e))
+    place = traceback.extract_tb(e.__traceback__)[-1:]
+    at = f" ({Path(place[0].filename).name}:{place[0].lineno})" if place else ""
+    what = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+    where = "VANELOOP_DEBUG=1 prints the traceback"
+    if os.environ.get("VANELOOP_DEBUG"):
+        print(lines, end="", file=sys.stderr)
+        where = "traceback above"
+    else:
+        try:
+            with tempfile.NamedTemporaryFile("w", prefix="vaneloop-", suffix=".traceback", delete=False, encoding="utf-8") as f:
+                f.write(lines)
+            where = f"traceback in {f.name}"
+        except OSError:
+            pass
+    return f"internal error: {what}{at}. This is a defect of VaneLoop, not of your input; {where}"

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from plant.compiled import in_place
+from plant.compiled import in_place, is_cached
 
-__all__ = ["cut", "wrong_crc"]
+__all__ = ["cut", "warm_up", "wrong_crc"]
+
+
+def warm_up(say: Callable[[str], None]) -> None:
+    """Tell the user that reading the first CAN log compiles; silent when the compiled code is there already."""
+    if not is_cached("columns.cut"):
+        say("compiling the reader of CAN logs for this machine (once, about 3 s) ...")
 
 
 @in_place

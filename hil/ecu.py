@@ -8,7 +8,6 @@ started in any order; until then its first value is sent.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,8 @@ import numpy as np
 
 from hil.frames import R_LAST, R_LAST_TICK
 from hil.node import Ecu
-from tables import InputError
+from hil.plausible import LONGEST
+from tables import InputError, load_toml
 
 __all__ = ["BUILTIN", "Demand", "EcuStation", "Typed", "builtin", "demand_of_log", "read_profile"]
 
@@ -73,14 +73,16 @@ def builtin(name: str) -> Demand:
     return Demand(points[:, 0] - points[0, 0], points[:, 1])
 
 
-def read_profile(path: str | Path) -> Demand:
+def read_profile(path: str | Path, **options: Any) -> Demand:
     """Read a profile: TOML with the lists ``t`` (s) and ``n_dem`` (%), or any log with n_dem (CSV: a header ``t,n_dem``).
+
+    ``options`` say how to read a log (`hil.logs.read_log`).
 
     Straight lines between the points; a step is two points close to each other. Raises InputError in one line.
     """
     path = Path(path)
     if path.suffix.lower() == ".toml":
-        table = read_toml(path)
+        table = load_toml(path)
         columns: dict[str, np.ndarray] = {}
         for key in ("t", "n_dem"):
             values = table.get(key)
@@ -94,18 +96,8 @@ def read_profile(path: str | Path) -> Demand:
         return _checked(Demand(columns["t"], columns["n_dem"]), path)
     from hil.logs import read_log
 
-    channel = read_log(path).channels["n_dem"]
+    channel = read_log(path, **options).channels["n_dem"]
     return _checked(Demand(channel.t, channel.values), path)
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file. Raises InputError."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read ({e.strerror})") from None
-    except ValueError as e:
-        raise InputError(f"{path}: is not TOML ({' '.join(str(e).split())})") from None
 
 
 def demand_of_log(log: Any) -> Demand:
@@ -127,6 +119,8 @@ def _checked(demand: Demand, source: Any) -> Demand:
     if (np.diff(t) <= 0).any():
         k = int(np.argmax(np.diff(t) <= 0))
         raise InputError(f"{source}: t (={t[k + 1]:g} s after {t[k]:g} s) must increase")
+    if t[-1] - t[0] > LONGEST:
+        raise InputError(f"{source}: t spans {t[-1] - t[0]:g} s; allowed: up to {LONGEST:g} s")
     outside = (n < LOWEST) | (n > HIGHEST)
     if outside.any():
         raise InputError(f"{source}: n_dem (={n[np.argmax(outside)]:g} %) must be in [{LOWEST:g}, {HIGHEST:g}]")

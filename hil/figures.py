@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from tables import InputError
 
-__all__ = ["SignalError", "error_figures", "noise_floor", "resolution"]
+__all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution"]
 
 Array = NDArray[np.float64]
 
+AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; discrepancy.locate has the same number
 DESIGN_POINT = (99.0, 100.0)  # % of design speed, open interval: the range of the third figure of the paper's Table 5
 
 WINDOW_S = 1.0  # s; long against sensor lags (milliseconds), short against a dwell of an engine run (several seconds)
@@ -58,7 +59,8 @@ def error_figures(
     """Error of ``model_values`` against ``reference_values``, both on the raster ``t`` (s).
 
     n_r          rotor speed in % on the same raster, for the figure between 99 and 100 %
-    noise_floor  in ``unit``; None: estimated from ``reference_values`` by `noise_floor`
+    noise_floor  in ``unit``; None: estimated by `noise_floor`, from ``reference_values`` or from the error, which holds less motion where
+                 the model moves as the machine does: each is an upper bound
 
     Samples with a NaN or an infinity on either side do not count. Raises InputError when none is left,
     or when the arrays differ in length.
@@ -80,7 +82,7 @@ def error_figures(
         if inside.any():
             at_design = float(error[inside].mean())
     if noise_floor is None:
-        noise_floor = _noise_floor(times, ref)
+        noise_floor = min(_noise_floor(times, ref), _noise_floor(times, ref - model))
     return SignalError(
         signal=signal,
         stage=stage,

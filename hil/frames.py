@@ -25,13 +25,15 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "REMOTE", "VGV_ANGLES", "VGV_HEALTH", "VGV_SERVO", "VGV_STATUS",
-    "decode", "from_bytes", "from_message", "new_receiver", "receive", "refused", "to_bytes", "to_message", "word0",
+    "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES", "VGV_HEALTH", "VGV_SERVO",
+    "VGV_STATUS",
+    "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes", "to_message", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 HEAD_MASK = 0x04FFFFFFFFFF  # what of word 0 has a meaning
 FD = 1 << 42  # bit 2 of the flags byte, CANFD_FDF
+NOTE = 1 << 50  # no frame: the loop's own word to its node. No bus gives it: it is outside `HEAD_MASK`
 IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
 CLASSIC = LENGTH << 32  # word 0 without its identifier
@@ -44,7 +46,8 @@ DATA_ID = 0x5600  # plus the identifier
 _CRC = crc_table().astype(np.int64)
 _CRC.setflags(write=False)
 
-NOT_AVAILABLE_U16, NOT_AVAILABLE_S16 = 65535, -32768
+# "this node stood still before this tick": word 1 is for how many ticks. In a record it is a frame under an identifier that no node takes.
+PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 
 
 # ---- bits ---------------------------------------------------------------------------------------------------------------------------
@@ -135,15 +138,15 @@ def decode_status(data):
 
 @in_place
 def encode_servo(i_cmd, faults, counter):
-    """Return word 1 of VGV_SERVO: mean current in mA, eight fault bits."""
-    data = _at(_raw(i_cmd, 0.002, 0.0, -50.0, 50.0, -32768), 16) | ((faults & 0xFF) << 32)
+    """Return word 1 of VGV_SERVO: mean current in mA, nine fault bits."""
+    data = _at(_raw(i_cmd, 0.002, 0.0, -50.0, 50.0, -32768), 16) | ((faults & 0x1FF) << 32)
     return protect(VGV_SERVO, data, counter)
 
 
 @in_place
 def decode_servo(data):
     """Return i_cmd (mA) and the fault bits of word 1 of VGV_SERVO."""
-    return s16(data, 16) * 0.002, (data >> 32) & 0xFF
+    return s16(data, 16) * 0.002, (data >> 32) & 0x1FF
 
 
 @in_place
@@ -194,14 +197,14 @@ COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_leng
     R_WRONG_SEQUENCE,
     R_WRONG_LENGTH,
     R_WRONG_KIND,  # extended, remote or CAN FD under our identifier
-    R_LOST,  # by the counter; in a silence of MISSED periods or more by time
+    R_LOST,  # sent and not come, as the counter proves; in a silence it proves nothing
     R_STALE,  # silences
     R_IDENT,
     R_LAST,  # counter of the last good frame, -1 none
     R_LAST_TICK,
     R_CANDIDATE,  # counter of a frame out of sequence with a right CRC, -1 none
     R_CANDIDATE_TICK,
-    R_SILENT,  # periods counted as lost in the present silence; 0 = not stale
+    R_SILENT,  # periods of the present silence; 0 = not stale
     R_PERIOD,  # ticks
     N_RECEIVER,
 ) = range(17)
@@ -263,23 +266,38 @@ def receive(r, head, data, now):
 
 @in_place
 def grow_old(r, now):
-    """Count silence up to tick ``now``, after the frames of the tick; return True while stale."""
+    """State a silence of MISSED periods at tick ``now``, after the frames of the tick; return True while it lasts. It loses nothing."""
     if r[R_LAST] < 0:
         return False
     missed = (now - r[R_LAST_TICK]) // r[R_PERIOD]
     if missed < MISSED:
-        return False
+        return r[R_SILENT] > 0
     if r[R_SILENT] == 0:
         r[R_STALE] += 1
-    r[R_LOST] += missed - r[R_SILENT]
     r[R_SILENT] = missed
     return True
+
+
+@in_place
+def stand_still(r):
+    """Forget where the sender's counter was: its receiver stood still, and what came meanwhile is gone. Begins a silence."""
+    if r[R_LAST] >= 0 and r[R_SILENT] == 0:
+        r[R_STALE] += 1
+        r[R_SILENT] = MISSED
+    r[R_CANDIDATE] = -1
 
 
 @in_place
 def refused(r):
     """Return how many frames were refused since start."""
     return r[R_WRONG_CRC] + r[R_REPEATED] + r[R_WRONG_SEQUENCE] + r[R_WRONG_LENGTH] + r[R_WRONG_KIND]
+
+
+def noted(rows: np.ndarray) -> np.ndarray:
+    """Return recorded frames as a node has to get them again: notes of pauses are notes."""
+    out = rows.copy()
+    out[out[:, 0] == PAUSE & HEAD_MASK, 0] = PAUSE
+    return out
 
 
 # ---- the same for people ------------------------------------------------------------------------------------------------------------

@@ -296,7 +296,7 @@ class Bench:
 
     def _arrays(self) -> list[np.ndarray]:
         a = self.node.arrays
-        return [a.inputs, a.z, a.s, a.mean, a.receiver, a.counter]
+        return [a.inputs, a.z, a.s, a.mean, a.sent, a.supply, a.receiver, a.counter]
 
     def _saved(self) -> list[np.ndarray]:
         return [x.copy() for x in self._arrays()]
@@ -443,7 +443,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--recovery", type=float, default=RECOVERY * 1e-3, metavar="S", help="s within which RUN must be back (default 2.5)"
     )
     parser.epilog = """examples:
-  vaneloop fuzz --frames 10000000 --seed 1
+  vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
   vaneloop fuzz --replay fuzz_failure.log
 
 exit codes: 0 everything held, 1 something did not, 2 bad input"""

@@ -60,7 +60,7 @@ from tables import InputError
 
 if TYPE_CHECKING:
     from controller import Calibration
-    from hil.node import Node
+    from hil.node import Ecu, Node
     from plant import Plant
 
 __all__ = [
@@ -76,12 +76,12 @@ SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES
 
 
 class MachineChange:
-    """What a `Machine` action does to the plant, undone at its end."""
+    """What a `Machine` action does to the machine, undone at its end: the controller's plant and calibration, the ECU's engine."""
 
-    def __init__(self, action: Machine, node: Node):
+    def __init__(self, action: Machine, node: Node, ecu: Ecu):
         from plant.effects import EFFECTS, ROW
 
-        self.arrays, self.first, self.end = node.arrays, tick_of(action.start), tick_of(action.end)
+        self.arrays, self.engine, self.first, self.end = node.arrays, ecu.arrays, tick_of(action.start), tick_of(action.end)
         self.new: dict[int, float] = {}
         if action.effect is not None:
             for i, q in enumerate(EFFECTS[action.effect].parameters):
@@ -101,15 +101,18 @@ class MachineChange:
             self._set(*self.old)
 
     def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
+        from controller.firmware import I_CMD
         from plant import chain
         from plant.parameters import derive
 
         for i, v in supply.items():
             self.arrays.supply[i] = v
         if rows:
-            for r, v in rows.items():
-                self.arrays.p[r, 0] = v
-            derive(self.arrays.p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+            chain.wake(self.arrays.s, self.arrays.p, 0, self.arrays.z[I_CMD])
+            for p in (self.arrays.p, self.engine.p):
+                for r, v in rows.items():
+                    p[r, 0] = v
+                derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
 
 
 class Disturber:
@@ -166,7 +169,7 @@ def _lockstep(
     recorded: list[tuple[int, int, int]] = []
     keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
     intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
-    machines = [MachineChange(a, node) for a in of[Machine]]  # type: ignore[arg-type]
+    machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
     channel = Channel(seed=scenario.seed)
     wire, join = channel.wire, channel.join
     places = {"ECU": join(), "VGV": join()}
@@ -355,10 +358,11 @@ def run(
 
 DESCRIPTION = """Frame and fault injection: do to the bus what a scenario says, and judge whether the controller reacted as it must.
 
+examples:
   vaneloop inject --list                     what ships
   vaneloop inject demand_stops               one of them
   vaneloop inject --all --junit inject.xml   all of them, for continuous integration
-  vaneloop inject my_day.toml                your own (docs/injection.md)
+  vaneloop inject MY_DAY.toml                your own (docs/injection.md)
   vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
 
 On lockstep (default) controller, ECU and bus run in simulated time, bit for bit the same every time. On another bus only what an outsider
@@ -495,10 +499,7 @@ def _write_junit(file: str, outcomes: list[Outcome], skipped: list[tuple[str, st
 
 def main(argv: list[str] | None = None) -> int:
     """Command line of ``python -m hil.inject``."""
-    parser = cli.Parser(prog="python -m hil.inject", description=DESCRIPTION)
-    add_options(parser)
-    args = parser.parse_args(argv)
-    return cli.run(lambda: command(args))
+    return cli.start("python -m hil.inject", lambda: sys.modules[__name__], argv)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 
 import tables
-from hil import canlog
+from hil import canlog, plausible
 from hil.canlog import LogError
 
 __all__ = ["UNITS", "Channel", "Log", "LogError", "offered", "read_log", "write_log"]
@@ -50,11 +50,39 @@ class Channel:
 
 @dataclass(frozen=True)
 class Log:
-    """A measured run: where it is from, its channels by name, and what was left out or assumed on reading."""
+    """A measured run: where it is from, its channels by name, and what was left out or assumed on reading.
+
+    Raises LogError where a channel of the product's signals cannot be in its unit, or where the time spans more than the rows are worth
+    (`hil.plausible`): no command gets such a log, whoever made it.
+    """
 
     path: str
     channels: dict[str, Channel]
     notes: list[str] = field(default_factory=list)
+    signals: Mapping[str, str] = field(default_factory=lambda: UNITS, repr=False)
+
+    def __post_init__(self) -> None:
+        wrong = []
+        for name, c in self.channels.items():
+            if _ours(name, self.signals) and (why := plausible.judge(name, c.values)[1]):
+                wrong.append((name, name, why, c.values))
+        _refuse_units(self.path, wrong)
+        times = [c.t for c in self.channels.values() if c.t.size]
+        if times and (why := plausible.span_complaint(times)):
+            raise LogError(f"{self.path}: {why}; --unit t=ms, if time counts in ms")
+
+
+def _ours(name: str, signals: Mapping[str, str]) -> bool:
+    """Whether ``name`` is one of the product's signals: a system of a user's own may give its name to something else."""
+    return name in plausible.RANGES and signals.get(name) == UNITS[name]
+
+
+def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]]) -> None:
+    """Raise LogError if there is a channel (signal, name in the log, why, values) that cannot be in its unit."""
+    if wrong:
+        signal, key, why, values = wrong[0]
+        also = "; the same for " + ", ".join(w[0] for w in wrong[1:]) if len(wrong) > 1 else ""
+        raise LogError(f"{path}: {signal} ({key}): {why}; {plausible.proposed(signal, values)}{also}")
 
 
 # --- sources: what a file offers, before names and units ---------------------------------------------------------------------------------
@@ -314,12 +342,21 @@ def _is_absent(values: np.ndarray) -> np.ndarray:
     return values.view(np.uint64) == np.uint64(0x7FF8_0000_0000_0A0B)
 
 
+_MOST_ROWS = 4_000_000, 2  # of a Parquet file, and more for each of its bytes; a column that never changes takes next to none
+
+_MOST_UNPACKED = 40  # bytes a row of a column of numbers
+
+
+def _chunks(group: Any) -> Iterable[Any]:
+    return (group.column(k) for k in range(group.num_columns))
+
+
 def _open_parquet(path: Path, options: _Options) -> Source:
     """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a damaged page."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    canlog.check_file(path)
+    size = canlog.check_file(path)
     damage = pa.ArrowException, OSError, ValueError, OverflowError, MemoryError
     try:
         file = pq.ParquetFile(path)
@@ -328,6 +365,9 @@ def _open_parquet(path: Path, options: _Options) -> Source:
         raise LogError(f"{path}: is not a Parquet file ({str(e)[:160]})") from None
     if again := next((n for k, n in enumerate(schema.names) if n in schema.names[:k]), None):
         raise LogError(f"{path}: column {again!r} is there more than once")
+    most = _MOST_ROWS[0] + _MOST_ROWS[1] * size
+    if file.metadata.num_rows > most:
+        raise LogError(f"{path}: {size:,} bytes say that they hold {file.metadata.num_rows:,} rows; allowed: up to {most:,}")
 
     def load(key: str) -> np.ndarray:
         kind = schema.field(key).type
@@ -337,6 +377,10 @@ def _open_parquet(path: Path, options: _Options) -> Source:
             scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
         elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind) or pa.types.is_boolean(kind)):
             raise LogError(f"{path}: column {key!r} holds {kind}, not numbers")
+        chunks = [c for g in range(file.metadata.num_row_groups) for c in _chunks(file.metadata.row_group(g)) if c.path_in_schema == key]
+        unpacked, most = sum(c.total_uncompressed_size for c in chunks), _MOST_UNPACKED * (file.metadata.num_rows + 100_000)
+        if unpacked > most:
+            raise LogError(f"{path}: column {key!r} unpacks to {unpacked:,} bytes; allowed: up to {most:,}")
         try:
             column = file.read(columns=[key], use_threads=False).column(key).combine_chunks().cast(kind)
             column.validate(full=True)
@@ -705,6 +749,27 @@ def _take(path: Path, source: Source, signal: str, name: str, mapped: bool, need
     return None
 
 
+def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list[str]) -> np.ndarray:
+    """The times ``t`` (s) of a series; rows whose stamp is wrong have none. ``known``: what was found before, by the array of the file."""
+    if id(s.t) not in known:
+        rows = np.flatnonzero(np.isfinite(t))
+        bad = None
+        if rows.size and (np.diff(t[rows]) < 0).any():
+            bad = plausible.out_of_order(t[rows])
+        known[id(s.t)] = rows[bad] if bad is not None else rows[:0]
+        if known[id(s.t)].size:
+            first = int(known[id(s.t)][0])
+            what = f"{known[id(s.t)].size:,} of {rows.size:,} {s.word}s"
+            notes.append(f"time: {what} have a wrong time stamp (first {s.word} {first + s.first}: {t[first]:.9g} s): left out")
+    bad = known[id(s.t)]
+    there = np.isfinite(s.values)
+    if not bad.size or 2 * np.count_nonzero(there[bad]) > np.count_nonzero(there):  # a channel that has a block of rows of its own
+        return t
+    t = t.copy()
+    t[bad] = _ABSENT
+    return t
+
+
 def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: list[str]) -> Channel | None:
     """Samples that can be used: both numbers finite, time strictly increasing; None where nothing is left."""
     t, values = s.t, s.values
@@ -766,6 +831,9 @@ def read_log(
     notes: list[str] = []
     unit = _Units(path, units or {}, design_rpm, notes, signals)
     channels: dict[str, Channel] = {}
+    keys: dict[str, str] = {}
+    wrong: list[tuple[str, str, str, np.ndarray]] = []
+    known: dict[int, np.ndarray] = {}
     for signal in signals:
         name = named.get(signal, signal)
         said = len(source.notes), len(notes)
@@ -780,16 +848,67 @@ def read_log(
                 values = unit.convert(signal, key, s.values, s.unit)
             if values is not s.values:
                 values = np.where(_is_absent(s.values), _ABSENT, values)
+            if not plausible.latest(t[np.isfinite(t)]):
+                raise LogError(f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if it is in ms")
+            if not source.sorted:
+                t = _in_time(s, t, known, notes)
             channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
+            if channel is not None and _ours(signal, signals):
+                channel = _inside(signal, key, channel, wrong, notes)
             if channel is not None:
-                channels[signal] = channel
+                channels[signal], keys[signal] = channel, key
         if signal in require and (signal not in channels or channels[signal].t.size < 2):
             found = "only one sample of" if signal in channels else "no"
             reason = "; ".join(source.notes[said[0] :] + notes[said[1] :]) or source.absent(name)
             asked = f"looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
             raise LogError(f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}")
+    _refuse_units(path, wrong)
+    channels = _one_run(path, channels, require, notes)
     _shift(channels, notes)
-    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])))
+    ours = {name: (c.t, c.values) for name, c in channels.items() if _ours(name, signals)}
+    sure, perhaps = plausible.too_small(ours, set(units or {}))
+    if sure:
+        small, *others = sure
+        raise LogError(f"{path}: {small} ({keys[small]}): {sure[small]}" + (f"; the same for {', '.join(others)}" if others else ""))
+    notes += [f"{name} ({keys[name]}): {why}" for name, why in perhaps.items()]
+    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals)
+
+
+def _inside(
+    signal: str, key: str, c: Channel, wrong: list[tuple[str, str, str, np.ndarray]], notes: list[str]
+) -> Channel | None:
+    """The channel without the few samples that its signal cannot have; where they are not few, it goes on the list of the wrong."""
+    inside, why = plausible.judge(signal, c.values)
+    if why:
+        wrong.append((signal, key, why, c.values))
+    if why or inside.all():
+        return c
+    r, far = plausible.RANGES[signal], c.values[~inside]
+    unit = "" if r.unit == "-" else f" {r.unit}"
+    furthest = far[np.argmax(np.abs(far))]
+    what = f"{far.size:,} of {inside.size:,} samples are outside {r.low:g} to {r.high:g}{unit} (furthest {furthest:.6g})"
+    notes.append(f"{signal} ({key}): {what}: left out")
+    return Channel(c.t[inside], c.values[inside])
+
+
+def _one_run(path: Path, channels: dict[str, Channel], require: tuple[str, ...], notes: list[str]) -> dict[str, Channel]:
+    """Channels of the one run that the log holds, where its clock jumped."""
+    if not channels:
+        return channels
+    first, last, note, why = plausible.longest_part([c.t for c in channels.values()])
+    if why:
+        raise LogError(f"{path}: {why}")
+    if not note:
+        return channels
+    notes.append(note)
+    out = {}
+    for name, c in channels.items():
+        use = (c.t >= first) & (c.t <= last)
+        if use.any():
+            out[name] = Channel(c.t[use], c.values[use])
+        if name in require and np.count_nonzero(use) < 2:
+            raise LogError(f"{path}: no {name} in the part of the log that is kept ({note})")
+    return out
 
 
 def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
@@ -804,9 +923,10 @@ def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
 
 
 def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
-    """Count time from the start of the log where the file counts from 1970."""
-    if channels and (start := min(float(c.t[0]) for c in channels.values())) > _EPOCH:
-        notes.append(f"time counts from 1970: {start:.6f} s taken for the start of the log")
+    """Count time from the start of the log where the file counts from 1970, from midnight, or from an event far away."""
+    if channels and abs(start := min(float(c.t[0]) for c in channels.values())) > plausible.JUMP:
+        since = "counts from 1970" if start > _EPOCH else "does not count from the start"
+        notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
         for name, c in channels.items():
             channels[name] = Channel(c.t - start, c.values)
 

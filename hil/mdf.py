@@ -24,7 +24,7 @@ from hil.canlog import EXTENDED, Frames, LogError, check_file, in_order, read_by
 
 __all__ = ["read_mdf", "write_bus", "write_groups"]
 
-_MEMORY = 2 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
+_MEMORY = 1 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
 _TIME = 20.0, 1e6  # s, and bytes of file per further second
 _BUS = "CAN_DataFrame"
 _FRAMES = "CAN_DataFrame", "CAN_ErrorFrame", "CAN_RemoteFrame", "CAN_OverloadFrame", "LIN_", "FLX_"  # kept by the standard for bus events
@@ -116,6 +116,9 @@ def answer(request: bytes, out: BinaryIO) -> None:
     try:
         with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
             reply = _read(mdf, asked["wanted"], arrays)
+    except MemoryError:
+        reply = {"error": f"unpacks to more memory than its size allows, {_MEMORY[0]:,} bytes and {_MEMORY[1]} for each of its own"}
+        arrays = {}
     except Exception as e:  # the library meets a damaged file with any exception there is
         reply = {"error": f"{type(e).__name__}: {' '.join(str(e).split())}"[:160]}
         arrays = {}

@@ -19,21 +19,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller import Calibration, load_calibration, new_inputs, new_state, tick
+from controller import Calibration, load_calibration
 from controller.firmware import (
-    DEMAND_SEEN,
+    DEMAND_HIGH,
+    DEMAND_LOW,
     FAULT_BITS,
-    I_CMD,
     IN_FRESH,
-    IN_MODE_REQUEST,
-    IN_N_DEM,
-    IN_N_R,
+    IN_PAUSE,
     IN_REJECTED,
     IN_X_LVDT,
     MODE,
     MODES,
-    N_DEM,
-    N_R_RAW,
     SLOW,
     X_DEM,
 )
@@ -45,6 +41,7 @@ from hil.frames import (
     IDENT_MASK,
     N_RECEIVER,
     OTHER,
+    PAUSE,
     VGV_ANGLES,
     VGV_HEALTH,
     VGV_SERVO,
@@ -59,8 +56,9 @@ from hil.frames import (
     new_receiver,
     receive,
     refused,
+    stand_still,
 )
-from hil.lockstep import flashed, move, sense, spoil
+from hil.tick import Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain
 from plant.compiled import in_place
 
@@ -77,24 +75,24 @@ DEGREES = 180.0 / np.pi
 class NodeArrays(NamedTuple):
     """All that the VGV node's tick works on, in place.
 
-    inputs, z, calibration  the firmware's (`controller`)
-    s, p        the plant's state and parameters
-    sigma       float64[5] rms noise of the sensors, SI (LVDT, three potentiometers, speed); zeros = noise-free
-    mean        float64[2] sum and number of currents since the last VGV_SERVO
-    pots        float64[1, 6] what the controller gets of each stem potentiometer: share of its reading, offset (rad; NaN = not fitted)
-    supply      float64[3] supply pressure (Pa), oil temperature (degC), rotor speed (%) of the machine before a demand has come
+    inputs .. sent  the loop's (`hil.tick.Loop`)
+    supply      float64[4] supply pressure (Pa), oil temperature (degC); demand and speed (%) of the machine: the last plausible frame's
     receiver    int64, of ECU_DEMAND (`hil.frames`)
     counter     int64: E2E counters of the four frames sent; frames of other identifiers, under our own identifiers, error frames
     """
 
     inputs: np.ndarray
     z: np.ndarray
+    built: Calibration
     calibration: Calibration
+    flash: np.ndarray
     s: np.ndarray
     p: np.ndarray
     sigma: np.ndarray
     mean: np.ndarray
+    angles: np.ndarray
     pots: np.ndarray
+    sent: np.ndarray
     supply: np.ndarray
     receiver: np.ndarray
     counter: np.ndarray
@@ -102,15 +100,20 @@ class NodeArrays(NamedTuple):
 
 @in_place
 def _take(a, received, n, k):
-    """Judge the ``n`` received frames of tick ``k``; set the firmware's inputs."""
+    """Judge the ``n`` received frames of tick ``k``, and the loop's word that it stood still; set the firmware's inputs."""
     before = refused(a.receiver)
-    fresh = 0.0
+    fresh = pause = 0.0
+    n_dem = n_r = 0.0
+    request = 0
     for i in range(n):
         head, data = received[i, 0], received[i, 1]
+        if head == PAUSE:
+            pause += data * chain.TICK
+            stand_still(a.receiver)
+            continue
         verdict = receive(a.receiver, head, data, k)
         if verdict == GOOD:
             n_dem, n_r, request = decode_demand(data)
-            a.inputs[IN_N_DEM], a.inputs[IN_N_R], a.inputs[IN_MODE_REQUEST] = n_dem, n_r, request
             fresh = 1.0
         elif verdict == OTHER:
             ident = head & IDENT_MASK
@@ -121,7 +124,13 @@ def _take(a, received, n, k):
             else:
                 a.counter[C_OTHER] += 1
     grow_old(a.receiver, k)
+    if fresh == 1.0:
+        arrive(k, a, n_dem, n_r, float(request))
+        low, high = a.calibration.k[DEMAND_LOW], a.calibration.k[DEMAND_HIGH]
+        if low <= n_dem <= high and low <= n_r <= high and request <= 1:
+            a.supply[2], a.supply[3] = n_dem, n_r
     a.inputs[IN_FRESH] = fresh
+    a.inputs[IN_PAUSE] = pause
     a.inputs[IN_REJECTED] = float(refused(a.receiver) - before)
 
 
@@ -149,30 +158,19 @@ def node_tick(k, received, n, noise, row, a, sent):
     sent      int64[4, 2]
     """
     _take(a, received, n, k)
-    z, s, p = a.z, a.s, a.p
-    p_s, t_oil = a.supply[0], a.supply[1]
-    sense(a.inputs, s, p, a.sigma, noise, row, t_oil)
-    spoil(a.inputs, a.pots, 0)
-    tick(a.inputs, z, a.calibration)
-    a.mean[0] += z[I_CMD]
-    a.mean[1] += 1.0
+    z, p_s, t_oil = a.z, a.supply[0], a.supply[1]
+    control(k, a, noise, row, t_oil)
     m = 0
     if k % SLOW == 0:
         c = a.counter
         m = _put(sent, m, VGV_STATUS, encode_status(z[X_DEM] * 1e3, a.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)))
-        m = _put(sent, m, VGV_SERVO, encode_servo(a.mean[0] / a.mean[1] * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
-        vigv = (s[chain.POT, 0] + a.sigma[1] * noise[row, 1]) * DEGREES
-        vgv1 = (s[chain.POT + 1, 0] + a.sigma[2] * noise[row, 2]) * DEGREES
-        vgv2 = (s[chain.POT + 2, 0] + a.sigma[3] * noise[row, 3]) * DEGREES
+        m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(a) * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
+        vigv, vgv1, vgv2 = a.angles[0] * DEGREES, a.angles[1] * DEGREES, a.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
-        a.mean[0], a.mean[1] = 0.0, 0.0
         if k % (10 * SLOW) == 0:
             lost, rejected = a.receiver[frames.R_LOST], refused(a.receiver)
             m = _put(sent, m, VGV_HEALTH, encode_health(p_s * 1e-6, t_oil, lost, rejected, _next(c, C_HEALTH)))
-    n_dem, n_r = a.supply[2], a.supply[2]
-    if z[DEMAND_SEEN] == 1.0:  # the machine's own speed is what the last plausible demand said
-        n_dem, n_r = z[N_DEM], z[N_R_RAW]
-    move(k, s, p, z[I_CMD], n_dem, n_r, p_s, t_oil)
+    move(k, a, a.supply[2], a.supply[3], p_s, t_oil)
     return m
 
 
@@ -196,22 +194,10 @@ class Node:
         t_oil: float = 40.0,
         seed: int | None = None,
     ):
-        machine = plant or build_plant()
-        cal = flashed(calibration or load_calibration(), machine)
-        stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
-        self.arrays = NodeArrays(
-            new_inputs(),
-            new_state(),
-            cal,
-            machine.start(stroke=stroke, n_r=n_r, t_oil=t_oil),
-            machine.p.copy(),
-            machine.sigma.copy() if seed is not None else np.zeros(5),
-            np.zeros(2),
-            np.array([[1.0, 0.0] * 3]),
-            np.array([p_s, t_oil, n_r]),
-            new_receiver(ECU_DEMAND),
-            np.zeros(N_COUNTER, np.int64),
-        )
+        machine, cal = plant or build_plant(), calibration or load_calibration()
+        loop = new_loop(machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=np.array([[1.0, 0.0] * 3]))
+        assert NodeArrays._fields[: len(loop)] == Loop._fields
+        self.arrays = NodeArrays(*loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64))
         self.k = 0
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
         self._generator = np.random.Generator(np.random.PCG64(seed)) if seed is not None else None
@@ -337,7 +323,11 @@ ECU_VALUES = ("x_dem", "x_lvdt", "state", "i_cmd", "faults", "vigv", "vgv1", "vg
 
 @in_place
 def _listen(a, head, data, k):
-    """Judge one frame of the controller; keep its values if it is good."""
+    """Judge one frame of the controller; keep its values if it is good. After a pause of the ECU none is known to be new."""
+    if head == PAUSE:
+        for row in range(4):
+            stand_still(a.receiver[row])
+        return
     ident = head & IDENT_MASK
     if not VGV_STATUS <= ident <= VGV_HEALTH:
         return

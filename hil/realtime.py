@@ -6,8 +6,13 @@ until shortly before the deadline (``clock_nanosleep``, absolute) and spins the 
 Overrun. A tick that begins after the deadline of the next one has *missed* it. What then:
 
 ``catch-up``  (default) every tick is run, late ones back to back, until the loop is on time again: the firmware's clock stays with the wall
-              clock, a stall shows as a burst. After more than 100 ms (a suspended machine) the rest is skipped, and counted.
+              clock, a stall shows as a burst. Beyond 100 ms the rest is skipped, and counted.
 ``skip``      deadlines that have passed are left out and counted: no bursts, but the firmware's clock falls behind the wall clock.
+
+Pause. Where 50 ms or more lie between one tick's due begin and its begin, counted from the tick before (a suspended process, a stopped
+machine), the loop *stood still*: all that a receiver could say of frames is as old as a silence. The ticks missed are skipped under either
+policy, what came meanwhile and in the next 50 ms is dropped, and the node is told with its next tick (`hil.frames.PAUSE`), which is
+recorded with the frames: the firmware has no clock of its own. Several shorter stalls in a row are no pause: ticks ran in between.
 
 Frames are recorded with the time of the tick in which they were taken or sent: start + k ms, within a tick 1 us apart in their order. The
 start is a whole millisecond, so a record says exactly what to give to which tick, and lockstep repeats the run bit for bit.
@@ -30,11 +35,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hil.frames import HEAD_MASK, PAUSE
+
 __all__ = ["POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "stop_on_signals", "undisturbed"]
 
 TICK_NS = 1_000_000
 POLICIES = ("catch-up", "skip")
 MOST_BEHIND = 100  # ticks to catch up; beyond, the rest is skipped
+PAUSED_NS = 50 * TICK_NS  # that much without a tick is a pause: a demand would be stale (`hil.frames.MISSED` periods)
+DEAF = 50  # ticks after a pause in which frames are dropped: a broker hands over what it kept only once its reader reads again
 SPIN_US = 50  # a sleep ends up to 50 us late; the spin hides that
 MOST_READ = 64  # frames taken in one tick (a full 500 kbit/s bus carries five); the rest wait for the next
 
@@ -125,18 +134,20 @@ class Ticker:
 
     missed   ticks that began after the deadline of the next one
     skipped  deadlines left out (`policy`)
+    paused   whole periods for which the loop stood still before the last tick, 0 if that was less than 50 ms;  pauses  how often it did
     """
 
     def __init__(self, period_ns: int = TICK_NS, *, spin_us: float = SPIN_US, policy: str = "catch-up"):
         self.period, self.spin, self.policy = period_ns, int(spin_us * 1000), policy
-        self.missed = self.skipped = 0
+        self.missed = self.skipped = self.paused = self.pauses = 0
         self._time = _Timespec()
         self._sleep, self._at = _libc.clock_nanosleep, ctypes.byref(self._time)
-        self.start = self.deadline = 0
+        self.start = self.deadline = self._last = 0
 
     def begin(self) -> None:
         """Set the first deadline one period from now."""
-        self.start = self.deadline = time.monotonic_ns() + self.period
+        self._last = time.monotonic_ns()
+        self.start = self.deadline = self._last + self.period
 
     def wait(self) -> int:
         """Sleep until the deadline; set the next one. Returns the lateness, ns."""
@@ -151,10 +162,16 @@ class Ticker:
             now = clock()
         late = now - deadline
         self.deadline = deadline + self.period
+        still = now - self._last - self.period
+        self._last = now
+        self.paused = 0
         if late >= self.period:
             self.missed += 1
             behind = late // self.period
-            if self.policy == "skip" or behind > MOST_BEHIND:
+            if still >= PAUSED_NS:
+                self.paused = still // self.period
+                self.pauses += 1
+            if self.policy == "skip" or behind > MOST_BEHIND or self.paused:
                 self.skipped += behind
                 self.deadline += behind * self.period
         return late
@@ -259,7 +276,8 @@ class Port(Protocol):
 class Report:
     """How a real-time run went.
 
-    ticks     run;  missed, skipped as `Ticker` counts them
+    ticks     run;  missed, skipped, pauses as `Ticker` counts them
+    dropped   frames that came in a pause or soon after it
     begin     lateness of each tick's begin;  end  from the deadline until its frames were sent;  work  the tick itself
     received, sent  frames
     started_ns      time since 1970 of tick 0
@@ -269,7 +287,9 @@ class Report:
     ticks: int = 0
     missed: int = 0
     skipped: int = 0
+    pauses: int = 0
     received: int = 0
+    dropped: int = 0
     sent: int = 0
     started_ns: int = 0
     wall_s: float = 0.0
@@ -286,10 +306,19 @@ _TX = 1 << 48
 
 def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
     """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us apart, in order."""
-    out = [_pack(ns + 1000 * i, head, data) for i, (head, data) in enumerate(received.tolist())]
+    out = [_pack(ns + 1000 * i, head & HEAD_MASK, data) for i, (head, data) in enumerate(received.tolist())]
     ns += 1000 * len(out)
     out += [_pack(ns + 1000 * i, head | _TX, data) for i, (head, data) in enumerate(sent.tolist())]
     return b"".join(out)
+
+
+def _drop(read: Callable[[np.ndarray], int], rows: np.ndarray) -> int:
+    """Take what has come and forget it; return how much it was."""
+    dropped = n = read(rows)
+    while n == len(rows) and dropped < 1_000_000:
+        n = read(rows)
+        dropped += n
+    return dropped
 
 
 def run_realtime(
@@ -323,12 +352,19 @@ def run_realtime(
         pass
     report.started_ns = (time.time_ns() // TICK_NS + 1) * TICK_NS
     ticker.begin()
-    k, started = 0, ticker.start
+    k, started, deaf = 0, ticker.start, 0
     try:
         while not stop and (ticks is None or k < ticks):
             deadline = ticker.deadline
             late = ticker.wait()
-            n = read(rows)
+            if ticker.paused:
+                deaf = k + DEAF
+            if k < deaf:
+                report.dropped += _drop(read, rows)
+                rows[0] = PAUSE, ticker.paused
+                n = 1 if ticker.paused else 0
+            else:
+                n = read(rows)
             out = tick(rows, n)
             if len(out):
                 report.sent += write(out)
@@ -338,19 +374,19 @@ def run_realtime(
             add_work(done - deadline - late, k)
             if put is not None and (n or len(out)):
                 put(packed(report.started_ns + k * TICK_NS, rows[:n], out))
-            report.received += n
+            report.received += 0 if ticker.paused else n
             if watch is not None and (why := watch(k)):
                 report.ended = why
                 k += 1
                 break
             k += 1
             if live is not None and k % 1000 == 0:
-                report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
+                report.ticks, report.missed, report.skipped, report.pauses = k, ticker.missed, ticker.skipped, ticker.pauses
                 live(report)
     except CanError as e:
         report.failed = f"the bus failed: {e}"
     finally:
-        report.ticks, report.missed, report.skipped = k, ticker.missed, ticker.skipped
+        report.ticks, report.missed, report.skipped, report.pauses = k, ticker.missed, ticker.skipped, ticker.pauses
         report.wall_s = (clock() - started) * 1e-9
         report.ended = report.ended or stop.asked
     return report

@@ -734,4 +734,6 @@ def serve(path: str, channel: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(*sys.argv[1:]))
+    from hil import cli
+
+    sys.exit(cli.run(lambda: serve(*sys.argv[1:])))

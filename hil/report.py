@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.figures import SignalError, noise_floor
+from hil.figures import AGREES, SignalError, noise_floor
 from hil.page import Line, Page, Panel, Tone, bars, break_at_holes, histogram, loop, number, overlay
 
 __all__ = ["PAPER_TABLE_5", "engine_test_report", "replay_report"]
@@ -275,7 +275,7 @@ def _replay_verdict(result: Result, measured: Sequence[SignalError], schedule: S
         what, size = _name(worst.signal), f"{number(worst.mean_abs)} {worst.unit} on average"
         at = _time_of_worst(result, worst.signal)
         peak = f"{number(worst.max_abs)} {worst.unit} at worst" + (f", at t = {number(at, 4)} s" if at is not None else "")
-        if ratio <= 1.2:
+        if ratio <= AGREES:
             text = f"The model follows the log to within the sensors' noise: the largest disagreement, in {what}, is {size} and {peak}."
             return text, "good"
         times = f"{number(ratio, 2)} times what sensor noise explains" if np.isfinite(ratio) else "and its sensor shows no noise"

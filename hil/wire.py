@@ -242,10 +242,8 @@ def _tell(wire, j, kind, detail, at):
 
 @in_place
 def _judge(wire, j, at):
-    """Set the mode of node ``j`` by its error counters."""
+    """Set the mode of node ``j``, which is not bus-off, by its error counters."""
     node = wire.node[j]
-    if node[MODE] == BUS_OFF:
-        return
     if node[TEC] > 255:
         node[MODE] = BUS_OFF
         node[TO_RECOVER] = RECOVER
@@ -312,11 +310,12 @@ def run_wire(wire, until, watch):
                     winner, lowest = j, priority
         head, data = tx[winner, node[winner, TX_AT], 0], tx[winner, node[winner, TX_AT], 1]
         n = frame_bits(head, data, bits[0])
-        senders, spoiled = 0, n + END
+        senders, spoiled, fits = 0, n + END, clock[DESTROY_NODE] < 0
         for j in range(nodes):
             if not _sends(wire, j, start, lowest):
                 continue
             senders += 1
+            fits = fits or clock[DESTROY_NODE] == j
             at = node[j, TX_AT]
             if j != winner and (tx[j, at, 0] != head or tx[j, at, 1] != data):
                 m = frame_bits(tx[j, at, 0], tx[j, at, 1], bits[1])
@@ -327,13 +326,13 @@ def run_wire(wire, until, watch):
         unheard = listeners <= senders
         if unheard:
             spoiled = min(spoiled, n + 2)  # nobody sets the acknowledge bit
-        fits = clock[DESTROY_NODE] < 0 or clock[DESTROY_NODE] == winner
         fits = fits and (clock[DESTROY_IDENT] < 0 or clock[DESTROY_IDENT] == head & IDENT_MASK)
         if clock[DESTROY] > 0 and fits:
             clock[DESTROY] -= 1
             spoiled = min(spoiled, n - 7)  # in the CRC
         elif wire.chance[0] > 0.0 and _random(clock) < wire.chance[0]:
             spoiled = min(spoiled, 1 + int(_random(clock) * n))
+        unheard = unheard and spoiled == n + 2  # else it ended before anybody could
         _recess(wire, (start - free) // RECESSIVE + 1)
 
         if spoiled < n + END:

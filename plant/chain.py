@@ -115,6 +115,7 @@ __all__ = [
     "true_stroke",
     "unloaded_ring_angle",
     "vane_step",
+    "wake",
 ]
 
 TICK = 1e-3  # s, one servo tick
@@ -145,7 +146,7 @@ PISTON_FRICTION = ROW["piston_friction"]
 OIL_COMPRESSIBILITY = ROW["oil_compressibility"]  # compliance, drag
 END_STOP_SHIFT = ROW["end_stop_shift"]
 LVDT_LAG_ERROR = ROW["lvdt_lag"]  # used through LVDT_SHARE
-LVDT_NONLINEARITY = ROW["lvdt_nonlinearity"]
+LVDT_NONLINEARITY = ROW["lvdt_nonlinearity"]  # amplitude, cubic
 LVDT_GAIN = ROW["lvdt_gain"]
 LVDT_THERMAL_DRIFT = ROW["lvdt_thermal_drift"]
 LVDT_BIAS = ROW["lvdt_bias"]
@@ -205,13 +206,14 @@ def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
 @inlined
 def drive_substep(
     u, du, v, x, y, lagged, z, off, give, reading,
-    i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop, limit, leakage,
-    force, excess, stribeck, stiffness, compliance, drag, per_stroke, low, high, lvdt_factor, lvdt_share, dt, loaded, lossy, sticky,
+    i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop, limit, roundness,
+    leakage, force, excess, stribeck, stiffness, compliance, drag, per_stroke, low, high, lvdt_factor, lvdt_share, dt,
+    loaded, lossy, sticky,
 ):  # fmt: skip
     """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
 
     loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
-    lossy   False leaves out droop and leakage, sticky: stiction, which take long: for lanes where these are neutral
+    lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where these are neutral
     """
     lagged = valve_lag.step(lagged, i, share)
     u, du = valve_step(u, du, lagged / rated, a11, a12, a21, a22)
@@ -224,9 +226,10 @@ def drive_substep(
         v = opening * (gain * math.sqrt(max(0.0, (p_s - against) * per_p_ref)))
         if lossy:
             v = supply_pressure_droop.step(v, p_s - against, droop)
-        v = valve_flow_saturation.step(v, limit)
-        if lossy:
+            v = valve_flow_saturation.step(v, limit, roundness)
             v = internal_leakage.step(v, p_load, drag * per_area, leakage)
+        else:
+            v = valve_flow_saturation.corner(v, limit)
         travel = 0.5 * (v_before + v) * dt
         level = piston_stiction.step(force, v, excess, stribeck) if sticky else force
         z_before, give_before = z, give
@@ -237,7 +240,7 @@ def drive_substep(
         give = oil_compressibility.step(load, v, compliance, drag)
         travel += (give - give_before) - (k * (z - z_before) + r * back) / stiffness
     else:
-        v = valve_flow_saturation.step(opening * (gain * root), limit)
+        v = valve_flow_saturation.corner(opening * (gain * root), limit)
         travel = 0.5 * (v_before + v) * dt
     x = min(max(x + travel, low), high)
     y += lvdt_factor * (x - y)
@@ -267,7 +270,8 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
             u, du, v, x, y, lagged, z, off, give, reading,
             i, p[RATED_CURRENT, j], p[VALVE_SHARE, j], p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j], p[VALVE_A22, j],
             overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, p[SUPPLY_PRESSURE_DROOP, j],
-            p[VALVE_FLOW_SATURATION, j], p[INTERNAL_LEAKAGE, j], p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
+            p[VALVE_FLOW_SATURATION, j], p[VALVE_FLOW_SATURATION + 1, j], p[INTERNAL_LEAKAGE, j],
+            p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
             stiffness, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j], 1.0 / p[STROKE, j], low, high,
             p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True,
         )  # fmt: skip
@@ -277,9 +281,24 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
 
 
 @in_place
+def wake(s, p, j, i_cmd):
+    """Set what only the effects remember to where it would be had they been followed: before ``p`` changes while the plant runs.
+
+    i_cmd  A, the current of the last tick
+    """
+    if p[DRIVE_EFFECTS, j] == 0.0:
+        for q in range(4):
+            s[CURRENT + q, j] = i_cmd
+        s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j] = i_cmd, 0.0, 0.0, 0.0, s[X_LVDT, j]
+    for k in range(3):
+        if p[LINKAGE_FRICTION + k, j] == 0.0:
+            s[BRISTLE + k, j], s[DRIVEN + k, j] = 0.0, s[RING + k, j]
+
+
+@in_place
 def measured_stroke(x, p, j, t_oil):
     """Return what the LVDT makes of a resting stroke ``x`` (m): its effects without its lags."""
-    x = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j])
+    x = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j])
     return straight_reading(x, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
 
 
@@ -292,15 +311,15 @@ def straight_reading(x, gain, drift, bias, t_oil):
 @in_place
 def true_stroke(reading, p, j, t_oil):
     """Return the resting stroke (m) that the LVDT gives as ``reading`` (m): the inverse of `measured_stroke`, to 1e-9 m."""
-    off = measured_stroke(0.0, p, j, t_oil)
+    off = straight_reading(0.0, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
     x = target = (reading - off) / p[LVDT_GAIN, j]
-    if p[LVDT_NONLINEARITY, j] != 0.0:
-        for _ in range(8):  # Newton; the error's slope is below 0.4
-            e = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j]) - target
+    sine, cubic = p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j]
+    if sine != 0.0 or cubic != 0.0:
+        for _ in range(12):  # Newton; the error's slope is below 0.7 within the stroke
+            e = lvdt_nonlinearity.step(x, p[STROKE, j], sine, cubic) - target
             if abs(e) < 1e-10:
                 break
-            slope = 1.0 - 2.0 * math.pi * p[LVDT_NONLINEARITY, j] / p[STROKE, j] * math.cos(2.0 * math.pi * x / p[STROKE, j])
-            x -= e / slope
+            x -= e / max(lvdt_nonlinearity.slope(x, p[STROKE, j], sine, cubic), 0.2)
     return x
 
 

@@ -65,6 +65,6 @@ in_place = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[cal
 inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
 
 
-def is_cached() -> bool:
-    """Return True if compiled code of these sources is there already (the first run takes seconds to compile)."""
-    return any(Path(numba.config.CACHE_DIR).rglob("*.nbi"))  # type: ignore[attr-defined]
+def is_cached(name: str) -> bool:
+    """Whether compiled code of the function ``name`` (MODULE.FUNCTION) of these sources is there already; compiling takes seconds."""
+    return any(Path(numba.config.CACHE_DIR).rglob(f"{name}-*.nbi"))  # type: ignore[attr-defined]

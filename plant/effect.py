@@ -39,7 +39,10 @@ UNITS = {  # border unit -> factor into SI (speeds stay in %, temperatures in de
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect, in ``unit``: its neutral value, physical bounds and meaning. ``si`` turns it into SI."""
+    """One number of an effect, in ``unit``: its neutral value, physical bounds and meaning. ``si`` turns it into SI.
+
+    ``period``: after which it repeats itself, as an angle does; from ``low`` to ``high`` is then one turn. 0: it does not.
+    """
 
     name: str
     unit: str
@@ -47,12 +50,15 @@ class Parameter:
     low: float
     high: float
     meaning: str
+    period: float = 0.0
 
     def __post_init__(self) -> None:
         if self.unit not in UNITS:
             raise ValueError(f"{self.name}: unit (={self.unit!r}) must be one of {', '.join(UNITS)}")
         if not self.low <= self.neutral <= self.high:
             raise ValueError(f"{self.name}: neutral (={self.neutral:g} {self.unit}) must be in [{self.low:g}, {self.high:g}]")
+        if self.period and self.period != self.high - self.low:
+            raise ValueError(f"{self.name}: period (={self.period:g} {self.unit}) must be high - low")
 
     @property
     def si(self) -> float:

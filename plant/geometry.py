@@ -40,10 +40,12 @@ from plant.linkage import (
 from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
 
 __all__ = [
+    "STANDS_FOR",
     "Crank",
     "Geometry",
     "Schedules",
     "Stage",
+    "length_tolerances",
     "load_geometry",
     "load_schedules",
     "stroke_for_vigv",
@@ -164,6 +166,42 @@ def load_geometry(source: str | Path = "geometry.toml") -> Geometry:
 def load_schedules(source: str | Path = "schedules.toml") -> Schedules:
     """Read the target angles over rotor speed; InputError names file, key, value and what is allowed."""
     return read(source, Schedules)
+
+
+STANDS_FOR = ("lc", "l")  # an offset and a slope of the vane's angle over stroke
+
+
+def length_tolerances(geometry: Geometry) -> dict[str, float]:
+    """How far ``lc`` and ``l`` of each stage may be from the table, mm, when they stand for every length that has a tolerance there.
+
+    A length off within its tolerance moves a stage's angle over stroke by an offset, a slope and a bow that goes with the offset: nothing
+    else is seen of twelve numbers (the crank's four, the stage's eight). The vertical link Lc gives the offset, the lever arm L the slope.
+    Each number's change over the stroke is laid out in these two and a constant, by least squares. Errors within tolerance are
+    independent and even, so the sums' standard deviations s add in squares; the tolerance is 3 s, at most the plain sum.
+
+    Returns ``{"vigv_lc": ..., "vigv_l": ..., ...}``.
+    """
+    stroke = np.linspace(0.0, 48e-3, 25)
+    here = vane_angles(stroke, geometry)
+    out = {}
+    for k, stage in enumerate(STAGES):
+        shapes = {}
+        for part in ("crank", stage):
+            for key, q in getattr(geometry, part):
+                if key not in ("lb_initial", "hysteresis") and q.tolerance > 0.0:
+                    off = q.model_copy(update={"value": q.value + q.tolerance})
+                    moved = geometry.model_copy(update={part: getattr(geometry, part).model_copy(update={key: off})})
+                    shapes[part, key] = vane_angles(stroke, moved)[:, k] - here[:, k]
+        basis = [(stage, key) for key in STANDS_FOR]
+        if any(b not in shapes for b in basis):
+            continue  # a table that calls them exact
+        parts = np.linalg.lstsq(
+            np.column_stack([*(shapes[b] for b in basis), np.ones(len(stroke))]), np.column_stack(list(shapes.values())), rcond=None
+        )[0]
+        for (_, key), row in zip(basis, parts, strict=False):
+            tolerance = getattr(getattr(geometry, stage), key).tolerance
+            out[f"{stage}_{key}"] = float(tolerance * min(np.abs(row).sum(), math.sqrt(3.0 * np.sum(row * row))))
+    return out
 
 
 def _flat(geometry: Geometry | NDArray[np.float64]) -> NDArray[np.float64]:

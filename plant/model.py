@@ -27,7 +27,7 @@ from pydantic import Field
 from plant import chain
 from plant.effects import EFFECTS, ROW
 from plant.geometry import Stage
-from plant.layout import NAMES, PLAY
+from plant.layout import PLAY
 from plant.linkage import STAGES
 from plant.machine import Plant, build_plant
 from plant.parameters import PlantTable, derive, nominal
@@ -41,7 +41,7 @@ FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, so
 class Model(Table):
     """What a machine has beyond its tables.
 
-    parameters  name of a nominal parameter (`plant.layout.NAMES`) -> value in its table's unit
+    parameters  name of a nominal parameter (`plant.parameters.nominal`) -> value in its table's unit
     effects     name of an effect -> its parameters, in their declared units
     meta        free text and lists of it
     """
@@ -81,7 +81,7 @@ class Model(Table):
         p = machine.p.copy()
         known = {n.name: n for n in nominal(machine.table, machine.geometry)}
         for name, value in self.parameters.items():
-            row = NAMES.index(name)
+            row = known[name].row
             p[row] = value * known[name].si
             if PLAY <= row < PLAY + len(STAGES):  # declared at the vane, used at the ring
                 ldp, lever = machine.lever(row - PLAY)
@@ -137,7 +137,7 @@ def _bound(name: str) -> Bound:
     """Physical bounds of a nominal parameter, in its table's unit."""
     section, key = name.split(".")
     if section == "linkage":
-        fields: Any = Stage.model_fields["hysteresis"]
+        fields: Any = Stage.model_fields["hysteresis" if key.endswith("_play") else key.split("_", 1)[1]]
     else:
         table: Any = PlantTable.model_fields[section].annotation
         fields = table.model_fields["pot_bias" if key.endswith("_bias") else key]

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from plant.effects import DERIVED, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
-from plant.geometry import Geometry, load_geometry
+from plant.geometry import Geometry, length_tolerances, load_geometry
 from plant.layout import (
     ACCELERATION,
     AREA,
@@ -37,7 +37,7 @@ from plant.layout import (
     VALVE_A21,
     VALVE_A22,
 )
-from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
+from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from tables import Bound, Bounded, Quantity, Table, read
@@ -148,19 +148,23 @@ class PlantTable(Table):
 
 @dataclass(frozen=True)
 class Nominal:
-    """One parameter as an engineer knows it. ``value``, ``tolerance`` in ``unit``; ``si`` turns them into SI."""
+    """One parameter as an engineer knows it. ``value``, ``tolerance`` in ``unit``; ``si`` turns them into SI; ``row`` of the plant's p."""
 
     name: str
     value: float
     tolerance: float
     unit: str
     si: float
+    row: int
 
 
 def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
-    """Return every named parameter in the order of `NAMES`."""
+    """Return every named parameter: those of `NAMES` in their order, then each stage's link ``lc`` and lever arm ``l``.
+
+    These two stand for all lengths of the linkage, and so does their tolerance (`plant.geometry.length_tolerances`).
+    """
     out = []
-    for name in NAMES:
+    for row, name in enumerate(NAMES):
         section, key = name.split(".")
         if section == "linkage":
             q = getattr(geometry, key.removesuffix("_play")).hysteresis
@@ -168,13 +172,19 @@ def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
             q = table.sensors.pot_bias
         else:
             q = getattr(getattr(table, section), key)
-        out.append(Nominal(name, q.value, q.tolerance, q.unit, _SI.get(q.unit, 1.0)))
+        out.append(Nominal(name, q.value, q.tolerance, q.unit, _SI.get(q.unit, 1.0), row))
+    for name, tolerance in length_tolerances(geometry).items():
+        stage, key = name.split("_", 1)
+        q = getattr(getattr(geometry, stage), key)
+        row = GEOMETRY + N_CRANK + STAGES.index(stage) * N_PER_STAGE + {"lc": G_LC, "l": G_L}[key]
+        out.append(Nominal(f"linkage.{name}", q.value, tolerance, q.unit, _SI[q.unit], row))
     return out
 
 
 _NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])[:, None]
 _DRIVE_ROWS = rows_at("valve", "supply", "actuator", "lvdt")
 _LOAD_ROWS = [r for r in rows_at("supply", "actuator") if r not in (ROW["oil_viscosity"], ROW["end_stop_shift"])]
+_LOAD_ROWS.append(ROW["valve_flow_saturation"] + 1)  # a round corner is worked out where the load is
 _VANE_ROWS = rows_at("linkage", "pot")
 
 
@@ -202,9 +212,9 @@ def load_plant(source: str | Path = "plant.toml", geometry: str | Path = "geomet
     table, geo = read(source, PlantTable), load_geometry(geometry)
     p = np.zeros((N_PARAMETERS, 1))
     g = geo.arrays()
-    for row, n in enumerate(nominal(table, geo)):
-        p[row, 0] = n.value * n.si
     p[GEOMETRY : GEOMETRY + N_GEOMETRY, 0] = g
+    for n in nominal(table, geo):
+        p[n.row, 0] = n.value * n.si
     for k in range(len(STAGES)):
         o = N_CRANK + k * N_PER_STAGE
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]

@@ -348,7 +348,7 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 (_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
 (_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
 (_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _FLOW, _VISCOSITY, _ASYMMETRY, _P_REF, _AERO) = range(37, 47)
-(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _N_ROWS) = range(47, 54)
+(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _ROUNDNESS, _N_ROWS) = range(47, 55)
 
 
 @_plain
@@ -363,12 +363,12 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
-            lossy |= p[SUPPLY_PRESSURE_DROOP, q] != 0.0 or p[INTERNAL_LEAKAGE, q] != 0.0
+            lossy |= p[SUPPLY_PRESSURE_DROOP, q] != 0.0 or p[INTERNAL_LEAKAGE, q] != 0.0 or p[VALVE_FLOW_SATURATION + 1, q] != 0.0
             sticky |= p[PISTON_STICTION, q] != 0.0
             memory |= p[VALVE_HYSTERESIS, q] != 0.0
             viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
-            curved |= p[LVDT_NONLINEARITY, q] != 0.0
+            curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
             b[_LAGGED, j], b[_Z, j], b[_OFF, j] = s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q]
             b[_GIVE, j], b[_READING, j] = s[GIVE, q], s[READING, q]
@@ -377,7 +377,7 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
             b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = p[VALVE_A11, q], p[VALVE_A12, q], p[VALVE_A21, q], p[VALVE_A22, q]
             b[_OVERLAP, j] = p[VALVE_DEAD_BAND, q] / p[RATED_CURRENT, q]
-            b[_LIMIT, j] = p[VALVE_FLOW_SATURATION, q]
+            b[_LIMIT, j], b[_ROUNDNESS, j] = p[VALVE_FLOW_SATURATION, q], p[VALVE_FLOW_SATURATION + 1, q]
             b[_LOW, j], b[_HIGH, j] = end_stop_shift.step(p[STROKE, q], p[END_STOP_SHIFT, q])
             b[_LVDT, j], b[_LVDT_SHARE, j] = p[LVDT_FACTOR, q], p[LVDT_SHARE, q]
             b[_DROOP, j], b[_LEAK, j] = p[SUPPLY_PRESSURE_DROOP, q], p[INTERNAL_LEAKAGE, q]
@@ -434,7 +434,9 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
             if curved:
                 for j in range(last):
                     q = order[j0 + j]
-                    b[_LOGGED, j] = lvdt_nonlinearity.step(b[_READING, j], p[STROKE, q], p[LVDT_NONLINEARITY, q])
+                    b[_LOGGED, j] = lvdt_nonlinearity.step(
+                        b[_READING, j], p[STROKE, q], p[LVDT_NONLINEARITY, q], p[LVDT_NONLINEARITY + 1, q]
+                    )
             if sensed:
                 for j in range(W):
                     b[_LOGGED, j] = chain.straight_reading(b[_LOGGED, j], b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j], t_oil[k])
@@ -461,8 +463,9 @@ def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
             b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j],
             i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
             b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j], b[_DROOP, j],
-            b[_LIMIT, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j], b[_COMPLIANCE, j], b[_DRAG, j],
-            b[_PER_STROKE, j], b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j], h, loaded, lossy, sticky,
+            b[_LIMIT, j], b[_ROUNDNESS, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j],
+            b[_COMPLIANCE, j], b[_DRAG, j], b[_PER_STROKE, j], b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j],
+            h, loaded, lossy, sticky,
         )  # fmt: skip
         b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = u, du, v, x, y
         b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = y1, y2, y3, y4

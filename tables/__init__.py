@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-__all__ = ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"]
+__all__ = ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "load_toml", "path", "read"]
 
 _HERE = Path(__file__).parent
+MOST_BYTES = 1 << 20  # of a TOML file; the largest shipped has 6 kB. The parser takes up to 600 bytes for each of dotted keys
+MOST_PARTS = 16  # of a dotted key: the parser's memory grows with their square, 6.8 GB for 50,000
+_PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+_LONG_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:\.[ \t]*+" + _PART + rb"){%d}" % MOST_PARTS)
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: neither "1.0" nor true is a number
 
 
@@ -87,6 +92,30 @@ def path(name: str) -> Path:
     return _HERE / name
 
 
+def load_toml(file: str | Path) -> dict[str, Any]:
+    """The content of a TOML file, as it stands.
+
+    Raises InputError in one line for what cannot be read, is no TOML, has more than `MOST_BYTES` or a key of more than `MOST_PARTS` parts:
+    the parser would take more memory for it than any table of ours is worth.
+    """
+    try:
+        with Path(file).open("rb") as f:
+            raw = f.read(MOST_BYTES + 1)
+        if len(raw) > MOST_BYTES:
+            raise _refusal(file, f"is longer than a TOML table may be ({MOST_BYTES:,} bytes)")
+        if long := _LONG_KEY.search(raw):
+            start = long[0][:30].decode("utf-8", "replace")
+            line = raw.count(b"\n", 0, long.start()) + 1
+            raise _refusal(file, f"line {line}: key {start}... has too many dotted parts; allowed: {MOST_PARTS}")
+        return tomllib.loads(raw.decode("utf-8-sig").replace("\r\n", "\n"))
+    except OSError as e:
+        raise _refusal(file, f"cannot be read ({e.strerror})") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as e:  # TOMLDecodeError, UnicodeDecodeError, a number of thousands of digits
+        raise _refusal(file, f"not a TOML table ({e})") from None
+
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -100,11 +129,9 @@ def read(source: str | Path, model: type[M]) -> M:
     try:
         if not file.is_file() and path(str(source)).is_file():
             file = path(str(source))
-        data: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except OSError as e:
-        raise _refusal(source, f"cannot be read ({e.strerror})") from None
-    except (ValueError, RecursionError) as e:  # TOMLDecodeError, UnicodeDecodeError, a number of thousands of digits
-        raise _refusal(file, f"not a TOML table ({e})") from None
+    except (OSError, ValueError) as e:  # a name with a null byte in it
+        raise _refusal(source, f"cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    data = load_toml(file)
     try:
         return model.model_validate(data)
     except ValidationError as e:

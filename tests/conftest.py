@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-from tests.uml.run import INTERFACE, is_up
+from tests.vcan.run import INTERFACE, is_up
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -19,13 +20,29 @@ settings.load_profile("vaneloop")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs a CAN interface where there is none, except where the run is there for it (tests/uml/run.py)."""
+    """Skip what needs a CAN interface where there is none, except where the run is there for it (tests/vcan/run.py)."""
     if os.environ.get("VANELOOP_NEED_VCAN") or is_up():
         return
-    skip = pytest.mark.skip(reason=f"this kernel has no {INTERFACE}; `make test-can` runs it inside user-mode Linux")
+    skip = pytest.mark.skip(reason=f"this kernel has no {INTERFACE}; `make test-can` boots one that has")
     for item in items:
         if item.get_closest_marker("socketcan"):
             item.add_marker(skip)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Write down what was skipped, and why, into the file VANELOOP_NOT_TESTED: the last lines of `make test` say it (tests/vcan/run.py)."""
+    if not (file := os.environ.get("VANELOOP_NOT_TESTED")):
+        return
+    told: Counter[str] = Counter()
+    for report in terminalreporter.stats.get("skipped", []):
+        why = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        told[f"{report.nodeid.split('::')[0]}: {why.removeprefix('Skipped: ')}"] += 1
+    if "any_speed" in config.option.markexpr:
+        for item in terminalreporter.stats.get("deselected", []):
+            if item.get_closest_marker("socketcan") and not item.get_closest_marker("any_speed"):
+                told[f"{item.nodeid.split('[')[0]}: would judge time, which says nothing on an emulated processor"] += 1
+    with open(file, "a", encoding="utf-8") as out:
+        out.writelines(f"{line}{f' ({n} tests)' if n > 1 else ''}\n" for line, n in told.items())
 
 
 @pytest.fixture(scope="session")

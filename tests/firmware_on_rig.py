@@ -8,6 +8,7 @@ from controller import Calibration, load_calibration, new_inputs, new_state, tic
 from controller.firmware import (
     I_CMD,
     IN_FRESH,
+    IN_MODE_REQUEST,
     IN_N_DEM,
     IN_N_R,
     IN_X_LVDT,
@@ -33,7 +34,7 @@ def firmware(calibration: Calibration | None = None) -> Compiled:
     inputs = new_inputs()
     out = Compiled(
         tick=tick, inputs=inputs, state=new_state(), calibration=cal, n_dem=IN_N_DEM, n_r=IN_N_R, x_lvdt=IN_X_LVDT, fresh=IN_FRESH,
-        i_cmd=I_CMD, x_dem=X_DEM, mode=MODE,
+        i_cmd=I_CMD, x_dem=X_DEM, mode=MODE, mode_request=IN_MODE_REQUEST,
     )  # fmt: skip
 
     def change(name: str, parameters: dict[str, float]) -> Compiled:

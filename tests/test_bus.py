@@ -25,6 +25,7 @@ from tables import InputError
 from tests.conftest import ROOT
 
 Join = Callable[..., can.BusABC]
+PATIENCE = 120.0  # s for what must come: a busy machine takes its time, and nothing here judges it
 
 
 def data_frame(ident: int, data: bytes = b"", **more: object) -> can.Message:
@@ -50,15 +51,15 @@ class BusTests:
         a, b, c = join(), join(), join()
         sent = data_frame(0x123, b"\x01\x02\x03")
         a.send(sent)
-        assert same(b.recv(2), sent) and same(c.recv(2), sent)
+        assert same(b.recv(PATIENCE), sent) and same(c.recv(PATIENCE), sent)
         assert a.recv(0.05) is None
 
     def test_own_frames_are_heard_only_where_asked_for(self, join: Join) -> None:
         a, b = join(receive_own_messages=True), join()
         sent = data_frame(0x321, b"own")
         a.send(sent)
-        assert same(own := a.recv(2), sent) and own is not None and not own.is_rx
-        other = b.recv(2)
+        assert same(own := a.recv(PATIENCE), sent) and own is not None and not own.is_rx
+        other = b.recv(PATIENCE)
         assert same(other, sent) and other is not None and (other.is_rx or not self.tells_own_process)
 
     @pytest.mark.parametrize("length", range(9))
@@ -67,19 +68,19 @@ class BusTests:
         for ident in (0, 0x7FF, 0x800, 0x1FFFFFFF):
             sent = data_frame(ident, bytes(range(length)))
             a.send(sent)
-            assert same(b.recv(2), sent)
+            assert same(b.recv(PATIENCE), sent)
 
     def test_extended_identifier_below_0x800_stays_extended(self, join: Join) -> None:
         a, b = join(), join()
         sent = can.Message(arbitration_id=0xA0, is_extended_id=True, data=bytes(8))
         a.send(sent)
-        assert same(b.recv(2), sent)
+        assert same(b.recv(PATIENCE), sent)
 
     def test_remote_frame_arrives_with_its_length(self, join: Join) -> None:
         a, b = join(), join()
         sent = can.Message(arbitration_id=0xA0, is_extended_id=False, is_remote_frame=True, dlc=5)
         a.send(sent)
-        assert same(b.recv(2), sent)
+        assert same(b.recv(PATIENCE), sent)
 
     def test_can_fd_arrives_or_is_refused(self, join: Join) -> None:
         a, b = join(), join()
@@ -89,25 +90,25 @@ class BusTests:
                 a.send(sent)
             return
         a.send(sent)
-        assert same(b.recv(2), sent)
+        assert same(b.recv(PATIENCE), sent)
 
     def test_order_is_kept_in_a_burst(self, join: Join) -> None:
         a, b = join(), join()
         n = self.burst
         for k in range(n):
-            a.send(data_frame(0x100, k.to_bytes(4, "little")), timeout=1)
-        got = [b.recv(2) for _ in range(n)]
+            a.send(data_frame(0x100, k.to_bytes(4, "little")), timeout=PATIENCE)
+        got = [b.recv(PATIENCE) for _ in range(n)]
         assert [int.from_bytes(m.data, "little") for m in got if m] == list(range(n))
 
     def test_filters_let_through_what_they_name(self, join: Join) -> None:
         a, b = join(), join(can_filters=[{"can_id": 0x0B0, "can_mask": 0x7F0, "extended": False}])
         for ident in (0x0A0, 0x0B0, 0x0B3, 0x1B0):
             a.send(data_frame(ident, bytes(8)))
-        assert [m.arbitration_id for m in (b.recv(2), b.recv(2)) if m] == [0x0B0, 0x0B3]
+        assert [m.arbitration_id for m in (b.recv(PATIENCE), b.recv(PATIENCE)) if m] == [0x0B0, 0x0B3]
         assert b.recv(0.05) is None
         b.set_filters(None)
         a.send(data_frame(0x1B0, bytes(8)))
-        assert same(b.recv(2), data_frame(0x1B0, bytes(8)))
+        assert same(b.recv(PATIENCE), data_frame(0x1B0, bytes(8)))
 
     def test_recv_gives_none_when_nothing_comes(self, join: Join) -> None:
         a = join()
@@ -116,8 +117,8 @@ class BusTests:
     def test_timestamps_do_not_run_backwards(self, join: Join) -> None:
         a, b = join(), join()
         for k in range(8):
-            a.send(data_frame(k, bytes(8)), timeout=1)
-        stamps = [m.timestamp for m in (b.recv(2) for _ in range(8)) if m]
+            a.send(data_frame(k, bytes(8)), timeout=PATIENCE)
+        stamps = [m.timestamp for m in (b.recv(PATIENCE) for _ in range(8)) if m]
         assert len(stamps) == 8 and stamps == sorted(stamps)
 
     def test_port_carries_frames_as_words(self, join: Join) -> None:
@@ -125,7 +126,7 @@ class BusTests:
         rows = np.array([[frames.word0(0xA0), -1], [3 << 32 | 0x7FF, 0x030201], [frames.EXTENDED | 1 << 32 | 0x12345, 0x7F]], np.int64)
         assert a.write(rows) == 3
         got = np.zeros((10, 2), np.int64)
-        n, deadline = 0, time.monotonic() + 5
+        n, deadline = 0, time.monotonic() + PATIENCE
         while n < 3 and time.monotonic() < deadline:
             n += b.read(got[n:])
             self.wait(b.bus)
@@ -147,8 +148,8 @@ class BusTests:
         assert vgv.faults == 0 and ecu.values["state"] == 2.0
 
     def arrived(self, port: Port, rows: np.ndarray, frames: int) -> int:
-        """Take so many frames into the first ``rows``; they come within ten seconds."""
-        got, until = port.read(rows), time.monotonic() + 10.0
+        """Take so many frames into the first ``rows``."""
+        got, until = port.read(rows), time.monotonic() + PATIENCE
         while got < frames and time.monotonic() < until:
             self.step(port.bus)
             got += port.read(rows[got:])
@@ -192,8 +193,9 @@ class TestLockstep(BusTests):
 
 
 @pytest.mark.socketcan
+@pytest.mark.any_speed
 class TestSocketcan(BusTests):
-    """A real vcan0: this machine's own, or that of user-mode Linux."""
+    """A real vcan0: this machine's own, or that of a kernel booted for it."""
 
     tells_own_process = False
 
@@ -224,20 +226,19 @@ class TestLocal(BusTests):
         n = broker.BACKLOG + 6000
         for k in range(n):
             fast.send(data_frame(0x100, k.to_bytes(4, "little")))
-            while k % 64 == 63 and (m := quick.recv(2)) is not None and m.data[0] & 63 != 63:
+            while k % 64 == 63 and (m := quick.recv(PATIENCE)) is not None and m.data[0] & 63 != 63:
                 pass
         numbers, told = [], []
-        for _ in range(n):
-            m = slow.recv(0.5)
-            if m is None:
-                break
+        while len(numbers) - len(told) + sum(told) < n:
+            m = slow.recv(PATIENCE)
+            assert m is not None
             if m.is_error_frame:
                 told.append(int.from_bytes(m.data[4:8], "little"))
                 assert m.arbitration_id == 0x4 and m.data[1] == 1
                 numbers.append(None)
             else:
                 numbers.append(int.from_bytes(m.data, "little"))
-        assert sum(told) > 0 and len(numbers) - len(told) + sum(told) == n
+        assert sum(told) > 0 and len(numbers) - len(told) + sum(told) == n and slow.recv(0.05) is None
         gap = numbers.index(None)
         assert numbers[:gap] == list(range(gap))
         after = [k for k in numbers[gap:] if k is not None]
@@ -245,45 +246,43 @@ class TestLocal(BusTests):
         assert slow.lost == sum(told) and quick.lost == 0  # type: ignore[attr-defined]
         assert "too slow" in caplog.text
 
-    def test_any_python_can_program_joins_by_the_interface_name(self, join: Join, name: str, tmp_path: Path) -> None:
-        a, log = join(), tmp_path / "heard.log"
-        command = [sys.executable, "-u", "-m", "can.logger", "-i", "vaneloop", "-c", name, "-f", str(log)]
+    def test_any_python_can_program_joins_by_the_interface_name(self, join: Join, name: str) -> None:
+        a, heard = join(), []
+        command = [sys.executable, "-u", "-m", "can.logger", "-i", "vaneloop", "-c", name]  # it prints each frame
         logger = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         try:
             assert logger.stdout is not None
             while b"Can Logger" not in logger.stdout.readline():
                 pass
-            time.sleep(0.2)
-            for _ in range(50):
-                a.send(data_frame(0x0A0, bytes(8)))
-            time.sleep(0.5)
+            for k in range(50):
+                a.send(data_frame(0x0A0, bytes([k] * 8)))
+            heard = [logger.stdout.readline().decode() for _ in range(50)]
             logger.send_signal(signal.SIGINT)
-            logger.communicate(timeout=30)
+            assert b" ID: " not in logger.communicate(timeout=PATIENCE)[0]  # no frame came twice
         finally:
             logger.kill()
             logger.wait()
-        heard = list(can.LogReader(log))
-        assert len(heard) == 50 and {m.arbitration_id for m in heard} == {0x0A0}
+        assert all(" 0a0 " in line.lower() and f"{k:02x} {k:02x}" in line for k, line in enumerate(heard)), heard
 
     def test_a_killed_broker_is_replaced_and_the_reader_told(self, join: Join, name: str) -> None:
         a, b = join(), join()
         a.send(data_frame(1))
-        assert same(b.recv(2), data_frame(1))
+        assert same(b.recv(PATIENCE), data_frame(1))
         os.kill(broker_of(name), signal.SIGKILL)
-        told = b.recv(10)
+        told = b.recv(PATIENCE)
         assert told is not None and told.is_error_frame and told.arbitration_id == 0x100
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE
         while b.restarts < 1 or a.restarts < 1:  # type: ignore[attr-defined]
             assert time.monotonic() < deadline
             a.recv(0.05)
         a.send(data_frame(2))
-        assert same(b.recv(5), data_frame(2))
+        assert same(b.recv(PATIENCE), data_frame(2))
 
     def test_the_broker_ends_after_its_last_participant(self, join: Join, name: str) -> None:
         a = join()
         pid = broker_of(name)
         a.shutdown()
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE
         while Path(f"/proc/{pid}").exists():
             assert time.monotonic() < deadline, "the broker stays"
             time.sleep(0.05)
@@ -298,7 +297,11 @@ class TestLocal(BusTests):
         assert (os.sched_getscheduler(pid), os.sched_getparam(pid).sched_priority) == (os.SCHED_FIFO, 7)
         high.shutdown()
         a.send(data_frame(1))
-        assert same(low.recv(2), data_frame(1)) and os.sched_getparam(pid).sched_priority == 3
+        assert same(low.recv(PATIENCE), data_frame(1))
+        deadline = time.monotonic() + PATIENCE
+        while os.sched_getparam(pid).sched_priority != 3:  # the broker hears of the two in whichever order
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
 
     def test_a_killed_participant_leaves_the_others_undisturbed(self, join: Join, name: str) -> None:
         a, b = join(), join()
@@ -310,17 +313,17 @@ class TestLocal(BusTests):
         other.stdout.close()
         for k in range(20):
             a.send(data_frame(k))
-            assert same(b.recv(2), data_frame(k))
+            assert same(b.recv(PATIENCE), data_frame(k))
 
     def test_two_that_start_at_once_are_on_one_bus(self, name: str) -> None:
         code = (
-            f"from hil.bus import open_bus; import can, time; b = open_bus('local:{name}'); end = time.monotonic() + 60; heard = None\n"
+            f"from hil.bus import open_bus; import can, time; b = open_bus('local:{name}'); end = time.monotonic() + 120; heard = None\n"
             "while heard is None and time.monotonic() < end:\n"
             "    b.send(can.Message(arbitration_id=5, is_extended_id=False)); heard = b.recv(0.05)\n"
             "b.send(can.Message(arbitration_id=5, is_extended_id=False)); print(heard is not None)"
         )
         both = [subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE) for _ in range(2)]
-        assert [p.communicate(timeout=90)[0] for p in both] == [b"True\n", b"True\n"]
+        assert [p.communicate(timeout=180)[0] for p in both] == [b"True\n", b"True\n"]
 
     @pytest.mark.parametrize("bad", ["a b", "a/b", "x" * 61, "ä"])
     def test_a_bad_name_is_refused_in_one_line(self, bad: str) -> None:

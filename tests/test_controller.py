@@ -349,6 +349,54 @@ def test_a_single_bad_sample_is_ignored(wrong, moving):
     assert difference <= (1.7e-3 if moving else 1e-6)  # A: kp times 0.1 mm
 
 
+@pytest.mark.parametrize("mode", [INIT, STANDBY, RUN, DEGRADED])
+def test_a_pause_is_fail_safe_at_once_and_run_comes_back_a_second_after_good_frames(mode):
+    rig = Rig()
+    if mode == INIT:
+        rig.healthy(20)
+    elif mode == STANDBY:
+        rig.healthy(200, mode_request=0.0)
+    else:
+        rig.running()
+    if mode == DEGRADED:
+        rows = frames(10, phase=rig.now)
+        rows[:, fw.IN_N_DEM] = 400.0
+        rig.play(rows)
+    assert rig.z[fw.MODE] == mode
+    began = rig.now
+    rows = frames(1, phase=1)
+    rows[:, fw.IN_PAUSE] = 5.0
+    rig.play(rows)
+    assert rig.z[fw.MODE] == FAIL_SAFE and fault(rig.log[-1:], fw.F_PAUSED)[0]
+    assert fault(rig.log[-1:], fw.F_STALE)[0] == (mode != INIT or rig.z[fw.DEMAND_AGE] >= 0.05)
+    rig.healthy(1500)
+    after = rig.tail(began)
+    gone = after.first(lambda s: ~fault(s, fw.F_PAUSED))
+    assert gone == ticks("recover_time")
+    back = after.first(lambda s: s[:, fw.MODE] == RUN)
+    assert 2 * ticks("recover_time") - 1 <= back <= 2 * ticks("recover_time") + 11
+    assert (after.log[:back, fw.MODE] == FAIL_SAFE).all() and after.log[-1, fw.FAULT_BITS] == 0.0
+
+
+@pytest.mark.parametrize("pause", [0.0, -1.0, np.nan, -np.inf])
+def test_no_pause_changes_nothing(pause):
+    rigs = Rig().running(), Rig().running()
+    rows = frames(500, phase=rigs[0].now)
+    rigs[0].play(rows)
+    rows[:, fw.IN_PAUSE] = pause
+    rigs[1].play(rows)
+    assert np.array_equal(rigs[0].log, rigs[1].log)
+
+
+def test_the_piston_may_be_anywhere_after_a_long_pause():
+    rig = Rig().running()
+    rig.piston[0] += 0.01
+    rows = frames(1, phase=1)
+    rows[:, fw.IN_PAUSE] = 0.2
+    rig.play(rows)
+    assert rig.z[fw.LVDT_GOOD] == 1.0 and rig.z[fw.X_MEAS] == pytest.approx(rig.piston[0], abs=1e-3)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 0.06, -0.01, 1e308])
 def test_a_lost_lvdt_is_a_fault_at_lvdt_debounce_and_heals_at_lvdt_heal(wrong):
     rig = Rig().running()
@@ -973,5 +1021,6 @@ def test_names_and_indices_of_inputs_scalars_states_and_faults_belong_together()
         else:
             assert getattr(fw, "FAULT_BITS" if name == "faults" else name.upper()) == i
     assert [fw.STATE[fw.T_STALE + bit] for bit in range(fw.N_FAULTS)] == [  # timers in the order of the bits
-        *("t_stale", "t_rejected", "t_lvdt_range", "t_lvdt_rate", "t_lvdt_stuck", "t_tracking", "t_saturated", "t_demand_range")
+        *("t_stale", "t_rejected", "t_lvdt_range", "t_lvdt_rate", "t_lvdt_stuck", "t_tracking", "t_saturated", "t_demand_range"),
+        "t_paused",
     ]

@@ -12,9 +12,9 @@ import pytest
 from discrepancy import Effect, Parameter, Stage, StageError
 from discrepancy.diagnose import Found, StageDiagnosis, diagnose_stage
 from discrepancy.fit import Judge
-from discrepancy.locate import onset, regimes, shape
-from discrepancy.stage import noise_of
-from discrepancy.workflow import compare_stages, diagnose, diagnosis_json, extend_stage
+from discrepancy.locate import locate, onset, regimes, shape
+from discrepancy.stage import noise_of, reach_of
+from discrepancy.workflow import compare_stages, diagnose, diagnosis_json, extend_stage, locate_stages
 from hil.cli import plain
 
 DT = 0.01  # s
@@ -449,10 +449,46 @@ def test_side_by_side_gives_the_same_answer_as_one_after_the_other(machine: list
     assert answers[0] == answers[1]
 
 
-def test_comparing_refits_nothing() -> None:
+def test_comparing_refits_nominal_parameters_and_tells_the_error_as_given_too() -> None:
     clean, moved = compare_stages([integrator(), replace(integrator(gain=3.09), name="moved")])
     assert clean.rms == pytest.approx(NOISE, rel=0.03) and clean.noise_floor == NOISE and clean.samples == N
-    assert moved.rms > 5 * NOISE
+    assert clean.rms_as_given == pytest.approx(NOISE, rel=0.03)
+    assert moved.rms_as_given > 5 * NOISE
+    assert moved.agrees and moved.rms == pytest.approx(NOISE, rel=0.03)
+
+
+def test_locating_and_diagnosing_start_from_the_same_error() -> None:
+    stage = integrator(3, gain=3.05, dead_band=0.6)
+    (located,) = locate_stages([stage])
+    d, e = diagnose_stage(stage, FLOOR), extend_stage(stage, ("dead_band",))
+    assert located.fails and not located.signals[0].agrees
+    assert located.signals[0].rms == d.error_before[0] == e.error_before[0]
+    assert located.json()["verdict"] == "fails" and located.verdict().startswith("fails in ")
+
+
+def test_a_stage_fails_where_one_condition_does_or_the_whole_is_more_than_noise() -> None:
+    clean = locate(Judge(integrator(1), FLOOR))
+    assert not clean.fails and clean.verdict() == "agrees everywhere" and clean.json()["fails"] is False
+    louder = locate(Judge(integrator(1), FLOOR / 1.2))
+    assert louder.fails and louder.worst.ratio == pytest.approx(1.2, rel=0.03)
+    assert replace(louder, regimes=()).verdict().startswith("fails in no single condition more than in others: ")
+
+
+def test_what_is_quieter_than_the_model_s_error_is_the_noise() -> None:
+    stage = replace(integrator(2, gain_asymmetry=0.06), noise=white)
+    given = noise_of(stage, stage.neutral())[0]
+    assert noise_of(replace(stage, quiet=np.array([0.5 * given])), stage.neutral())[0] == 0.5 * given
+    for less in (0.99, 1.5):  # no more than two estimates of one noise differ
+        assert noise_of(replace(stage, quiet=np.array([less * given])), stage.neutral())[0] == given
+
+
+def test_a_floor_is_raised_to_what_an_effect_hides_between_two_rows_and_only_then() -> None:
+    stage = replace(integrator(2, dead_band=0.6), hidden=lambda theta: np.array([0.03]))
+    with_it = stage.neutral()
+    assert reach_of(stage, FLOOR, with_it)[0] == NOISE
+    with_it[stage.index()["dead_band"]] = 0.6
+    assert reach_of(stage, FLOOR, with_it)[0] == pytest.approx(np.hypot(NOISE, 0.03))
+    assert diagnose_stage(stage, FLOOR).floor[0] == extend_stage(replace(stage, floor=FLOOR), ("dead_band",)).floor[0] > 0.03
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 
 from controller import firmware as fw
 from controller import load_calibration, new_state
-from hil.lockstep import Stimulus, flashed, lockstep
+from hil.lockstep import Stimulus, lockstep
+from hil.tick import flashed
 from plant import Model, build_plant, chain, load_model, stages, write_model
 from plant import effects as library
 from plant.effect import DEG, STAGES
@@ -97,7 +98,7 @@ SIZES: dict[str, dict[str, float]] = {
     "valve_null_bias": {"bias": 1.0},
     "valve_dead_band": {"half_width": 1.2},
     "valve_hysteresis": {"width": 1.5, "spread": 0.7},
-    "valve_flow_saturation": {"limit": 40.0},
+    "valve_flow_saturation": {"limit": 40.0, "roundness": 0.4},
     "valve_lag": {"time_constant": 0.01},
     "valve_gain_asymmetry": {"ratio": 1.2},
     "supply_pressure_droop": {"droop": 40.0},
@@ -110,7 +111,7 @@ SIZES: dict[str, dict[str, float]] = {
     "end_stop_shift": {"shift": 4.0},
     "lvdt_bias": {"bias": 0.4},
     "lvdt_gain": {"factor": 1.03},
-    "lvdt_nonlinearity": {"amplitude": 0.3},
+    "lvdt_nonlinearity": {"amplitude": 0.3, "cubic": -0.1},
     "lvdt_lag": {"time_constant": 0.01},
     "lvdt_thermal_drift": {"coefficient": 0.01},
     "linkage_backlash": {"vgv1": 0.5},
@@ -410,7 +411,9 @@ def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
 # what a block of the actuator's lanes leaves out, by the effects that its lanes have
 KINDS = {
     "nothing": (
-        {}, {"valve_dead_band": {"half_width": 0.5}}, {"lvdt_nonlinearity": {"amplitude": 0.1}},
+        {},
+        {"valve_dead_band": {"half_width": 0.5}},
+        {"lvdt_nonlinearity": {"amplitude": 0.1}},
         {"oil_viscosity": {"coefficient": 3e-3}},
     ),
     "hysteresis": ({"valve_hysteresis": {"width": 1.0, "spread": 0.6}}, {"lvdt_gain": {"factor": 1.02}}),
@@ -593,6 +596,15 @@ def test_flow_saturation_limits_the_speed_and_leaves_slower_motion_alone() -> No
     assert np.array_equal(drive(machine, 0.020, 50)[:, chain.X], drive(build_plant(), 0.020, 50)[:, chain.X])
 
 
+def test_a_round_flow_saturation_adds_the_pressure_drops_of_two_orifices_in_series() -> None:
+    # dp = (v / a)^2 + (v / b)^2: the speed of both is 1 / sqrt(1 / a^2 + 1 / b^2), of the spool alone a, of the passage alone b
+    for current in (0.005, 0.020, 0.040):
+        a, b = speed(build_plant(), current, stroke=0.002), 0.100
+        both = speed(machine_with(valve_flow_saturation={"limit": 100.0, "roundness": 1.0}), current, stroke=0.002)
+        assert both == pytest.approx((a**-2 + b**-2) ** -0.5, rel=1e-9)
+        assert speed(machine_with(valve_flow_saturation={"limit": 100.0, "roundness": 0.5}), current, stroke=0.002) > both
+
+
 def test_valve_lag_reaches_63_per_cent_after_its_time_constant() -> None:
     machine = machine_with(valve_lag={"time_constant": 20.0e-3})
     out = drive(machine, 0.010, 20)
@@ -723,12 +735,13 @@ def test_shifted_stops_hold_the_piston() -> None:
 # ---- physics: LVDT ------------------------------------------------------------------------------------------------------------------
 
 
-@given(st.floats(0.0, 0.048), st.floats(-5, 5), st.floats(0.8, 1.25), st.floats(-3, 3), st.floats(-0.2, 0.2), st.floats(0.0, 100.0))
-def test_true_stroke_undoes_every_effect_of_the_lvdt(x, bias, factor, amplitude, drift, t_oil) -> None:
+@given(*(st.floats(a, b) for a, b in ((0.0, 0.048), (-5, 5), (0.8, 1.25), (-3, 3), (-0.2, 0.2), (0.0, 100.0), (-1, 1))))
+def test_true_stroke_undoes_every_effect_of_the_lvdt(x, bias, factor, amplitude, drift, t_oil, cubic) -> None:
     p = np.zeros((library.N_PARAMETERS, 1))
     p[chain.STROKE] = 0.048
     p[ROW["lvdt_bias"]], p[ROW["lvdt_gain"]] = bias * 1e-3, factor
     p[ROW["lvdt_nonlinearity"]], p[ROW["lvdt_thermal_drift"]] = amplitude * 1e-3, drift * 1e-3
+    p[ROW["lvdt_nonlinearity"] + 1] = cubic * 1e-3
     assert chain.true_stroke(chain.measured_stroke(x, p, 0, t_oil), p, 0, t_oil) == pytest.approx(x, abs=2e-10)
 
 
@@ -738,8 +751,20 @@ def test_lvdt_effects_add_up_as_on_a_data_sheet() -> None:
 
 
 def test_lvdt_nonlinearity_is_nil_at_the_ends_and_in_the_middle() -> None:
-    wave = [lvdt_nonlinearity.step(q * 0.048, 0.048, 1e-4) - q * 0.048 for q in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    wave = [lvdt_nonlinearity.step(q * 0.048, 0.048, 1e-4, 0.0) - q * 0.048 for q in (0.0, 0.25, 0.5, 0.75, 1.0)]
     assert wave == pytest.approx([0.0, -1e-4, 0.0, 1e-4, 0.0], abs=1e-15)
+
+
+def test_the_windings_cubic_bends_without_a_gain() -> None:
+    """Odd about the middle, its size at both ends, and no straight part: a line through it by least squares is level."""
+    q = np.linspace(0.0, 1.0, 20001)
+    error = np.array([lvdt_nonlinearity.step(x * 0.048, 0.048, 0.0, 1e-4) - x * 0.048 for x in q])
+    assert error[[0, 10000, -1]] == pytest.approx([-1e-4, 0.0, 1e-4], abs=1e-15)
+    assert abs(np.polyfit(q, error, 1)[0]) < 1e-7
+    step = 1e-7
+    for x in (0.0005, 0.011, 0.0475, -0.001, 0.049):
+        rise = lvdt_nonlinearity.step(x + step, 0.048, 2e-3, -5e-4) - lvdt_nonlinearity.step(x - step, 0.048, 2e-3, -5e-4)
+        assert lvdt_nonlinearity.slope(x, 0.048, 2e-3, -5e-4) == pytest.approx(rise / (2.0 * step), rel=1e-6)
 
 
 def test_lvdt_lag_trails_a_moving_piston_by_its_time_constant() -> None:

@@ -21,10 +21,16 @@ from hil.logs import read_log
 from hil.recorder import ERROR, EXTENDED, FD, FRAME, REMOTE, Recorder, RecorderProcess, read_record
 from tables import InputError, path
 from tests.conftest import ROOT
+from tests.test_bus import broker_of
 
 FORMATS = (".log", ".blf", ".mf4", ".parquet")
 START = 1_700_000_000 * 10**9  # ns
 COMMAND = [sys.executable, "-m", "app.main"]
+
+
+def waited(pid: int) -> float:
+    """Time, s, that a process's threads have waited for a processor so far: what a busy machine adds to everything that they do."""
+    return sum(int(f.read_text().split()[1]) for f in Path(f"/proc/{pid}/task").glob("*/schedstat")) * 1e-9
 
 
 def some_frames(n: int, first: int = 0) -> np.ndarray:
@@ -168,7 +174,7 @@ def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: 
         except InputError as e:
             print(recorder.frames, e)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240)
     frames, _, words = done.stdout.partition(" ")
     assert int(frames) > 100 and f"ends after {int(frames):,} frames" in words and "File too large" in words
     assert len(read_record(file).ms) == int(frames)
@@ -191,7 +197,7 @@ def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str
         recorder.flush()
         print(sorted(map(str, loaded() - before)))
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240)
     assert done.stdout.strip() == "[]"
 
 
@@ -203,18 +209,21 @@ def test_killing_the_recorder_costs_at_most_a_second(suffix: str, tmp_path: Path
     file = tmp_path / f"run{suffix}"
     recorder = RecorderProcess(file)
     put_at, k = [], 0
-    end = time.monotonic() + 1.7
-    while time.monotonic() < end:
+    end, late, due = time.monotonic() + 1.7, 0.0, 0
+    while time.monotonic() < end or due <= 50:
         recorder.put(some_frames(1, k).tobytes())
         put_at.append(time.monotonic())
         k += 1
         time.sleep(0.002)
-    killed = time.monotonic()
+        if time.monotonic() > end:  # frames that must be in the file by now: a second old, more where the recorder had to wait
+            late = waited(recorder._process.pid)
+            due = sum(t < time.monotonic() - 1.0 - late for t in put_at)
+            assert time.monotonic() < end + 120.0
     recorder._process.send_signal(signal.SIGKILL)
     recorder._process.wait()
     held = read_record(file)
     assert (held.ms - START // 10**6).tolist() == list(range(len(held.ms)))
-    assert len(held.ms) >= sum(t < killed - 1.0 for t in put_at) > 50
+    assert len(held.ms) >= due > 50
     recorder.close()
     assert "killed" in recorder.error
 
@@ -234,7 +243,7 @@ def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> N
     command = [sys.executable, "-c", textwrap.dedent(code)]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120, check=False)
     assert done.returncode == -signal.SIGKILL
-    pid, end = int(done.stdout), time.monotonic() + 20
+    pid, end = int(done.stdout), time.monotonic() + 120
     while Path(f"/proc/{pid}").exists() and Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z" and time.monotonic() < end:
         time.sleep(0.05)
     assert len(read_record(file).ms) == 500
@@ -244,9 +253,7 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
     """Four recorders on one bus, killed while frames come; and one that is asked to end, which has them all."""
     name = f"local:record{os.getpid()}"
     files = [tmp_path / f"killed{s}" for s in FORMATS] + [tmp_path / "whole.blf"]
-    started = [
-        subprocess.Popen([*COMMAND, "record", str(f), "--bus", name], cwd=ROOT, stdout=subprocess.PIPE, text=True) for f in files
-    ]
+    started = [subprocess.Popen([*COMMAND, "record", str(f), "--bus", name], cwd=ROOT, stdout=subprocess.PIPE, text=True) for f in files]
     for p in started:
         assert p.stdout is not None
         assert p.stdout.readline().startswith("recording")
@@ -258,17 +265,21 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
             sent_at.append(time.monotonic())
             time.sleep(0.005)
         killed = time.monotonic()
+        late = [waited(p.pid) + waited(broker_of(name.partition(":")[2])) for p in started]
         for p in started[:-1]:
             p.kill()
-        time.sleep(0.3)
+        until = time.monotonic() + 120
+        while (not files[-1].is_file() or len(read_record(files[-1]).ms) < len(sent_at)) and time.monotonic() < until:
+            time.sleep(0.2)  # the bus still carries frames to the last one
         started[-1].send_signal(signal.SIGINT)
-    said = started[-1].communicate(timeout=60)[0]
+    said = started[-1].communicate(timeout=240)[0]
     for p in started:
-        p.wait(timeout=60)
-    for file in files:
+        p.wait(timeout=240)
+    for file, more in zip(files, late, strict=True):
         held = read_record(file).rows[:, 1].tolist()
         assert held == list(range(len(held))), file.suffix
-        assert len(held) >= sum(t < killed - 1.0 for t in sent_at) > 50, file.suffix
+        assert len(held) >= sum(t < killed - 1.0 - more for t in sent_at), (file.suffix, more)
+    assert len(sent_at) > 100
     assert len(held) == len(sent_at)
     assert started[-1].returncode == 0 and "ended by SIGINT" in said
 
@@ -276,6 +287,6 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
 def test_vaneloop_record_says_what_it_did_and_ends_by_itself(tmp_path: Path) -> None:
     file = tmp_path / "run.log"
     command = [*COMMAND, "record", str(file), "--bus", f"local:quiet{os.getpid()}", "--duration", "0.3", "--json", "-"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0
     assert json.loads(done.stdout)["frames"] == 0

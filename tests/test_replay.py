@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.main import main
 from hil.lockstep import Stimulus, lockstep
 from hil.logs import Channel, write_log
 from tests.conftest import ROOT
@@ -18,6 +21,17 @@ from tests.conftest import ROOT
 def vaneloop(*args: str | Path, module: str = "app.main", cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", module, *map(str, args)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
+
+
+def inside(*args: str | Path) -> subprocess.CompletedProcess[str]:
+    """The same command without a process of its own."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([*map(str, args)])
+        except SystemExit as leaving:
+            code = int(leaving.code or 0)
+    return subprocess.CompletedProcess(args, code, out.getvalue(), err.getvalue())
 
 
 def refused(done: subprocess.CompletedProcess[str]) -> str:
@@ -48,7 +62,7 @@ def test_model_agrees_with_a_log_that_it_made(own_log, name, tmp_path) -> None:
     out = tmp_path / "r.json"
     tolerances = {"vigv": 0.02, "x_lvdt": 0.02, "i_cmd": 0.3}  # a bus log is coarser: resolution, 10 ms frames
     args = [a for k, v in tolerances.items() for a in ("--tolerance", f"{k}={v}")]
-    done = vaneloop("replay", own_log / name, *args, "--json", out)
+    done = inside("replay", own_log / name, *args, "--json", out)
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads(out.read_text())
     assert result["schema"] == 1 and len(result["state_hash"]) == 64
@@ -72,13 +86,13 @@ def test_module_and_command_are_the_same(own_log) -> None:
 
 
 def test_strategy_changes_the_stroke_demand(own_log) -> None:
-    done = vaneloop("replay", own_log / "own.csv", "--strategy", "single", "--tolerance", "x_dem=0.3", "--quiet")
+    done = inside("replay", own_log / "own.csv", "--strategy", "single", "--tolerance", "x_dem=0.3", "--quiet")
     assert done.returncode == 1
 
 
 def test_report_is_one_file_that_needs_no_network(own_log, tmp_path) -> None:
     page = tmp_path / "r.html"
-    assert vaneloop("replay", own_log / "own.csv", "--report", page, "--out", tmp_path / "sim.parquet").returncode == 0
+    assert inside("replay", own_log / "own.csv", "--report", page, "--out", tmp_path / "sim.parquet").returncode == 0
     html = page.read_text(encoding="utf-8")
     assert "vigv" in html.lower() and "<script src=" not in html and "<link " not in html
     assert (tmp_path / "sim.parquet").stat().st_size > 1000
@@ -101,7 +115,7 @@ def test_report_is_one_file_that_needs_no_network(own_log, tmp_path) -> None:
     ],
 )
 def test_bad_argument_is_refused_in_one_line(own_log, args, words) -> None:
-    done = vaneloop("replay", own_log / "own.csv", *args, *([] if "--json" in args else ["--quiet"]))
+    done = inside("replay", own_log / "own.csv", *args, *([] if "--json" in args else ["--quiet"]))
     if args[0] == "--dbc":
         assert done.returncode in (0, 2) and "Traceback" not in done.stderr  # a CSV has no use for it
         return
@@ -111,25 +125,25 @@ def test_bad_argument_is_refused_in_one_line(own_log, args, words) -> None:
 
 def test_log_without_demand_is_refused_in_one_line(tmp_path) -> None:
     (tmp_path / "x.csv").write_text("t,vigv\n0,1\n0.01,2\n")
-    line = refused(vaneloop("replay", tmp_path / "x.csv"))
+    line = refused(inside("replay", tmp_path / "x.csv"))
     assert "x.csv" in line and "n_dem" in line
 
 
 def test_speed_in_rpm_without_saying_so_is_refused_with_the_way_out(tmp_path) -> None:
     (tmp_path / "x.csv").write_text("t,n_dem\n" + "".join(f"{i / 100},{5000 + i}\n" for i in range(100)))
-    line = refused(vaneloop("replay", tmp_path / "x.csv"))
+    line = refused(inside("replay", tmp_path / "x.csv"))
     assert "--design-rpm" in line and "n_dem" in line
 
 
 def test_time_running_backwards_is_refused_in_one_line(tmp_path) -> None:
     (tmp_path / "x.csv").write_text("t,n_dem\n0,60\n0.01,60\n0.005,60\n0.02,60\n")
-    assert "n_dem" in refused(vaneloop("replay", tmp_path / "x.csv"))
+    assert "n_dem" in refused(inside("replay", tmp_path / "x.csv"))
 
 
 def test_gap_in_the_demand_is_noted_and_does_not_count(tmp_path) -> None:
     t = np.concatenate([np.arange(0, 5, 0.01), np.arange(15, 20, 0.01)])
     write_log(tmp_path / "gap.csv", {"n_dem": Channel(t, np.full(len(t), 70.0))})
-    done = vaneloop("replay", tmp_path / "gap.csv", "--json", "-")
+    done = inside("replay", tmp_path / "gap.csv", "--json", "-")
     result = json.loads(done.stdout)
     assert any("gap" in n for n in result["notes"])
     assert result["simulated_s"] == pytest.approx(20.0, abs=0.05)

@@ -440,3 +440,61 @@ def test_the_firmware_runs_on_the_rig():
 
 def test_kernel_slots_are_all_different():
     assert len({int(v) for v in P}) == len(P) == kernel.N_P
+
+
+# ---- ordinary machines and loggers -----------------------------------------------------------------------------------------------------
+
+
+def test_links_are_drawn_within_the_tolerance_that_the_table_states():
+    nominal = load()
+    drawn = [load(rng=np.random.default_rng(seed)) for seed in range(40)]
+    for part in ("x1", "y1", "Le", "length_0"):
+        off = [getattr(g, part) - getattr(nominal, part) for g in drawn]
+        assert 3e-5 < np.abs(off).max() <= 5e-5 + 1e-12, part  # m: up to the tolerance, and not all of them near nominal
+    for k in range(3):
+        for part in ("Lb", "Lc", "Ld"):
+            off = [getattr(g.stages[k], part) - getattr(nominal.stages[k], part) for g in drawn]
+            assert 3e-5 < np.abs(off).max() <= 5e-5 + 1e-12, part
+        ratio = [g.stages[k].vane_ratio / nominal.stages[k].vane_ratio - 1.0 for g in drawn]
+        assert 5e-4 < np.abs(ratio).max() <= 0.05 / 36.7 + 0.05 / 158.5
+        centre = [np.hypot(g.stages[k].dx - nominal.stages[k].dx, g.stages[k].dy - nominal.stages[k].dy) for g in drawn]
+        assert 1e-4 < np.max(centre) < 0.02 * DEG * 0.51 + 7.1e-5  # theta6 turns it, dx and dy move it along
+        assert {g.stages[k].hysteresis for g in drawn} == {nominal.stages[k].hysteresis}
+
+
+def test_links_within_tolerance_move_the_vanes_and_nothing_before_them():
+    plain = closed_loop(seconds=20.0)
+    other = simulate(manoeuvre(1, 20.0), controller(), seed=1, rate=1000, geometry=load(rng=np.random.default_rng(4)))
+    assert np.abs(other.log["vigv"] - plain.log["vigv"]).max() > 0.03
+    assert np.abs(other.log["x_dem"] - plain.log["x_dem"]).max() < 0.1
+
+
+def test_a_gap_takes_rows_out_and_leaves_the_others():
+    whole = simulate(manoeuvre(2, 20.0), controller(), seed=2)
+    cut = simulate(manoeuvre(2, 20.0), controller(), seed=2, gaps=[(4.0, 2.5), (11.0, 1.0)])
+    t = whole.truth["t"]
+    kept = ~(((t >= 4.0) & (t < 6.5)) | ((t >= 11.0) & (t < 12.0)))
+    assert len(cut.log["t"]) == 2000 - 350
+    for channel in LOG:
+        np.testing.assert_array_equal(cut.log[channel], whole.log[channel][kept], err_msg=channel)
+    np.testing.assert_array_equal(cut.truth["x"], whole.truth["x"][kept])
+
+
+@pytest.mark.parametrize("kind", ["standby", "deaf"])
+def test_a_spell_in_another_mode_is_the_firmwares(kind):
+    """The controller leaves RUN and comes back by itself; the machine moves as it says; the rows before are untouched."""
+    firmware = pytest.importorskip("controller.firmware")
+    from tests.firmware_on_rig import firmware as controller_of_the_product
+    from tests.rig import Spell
+
+    test = manoeuvre(3, 30.0)
+    plain = simulate(test, controller_of_the_product(), seed=3)
+    run = simulate(test, controller_of_the_product(), seed=3, spells=[Spell(kind, 10.0, 4.0)])
+    state, t = run.log["state"], run.truth["t"]
+    for channel in LOG:
+        np.testing.assert_array_equal(run.log[channel][:1000], plain.log[channel][:1000], err_msg=channel)
+    other = firmware.STANDBY if kind == "standby" else firmware.FAIL_SAFE
+    assert set(state[(t > 11.0) & (t < 13.5)]) == {other}
+    assert set(state[t < 9.9]) == set(state[t > 16.0]) == {firmware.RUN}
+    assert np.abs(run.log["x_lvdt"] - plain.log["x_lvdt"])[(t > 11.0) & (t < 13.5)].max() > 1.0
+    np.testing.assert_array_equal(run.log["n_dem"], plain.log["n_dem"])  # a logger hears the ECU all the same

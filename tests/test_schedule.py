@@ -293,7 +293,8 @@ def upwards(t, x):
         (upwards, "retraction is missing: x_lvdt from 1 to"),
         (lambda t, x: (t, x, -angles(GEOMETRY, 0, x)), "vigv changes by -1.0"),
         (lambda t, x: (t, x, 0.0 * x + 3.0), "vigv stays at 3 deg while x_lvdt moves from 1 to"),
-        (lambda t, x: (t, 25.4 * x, angles(GEOMETRY, 0, x)), "x_lvdt (="),
+        (lambda t, x: (t, 25.4 * x, angles(GEOMETRY, 0, x)), "x_lvdt (x_lvdt): 461 of 500 values are outside -25 to 75 mm"),
+        (lambda t, x: (t, 1.5 * x, angles(GEOMETRY, 0, x)), "x_lvdt (="),
         (lambda t, x: (t[:10], x[:10], angles(GEOMETRY, 0, x[:10])), "a loop needs at least 20"),
     ],
 )

@@ -42,7 +42,7 @@ EXPORTS: dict[str, list[str]] = {
     "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
     "plant": ["Geometry", "Model", "Plant", "Schedules", "build_plant", "load_geometry", "load_model", "load_schedules", "write_model"],
     "plant.effects": ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"],
-    "tables": ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "path", "read"],
+    "tables": ["Axis", "Bound", "Bounded", "InputError", "Quantity", "Table", "load_toml", "path", "read"],
 }
 
 

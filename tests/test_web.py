@@ -5,6 +5,7 @@ Screenshots are kept in ``out/web`` (or VANELOOP_SHOTS).
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -18,8 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tests.conftest import ROOT
+from tests.test_realtime import ON_TIME_US
 
 CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
 SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
@@ -38,7 +42,15 @@ class Server:
         self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=folder, env=self.environment)
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
-        assert self.url.startswith("http://"), "vaneloop web printed no address"
+        link = re.fullmatch(r"(http://[^/]+:(\d+)/)\?token=([\w-]{16,})", self.url)
+        assert link, f"vaneloop web printed no link, but {self.url!r}"
+        self.port, self.token = int(link[2]), link[3]
+        self.known = f"vaneloop_token_{self.port}={self.token}"  # the cookie
+        self.session = ""  # the cookie of the one session that all requests of our own share
+
+    def at(self, page: str) -> str:
+        """Address of a page, with the token."""
+        return self.url.replace("/?", f"/{page}?")
 
     def workers(self) -> list[int]:
         """All processes that the server has started, and theirs."""
@@ -112,8 +124,8 @@ def shot(page: Any, name: str) -> None:
 
 
 def looks(page: Any, name: str) -> None:
-    """Pictures at both widths, light and dark; nothing may stick out of the page."""
-    for width, dark in ((1280, False), (1920, False), (1920, True), (1280, True)):
+    """Pictures, narrow and light, wide and dark; nothing may stick out of the page."""
+    for width, dark in ((1280, False), (1920, True)):
         page.set_viewport_size({"width": width, "height": 900})
         if dark != ("body--dark" in (page.locator("body").get_attribute("class") or "")):
             page.get_by_label("light or dark").click()
@@ -146,7 +158,7 @@ def wait_ratio(page: Any, condition: str) -> None:
 def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page: Any) -> None:
     page.goto(server.url)
     choose(page, "hidden_effect.parquet")
-    page.get_by_text("The actuator stage fails most").wait_for()
+    page.get_by_text("fails most in the actuator stage").wait_for()
     search = page.get_by_role("button", name="Find the missing physics")
 
     # a cancelled search leaves nothing behind
@@ -235,7 +247,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
         page.get_by_label(f"unit of {ours} in the log").fill(unit)
     page.get_by_label("design speed [rpm]").fill("38000")
     page.get_by_role("button", name="Read again").click()
-    page.get_by_text("stage fails most").wait_for()
+    page.get_by_text("fails most in the").wait_for()
     preview = page.locator(".vtable").first.inner_text()
     assert "ACT_POS" in preview and "N1_DEM" in preview
     command = page.locator(".cmd code").first.inner_text()
@@ -253,7 +265,7 @@ def step(page: Any, name: str) -> None:
 
 @needs_browser
 def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page: Any, tmp_path: Path) -> None:
-    page.goto(server.url + "schedule")
+    page.goto(server.at("schedule"))
     page.locator(".loop-log").click()
     page.get_by_role("option", name="hidden_effect.parquet").click()
 
@@ -294,21 +306,59 @@ def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page
 # ---- page 3: run ------------------------------------------------------------------------------------------------------------------------
 
 
+# What lamps have shown in this browser, however short: a busy machine may draw a lamp's end with its beginning.
+WATCH_LAMPS = """window.lamps = new Set(); new MutationObserver((changes) => { for (const c of changes)
+  if (c.target.dataset.lamp) window.lamps.add(c.target.dataset.lamp + ' ' + c.target.className.split(' ')[1]); })
+  .observe(document, { subtree: true, attributes: true, attributeFilter: ['class'] });"""
+
+
+def press(page: Any, button: str, until: str) -> None:
+    """Press ``button`` until ``until`` (JavaScript) is so: a page that could not answer for long is loaded anew, and loses a click."""
+    from playwright.sync_api import TimeoutError as Late
+
+    end = time.monotonic() + 2 * LONG / 1000.0
+    while True:
+        with contextlib.suppress(Late):
+            page.get_by_role("button", name=button, exact=True).click(timeout=LONG / 4)
+        with contextlib.suppress(Late):
+            page.wait_for_function(until, timeout=LONG / 4)
+            return
+        assert time.monotonic() < end, f"{button}: never {until}"
+
+
+def downloaded(page: Any, name: re.Pattern[str]) -> Path:
+    with page.expect_download() as download:
+        page.get_by_role("link", name=name).click()
+    return Path(download.value.path()).rename(Path(download.value.path()).with_suffix(".log"))
+
+
+def states_in(record: Path) -> tuple[set[str], set[int]]:
+    """Modes that the controller said in a record, and the identifiers in it."""
+    from controller import MODES
+    from hil.frames import IDENT_MASK
+    from hil.logs import read_log
+    from hil.recorder import read_record
+
+    state = read_log(record, require=("state",)).channels["state"].values
+    return {MODES[int(v)] for v in state}, set((read_record(record).rows[:, 0] & IDENT_MASK).tolist())
+
+
+RECORD_IS_THERE = "!!document.querySelector('.open-record')"
+
+
 @needs_browser
 def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: Any) -> None:
-    page.goto(server.url + "run")
+    page.add_init_script(WATCH_LAMPS)
+    page.goto(server.at("run"))
     page.locator(".pace").click()
     page.get_by_role("option", name="10 x", exact=True).click()
-    page.get_by_role("button", name="Start", exact=True).click()
-    page.locator('[data-lamp="RUN"].good').wait_for()
+    press(page, "Start", "window.lamps.has('RUN good')")
     slider = page.get_by_role("slider", name="speed demand")
     box = slider.bounding_box()
     slider.click(position={"x": 0.8 * box["width"], "y": box["height"] / 2})
     page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[1].innerText) > 80")  # rotor speed follows
     page.get_by_label("find a scenario").fill("demand_stops")
-    page.get_by_role("button", name="demand_stops", exact=True).click()
-    page.locator('[data-lamp="FAIL_SAFE"].bad').wait_for()
-    page.locator('[data-lamp="demand_stale"].bad').wait_for()
+    press(page, "demand_stops", "window.lamps.has('FAIL_SAFE bad') && window.lamps.has('demand_stale bad')")
     page.get_by_label("filter of the trace").fill("VGV_HEALTH")
     page.wait_for_function(
         "(() => { const l = document.querySelector('.trace').innerText.trim().split('\\n');"
@@ -318,7 +368,7 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
     page.locator('[data-lamp="RUN"].good').wait_for()
     page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 15")
     looks(page, "run")
-    page.get_by_role("button", name="Stop", exact=True).click()
+    press(page, "Stop", RECORD_IS_THERE)
     page.locator(".open-record").click()
     page.locator(".verdict").first.wait_for()
     assert "noise" in page.locator(".verdict").first.inner_text()
@@ -326,31 +376,75 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
 
 @needs_browser
 def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None:
-    page.goto(server.url + "run")
+    page.goto(server.at("run"))
     page.locator(".bus").click()
     page.get_by_role("option", name="real time, embedded bus").click()
-    page.get_by_role("button", name="Start", exact=True).click()
-    page.locator('[data-lamp="RUN"].good').wait_for()
-    page.get_by_text(re.compile(r"p50 \d+ us")).wait_for()
-    shot(page, "run_real_time_1280_light")
-    page.get_by_role("button", name="Stop", exact=True).click()
-    page.locator(".open-record").wait_for()
+    press(page, "Start", "parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 3")  # s that the listener has heard
+    late = page.get_by_text(re.compile(r"p50 \d+ us"))
+    late.wait_for()
+    press(page, "Stop", RECORD_IS_THERE)
     assert not page.get_by_role("alert").count(), page.get_by_role("alert").first.inner_text()
+    shot(page, "run_real_time_1280_light")
+    worst = re.search(r"max (\d+) us", late.inner_text())
+    states, idents = states_in(downloaded(page, re.compile(r"download run\d+\.log")))
+    assert {0x0A0, 0x0B0} <= idents  # the ECU's frames, and the controller's
+    assert worst and ("RUN" in states or int(worst[1]) > ON_TIME_US), (states, worst)  # late ticks cost frames
+
+
+def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> None:
+    import shlex
+
+    from app.web.run import Loop
+    from app.web.session import Session
+    from app.web.worker import parsed
+
+    loop = Loop(Session("x", tmp_path / "0123456789abcdef", []))
+    asked: list[tuple[str, dict[str, Any]]] = []
+    for loop.bus in ("lockstep", "local", "vcan0"):
+        for loop.profile, loop.seed, loop.record in ((None, None, True), ("staircase", 7, False)):
+            for without, words in loop.commands():
+                args = parsed(words[0], words[1:])
+                assert args.bus == loop.bus_name and shlex.split(shlex.join(words)) == words
+                assert bool(without) == (loop.bus == "lockstep")
+                if words[0] == "run":
+                    assert (args.seed, args.record) == (loop.seed, "run1.log" if loop.record else None)
+                else:
+                    assert args.profile == loop.profile
+    loop.bus = "local"
+    loop._worker = lambda name: type("W", (), {"call": lambda self, task, _, **given: asked.append((task, given))})()  # type: ignore
+    with pytest.raises(TypeError):  # these answers cannot be waited for
+        loop._in_real_time().send(None)
+    assert [given["bus"] for _, given in asked] == [loop.bus_name] * 3
 
 
 # ---- who may ask ------------------------------------------------------------------------------------------------------------------------
 
+NAVIGATION = {"Accept": "text/html,*/*;q=0.8", "Sec_Fetch_Site": "none", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
+UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec_WebSocket_Version": "13", "Sec_WebSocket_Key": "A" * 22 + "=="}
+SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
-def ask(server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, str]:
-    """One request with headers of our own; status and the first line of the answer."""
+
+def answer_of(server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, dict[str, str], str]:
+    """One request with headers of our own; status, headers by small names and content of the answer."""
     from http.client import HTTPConnection
-    from urllib.parse import urlsplit
 
-    at = urlsplit(server.url)
-    connection = HTTPConnection("127.0.0.1", at.port, timeout=60)
+    connection = HTTPConnection("127.0.0.1", server.port, timeout=60)
     connection.request(method, path, body=body, headers={k.replace("_", "-"): v for k, v in headers.items()})
     answer = connection.getresponse()
-    return answer.status, answer.read().decode("utf-8", "replace").partition("\n")[0]
+    return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read().decode("utf-8", "replace")
+
+
+def ask(server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, str]:
+    """A request of one browser that knows the token; status and the first line of the answer."""
+    status, sent, text = answer_of(server, path, method, body, **({"Cookie": server.known + server.session} | NAVIGATION | headers))
+    if sent.get("set-cookie", "").startswith("vaneloop_session_"):
+        server.session = "; " + sent["set-cookie"].partition(";")[0]
+    return status, text.partition("\n")[0]
+
+
+def folders_of(place: Path) -> list[Path]:
+    """Folders of sessions that servers with this TMPDIR have made."""
+    return [f for f in place.glob("vaneloop-web-*/*") if f.is_dir()]
 
 
 def test_another_site_cannot_reach_the_server(server: Server) -> None:
@@ -361,58 +455,406 @@ def test_another_site_cannot_reach_the_server(server: Server) -> None:
     assert ask(server, Origin="http://rebound.example")[0] == 403
     assert ask(server, "/_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="null")[0] == 403
     assert ask(server, Host="127.1.2.3")[0] == 200 and ask(server, Host="[::1]:80")[0] == 200
-    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec_WebSocket_Version": "13", "Sec_WebSocket_Key": "A" * 22 + "=="}
-    socket = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
-    assert ask(server, socket, Origin="http://rebound.example", **upgrade)[0] == 403
+    assert ask(server, SOCKET, Origin="http://rebound.example", **UPGRADE)[0] == 403
+
+
+def test_a_page_of_another_port_of_this_machine_cannot_use_the_server(server: Server) -> None:
+    """To a browser all ports of a host are one site: it sends the cookie along, however strict that is."""
+    for site in ("same-site", "cross-site", "nonsense", "none, none"):
+        for path in ("/", "/curves/log", "/_nicegui_ws/socket.io/?EIO=4&transport=polling"):
+            assert ask(server, path, Sec_Fetch_Site=site)[0] == 403
+        assert ask(server, SOCKET, Sec_Fetch_Site=site, **UPGRADE)[0] == 403
+    other = f"http://127.0.0.1:{server.port + 1}"  # of a browser that does not send Sec-Fetch-Site
+    for path, more in (("/", {}), (SOCKET, UPGRADE)):
+        status, _, _ = answer_of(server, path, Cookie=server.known, Accept="text/html", Origin=other, **more)
+        assert status == 403
+    status, _, _ = answer_of(server, SOCKET, Cookie=server.known, Origin=f"http://127.0.0.1:{server.port}", **UPGRADE)
+    assert status == 101
+
+
+def test_the_token_is_asked_for_on_loopback_too(server: Server) -> None:
+    wrong = server.known[:-1] + ("a" if server.known[-1] != "a" else "b")
+    for cookie in ("", wrong, f"vaneloop_token={server.token}", f"x={server.known}", server.known + "x"):
+        for path, more in (("/", {}), ("/run", {}), ("/curves/log", {}), (SOCKET, UPGRADE), ("/?token=wrong", {}), ("/?token=", {})):
+            status, _, text = answer_of(server, path, Cookie=cookie, **NAVIGATION, **more)
+            assert status == 403 and server.token not in text
+            assert more or "Open the link that `vaneloop web` printed" in text
+    others = '{"odd": [1, 2]}; =; ;;; "=x; ' + server.known + "; other=\x7f"  # cookies of other programs on this machine come along
+    assert ask(server, "/", Cookie=others + server.session)[0] == 200
+
+
+def test_the_token_becomes_a_cookie_and_leaves_the_address(server: Server) -> None:
+    for page in ("", "schedule", "run"):
+        status, headers, text = answer_of(server, f"/{page}?token={server.token}", **NAVIGATION)
+        assert (status, headers["location"], text) == (303, f"/{page}", "")
+        kept = headers["set-cookie"].split("; ")
+        assert kept[0] == server.known and set(kept[1:]) == {"HttpOnly", "SameSite=Strict", "Path=/"}
+    for path in ("//evil.example/", "/\\evil.example", "/nowhere", "/%0d%0aX:%20y"):  # nothing of the address but a page of ours
+        status, headers, _ = answer_of(server, f"{path}?token={server.token}", **NAVIGATION)
+        assert status == 400 or (status, headers["location"]) == (303, "/")
+    # a link on another site: a redirect would still be that site's
+    status, headers, text = answer_of(server, f"/run?token={server.token}", **{**NAVIGATION, "Sec_Fetch_Site": "cross-site"})
+    assert status == 200 and headers["set-cookie"].startswith(server.known) and server.token not in text and "url=/run" in text
+
+
+@needs_browser
+def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: Any) -> None:
+    page.goto(server.at("run"))
+    assert page.url == server.at("run").partition("?")[0]
+    page.reload()
+    page.get_by_role("button", name="Start", exact=True).wait_for()
+    # a page of another port: neither its requests nor its frames get anywhere
+    import http.server
+    import threading
+
+    class Other(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("content-type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>other</title>")
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Other) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        there = page.context.new_page()
+        there.goto(f"http://127.0.0.1:{other.server_port}/")
+        ours = f"http://127.0.0.1:{server.port}"
+        opened = there.evaluate(f"new Promise((r) => {{ const w = new WebSocket('{ours.replace('http', 'ws')}{SOCKET}');"
+                                " w.onopen = () => r('opened'); w.onerror = () => r('refused'); })")  # fmt: skip
+        with there.expect_navigation() as navigation:
+            there.evaluate(f"location.href = '{ours}/'")
+        status, said = navigation.value.status, there.inner_text("body")
+        there.close()
+        other.shutdown()
+    assert opened == "refused" and status == 403 and "another site's page ('same-site')" in said
+    page.reload()
+    page.get_by_role("button", name="Start", exact=True).wait_for()
+
+
+def test_only_a_page_that_a_browser_goes_to_makes_a_session_and_a_seventh_ends_none(tmp_path: Path) -> None:
+    s = Server(tmp_path, TMPDIR=str(tmp_path))
+    try:
+        for more in ({}, {"Accept": "*/*"}, {"Accept": "image/*", **{k: v for k, v in NAVIGATION.items() if k != "Accept"}},
+                     NAVIGATION | {"Sec_Fetch_Mode": "no-cors"}, NAVIGATION | {"Sec_Fetch_Dest": "iframe"}):  # fmt: skip
+            assert answer_of(s, "/", Cookie=s.known, **more)[0] == 406
+        for path in ("/curves/log", "/saved/model", "/nowhere", "/_nicegui/nothing"):
+            assert ask(s, path)[0] == 404
+        assert answer_of(s, "/", **NAVIGATION)[0] == 403
+        assert folders_of(tmp_path) == []
+        for n in range(6):  # each a browser of its own: no cookie of a session
+            assert ask(s, Cookie=s.known)[0] == 200 and len(folders_of(tmp_path)) == n + 1
+        six = sorted(folders_of(tmp_path))
+        status, line = ask(s, Cookie=s.known)
+        assert status == 429 and "open tab" in line
+        assert sorted(folders_of(tmp_path)) == six
+    finally:
+        s.stop()
+
+
+def test_a_session_with_an_open_tab_never_gives_way() -> None:
+    from collections import Counter
+
+    from app.web.server import MOST_SESSIONS, Sessions
+
+    class Made:
+        def __init__(self, key: str):
+            self.key, self.closed, self.working = key, False, Counter[str]()
+
+        def close(self) -> None:
+            self.closed = True
+
+    class Tab:
+        def on_delete(self, then: Any) -> None:
+            self.close = then
+
+    sessions = Sessions(Made)  # type: ignore[arg-type]
+    tabs = [Tab() for _ in range(MOST_SESSIONS)]
+    made: list[Any] = [sessions.get(str(i), t) for i, t in enumerate(tabs)]  # type: ignore[arg-type]
+    for k in range(20):
+        assert sessions.get(f"another {k}", Tab()) is None  # type: ignore[arg-type]
+    assert not any(s.closed for s in made)
+    second = Tab()
+    assert sessions.get("3", second) is made[3]  # type: ignore[arg-type]
+    for i in (3, 4, 1):  # 3 has a second tab; 4 is at work
+        tabs[i].close()
+    made[4].working["diagnose"] += 1
+    assert sessions.get("new", Tab()) is not None and made[1].closed  # type: ignore[arg-type]
+    assert sessions.get("newer", Tab()) is not None and made[4].closed  # type: ignore[arg-type]
+    assert sessions.get("newest", Tab()) is None  # type: ignore[arg-type]
+    second.close()
+    assert sessions.get("newest", Tab()) is not None and made[3].closed  # type: ignore[arg-type]
+    assert [s.closed for s in made] == [False, True, False, True, True, False]
+    sessions.close()
+    assert all(s.closed for s in made)
+
+
+TEXTS = st.one_of(
+    st.text(st.characters(max_codepoint=255), max_size=40),
+    st.sampled_from(["", "[", "[::1", "]", "::", "[::1]", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999999", "localhost", "local host"]),
+    st.sampled_from(["a@127.0.0.1", "http://[", "http://127.0.0.1", "null", "http://127.0.0.1:1@x"]),
+    st.sampled_from(["\xb2", "9" * 5000, "-1", "1e9", "%", "%zz", "a" * 70_000]),
+)
+
+
+def through_the_guard(kind: str, method: str, path: str, query: bytes, headers: list[tuple[bytes, bytes]], guard: Any = None) -> list[Any]:
+    """What a guard in front of an application answers."""
+    from app.web.guard import Guard
+
+    async def behind(scope: Any, receive: Any, send: Any) -> None:
+        await receive()
+        await send({"type": "http.response.start", "status": 200, "headers": []} if kind == "http" else {"type": "websocket.accept"})
+        if kind == "http":
+            await send({"type": "http.response.body", "body": b"secret"})
+
+    async def receive() -> Any:
+        return {"type": "http.request", "body": b"12"} if kind == "http" else {"type": "websocket.connect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    sent: list[Any] = []
+    if guard is None:
+        guard = Guard(behind, "the-token-of-the-test", 8765, 100, loopback=True, pages=("/", "/run"))
+        guard.ticket()
+    scope = {"type": kind, "method": method, "path": path, "raw_path": path.encode(), "query_string": query, "headers": headers}
+    with pytest.raises(StopIteration):  # nothing in it waits
+        guard(scope, receive, send).send(None)  # type: ignore[attr-defined]
+    return sent
+
+
+GUARDED = st.sampled_from(["host", "origin", "cookie", "content-length", "sec-fetch-site", "sec-fetch-mode", "accept"])
+
+
+@given(
+    st.sampled_from(["http", "websocket"]),
+    st.sampled_from(["GET", "POST", "HEAD", "OPTIONS"]),
+    st.one_of(st.sampled_from(["/", "/run", "//x", "/curves/log"]), st.text(max_size=30)),
+    st.one_of(st.binary(max_size=60), st.just(b"token=%ff")),
+    st.lists(st.tuples(GUARDED, TEXTS), max_size=6),
+    st.booleans(),
+    st.booleans(),
+)
+@settings(max_examples=400)
+def test_nothing_that_is_asked_breaks_the_guard(
+    kind: str, method: str, path: str, query: bytes, extra: list[tuple[str, str]], good: bool, known: bool
+) -> None:
+    """Any header, path and query: one answer, never one that says that the server failed; and without the token nothing passes."""
+    headers = [("host", "127.0.0.1:8765")] * good + [("cookie", "vaneloop_token_8765=the-token-of-the-test")] * known + extra
+    raw = [(k.encode(), v.encode("latin-1")) for k, v in headers]
+    sent = through_the_guard(kind, method, path, query, raw)
+    if kind == "http":
+        assert [m["type"] for m in sent] == ["http.response.start", "http.response.body"] and sent[0]["status"] < 500
+        passed = sent[1]["body"] == b"secret"
+    else:
+        assert [m["type"] for m in sent] in (["websocket.close"], ["websocket.accept"])
+        passed = sent[0]["type"] == "websocket.accept"
+    if passed:
+        assert known and sum(k == "host" for k, _ in headers) == 1
+
+
+def raw_status(server: Server, request: bytes) -> int:
+    """Status of the answer to these bytes; 0 where the connection is only closed."""
+    import socket
+
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as s:
+        with contextlib.suppress(OSError):  # closed before it has read all of it
+            s.sendall(request)
+            s.shutdown(socket.SHUT_WR)
+        head = b""
+        with contextlib.suppress(OSError):
+            while b"\r\n" not in head and (more := s.recv(4096)):
+                head += more
+    return int(head.split()[1]) if head else 0
+
+
+ODD_REQUESTS = [
+    "GET / HTTP/1.1\r\nHost: [\r\n{c}\r\n",
+    "GET / HTTP/1.1\r\n{c}\r\n",
+    "GET / HTTP/1.0\r\n{c}\r\n",
+    "GET / HTTP/1.1\r\n{h}Host: 127.0.0.1\r\n{c}\r\n",
+    "GET / HTTP/1.1\r\n{h}{c}Origin: http://[\r\n\r\n",
+    "GET / HTTP/1.1\r\n{h}{c}X: {long}\r\n\r\n",
+    "GET /{long} HTTP/1.1\r\n{h}{c}\r\n",
+    "GET /_nicegui/{mid} HTTP/1.1\r\n{h}{c}\r\n",
+    "POST / HTTP/1.1\r\n{h}{c}Content-Length: \xb2\r\n\r\n",
+    "POST / HTTP/1.1\r\n{h}{c}Content-Length: {nines}\r\n\r\n",
+    "GET /saved/%00 HTTP/1.1\r\n{h}{c}\r\n",
+    "GET /%ff%fe/%zz%% HTTP/1.1\r\n{h}{c}\r\n",
+    "GET /assets/uPlot.css%00 HTTP/1.1\r\n{h}{c}\r\n",
+    "GET /curves/log?from=nan&to=inf&n=1e400 HTTP/1.1\r\n{h}{s}\r\n",
+    "GET /curves/log?from=9&to=1&n=-{nines} HTTP/1.1\r\n{h}{s}\r\n",
+    "GET /?token=%00%ff&token= HTTP/1.1\r\n{h}\r\n",
+    "GET /?%=&&&=; HTTP/1.1\r\n{h}{c}\r\n",
+    "GET * HTTP/1.1\r\n{h}{c}\r\n",
+    "OPTIONS * HTTP/1.1\r\n{h}{c}\r\n",
+    "CONNECT x:1 HTTP/1.1\r\n{h}{c}\r\n",
+    "GET http://other.example/ HTTP/1.1\r\n{h}{c}\r\n",
+    "GET / HTTP/1.1\r\n{h}Cookie: vaneloop_session_{p}=e30=.x.y; {k}\r\n\r\n",
+    "GET / HTTP/1.1\r\n{h}Cookie: vaneloop_session_{p}=\xff\xfe; {k}\r\n\r\n",
+    "GET / HTTP/1.1\r\n{h}{c}Upgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
+    "GET /_nicegui_ws/socket.io/?EIO=%ff&transport=%00 HTTP/1.1\r\n{h}{c}\r\n",
+    "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket&client_id=%ff HTTP/1.1\r\n{h}{c}Upgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: !\r\n\r\n",
+    "POST /_nicegui_ws/socket.io/?EIO=4&transport=polling&sid=x HTTP/1.1\r\n{h}{c}Content-Length: 3\r\n\r\n\xff\xff\xff",
+    "POST /_nicegui/client/x/upload/y HTTP/1.1\r\n{h}{c}Content-Length: 0\r\n\r\n",
+    "\x00\x01\x02\r\n\r\n",
+    "GET / HTTP/9.9\r\n\r\n",
+]
+
+
+def test_no_odd_request_gets_a_server_error(server: Server) -> None:
+    """The kind of `Host: [`: hosts, origins, lengths, paths, cookies and upgrades that are none, sent as bytes to the real server."""
+    _, headers, _ = answer_of(server, "/", Cookie=server.known, **NAVIGATION)
+    session = headers["set-cookie"].partition(";")[0]
+    words = {
+        "h": f"Host: 127.0.0.1:{server.port}\r\n", "c": f"Cookie: {server.known}\r\nAccept: text/html\r\n", "long": "a" * 200_000,
+        "s": f"Cookie: {server.known}; {session}\r\n", "k": server.known, "p": server.port, "nines": "9" * 5000, "mid": "a" * 5000,
+    }  # fmt: skip
+    statuses = {odd: raw_status(server, odd.format(**words).encode("latin-1")) for odd in ODD_REQUESTS}
+    assert not {odd: status for odd, status in statuses.items() if status >= 500}
+    assert statuses[ODD_REQUESTS[0]] == 400 and ask(server)[0] == 200
+
+
+@given(
+    st.sampled_from(["GET", "POST", "HEAD"]), st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=30),
+    st.lists(st.tuples(st.sampled_from(["Host", "Origin", "Content-Length", "Transfer-Encoding", "Accept", "Range", "Cookie"]),
+                       st.text(st.characters(min_codepoint=32, max_codepoint=255, exclude_characters="\x7f"), max_size=20)), max_size=4),
+    st.sampled_from(["/", "/curves/", "/saved/", "/_nicegui/", "/_nicegui/3.0/static/", "/_nicegui_ws/socket.io/?"]),
+)  # fmt: skip
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_random_requests_get_no_server_error(server: Server, method: str, tail: str, more: list[tuple[str, str]], path: str) -> None:
+    lines = [f"{method} {path}{tail} HTTP/1.1", f"Host: 127.0.0.1:{server.port}", f"Cookie: {server.known}"]
+    lines += [f"{k}: {v}" for k, v in more]
+    assert raw_status(server, ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")) < 500
 
 
 def test_what_belongs_to_a_session_is_given_to_nobody_else(server: Server) -> None:
-    assert ask(server, "/curves/log")[0] == 404
-    assert ask(server, "/saved/model")[0] == 404
-    assert ask(server, "/saved/..%2f..%2fetc%2fpasswd")[0] == 404
+    assert ask(server)[0] == 200 and ask(server, "/curves/log")[0] == 200  # the session's own
+    for path in ("/curves/log", "/saved/model", "/saved/..%2f..%2fetc%2fpasswd"):
+        assert ask(server, path, Cookie=server.known)[0] == 404
 
 
-def test_elsewhere_than_on_loopback_a_token_is_needed(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "app.main", "web", "--host", "0.0.0.0", "--port", "0", "--no-open"]
-    short = subprocess.run(
-        words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "VANELOOP_WEB_TOKEN": "short"}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-    assert short.returncode == 2 and "VANELOOP_WEB_TOKEN" in short.stderr and "Traceback" not in short.stderr
+def test_elsewhere_than_on_loopback_the_token_is_the_users_own(tmp_path: Path) -> None:
+    for host in ("0.0.0.0", "127.0.0.1"):
+        words = [sys.executable, "-m", "app.main", "web", "--host", host, "--port", "0", "--no-open"]
+        short = subprocess.run(
+            words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "VANELOOP_WEB_TOKEN": "short"}, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+        assert short.returncode == 2 and "VANELOOP_WEB_TOKEN" in short.stderr and "Traceback" not in short.stderr
     token = "a-token-for-the-test"
     s = Server(tmp_path, "--host", "0.0.0.0", "--upload-limit", "1", VANELOOP_WEB_TOKEN=token)
     try:
-        assert s.url.endswith(f"?token={token}")
-        status, line = ask(s)
-        assert status == 401 and "token" in line and token not in line
-        assert ask(s, Cookie="vaneloop_token=wrong")[0] == 401
-        assert ask(s, "/?token=" + token)[0] == 200
-        assert ask(s, Cookie=f"vaneloop_token={token}")[0] == 200
-        status, line = ask(s, "/_nicegui/client/x/upload/1", "POST", b"0" * (2 << 20), Cookie=f"vaneloop_token={token}")
+        assert s.token == token
+        status, line = ask(s, Cookie="", Host="this.machine:80")
+        assert status == 403 and "token" in line and token not in line
+        assert ask(s, Host="this.machine:80")[0] == 200
+        assert ask(s, Host="[")[0] == 400
+        status, line = ask(s, "/_nicegui/client/x/upload/1", "POST", b"0" * (2 << 20))
         assert status == 413 and "1 MB" in line
     finally:
         s.stop()
 
 
-def test_uploads_are_private_and_gone_at_the_end(tmp_path: Path) -> None:
-    import stat
+def test_the_browser_is_opened_with_a_word_that_works_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    """Every user of a machine may read the command line of a browser."""
+    import webbrowser
 
-    s = Server(tmp_path, TMPDIR=str(tmp_path))
-    (private,) = tmp_path.glob("vaneloop-web-*")
-    assert stat.S_IMODE(private.stat().st_mode) == 0o700
-    s.stop()
-    assert not private.exists()
+    from app.main import main
+    from app.web.guard import Guard
+
+    def serve(sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any) -> None:
+        nonlocal guard
+        guard = Guard(None, token, 8765, most, loopback=loopback)  # type: ignore[arg-type]
+        ready(guard.ticket())
+        sock.close()
+
+    guard: Any = None
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr("app.web.server.serve", serve)
+    assert main(["web", "--port", "0", "--folder", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out.strip()
+    assert printed.endswith(guard.token) and guard.loopback
+    (link,) = opened
+    assert link.partition("=")[0] == printed.partition("=")[0] and guard.token not in link
+    query = link.partition("?")[2].encode()
+    host = [(b"host", b"127.0.0.1:8765")]
+    for q, statuses in ((query, [303, 403]), (printed.partition("?")[2].encode(), [303, 303])):
+        assert [through_the_guard("http", "GET", "/", q, host, guard)[0]["status"] for _ in range(2)] == statuses
+
+
+# ---- temporary folders ------------------------------------------------------------------------------------------------------------------
+
+
+def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import stat
+    import tempfile
+
+    from app.web.private import private_folder
+
+    killed = Server(tmp_path, TMPDIR=str(tmp_path))
+    assert ask(killed)[0] == 200
+    (left,) = tmp_path.glob("vaneloop-web-*")
+    assert left.name.startswith(f"vaneloop-web-{killed.process.pid}-") and stat.S_IMODE(left.stat().st_mode) == 0o700
+    killed.process.kill()
+    killed.process.wait()
+    assert len(folders_of(tmp_path)) == 1
+    left = left.rename(left.with_name(f"vaneloop-web-{os.getpid()}-left"))  # its number is another process's by now
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "elsewhere"))
+    (tmp_path / "elsewhere").mkdir()
+    with private_folder() as made:
+        running = made.rename(tmp_path / made.name)
+        another = Server(tmp_path, TMPDIR=str(tmp_path))
+        (own,) = tmp_path.glob(f"vaneloop-web-{another.process.pid}-*")
+        assert set(tmp_path.glob("vaneloop-web-*")) == {running, own}
+        another.stop()
+        assert list(tmp_path.glob("vaneloop-web-*")) == [running]
+
+
+def test_only_folders_of_this_user_whose_process_is_gone_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tempfile
+
+    from app.web.private import private_folder, sweep
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "lock").touch()
+    (tmp_path / "vaneloop-web-link").symlink_to(elsewhere, target_is_directory=True)
+    (tmp_path / "vaneloop-web-a-file").touch()
+    starting = tmp_path / f"vaneloop-web-{os.getppid()}-starting"  # made, not locked yet
+    free, dead = tmp_path / f"vaneloop-web-{os.getppid()}-free", tmp_path / "vaneloop-web-99999999-dead"
+    for folder in (starting, free, dead):
+        (folder / "inside").mkdir(parents=True)
+    (free / "lock").touch()
+    with private_folder() as held:
+        assert not free.exists() and not dead.exists()  # at the start
+        free.mkdir()
+        (free / "lock").touch()
+        monkeypatch.setattr(os, "getuid", lambda: 12345)  # now they are another user's
+        assert sweep(tmp_path) == [] and free.exists()
+        monkeypatch.undo()
+        assert sweep(tmp_path) == [free] and held.is_dir()
+    assert not held.exists()
+    assert {p.name for p in tmp_path.iterdir()} == {"elsewhere", "vaneloop-web-link", "vaneloop-web-a-file", starting.name}
+    assert (elsewhere / "lock").exists()
 
 
 @pytest.mark.parametrize(
-    ("given", "kept"),
+    ("name", "kept"),
     [("run.csv", "run.csv"), ("../../etc/passwd", "passwd"), ("C:\\x\\log.mf4", "log.mf4"), (".bashrc", "bashrc"),
      ("a;rm -rf $HOME.csv", "a_rm -rf _HOME.csv"), ("\u202ecsv.exe", "_csv.exe"), ("", "file"), ("x" * 300 + ".csv", "x" * 80 + ".csv")],
 )  # fmt: skip
-def test_a_name_of_an_upload_is_a_name_and_no_path(given: str, kept: str) -> None:
+def test_a_name_of_an_upload_is_a_name_and_no_path(name: str, kept: str) -> None:
     from app.web.session import safe_name
 
-    assert safe_name(given) == kept
+    assert safe_name(name) == kept
 
 
 # ---- curves -----------------------------------------------------------------------------------------------------------------------------

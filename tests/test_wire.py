@@ -349,3 +349,520 @@ def test_compiled_and_interpreted_loops_give_the_same_bits() -> None:
         for off in ("0", "1")
     }  # fmt: skip
     assert len(answers) == 1
+
+
+# ---- limits -----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_an_error_passive_node_waits_eight_bits_more_after_its_own_frames() -> None:
+    gaps = []
+    for passive in (False, True):
+        channel, a, b, _ = three()
+        channel.wire.node[a.place, wire.TEC] = 140 if passive else 0
+        channel.wire.node[a.place, wire.MODE] = wire.PASSIVE if passive else wire.ACTIVE
+        sent = [frame(0x100), frame(0x101)]
+        for m in sent:
+            a.send(m)
+        first, second = b.recv(1), b.recv(1)
+        assert first is not None and second is not None
+        gaps.append(round((second.timestamp - first.timestamp) / BIT) - len(bits_by_the_book(sent[1])) - wire.END)
+    assert gaps == [3, 3 + 8]
+
+
+@pytest.mark.parametrize(("before", "after"), [(0, 0), (1, 0), (127, 126), (128, 120), (255, 120)])
+def test_a_good_frame_takes_back_one_point_of_a_receiver_or_ends_its_passive_state(before: int, after: int) -> None:
+    channel, a, b, _ = three()
+    channel.wire.node[b.place, wire.REC] = before
+    a.send(frame(0x100))
+    assert b.recv(1) is not None and b.rec == after and b.state is can.BusState.ACTIVE
+
+
+@pytest.mark.parametrize(("before", "after", "state"), [(126, 127, "ACTIVE"), (127, 128, "PASSIVE"), (255, 255, "PASSIVE")])
+def test_a_destroyed_frame_costs_a_receiver_one_point_up_to_255(before: int, after: int, state: str) -> None:
+    channel, a, b, _ = three()
+    channel.wire.node[b.place, wire.REC] = before
+    channel.destroy(1)
+    a.send(frame(0x100))
+    channel.advance(4e-5)
+    assert channel.wire.clock[wire.ERRORS] == 1 and b.rec == after and b.state is getattr(can.BusState, state)
+
+
+def test_an_error_frame_ends_fourteen_bits_after_the_error() -> None:
+    channel, a, b, _ = three()
+    sent = frame(0x100)
+    channel.destroy(1)
+    a.send(sent)
+    told = b.recv(1)
+    assert told is not None and told.is_error_frame
+    assert round(told.timestamp / BIT) == len(bits_by_the_book(sent)) - 7 + 6 + 8
+
+
+@pytest.mark.parametrize(
+    ("node", "ident", "hit"), [(0, None, True), (1, None, False), (None, 0x100, True), (None, 0x101, False), (None, 0, False)]
+)
+def test_only_the_frames_asked_for_are_destroyed(node: int | None, ident: int | None, hit: bool) -> None:
+    channel, a, b, _ = three()
+    place = {0: a.place, 1: b.place}
+    channel.destroy(1, **({"node": place[node]} if node is not None else {"ident": ident}))
+    a.send(frame(0x100))
+    channel.advance(1e-3)
+    assert channel.wire.clock[wire.ERRORS] == hit and channel.wire.clock[wire.DESTROY] == (not hit)
+
+
+@pytest.mark.parametrize(
+    ("head", "taken"),
+    [(0x100, True), (0x100 | 8 << 32, True), (0x100 | 9 << 32, False), (0x100 | frames.FD | 8 << 32, False), (0x100 | frames.ERROR, False)],
+)
+def test_only_classic_frames_of_up_to_eight_bytes_are_queued(head: int, taken: bool) -> None:
+    channel, a, _, _ = three()
+    assert bool(wire.put(channel.wire, a.place, head, 0)) == taken
+    assert channel.wire.node[a.place, wire.TX_N] == taken and channel.wire.node[a.place, wire.REFUSED] == (not taken)
+
+
+def test_a_tick_is_a_millisecond_and_faults_of_a_seed_are_the_same_in_every_version() -> None:
+    assert wire.BITS_PER_TICK / wire.BIT_RATE == 1e-3
+    clock = wire.new_wire(seed=0).clock
+    assert [round(float(wire._random(clock)), 9) for _ in range(3)] == [0.252481907, 0.616829282, 0.157647218]
+
+
+def test_a_node_is_active_again_at_127_points() -> None:
+    channel, a, b, _ = three()
+    for before, state in ((129, can.BusState.PASSIVE), (128, can.BusState.ACTIVE)):
+        channel.wire.node[a.place, wire.TEC], channel.wire.node[a.place, wire.MODE] = before, wire.PASSIVE
+        a.send(frame(0x100))
+        assert b.recv(1) is not None and a.tec == before - 1 and a.state is state
+
+
+def test_others_come_first_while_an_error_passive_node_pauses() -> None:
+    channel, a, b, c = three()
+    channel.wire.node[a.place, wire.TEC], channel.wire.node[a.place, wire.MODE] = 140, wire.PASSIVE
+    a.send(frame(0x100)), a.send(frame(0x101)), b.send(frame(0x200))
+    assert [m.arbitration_id for m in (c.recv(1) for _ in range(3)) if m] == [0x100, 0x200, 0x101]
+
+
+def test_frames_sent_and_received_are_counted_once() -> None:
+    channel, a, b, _ = three()
+    for k in range(3):
+        a.send(frame(0x100 + k))
+    channel.advance(2e-3)
+    node = channel.wire.node
+    assert node[a.place, wire.SENT] == 3 == node[b.place, wire.RECEIVED] == channel.wire.clock[wire.FRAMES]
+
+
+# ---- the wire by itself: no bus, no messages --------------------------------------------------------------------------------------------
+
+
+def joined(nodes: int, **options: Any) -> wire.Wire:
+    """A wire on which all nodes have joined and want error frames."""
+    w = wire.new_wire(nodes, **options)
+    w.node[:, [wire.JOINED, wire.WANTS_ERRORS]] = 1
+    return w
+
+
+def off(nodes: int, *which: int, **options: Any) -> wire.Wire:
+    """A wire with these nodes bus-off from bit 0 on."""
+    w = joined(nodes, **options)
+    for j in which:
+        w.node[j, wire.TEC], w.node[j, wire.MODE], w.node[j, wire.TO_RECOVER] = 256, wire.BUS_OFF, 128
+    return w
+
+
+def put(w: wire.Wire, j: int, message: can.Message) -> None:
+    assert wire.put(w, j, *frames.from_message(message))
+
+
+def heard_by(w: wire.Wire, j: int) -> list[tuple[int, can.Message]]:
+    """What node ``j`` has received up to now, each with the bit at which it came."""
+    row = np.zeros((1, 3), np.int64)
+    out = []
+    while wire.take(w, j, row):
+        head, data, at = row[0].tolist()
+        out.append((at, frames.to_message(head, data)))
+    return out
+
+
+def idents(heard: list[tuple[int, can.Message]]) -> list[int]:
+    return [m.arbitration_id for _, m in heard]
+
+
+def errors(heard: list[tuple[int, can.Message]]) -> list[tuple[int, bytes]]:
+    """Class and data of each error frame."""
+    return [(m.arbitration_id, bytes(m.data)) for _, m in heard if m.is_error_frame]
+
+
+def length(message: can.Message) -> int:
+    """Bits of a frame: the stuffed ones, then CRC delimiter, acknowledge slot and delimiter, seven of end of frame."""
+    return len(bits_by_the_book(message)) + 1 + 1 + 1 + 7
+
+
+def remote(ident: int, extended: bool = False) -> can.Message:
+    return can.Message(arbitration_id=ident, is_extended_id=extended, is_remote_frame=True, dlc=0)
+
+
+def test_a_wire_has_the_arrays_it_documents() -> None:
+    w = wire.new_wire(3, 5, 7, 0.25, 0.5)
+    assert w.clock.shape == (wire.N_CLOCK,) and w.node.shape == (3, wire.N_NODE) and w.chance.tolist() == [0.25, 0.5]
+    assert w.tx.shape == (3, 5, 3) and w.rx.shape == (3, 7, 3) and w.bits.shape == (2, 192)
+
+
+def test_each_seed_begins_its_own_numbers_the_same_in_every_version() -> None:
+    first = [wire._random(wire.new_wire(seed=seed).clock) for seed in (1, 3, 2**31)]
+    assert first == pytest.approx([0.968459920, 0.113890228, 0.536282271], abs=1e-9)
+
+
+def test_a_frame_ends_ten_bits_behind_its_crc() -> None:
+    w, sent = joined(2), frame(0x100)
+    put(w, 0, sent)
+    wire.run_wire(w, 1, -1)
+    assert w.clock[wire.FREE] == len(bits_by_the_book(sent)) + 10 + 3 and w.rx[1, 0, 2] == len(bits_by_the_book(sent)) + 10
+
+
+def test_a_length_beyond_eight_counts_as_eight() -> None:
+    outs = np.zeros((2, 192), np.int64)
+    numbers = [wire.frame_bits(0x100 | n << 32, 0x0123456789ABCDEF, out) for n, out in zip((8, 9), outs, strict=True)]
+    assert numbers[0] == numbers[1] and np.array_equal(outs[0], outs[1])
+
+
+# as ISO 11898-1 has it: each wins against all that follow
+ORDER = [
+    frame(0x060),
+    remote(0x060),
+    frame(0x060 << 18, extended=True),
+    frame(0x09F << 18 | 0x3FFFF, extended=True),
+    frame(0x0A0),
+    remote(0x0A0),
+    frame(0x0A0 << 18, extended=True),
+    remote(0x0A0 << 18, extended=True),
+    frame(0x0A0 << 18 | 1, extended=True),
+    remote(0x0A0 << 18 | 1, extended=True),
+    frame(0x0A0 << 18 | 0x10000, extended=True),
+    frame(0x0A0 << 18 | 0x20000, extended=True),
+    remote(0x0A0 << 18 | 0x3FFFF, extended=True),
+    frame(0x0A1),
+    remote(0x0A1),
+    frame(0x0A1 << 18, extended=True),
+    frame(0x0A2),
+    frame(0x7FF),
+]
+
+
+@pytest.mark.parametrize("first", range(len(ORDER) - 1))
+def test_arbitration_follows_identifier_then_kind_then_the_rest_of_the_identifier(first: int) -> None:
+    for second in range(first + 1, len(ORDER)):
+        w = joined(3)
+        put(w, 0, ORDER[second]), put(w, 1, ORDER[first])
+        wire.run_wire(w, 1, -1)
+        assert w.clock[wire.FRAMES] == 1 and w.node[:, wire.SENT].tolist() == [0, 1, 0]
+
+
+def test_who_queues_at_the_bit_at_which_a_frame_could_begin_takes_part() -> None:
+    w = joined(3)
+    put(w, 0, frame(0x200))
+    wire.run_wire(w, 0, -1)
+    put(w, 1, frame(0x100))
+    wire.run_wire(w, 1000, -1)
+    assert idents(heard_by(w, 2)) == [0x100, 0x200]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (frame(0x0A0, b"\x00" * 8), frame(0x0A0, b"\xff" + b"\x00" * 7)),
+        (frame(0x0A0, b"\x00" * 8), frame(0x0A0, b"\x00" * 7 + b"\x01")),
+        (frame(0x0A0, b"\xff" * 8), frame(0x0A0, b"\x7f" * 8)),
+        (frame(0x0A0, b""), frame(0x0A0, b"\x00")),
+        (frame(0x0A0, b"\x00"), frame(0x0A0, b"\x00" * 8)),
+        (remote(0x0A0), can.Message(arbitration_id=0x0A0, is_extended_id=False, is_remote_frame=True, dlc=8)),
+        (frame(0x155 << 18 | 77, b"\x12", extended=True), frame(0x155 << 18 | 77, b"\x13", extended=True)),
+    ],
+)
+def test_two_frames_that_differ_behind_the_identifier_end_at_the_first_bit_that_differs(one: can.Message, other: can.Message) -> None:
+    a, b = bits_by_the_book(one), bits_by_the_book(other)
+    differs = next(i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y) + 1
+    for first, second in ((one, other), (other, one)):
+        w = joined(4)
+        put(w, 1, first), put(w, 2, second)
+        wire.run_wire(w, 1, -1)
+        assert w.clock[wire.ERRORS] == 1 and w.clock[wire.FREE] == differs + 6 + 8 + 3
+        assert w.node[:, wire.TEC].tolist() == [0, 8, 8, 0] and w.node[:, wire.REC].tolist() == [1, 0, 0, 1]
+
+
+def test_who_still_pauses_does_not_send_along_with_a_frame_like_its_own() -> None:
+    w = joined(3)
+    w.node[0, wire.TEC], w.node[0, wire.MODE] = 140, wire.PASSIVE
+    put(w, 0, frame(0x100)), put(w, 0, frame(0x200))
+    wire.run_wire(w, 1, -1)
+    put(w, 1, frame(0x200))
+    wire.run_wire(w, 1000, -1)
+    assert idents(heard_by(w, 2)) == [0x100, 0x200, 0x200] and w.node[:, wire.SENT].tolist() == [2, 1, 0]
+
+
+def test_a_node_that_left_neither_sends_nor_holds_up_the_others() -> None:
+    w = joined(3)
+    put(w, 0, frame(0x100)), put(w, 1, frame(0x200))
+    w.node[0, wire.JOINED] = 0
+    wire.run_wire(w, 5000, -1)
+    assert w.clock[wire.FRAMES] == 1 and idents(heard_by(w, 2)) == [0x200] and w.clock[wire.ERRORS] == 0
+    w.node[1, wire.JOINED] = 0
+    wire.run_wire(w, 9000, -1)
+    assert w.clock[wire.FRAMES] == 1 and w.clock[wire.NOW] == 9000
+
+
+def test_a_node_that_left_while_bus_off_does_not_come_back() -> None:
+    w = off(3, 0)
+    w.node[0, wire.JOINED] = 0
+    wire.run_wire(w, 9000, -1)
+    assert w.node[0, wire.MODE] == wire.BUS_OFF and heard_by(w, 0) == []
+
+
+def test_the_first_node_is_waited_for_like_any_other() -> None:
+    w, sent = joined(2), frame(0x100)
+    put(w, 1, sent)
+    wire.run_wire(w, 9000, 0)
+    assert w.clock[wire.NOW] == length(sent)
+
+
+def test_a_wait_ends_before_all_else_that_happens_at_the_same_bit() -> None:
+    w = off(2, 0, 1)
+    wire.run_wire(w, 128 * 11, 0)
+    assert w.node[:, wire.MODE].tolist() == [wire.ACTIVE, wire.BUS_OFF] and w.clock[wire.NOW] == 128 * 11
+    wire.run_wire(w, 128 * 11, -1)
+    assert w.node[:, wire.MODE].tolist() == [wire.ACTIVE, wire.ACTIVE]
+
+
+def test_own_frames_are_given_to_those_that_want_them_and_marked() -> None:
+    channel = Channel()
+    a, b = LockstepBus(channel, receive_own_messages=True), LockstepBus(channel)
+    a.send(frame(0x100, b"\x05")), b.send(frame(0x101, b"\x06"))
+    for bus, expected in ((a, [(0x100, b"\x05", False), (0x101, b"\x06", True)]), (b, [(0x100, b"\x05", True)])):
+        got = list(iter(lambda bus=bus: bus.recv(1e-3), None))
+        assert [(m.arbitration_id, bytes(m.data), m.is_rx) for m in got] == expected and not any(m.is_extended_id for m in got)
+
+
+def test_rows_are_taken_in_order_as_many_as_there_is_room_for() -> None:
+    w = joined(2)
+    for k in range(3):
+        put(w, 0, frame(0x100 + k, bytes([k])))
+    wire.run_wire(w, 1000, -1)
+    rows = np.zeros((2, 2), np.int64)
+    assert wire.take(w, 1, rows) == 2 and rows.tolist() == [[0x100 | 1 << 32, 0], [0x101 | 1 << 32, 1]]
+    assert wire.take(w, 1, rows) == 1 and rows[0].tolist() == [0x102 | 1 << 32, 2] and wire.take(w, 1, rows) == 0
+
+
+def test_a_full_receive_buffer_takes_nothing_before_it_has_room_to_tell_what_is_gone() -> None:
+    w, row = joined(2, buffer=3), np.zeros((1, 2), np.int64)
+    until = 0
+
+    def send(ident: int) -> None:
+        nonlocal until
+        put(w, 0, frame(ident))
+        until += 500
+        wire.run_wire(w, until, -1)
+
+    for k in range(4):
+        send(0x100 + k)
+    assert w.node[1, [wire.RX_N, wire.OVERRUN]].tolist() == [3, 1]
+    assert wire.take(w, 1, row) == 1
+    send(0x104)  # room for one: that is kept for what is to be told
+    assert w.node[1, [wire.RX_N, wire.OVERRUN]].tolist() == [2, 2]
+    assert wire.take(w, 1, row) == 1
+    send(0x105)
+    assert w.node[1, [wire.RX_N, wire.OVERRUN]].tolist() == [3, 2]
+    heard = heard_by(w, 1)
+    assert idents(heard) == [0x102, 0x004, 0x105]
+    assert errors(heard) == [(0x004, bytes([0, 1, 0, 0, 2, 0, 0, 0]))]  # CAN_ERR_CRTL_RX_OVERFLOW, and how many
+    for k in range(3):
+        send(0x106 + k)
+    assert idents(heard_by(w, 1)) == [0x106, 0x107, 0x108] and w.node[1, wire.OVERRUN] == 2  # told once
+
+
+# ---- error frames as SocketCAN's linux/can/error.h lays them out, counters, bus-off -----------------------------------------------------
+
+NOTHING = bytes(8)
+DESTROYED, OFF, BACK = (0x088, NOTHING), (0x040, NOTHING), (0x100, NOTHING)  # PROT | BUSERROR, BUSOFF, RESTARTED
+RX_PASSIVE, TX_PASSIVE = (0x004, b"\0\x10\0\0\0\0\0\0"), (0x004, b"\0\x20\0\0\0\0\0\0")  # CRTL, detail in data[1]
+
+
+def test_a_sender_is_told_of_each_error_once_of_the_passive_state_and_of_bus_off() -> None:
+    w = joined(2)
+    w.clock[wire.DESTROY] = 32
+    put(w, 0, frame(0x100)), put(w, 0, frame(0x101))
+    wire.run_wire(w, 6000, -1)
+    heard = heard_by(w, 0)
+    assert errors(heard) == [DESTROYED] * 16 + [TX_PASSIVE] + [DESTROYED] * 16 + [OFF, BACK]
+    assert all(m.dlc == 8 and m.is_error_frame for _, m in heard)
+    assert errors(heard_by(w, 1)) == [DESTROYED] * 32
+    assert w.node[0, [wire.TEC, wire.REC, wire.BUS_OFFS, wire.REFUSED, wire.TX_N]].tolist() == [0, 0, 1, 2, 0]
+    assert w.node[1, wire.REC] == 32
+
+
+@pytest.mark.parametrize(
+    ("tec", "rec", "told"),
+    [
+        (112, 0, []),
+        (119, 0, []),
+        (120, 0, [TX_PASSIVE]),
+        (126, 0, [TX_PASSIVE]),
+        (0, 126, []),
+        (0, 127, [RX_PASSIVE]),
+        (127, 127, [RX_PASSIVE]),
+    ],
+)
+def test_beyond_127_points_a_node_is_told_which_counter_made_it_passive(tec: int, rec: int, told: list[tuple[int, bytes]]) -> None:
+    w, j = joined(2), 0 if rec == 0 else 1
+    w.node[j, wire.TEC], w.node[j, wire.REC] = tec, rec
+    w.clock[wire.DESTROY] = 1
+    put(w, 0, frame(0x100))
+    wire.run_wire(w, 1, -1)
+    wire.run_wire(w, int(w.clock[wire.FREE]), -1)
+    assert errors(heard_by(w, j)) == [DESTROYED, *told]
+    assert w.node[j, wire.MODE] == (wire.PASSIVE if told else wire.ACTIVE)
+
+
+@pytest.mark.parametrize(("before", "mode"), [(247, wire.PASSIVE), (248, wire.BUS_OFF)])
+def test_a_node_is_bus_off_beyond_255_points(before: int, mode: int) -> None:
+    w = joined(2)
+    w.node[0, wire.TEC], w.node[0, wire.MODE] = before, wire.PASSIVE
+    w.clock[wire.DESTROY] = 1
+    put(w, 0, frame(0x100))
+    wire.run_wire(w, 1, -1)
+    assert w.node[0, wire.TEC] == before + 8 and w.node[0, wire.MODE] == mode
+    assert w.node[0, wire.BUS_OFFS] == (mode == wire.BUS_OFF)
+
+
+def test_a_restart_takes_128_times_11_recessive_bits() -> None:
+    w = off(2, 0)
+    w.node[0, wire.REC] = 5
+    wire.run_wire(w, 128 * 11 - 1, -1)
+    assert w.node[0, wire.MODE] == wire.BUS_OFF and heard_by(w, 0) == []
+    wire.run_wire(w, 128 * 11, -1)
+    assert w.node[0, [wire.MODE, wire.TEC, wire.REC]].tolist() == [wire.ACTIVE, 0, 0]
+    assert [(at, *errors([(at, m)])[0]) for at, m in heard_by(w, 0)] == [(128 * 11, *BACK)]
+
+
+def test_recessive_bits_before_a_frame_and_its_end_count_for_a_restart() -> None:
+    w, sent = off(3, 0), frame(0x100)
+    wire.run_wire(w, 50, -1)
+    put(w, 1, sent)
+    wire.run_wire(w, 9000, -1)
+    # four times eleven before the frame, once behind it: acknowledge delimiter, end of frame, intermission
+    assert [at for at, _ in heard_by(w, 0)] == [50 + length(sent) + 3 + (128 - 4 - 1) * 11]
+
+
+def test_who_is_bus_off_hears_neither_frames_nor_errors() -> None:
+    w = off(3, 0, restart=False)
+    w.clock[wire.DESTROY] = 1
+    put(w, 1, frame(0x100))
+    wire.run_wire(w, 9000, -1)
+    assert (w.clock[wire.ERRORS], w.clock[wire.FRAMES]) == (1, 1) and heard_by(w, 0) == []
+    assert w.node[0, [wire.TEC, wire.REC, wire.RECEIVED]].tolist() == [256, 0, 0]
+    assert w.node[0, wire.TO_RECOVER] == 128  # nor does it recover before it is let
+
+
+def test_each_node_comes_back_at_its_own_time() -> None:
+    for waits in ((128, 100, 114), (100, 128, 114)):
+        w = off(4, 0, 1, 2)
+        w.node[:3, wire.TO_RECOVER] = waits
+        wire.run_wire(w, 9000, -1)
+        assert [at for j in range(3) for at, _ in heard_by(w, j)] == [11 * n for n in waits]
+        assert not w.node[:, wire.MODE].any()
+
+
+def test_a_good_frame_of_a_sender_without_points_leaves_it_none() -> None:
+    w = joined(2)
+    put(w, 0, frame(0x100))
+    wire.run_wire(w, 1, -1)
+    assert w.node[:, [wire.TEC, wire.REC]].tolist() == [[0, 0], [0, 0]]
+
+
+def test_a_frame_that_nobody_acknowledges_ends_behind_its_acknowledge_slot() -> None:
+    w, sent = joined(1), frame(0x100)
+    put(w, 0, sent)
+    wire.run_wire(w, 1, -1)
+    assert w.clock[wire.FREE] == len(bits_by_the_book(sent)) + 2 + 6 + 8 + 3 and w.clock[wire.ERRORS] == 1
+
+
+def test_a_missing_acknowledgement_costs_a_passive_sender_nothing_but_any_other_error_does() -> None:
+    for destroyed, points in ((0, 140), (1, 148)):
+        w = joined(1)
+        w.node[0, wire.TEC], w.node[0, wire.MODE], w.clock[wire.DESTROY] = 140, wire.PASSIVE, destroyed
+        put(w, 0, frame(0x100))
+        wire.run_wire(w, 1, -1)
+        assert w.node[0, wire.TEC] == points and w.clock[wire.ERRORS] == 1
+
+
+def test_two_nodes_that_destroy_each_other_go_bus_off_though_nobody_else_is_there() -> None:
+    w = joined(2, restart=False)
+    put(w, 0, frame(0x0A0, b"\x00")), put(w, 1, frame(0x0A0, b"\x01"))
+    wire.run_wire(w, 9000, -1)
+    assert w.node[:, wire.MODE].tolist() == [wire.BUS_OFF] * 2 and w.clock[wire.ERRORS] == 32
+
+
+def test_frames_to_destroy_are_those_of_the_node_given_be_it_the_first() -> None:
+    for node, hits in ((-1, 1), (0, 0), (1, 1), (2, 0)):
+        w = joined(3)
+        w.clock[wire.DESTROY], w.clock[wire.DESTROY_NODE] = 1, node
+        put(w, 1, frame(0x100))
+        wire.run_wire(w, 1, -1)
+        assert w.clock[wire.ERRORS] == hits
+
+
+def test_a_frame_that_two_nodes_send_is_destroyed_as_either_ones() -> None:
+    for node in (0, 1):
+        w = joined(3)
+        w.clock[wire.DESTROY], w.clock[wire.DESTROY_NODE] = 1, node
+        put(w, 0, frame(0x100)), put(w, 1, frame(0x100))
+        wire.run_wire(w, 1, -1)
+        assert w.clock[wire.ERRORS] == 1
+
+
+def test_the_wire_is_busy_from_the_start_of_a_frame_to_the_end_of_the_intermission() -> None:
+    w, sent = joined(2), frame(0x100)
+    for at in (700, 1400):
+        wire.run_wire(w, at, -1)
+        put(w, 0, sent)
+    wire.run_wire(w, 3000, -1)
+    assert w.clock[wire.BUSY] == 2 * (length(sent) + 3) and w.clock[wire.FREE] == 1400 + length(sent) + 3
+
+
+# ---- chance -----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_random_numbers_are_drawn_only_where_a_rate_is_not_0() -> None:
+    for error_rate, loss, drawn in ((0.0, 0.0, 0), (1e-12, 0.0, 1), (0.0, 1e-12, 2)):
+        w = joined(3, error_rate=error_rate, loss=loss, seed=7)
+        put(w, 0, frame(0x100))
+        fresh = wire.new_wire(seed=7).clock
+        wire.run_wire(w, 1, -1)
+        for _ in range(drawn):  # one a frame, and one for each of two receivers
+            wire._random(fresh)
+        assert w.clock[wire.RANDOM] == fresh[wire.RANDOM] and w.clock[wire.FRAMES] == 1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_frame_is_destroyed_or_lost_where_its_number_is_below_the_rate(seed: int) -> None:
+    number = wire._random(wire.new_wire(seed=seed).clock)
+    for rate, hit in ((number, 0), (np.nextafter(number, 1.0), 1)):
+        w = joined(2, error_rate=rate, seed=seed)
+        put(w, 0, frame(0x100))
+        wire.run_wire(w, 1, -1)
+        assert (w.clock[wire.ERRORS], w.clock[wire.FRAMES]) == (hit, 1 - hit)
+        w = joined(2, loss=rate, seed=seed)
+        put(w, 0, frame(0x100))
+        wire.run_wire(w, 1, -1)
+        assert w.node[1, [wire.LOST, wire.RECEIVED]].tolist() == [hit, 1 - hit] and w.clock[wire.ERRORS] == 0
+
+
+def test_a_random_error_is_at_any_bit_of_the_frame_alike() -> None:
+    sent = frame(0x100)
+    bits, at = len(bits_by_the_book(sent)), []
+    for seed in range(60):
+        w = joined(2, error_rate=1.0, seed=seed)
+        put(w, 0, sent)
+        wire.run_wire(w, 1, -1)
+        at.append(int(w.clock[wire.FREE]) - 3 - 8 - 6)
+        clock = wire.new_wire(seed=seed).clock
+        wire._random(clock)
+        share = wire._random(clock)
+        assert 0 <= at[-1] - 1 <= share * bits < at[-1]  # the bit in which that share of the frame lies
+    assert min(at) < 0.1 * bits and max(at) > 0.9 * bits

@@ -73,6 +73,16 @@ def test_the_page_s_example_runs_as_it_is_written(page: Path) -> None:
     assert json.loads((page / "c.json").read_text())["signals"][0]["rms"] < 0.06
 
 
+def test_diagnosing_a_model_that_has_a_law_already_keeps_the_law() -> None:
+    u = wave(6)
+    log = Record("log", T, {"u": u, "y": 2.0 * (u + 0.1 * u**3) + 0.3 + 0.02 * noise()})
+    model = own_model.extend(STRAIGHT, [log], ["u.cubic"]).model
+    answer = own_model.diagnose(STRAIGHT, [log], model=model)
+    assert answer.diagnosis.verdict == "none" and answer.json()["effects"] == []
+    assert answer.model.effects["u.cubic"]["coefficient"] == pytest.approx(0.1, rel=0.05)
+    assert set(own_model.locate(STRAIGHT, [log], model=model).model.effects) == {"u.cubic"}
+
+
 @pytest.mark.parametrize("law", ["absolute_value", "saturation", "dead_time", "none"])
 def test_a_sensor_s_fault_is_named_and_a_sound_sensor_is_left_alone(law: str) -> None:
     def record(seed: int) -> Record:

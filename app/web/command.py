@@ -14,17 +14,18 @@ from app.web.guard import is_loopback
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Open the workbench: a page of this machine on which a log is dropped, the missing effect is found and switched on, vanes
-are scheduled, and the loop runs live. Whatever it does is a call of a command's function, and it shows that command.
+are scheduled, and the loop runs live.
 
-It listens on loopback only. With another --host everyone who asks must know the token: the address printed carries it. Give your own in the
-environment variable VANELOOP_WEB_TOKEN (16 characters or more), or one is made up. There is no encryption: on a network that others listen
-to, use an SSH tunnel to loopback instead.
+It prints a link and opens it. Whoever asks must know the token in that link; a cookie then remembers it. Give your own token in the
+environment variable VANELOOP_WEB_TOKEN (16 characters or more), or one is made up. It listens on loopback only, or on another --host.
+There is no encryption: on a network that others listen to, use an SSH tunnel to loopback instead.
 
-Logs that are uploaded go into a private temporary folder, which is removed at the end. Python models are taken on the command line only.
+Logs that are uploaded go into a private temporary folder. It is removed at the end, or after a kill at the next start. Python models are
+taken on the command line only.
 
 examples:
   vaneloop web
-  vaneloop web --port 9000 --folder measurements --no-open
+  vaneloop web --port 9000 --folder examples --no-open
   vaneloop web --host 0.0.0.0
 
 exit codes: 0 ended, 2 bad input"""
@@ -39,8 +40,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", metavar="N", type=int, default=PORT, help=f"port to listen on; 0 takes a free one (default {PORT})")
     parser.add_argument("--folder", metavar="D", default=".", help="folder whose logs are offered (default: the current one)")
     parser.add_argument("--upload-limit", metavar="MB", type=int, default=512, help="largest file that may be uploaded (default 512)")
-    parser.add_argument("--no-open", action="store_true", help="do not open a browser")
-    parser.add_argument("--quiet", action="store_true", help="say nothing but the address")
+    parser.add_argument("--no-open", action="store_true", help="do not open a browser, only print the link")
+    parser.add_argument("--quiet", action="store_true", help="say nothing but the link")
 
 
 def command(args: argparse.Namespace) -> int:
@@ -54,13 +55,9 @@ def command(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     if not folder.is_dir():
         raise InputError(f"--folder {args.folder}: is not a folder")
-    token = None
-    if not is_loopback(args.host):
-        token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
-        if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
-            raise InputError(
-                f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} characters"
-            )
+    token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
+    if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
+        raise InputError(f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} characters")
     try:
         import nicegui  # noqa: F401
         import tsdownsample  # noqa: F401
@@ -71,20 +68,20 @@ def command(args: argparse.Namespace) -> int:
     shown = f"[{host}]" if ":" in host else host
     if host in ("0.0.0.0", "::"):
         shown = socket.gethostname()
-    address = f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
+    address = f"http://{shown}:{port}/?token="
 
-    def ready() -> None:
-        print(address, flush=True)
+    def ready(once: str) -> None:
+        print(address + token, flush=True)
         if not args.quiet:
             print("Ctrl-C ends it", file=sys.stderr, flush=True)
         if not args.no_open:
             import webbrowser
 
-            webbrowser.open(address)
+            webbrowser.open(address + once)  # every user may read a browser's command line
 
     from app.web.server import serve
 
-    serve(sock, folder, token, args.upload_limit << 20, ready)
+    serve(sock, folder, token, args.upload_limit << 20, is_loopback(args.host), ready)
     return 0
 
 

@@ -15,6 +15,7 @@ from nicegui.element import Element
 
 from app.web.charts import figure as figure_of
 from app.web.session import Session
+from discrepancy.locate import agrees
 from hil.page import THEMES
 
 __all__ = ["PAGES", "Live", "card", "command_line", "figure_of", "frame", "opened", "table", "tone"]
@@ -52,7 +53,10 @@ def frame(session: Session, here: str) -> Iterator[None]:
         ui.button(icon="contrast", on_click=flip).props('flat round dense color=grey aria-label="light or dark"').tooltip("light or dark")
 
     async def ask() -> None:
-        prefers = bool(await ui.run_javascript("matchMedia('(prefers-color-scheme: dark)').matches", timeout=5.0))
+        try:
+            prefers = bool(await ui.run_javascript("matchMedia('(prefers-color-scheme: dark)').matches", timeout=60.0))
+        except TimeoutError:  # the browser has gone, or is kept from answering
+            return
         if session.extra.get("prefers_dark") != prefers:
             session.extra["prefers_dark"] = prefers
             session.touch("theme")
@@ -227,4 +231,4 @@ def opened(session: Session, title: str, now: bool = False) -> ui.expansion:
 
 def tone(ratio: float) -> str:
     """Colour of an error in noise floors."""
-    return "good" if ratio < 1.2 else "mid" if ratio < 3.0 else "bad"
+    return "good" if agrees(ratio, 1.0) else "mid" if ratio < 3.0 else "bad"

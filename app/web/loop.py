@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from app.web.worker import INBOX, Progress, main
+from hil import cli
 
 __all__ = ["COLUMNS", "COMPILING", "TASKS"]
 
@@ -81,8 +82,8 @@ def _told() -> dict[str, Any]:
 class _Injected:
     """Actions of the scenarios that were started, shifted to when they were."""
 
-    def __init__(self, node: Any, channel: Any, places: dict[str, int]):
-        self.node, self.channel, self.places = node, channel, places
+    def __init__(self, node: Any, ecu: Any, channel: Any, places: dict[str, int]):
+        self.node, self.ecu, self.channel, self.places = node, ecu, channel, places
         self.gateways: dict[str, list[Any]] = {"ECU": [], "VGV": []}
         self.intruders: list[tuple[int, Any]] = []
         self.machines: list[Any] = []
@@ -108,7 +109,7 @@ class _Injected:
             if isinstance(a, Outsider):
                 self.intruders.append((self.channel.join(), Intruder(a, chance, self.recorded)))
             elif isinstance(a, Machine):
-                self.machines.append(inject.MachineChange(a, self.node))
+                self.machines.append(inject.MachineChange(a, self.node, self.ecu))
         on_bus = [a for a in moved if isinstance(a, OnBus)]
         if on_bus:
             self.disturbers.append(inject.Disturber(on_bus, self.channel.wire, self.places))
@@ -160,7 +161,7 @@ def lockstep(progress: Progress, demand: float, speed: float, record: str | None
     wire = channel.wire
     places = {"ECU": channel.join(), "VGV": channel.join()}
     ears = channel.join(silent=True)
-    injected = _Injected(node, channel, places)
+    injected = _Injected(node, ecu.ecu, channel, places)
     recorder = Recorder(record, "lockstep") if record else None
     heard = Heard()
     rows = np.zeros((256, 2), np.int64)
@@ -328,4 +329,4 @@ TASKS = {f.__name__: f for f in (ready, lockstep, node, ecu, listen)}
 if __name__ == "__main__":
     if "--nice" in sys.argv:
         os.nice(5)
-    main(int(sys.argv[1]), TASKS)
+    sys.exit(cli.run(lambda: main(int(sys.argv[1]), TASKS)))

@@ -10,7 +10,7 @@ from nicegui import events, ui
 from app.web.charts import Chart
 from app.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
 from app.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
-from discrepancy.locate import Regime
+from discrepancy.locate import AGREES, Located
 from hil.logs import UNITS
 from hil.page import Line as PageLine
 from hil.page import Panel as PagePanel
@@ -225,19 +225,12 @@ class _Page:
         c = s.compared
         if c is None:
             return
-        worst = max(c["figures"], key=lambda f: f.rms / f.noise_floor)
-        ratio = worst.rms / worst.noise_floor
-        if ratio > 1.2:
-            off = f"{worst.signal} is off by {number(worst.rms)} {worst.unit} RMS, {number(ratio)} noise floors"
-            text = f"The {worst.stage} stage fails most: {off}."
-        else:
-            text = "Every stage agrees with its measurements to within the noise."
-        ui.label(text).classes(f"verdict {'bad' if ratio > 2 else 'good' if ratio <= 1.2 else ''}")
+        ui.label(c["verdict"]).classes(f"verdict {c['tone']}")
         with ui.element("div").classes("half"):
             with ui.element("div").classes("stackc"):
                 self._figures(c)
             with ui.element("div").classes("stackc"):
-                stages = list(c["maps"])
+                stages = list(c["located"])
                 if stages:
                     with ui.element("div").classes("rowc"):
                         ui.label("Failure map of").classes("soft")
@@ -248,14 +241,15 @@ class _Page:
         s = self.s
         rows = []
         for f in c["figures"]:
-            r = f.rms / f.noise_floor
-            width = 100 * min(1.0, math.log10(max(r, 1.0)) / 2.2) + 2
-            bar = f'<span class="bar {tone(r)}" style="width:{width:.0f}px"></span>'
-            rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{r:.2f}", ("html", bar)])
+            width = 100 * min(1.0, math.log10(max(f.ratio, 1.0)) / 2.2) + 2
+            bar = f'<span class="bar {tone(f.ratio)}" style="width:{width:.0f}px"></span>'
+            rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{f.ratio:.2f}", ("html", bar)])
         for name, why in c["not_observed"].items():
             rows.append([name, f"not observed: {why}", "", "", "", "", ""])
         table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
-        ui.label("Nothing is refitted here: up to about 5 noise floors may be a nominal parameter within its tolerance.").classes("note")
+        given = [f"{f.signal} {number(f.rms_as_given / f.noise_floor)}" for f in c["figures"] if f.rms_as_given > AGREES * f.noise_floor]
+        as_given = f" With the parameters as given, in noise floors: {', '.join(given)}." if given else ""
+        ui.label(f"Nominal parameters are refitted within their tolerances.{as_given}").classes("note")
         if c["loop"]:
             with opened(s, "The whole loop"):
                 table(
@@ -270,18 +264,16 @@ class _Page:
 
     def _map(self) -> None:
         c = self.s.compared
-        if c is not None:
-            self._heat(c["maps"].get(self.s.stage, []), c["onset"].get(self.s.stage))
+        if c is not None and self.s.stage in c["located"]:
+            self._heat(c["located"][self.s.stage])
 
-    def _heat(self, found: list[Regime], onset: float | None) -> None:
-        hot = [r for r in found if r.significant.any()]
+    def _heat(self, located: Located) -> None:
+        hot = located.hot
+        ui.label(f"{located.stage}: {located.verdict()}.").classes("soft")
         if not hot:
-            ui.label(
-                f"The {self.s.stage} stage agrees everywhere once its nominal parameters are refitted within their tolerances."
-            ).classes("soft")
             return
-        if onset is not None:
-            ui.label(f"The error begins at t = {onset:.0f} s.")
+        if located.onset is not None:
+            ui.label(f"The error begins at t = {located.onset:.0f} s.")
         output = hot[0].output
         mine = [r for r in hot if r.output == output][:9]
         width = max(len(r.ratio) for r in mine)

@@ -28,7 +28,7 @@ __all__ = ["build"]
 
 KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
 SHOWN = 30.0  # s in the strip charts
-LIT = 1.5  # s that a lamp stays lit, so that what passes quickly is seen
+LIT = 1.5  # s that a lamp stays lit once it is shown, so that what passes quickly is seen
 TRACE_LINES = 40
 TRACED = 2000  # frames kept for the trace
 TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
@@ -61,7 +61,23 @@ class Loop:
     events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
-    lit: dict[str, float] = field(default_factory=dict)  # lamp -> clock when it was last on
+    lit: dict[str, int] = field(default_factory=dict)  # lamp -> how often news came in which it was on
+
+    @property
+    def bus_name(self) -> str:
+        """The bus as a command names it: an embedded one is this session's own."""
+        return self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
+
+    def commands(self) -> list[tuple[str, list[str]]]:
+        """Commands for what Start does, each after what it leaves out ("" where nothing)."""
+        seed = ["--seed", str(self.seed)] if self.seed is not None else []
+        record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
+        profile = ["--profile", self.profile] if self.profile else []
+        if self.bus == "lockstep":
+            own = "The slider, the pace and the buttons are the page's own. " if profile else "By slider: the page's own. "
+            words = ["run", "--bus", "lockstep", *(profile or ["--profile", "ramp"]), "--start-speed", f"{self.demand:g}", *seed, *record]
+            return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
+        return [("", ["run", "--bus", self.bus_name, *seed, *record]), ("", ["ecu", "--bus", self.bus_name, *profile])]
 
     # ---- begin and end
 
@@ -74,7 +90,6 @@ class Loop:
         self.rows = np.empty((KEPT, len(COLUMNS)))
         self.trace.clear()
         self.events.clear()
-        self.lit.clear()
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -111,7 +126,7 @@ class Loop:
         import asyncio
 
         record = self._record_path()
-        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
+        bus = self.bus_name
         listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
         calls = [
             listener.call("listen", "running", bus=bus),
@@ -166,7 +181,7 @@ class Loop:
             self.session.do("inject", self._inject_outside(name))
 
     async def _inject_outside(self, name: str) -> None:
-        bus = self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
+        bus = self.bus_name
         w = Worker()
         self.session.extra.setdefault("closers", []).append(w.stop)
         try:
@@ -205,15 +220,14 @@ class Loop:
         self._draw()
 
     def _light(self, rows: np.ndarray) -> None:
-        now = time.monotonic()
         for mode in set(rows[:, COLUMNS.index("state")].tolist()):
             if mode == mode and 0 <= mode < len(MODES):
-                self.lit[MODES[int(mode)]] = now
+                self.lit[MODES[int(mode)]] = self.lit.get(MODES[int(mode)], 0) + 1
         faults = rows[:, COLUMNS.index("faults")]
         bits = int(np.bitwise_or.reduce(faults[np.isfinite(faults)].astype(np.int64), initial=0))
         for i, fault in enumerate(FAULTS):
             if bits >> i & 1:
-                self.lit[fault] = now
+                self.lit[fault] = self.lit.get(fault, 0) + 1
 
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
@@ -252,6 +266,7 @@ class _Page:
         self.s, self.live = session, live
         self.loop: Loop = session.extra["loop"]
         self.traced: tuple[Any, str] = (None, "")
+        self.seen = {name: (n, time.monotonic() - LIT) for name, n in self.loop.lit.items()}  # lamp -> news counted, clock when shown
 
     # ---- start, stop, demand
 
@@ -274,6 +289,8 @@ class _Page:
                     self.loop.demand, self.loop.profile = float(e.args), None
                     self.demand.set_text(f"{self.loop.demand:.1f} %")
                     self.loop.tell(demand=self.loop.demand)
+                    if not self.loop.running:
+                        self.s.touch("loop")
 
                 slider.on("update:model-value", turned, throttle=0.05)
 
@@ -294,7 +311,7 @@ class _Page:
                     "dense unelevated no-caps padding='2px 10px'"
                 ).tooltip("mode that the ECU asks for")
             self.live.part(self._waiting, "loop", "loop-jobs", "run", shows=lambda: (" ".join(self._waits()),))
-            self.live.part(self._commands, "loop", "run", shows=lambda: (lp.bus, lp.seed is None, lp.record, lp.profile or ""))
+            self.live.part(self._commands, "loop", "run", shows=lambda: tuple(" ".join(w) for _, w in lp.commands()))
 
     def _start(self) -> None:
         lp = self.loop
@@ -354,14 +371,10 @@ class _Page:
             ui.label(line).classes("note")
 
     def _commands(self) -> None:
-        lp = self.loop
-        seed = ["--seed", str(lp.seed)] if lp.seed is not None else []
-        record = ["--record", "run.log"] if lp.record else []
-        if lp.bus == "lockstep":
-            command_line(shlex.join(["vaneloop", "run", "--bus", "lockstep", "--profile", lp.profile or "ramp", *seed, *record]))
-        else:
-            command_line(shlex.join(["vaneloop", "run", "--bus", lp.bus, *seed, *record]))
-            command_line(shlex.join(["vaneloop", "ecu", "--bus", lp.bus, *(["--profile", lp.profile] if lp.profile else [])]))
+        for without, words in self.loop.commands():
+            if without:
+                ui.label(without).classes("note")
+            command_line(shlex.join(["vaneloop", *words]))
 
     # ---- charts and lamps
 
@@ -401,7 +414,9 @@ class _Page:
         state, now = lp.latest("state"), time.monotonic()
         mode = MODES[int(state)] if state == state and 0 <= state < len(MODES) else ""
         for name, lamp in self.lamps.items():
-            fresh = now - lp.lit.get(name, -LIT) < LIT or name == mode
+            if lp.lit.get(name, 0) != self.seen.get(name, (0, 0.0))[0]:
+                self.seen[name] = lp.lit[name], now  # from now on, however late this page comes to show it
+            fresh = now - self.seen.get(name, (0, now - LIT))[1] < LIT or name == mode
             tone = (TONES.get(name, "mid") if name in MODES else "bad") if fresh else ""
             wanted = f"lamp {tone}".strip()
             if getattr(lamp, "shown", None) != wanted:
@@ -446,7 +461,9 @@ class _Page:
             ui.label(text).classes("small mono")
         if self.loop.events:
             last = self.loop.events[-1].split("  ", 1)[1].split(":")[0]
-            command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus]))
+            if self.loop.bus == "lockstep":
+                ui.label("Here it begins in the loop that runs. By itself, and judged:").classes("note")
+            command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
 
     # ---- trace
 

@@ -1,6 +1,7 @@
 """One user's work, apart from any page that shows it: a reload, or a second tab, finds everything as it was.
 
-Every action calls what the command line calls, in a process beside the server (worker.py), and says which command that is.
+Every action calls what the command line calls, in a process beside the server (worker.py), and says which command does the same, where
+there is one (docs/workbench.md).
 """
 
 from __future__ import annotations
@@ -428,9 +429,13 @@ class Session:
         words = ["extend", *self.choice.words(real=True), *self.extend_words()]
         for name in ("extended.toml", "extended.html"):
             words[words.index(name)] = str(self.folder / name)
+        files = {"model": self.folder / "extended.toml", "extended": self.folder / "extended.html"}
+        for key, file in files.items():
+            file.unlink(missing_ok=True)
+            self.saved.pop(key, None)
         self.touch("save")
         await self.bench.call("command", "extending the model", words=words)
-        self.saved |= {"model": self.folder / "extended.toml", "extended": self.folder / "extended.html"}
+        self.saved |= {key: file for key, file in files.items() if file.exists()}  # nothing is written that is no better
         self.touch("save")
 
     def stop(self, *names: str) -> None:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 __all__ = ["STEPS", "TASKS"]
 
@@ -56,7 +56,7 @@ def parsed(verb: str, words: list[str]) -> argparse.Namespace:
 
 def chain_for(words: list[str], progress: Progress) -> Any:
     """Return the log that ``words`` name (with its options), as stages; read once."""
-    from app.common import chain_of
+    from app.common import chain_of, tell_search
     from hil.lockstep import warm_up
 
     key = tuple(words)
@@ -64,6 +64,7 @@ def chain_for(words: list[str], progress: Progress) -> Any:
         warm_up(lambda text: progress(None, text))
         _CHAIN.clear()
         progress(None, "reading the log")
+        tell_search(lambda text: progress(None, text))
         _CHAIN[key] = chain_of(parsed("diagnose", words))
     return _CHAIN[key]
 
@@ -81,8 +82,11 @@ def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
 def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Read the log: its channels in our names and units."""
     from hil import cli
+    from hil.columns import warm_up
     from hil.logs import UNITS
 
+    if words[0].lower().endswith(cli.CAN_SUFFIXES):
+        warm_up(lambda text: progress(None, text))
     log = cli.read_log_of(parsed("diagnose", words), require=())
     return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in log.channels.items()}}
 
@@ -90,8 +94,8 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage and in the whole loop, failure maps, curves."""
     from discrepancy.fit import Judge
-    from discrepancy.locate import onset, regimes
-    from discrepancy.workflow import compare_stages, floor_of
+    from discrepancy.report import located_sentence, located_tone
+    from discrepancy.workflow import locate_stages
     from hil import cli
     from hil.replay import replay
     from plant import build_plant, load_model
@@ -99,28 +103,23 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
 
     chain = chain_for(words, progress)
     progress(0.1, "comparing")
-    figures = compare_stages(chain.stages)
-    maps, starts, curves = {}, {}, {}
-    for i, stage in enumerate(chain.stages):
-        progress(0.1 + 0.6 * i / len(chain.stages), f"locating: {stage.name}")
-        judge = Judge(stage, floor_of(stage))
-        fit = judge.fit((), stage.neutral())
-        maps[stage.name] = regimes(judge, fit, 2.0)
-        starts[stage.name] = onset(judge, fit) if any(r.significant.any() for r in maps[stage.name]) else None
-        curves[stage.name] = curves_of(judge, {"nominal model": stage.neutral()})
+    located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.6 * share, f"locating: {name}"))
+    figures = [f for x in located for f in x.signals]
+    curves = {x.stage: curves_of(Judge(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta}) for x in located}
     progress(0.7, "the whole loop")
     args = parsed("diagnose", words)
     loop: list[Any] = []
     why = ""
     try:
         machine = build_plant(model=load_model(args.model)) if args.model else None
-        loop = replay(cli.read_log_of(args), plant=machine).signals
+        loop = replay(cli.read_log_of(args), plant=machine, floors={f.signal: f.noise_floor for f in figures}).signals
     except InputError as e:
         why = str(e)
     progress(1.0, "")
     return {
-        "figures": figures, "maps": maps, "onset": starts, "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
-        "loop": loop, "loop_missing": why, "span": float(chain.t[-1]), "samples": len(chain.t),
+        "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located), "tone": located_tone(located),
+        "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes, "loop": loop, "loop_missing": why,
+        "span": float(chain.t[-1]), "samples": len(chain.t),
     }  # fmt: skip
 
 
@@ -216,8 +215,9 @@ def report(progress: Progress, words: list[str], diagnosis: Any, path: str, comm
 
 
 def command(progress: Progress, words: list[str]) -> dict[str, Any]:
-    """Run a whole command line of ours; return its exit code and what it said. InputError for exit code 2."""
+    """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a defect of ours."""
     from app.main import main
+    from hil import cli
     from tables import InputError
 
     said, complained = io.StringIO(), io.StringIO()
@@ -228,7 +228,7 @@ def command(progress: Progress, words: list[str]) -> dict[str, Any]:
             code = main(words)
         except SystemExit as e:
             code = int(e.code or 0)
-    if code == 2:
+    if code in (2, cli.DEFECT):
         lines = complained.getvalue().strip().splitlines()
         raise InputError(lines[-1].removeprefix("vaneloop: ") if lines else "bad input")
     return {"code": code, "text": said.getvalue()}
@@ -256,9 +256,9 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
     """One step of the scheduling method, by the functions of ``vaneloop schedule``."""
     import numpy as np
 
+    from app.schedule import log_of
     from app.schedule_page import NAMES, schedule_page
     from app.scheduling import STROKE_LIMITS, ScheduleOptions, schedule, stroke_tables, table_speeds, write_tables
-    from hil.logs import read_log
     from plant import load_geometry, load_schedules
     from plant.geometry import vane_angles
     from plant.linkage import STAGES
@@ -281,8 +281,7 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
         speed = table_speeds(schedules)
         return {"speed": speed, "table": stroke_tables(geometry, schedules, speed)}
     options = ScheduleOptions(args.step, args.lb_range, args.lc_range, ("lb", "lc"), args.criterion, args.limit)
-    log = read_log(args.log, require=("x_lvdt", "vigv")) if args.log else None
-    result = schedule(geometry, schedules, log, options, lambda f: progress(f, "scheduling"))
+    result = schedule(geometry, schedules, log_of(args), options, lambda f: progress(f, "scheduling"))
     if step != "tables":
         return result
     files = [str(f) for f in write_tables(result, out)]
@@ -308,7 +307,7 @@ def _limit_memory() -> None:
 INBOX: queue.Queue[dict[str, Any]] = queue.Queue()  # what the server tells a task that is running
 
 
-def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> None:
+def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> NoReturn:
     """Answer questions with ``tasks`` until the server is gone."""
     connection = Connection(fd)
     _limit_memory()
@@ -354,15 +353,13 @@ def _line(e: BaseException) -> str:
 
     if isinstance(e, InputError):
         return str(e)
-    if isinstance(e, MemoryError):
-        return "the machine's memory does not suffice for this log"
-    import traceback
+    from hil.cli import defect
 
-    traceback.print_exc()
-    where = traceback.extract_tb(e.__traceback__)[-1]
-    return f"internal error: {type(e).__name__}: {e} ({Path(where.filename).name}:{where.lineno})"[:300]
+    return defect(e)
 
 
 if __name__ == "__main__":
+    from hil import cli
+
     os.nice(10)  # the page answers first
-    main(int(sys.argv[1]), TASKS)
+    sys.exit(cli.run(lambda: main(int(sys.argv[1]), TASKS)))

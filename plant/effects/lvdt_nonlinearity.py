@@ -1,15 +1,16 @@
-"""Windings that are not uniform: the stroke sensor's error swings once over the stroke.
+"""Windings that are not uniform: the stroke sensor's error bends over the stroke.
 
-Equation::
+Equation, with r the stroke from the middle over half the stroke (-1 to 1)::
 
-    reading = x - amplitude sin(2 pi x / stroke)
+    reading = x - amplitude sin(2 pi x / stroke) + cubic (5 r^3 - 3 r) / 2
 
-Symbols: x stroke (m), amplitude (m), stroke full stroke (m). The error is nil at both ends and in the middle,
-negative first.
-Limits: the first harmonic only.
-In a log: vanes off one way at a quarter of the stroke and the other way at three quarters, all three stages at once;
+Symbols: x stroke (m), amplitude (m), cubic (m), stroke full stroke (m). The sine is nil at both ends and in the middle.
+The cubic is what coils that weaken towards their ends give, with its straight part, which is a gain, taken out.
+Limits: two odd shapes about mid-stroke; an even one moves the null and is left out. Beyond the stroke the cubic stays
+what it is at its end.
+In a log: vanes off one way in one half of the stroke and the other way in the other half, all three stages at once;
 independent of direction and speed.
-Source: 0.25 % of range is a usual data-sheet linearity of an LVDT.
+Source: 0.25 % of range is a usual data-sheet linearity of an LVDT; Herceg, Handbook of Measurement and Control (1976).
 """
 
 from __future__ import annotations
@@ -19,20 +20,36 @@ import math
 from plant.compiled import compiled
 from plant.effect import Effect, Parameter
 
-__all__ = ["EFFECT", "step"]
+__all__ = ["EFFECT", "slope", "step"]
 
 EFFECT = Effect(
     "lvdt_nonlinearity",
     "lvdt",
     ("actuator", "linkage"),
-    (Parameter("amplitude", "mm", 0.0, -3.0, 3.0, "one sine wave of error over the stroke, reading high in its upper half"),),
+    (
+        Parameter("amplitude", "mm", 0.0, -3.0, 3.0, "one sine wave of error over the stroke, reading high in its upper half"),
+        Parameter("cubic", "mm", 0.0, -1.0, 1.0, "cubic error at full stroke, reading high there, without its straight part"),
+    ),
     (),
-    "the stroke reading swings over the stroke",
+    "the stroke reading bends over the stroke",
     "strokes over most of the range",
 )
 
 
 @compiled
-def step(x, stroke, amplitude):
+def step(x, stroke, amplitude, cubic):
     """Return the reading (m) of the stroke ``x`` (m)."""
-    return x if amplitude == 0.0 else x - amplitude * math.sin(2.0 * math.pi * x / stroke)
+    y = x if amplitude == 0.0 else x - amplitude * math.sin(2.0 * math.pi * x / stroke)
+    if cubic != 0.0:
+        r = min(max(2.0 * x / stroke - 1.0, -1.0), 1.0)
+        y += cubic * 0.5 * (5.0 * r * r - 3.0) * r
+    return y
+
+
+@compiled
+def slope(x, stroke, amplitude, cubic):
+    """Return the derivative of the reading by the stroke, at ``x`` (m)."""
+    r = 2.0 * x / stroke - 1.0
+    sine = amplitude * (2.0 * math.pi / stroke) * math.cos(2.0 * math.pi * x / stroke)
+    bend = cubic * (15.0 * r * r - 3.0) / stroke if abs(r) < 1.0 else 0.0
+    return 1.0 - sine + bend

@@ -28,7 +28,7 @@ EFFECT = Effect(
     ("linkage",),
     (
         *per_vane_stage("deg", 0.0, 0.0, 2.0, "sine of the ring's own angle added to it"),
-        Parameter("phase", "deg", 0.0, -180.0, 180.0, "direction of the eccentricity"),
+        Parameter("phase", "deg", 0.0, -180.0, 180.0, "direction of the eccentricity", period=360.0),
     ),
     (),
     "a ring turns about the wrong centre",

@@ -2,29 +2,35 @@
 
 Equation::
 
-    v <- clip(v, -limit, limit)
+    v <- (1 - roundness) clip(v, -limit, limit) + roundness v / sqrt(1 + (v / limit)^2)
 
 Symbols: v speed of the piston (m/s), limit (m/s); the neutral 1,000 mm/s is beyond any spool position and switches
-the effect off.
-Limits: sharp corner, the same both ways, independent of the supply pressure; a real orifice in series bends
-gradually.
-In a log: the stroke's speed stops rising with i_cmd, everything below the limit is untouched: only fast manoeuvres
-show it.
-Source: Merritt, Hydraulic Control Systems (1967), section 5, flow saturation of two-stage valves.
+the effect off; roundness (-): 0 a sharp corner, as of a spool whose ports are fully open, 1 an orifice in series with
+the spool's, whose pressure drops add up.
+Limits: the same both ways, independent of the supply pressure.
+In a log: the stroke's speed stops rising with i_cmd. A sharp corner leaves everything below the limit untouched, so
+that only fast manoeuvres show it; a series orifice bends gradually, some 6 % at a third of the limit.
+Source: Merritt, Hydraulic Control Systems (1967), section 5, flow saturation of two-stage valves; section 3-3, orifices
+in series.
 """
 
 from __future__ import annotations
 
+import math
+
 from plant.compiled import compiled
 from plant.effect import Effect, Parameter
 
-__all__ = ["EFFECT", "step"]
+__all__ = ["EFFECT", "corner", "step"]
 
 EFFECT = Effect(
     "valve_flow_saturation",
     "valve",
     ("actuator",),
-    (Parameter("limit", "mm/s", 1000.0, 1.0, 1000.0, "speed beyond which the flow does not rise"),),
+    (
+        Parameter("limit", "mm/s", 1000.0, 1.0, 1000.0, "speed beyond which the flow does not rise"),
+        Parameter("roundness", "-", 0.0, 0.0, 1.0, "0: a sharp corner, 1: an orifice in series"),
+    ),
     (),
     "the flow stops rising before the spool is fully open",
     "motion faster than the limit: slams",
@@ -34,6 +40,15 @@ OFF = 1.0  # m/s, the neutral limit
 
 
 @compiled
-def step(v, limit):
-    """Return the speed (m/s) that the passage lets through."""
+def corner(v, limit):
+    """Return the speed (m/s) that a passage with a sharp corner lets through."""
     return v if limit >= OFF else min(max(v, -limit), limit)
+
+
+@compiled
+def step(v, limit, roundness):
+    """Return the speed (m/s) that the passage lets through."""
+    if limit >= OFF:
+        return v
+    ratio = v / limit
+    return (1.0 - roundness) * min(max(v, -limit), limit) + roundness * v / math.sqrt(1.0 + ratio * ratio)

@@ -2,8 +2,10 @@
 
 from .controller import AsObject, Compiled, Controller, playback, stand_in
 from .effects import CATALOGUE, EFFECTS, OUTSIDE, Effect, Hidden, draw, neutral
+from .geometry import Geometry
+from .geometry import load as load_geometry
 from .manoeuvre import MANOEUVRES, Manoeuvre, manoeuvre, slow_ramps, small_moves, steady
-from .simulate import Run, machine, simulate, write
+from .simulate import Run, Spell, machine, simulate, write
 
 __all__ = [
     "CATALOGUE",
@@ -14,10 +16,13 @@ __all__ = [
     "Compiled",
     "Controller",
     "Effect",
+    "Geometry",
     "Hidden",
     "Manoeuvre",
     "Run",
+    "Spell",
     "draw",
+    "load_geometry",
     "machine",
     "manoeuvre",
     "neutral",

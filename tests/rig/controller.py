@@ -28,11 +28,12 @@ class Controller(Protocol):
 class Compiled:
     """A compiled controller ``tick(inputs, state, calibration)`` that changes ``state`` in place, and where its signals are.
 
-    inputs, state   float64 arrays to start from (copied for each run; put a standing mode request into ``inputs``)
+    inputs, state   float64 arrays to start from (copied for each run)
     n_dem .. fresh  places in ``inputs``: %, %, m, 1 on a tick with a new frame
     i_cmd .. mode   places in ``state``: A, m, number of the mode
     current_limit   A
     vigv            place in ``inputs`` of the first of three stem angles (rad); -1: it takes none
+    mode_request    place in ``inputs`` of the mode asked for (0 standby, 1 run); -1: it takes none
     change          (effect name, parameters) -> another Compiled with that error in it, or None where the rig is to do it from outside
     """
 
@@ -49,12 +50,13 @@ class Compiled:
     mode: int
     current_limit: float = 0.040
     vigv: int = -1
+    mode_request: int = -1
     change: Callable[[str, dict[str, float]], Compiled | None] | None = None
 
     @property
     def slots(self) -> np.ndarray:
         """Places of the signals in the order the kernel wants them."""
-        return np.array([self.n_dem, self.n_r, self.x_lvdt, self.fresh, self.i_cmd, self.x_dem, self.mode, self.vigv])
+        return np.array([self.n_dem, self.n_r, self.x_lvdt, self.fresh, self.i_cmd, self.x_dem, self.mode, self.vigv, self.mode_request])
 
 
 class Settings(NamedTuple):

@@ -108,21 +108,25 @@ def vane_angle(ring: np.ndarray, ratio: float) -> np.ndarray:
     return np.arcsin(ratio * np.tan(ring))
 
 
-def load(folder: Path = TABLES) -> Geometry:
-    """Read ``geometry.toml``.
+def load(folder: Path = TABLES, rng: np.random.Generator | None = None) -> Geometry:
+    """Read ``geometry.toml``; with ``rng``, every length and angle is drawn uniformly within the tolerance that stands beside it.
 
     Its ring centre is given as the paper has it (equations 11, 12): straight below the pivot at the distance La of (dx, dy), turned by
     theta6, in the frame where the lower arm is the upper arm's prolongation J2 -> J1; the ring is neutral with J4 straight below J5.
     """
     table = tomllib.loads((folder / "geometry.toml").read_text(encoding="utf-8"))
 
+    def drawn(part: str, key: str) -> float:
+        cell = table[part][key]
+        return cell["value"] + (0.0 if rng is None else rng.uniform(-1.0, 1.0) * cell["tolerance"])
+
     def mm(part: str, key: str) -> float:
-        return table[part][key]["value"] * 1e-3
+        return drawn(part, key) * 1e-3
 
     stages = []
     for name in STAGES:
         distance = float(np.hypot(mm(name, "dx"), mm(name, "dy")))
-        direction = np.deg2rad(270.0 + table[name]["theta6"]["value"])
+        direction = np.deg2rad(270.0 + drawn(name, "theta6"))
         stages.append(
             Stage(
                 Lb=mm(name, "lb"),
@@ -131,6 +135,7 @@ def load(folder: Path = TABLES) -> Geometry:
                 vane_ratio=mm(name, "ld_prime") / mm(name, "l"),
                 dx=float(distance * np.cos(direction)),
                 dy=float(distance * np.sin(direction)),
+                # the play's own tolerance is the specimen's (`parameters.TOLERANCES`)
                 hysteresis=float(np.deg2rad(table[name]["hysteresis"]["value"])),
             )
         )

@@ -146,6 +146,8 @@ class P(IntEnum):
     snag_angle = 109  # rad of the VIGV ring where it catches
     snag_depth = 110  # rad
     t_ref = 111  # degC
+    lvdt_cubic = 112  # m, at the ends of the stroke
+    flow_exponent = 113  # -, 2: an orifice in series, 20: nearly a corner
 
 
 N_P = len(P)
@@ -319,7 +321,7 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
             q2 = k_in * opening * orifice(p_valve - p2)
         if p[P.flow_limit] < 1e9:
             ratio = 0.5 * abs(q1 + q2) / (area0 * p[P.flow_limit])
-            share = (1.0 + ratio**20) ** -0.05
+            share = (1.0 + ratio ** p[P.flow_exponent]) ** (-1.0 / p[P.flow_exponent])
             q1, q2 = q1 * share, q2 * share
         p_valve += droop_share * (p_s - p[P.droop] * 0.5 * abs(q1 + q2) / area0 - p_valve)
 
@@ -460,6 +462,9 @@ def read_lvdt(s, p, t, t_oil, noise):
     y = x * p[P.lvdt_gain] + p[P.lvdt_bias] + p[P.lvdt_thermal] * (t_oil - p[P.t_ref])
     if p[P.lvdt_nonlinearity] != 0.0:
         y += p[P.lvdt_nonlinearity] * math.sin(math.pi * (x - HALF_STROKE) / HALF_STROKE)
+    if p[P.lvdt_cubic] != 0.0:
+        part = (x - HALF_STROKE) / HALF_STROKE
+        y += p[P.lvdt_cubic] * (part**3 - 0.6 * part)
     if p[P.ripple_amplitude] != 0.0:
         y += p[P.ripple_amplitude] * math.sin(2.0 * math.pi * p[P.ripple_frequency] * t)
     y += p[P.lvdt_noise] * noise
@@ -518,12 +523,15 @@ def ecu_frame(k, warm, p):
 
 @njit(cache=True, error_model="numpy")
 def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view):
-    """Sense at tick ``k``: fill ``view`` (n_dem, n_r, x_lvdt, fresh, x_lvdt as logged) with what the controller sees."""
+    """Sense at tick ``k``: fill ``view`` (n_dem, n_r, x_lvdt, fresh, x_lvdt as logged, mode request) with what the controller sees.
+
+    ``frames`` has a row every 10 ms: n_dem and n_r (written here), the mode asked for, and the newest frame that the controller hears then.
+    """
     f = k // FRAME
     if k % FRAME == 0:
         frames[f, 0] = math.floor(n_dem[f] / 0.002 + 0.5) * 0.002
         frames[f, 1] = math.floor((s[S.n] + p[P.speed_noise] * speed_noise[f]) / 0.002 + 0.5) * 0.002
-    seen = min(ecu_frame(k, warm, p), f)
+    seen = int(frames[min(ecu_frame(k, warm, p), f), 3])
     x = read_lvdt(s, p, (k - warm) * TICK, t_oil[f], lvdt_noise[k])
     view[0] = frames[seen, 0]
     view[1] = frames[seen, 1]
@@ -531,8 +539,10 @@ def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, vi
     view[2] = x - p[P.schedule_offset]
     # frames go on arriving every 10 ms, whatever they hold
     late = int(math.floor(p[P.can_delay] / TICK + 0.5))
-    view[3] = 1.0 if (k - late) % FRAME == 0 else 0.0
+    sent = max(k - late, 0) // FRAME
+    view[3] = 1.0 if (k - late) % FRAME == 0 and frames[sent, 3] == sent else 0.0
     view[4] = x
+    view[5] = frames[seen, 2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -589,7 +599,7 @@ def run_compiled(
     truth,
 ):
     """The whole run with a compiled controller ``tick(inputs, state, calibration)``; ``slots`` says where its signals are."""
-    view = np.zeros(5)
+    view = np.zeros(6)
     total, count, row = 0.0, 0, 0
     segment = 0
     n_ticks = len(lvdt_noise)
@@ -603,6 +613,8 @@ def run_compiled(
         inputs[slots[1]] = view[1]
         inputs[slots[2]] = view[2]
         inputs[slots[3]] = view[3]
+        if slots[8] >= 0:
+            inputs[slots[8]] = view[5]
         if slots[7] >= 0:
             sample = min(max((k - warm) // every, 0), len(pot_noise) - 1)  # one number for all ticks of a row: noisier than a real one
             for j in range(3):

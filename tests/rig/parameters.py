@@ -49,6 +49,7 @@ def _nominal() -> np.ndarray:
         P.pot_tau_2: 5e-3,
         P.controller_gain: 1.0,
         P.flow_limit: np.inf,
+        P.flow_exponent: 20.0,
         P.asymmetry: 1.0,
         P.stribeck_speed: 5e-3,
         P.lvdt_gain: 1.0,

@@ -35,6 +35,22 @@ UNITS = {
 
 
 @dataclass(frozen=True)
+class Spell:
+    """Some seconds in which the controller is asked to stand by (``standby``) or hears no frame of the ECU (``deaf``), from ``start`` (s).
+
+    A logger hears the ECU all the same.
+    """
+
+    kind: str
+    start: float
+    length: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("standby", "deaf"):
+            raise ValueError(f"spell (={self.kind!r}) must be standby or deaf")
+
+
+@dataclass(frozen=True)
 class Run:
     """What a run leaves.
 
@@ -78,6 +94,9 @@ def simulate(
     x0: float | None = None,
     mean_through: bool = True,
     parameters: np.ndarray | None = None,
+    geometry: Geometry | None = None,
+    spells: Sequence[Spell] = (),
+    gaps: Sequence[tuple[float, float]] = (),
 ) -> Run:
     """Run a controller on the machine through a manoeuvre.
 
@@ -95,6 +114,9 @@ def simulate(
     mean_through  i_cmd is the mean of the ticks since the last row, the one at the row included (as a frame sent after the tick); False: of
                   the ticks before the row, which is the current that acted between the two rows
     parameters    array in the order of `kernel.P` in place of the drawn specimen
+    geometry      links of this machine; None: those of the table (`geometry.load` draws some within their tolerance)
+    spells        seconds in which the controller is asked to stand by, or hears nothing and takes care of itself
+    gaps          (start, length), s: stretches whose rows the logger lost; time stamps go on
     """
     if rate not in RATES:
         raise ValueError(f"rate (={rate}) must be one of {', '.join(map(str, RATES))} Hz")
@@ -102,7 +124,7 @@ def simulate(
         raise ValueError(f"substeps (={substeps}) must be a multiple of {kernel.LINKS}")
     if not 0.0 <= jitter < 1.0 / rate:
         raise ValueError(f"jitter (={jitter:g} s) must be in [0, {1.0 / rate:g})")
-    geometry = load()
+    geometry = geometry or load()
     streams = {
         name: np.random.default_rng([seed, k]) for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
     }
@@ -138,7 +160,16 @@ def simulate(
     speed_noise = level * streams["speed"].standard_normal(n_frames)
     lvdt_noise = level * streams["lvdt"].standard_normal(n_ticks)
     pot_noise = level * streams["pots"].standard_normal((rows, 3))
-    frames = np.empty((n_frames, 2))
+    frames = np.empty((n_frames, 4))
+    frames[:, 2] = 1.0
+    hears = np.ones(n_frames, dtype=bool)
+    for spell in spells:
+        during = slice(ahead + round(spell.start * 100), ahead + round((spell.start + spell.length) * 100))
+        if spell.kind == "standby":
+            frames[during, 2] = 0.0
+        else:
+            hears[during] = False
+    frames[:, 3] = np.maximum.accumulate(np.where(hears, np.arange(n_frames), 0))
     log, truth = np.empty((rows, len(kernel.LOG))), np.empty((rows, len(kernel.TRUTH)))
 
     s = np.zeros(kernel.N_S)
@@ -165,6 +196,11 @@ def simulate(
     out = {name: np.ascontiguousarray(log[:, k]) for k, name in enumerate(kernel.LOG)}
     true = {"t": out["t"].copy()} | {name: np.ascontiguousarray(truth[:, k]) for k, name in enumerate(kernel.TRUTH)}
     out["t"] = out["t"] + streams["jitter"].uniform(0.0, jitter, rows)
+    kept = np.ones(rows, dtype=bool)
+    for start, length in gaps:
+        kept &= (true["t"] < start) | (true["t"] >= start + length)
+    if not kept.all():
+        out, true = ({name: np.ascontiguousarray(v[kept]) for name, v in part.items()} for part in (out, true))
     record = {
         "manoeuvre": test.name,
         "manoeuvre_seed": test.seed,
@@ -173,6 +209,8 @@ def simulate(
         "rate_hz": rate,
         "jitter_s": jitter,
         "came_from": came_from,
+        "spells": [{"kind": s.kind, "start_s": s.start, "length_s": s.length} for s in spells],
+        "gaps_s": [list(g) for g in gaps],
         "hidden": [
             {
                 "effect": h.name,
@@ -240,7 +278,7 @@ def _run_object(
     truth,
 ):
     """`kernel.run_compiled` for a controller called from Python."""
-    view = np.zeros(5)
+    view = np.zeros(6)
     currents: list[float] = []
     row, segment = 0, 0
     for k in range(len(lvdt_noise)):
@@ -248,7 +286,7 @@ def _run_object(
             segment += 1
         p, f = par[segment], k // FRAME
         kernel.before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view)
-        i = controller.step(view[0], view[1], view[2], view[3] == 1.0, 1)
+        i = controller.step(view[0], view[1], view[2], view[3] == 1.0, int(view[5]))
         i = kernel.current(i, p, getattr(controller, "current_limit", 0.040))
         if k == warm:
             currents.clear()
@@ -280,4 +318,4 @@ def write(run: Run, path: str | Path) -> None:
         raise ValueError(f"suffix (={path.suffix!r}) must be .csv or .parquet")
 
 
-__all__ = ["RATES", "UNITS", "Run", "S", "machine", "simulate", "write"]
+__all__ = ["RATES", "UNITS", "Run", "S", "Spell", "machine", "simulate", "write"]

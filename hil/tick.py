@@ -1,0 +1,186 @@
+"""One tick of the closed loop, written once: lockstep, the nodes on the bus, replay and injection all run it.
+
+Tick k, at t = k ms, in two halves; what is logged or sent at t is taken between them::
+
+    `arrive`    a good frame of the ECU came: its demand, late and held as can_delay and frame_hold say
+    `control`   the calibration as it is flashed, the sensors' samples at t, the firmware's tick, its current
+    `move`      the plant moves on to t + 1 ms under the new current
+
+Everything works in place on the arrays of a `Loop` and allocates nothing. An effect whose parameters change in ``p`` while the loop runs
+acts from the next tick on; `plant.parameters.derive` must follow such a change.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from controller import Calibration, new_inputs, new_state, tick
+from controller.firmware import (
+    I_CMD,
+    IN_MODE_REQUEST,
+    IN_N_DEM,
+    IN_N_R,
+    IN_VIGV,
+    IN_X_LVDT,
+    KFF,
+    KI,
+    KP,
+    SLOW,
+    TREND_CHANGE,
+    TREND_RATE_ON,
+)
+from plant import Plant, chain
+from plant.compiled import in_place
+from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
+
+__all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "move", "new_loop"]
+
+FRAME = 1e-2  # s, period of the ECU's frame
+KEPT = 256  # contents of frames kept: can_delay and frame_hold together reach back 2 s
+CHANGED_BY = (chain.SCHEDULE_ERROR, chain.TREND_THRESHOLD_ERROR, chain.CONTROLLER_GAIN_ERROR)  # rows of p that the flashed calibration has
+
+
+class Loop(NamedTuple):
+    """What the one tick works on.
+
+    inputs, z    the firmware's (`controller`)
+    built        calibration as the tables have it
+    calibration  the same as it is flashed: with the effects that change tables and gains
+    flash        float64[3] those effects' parameters, as flashed
+    s, p         the plant's state and parameters
+    sigma        float64[5] rms noise of the sensors, SI (LVDT, three potentiometers, speed); zeros = noise-free
+    mean         float64[2] sum and number of currents since the last one that was logged or sent
+    angles       float64[3] rad, the potentiometers' readings at this tick
+    pots         float64[frames or 0, 6] what the controller gets of each reading: share of it and offset (rad; NaN = not fitted), stage by
+                 stage, a row every 10 ms, the last one held
+    sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%), mode_request
+    """
+
+    inputs: np.ndarray
+    z: np.ndarray
+    built: Calibration
+    calibration: Calibration
+    flash: np.ndarray
+    s: np.ndarray
+    p: np.ndarray
+    sigma: np.ndarray
+    mean: np.ndarray
+    angles: np.ndarray
+    pots: np.ndarray
+    sent: np.ndarray
+
+
+def new_loop(
+    plant: Plant, calibration: Calibration, *, n_engine: float, n_r: float, t_oil: float, noisy: bool, pots: np.ndarray | None = None
+) -> Loop:
+    """Return a loop at rest: its engine at ``n_engine`` (%), its stroke where the mean curve has it at the measured speed ``n_r`` (%)."""
+    cal = flashed(calibration, plant)
+    stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
+    return Loop(
+        new_inputs(),
+        new_state(),
+        calibration,
+        cal,
+        plant.p[list(CHANGED_BY), 0],
+        plant.start(stroke=stroke, n_r=n_engine, t_oil=t_oil),
+        plant.p.copy(),
+        plant.sigma.copy() if noisy else np.zeros(5),
+        np.zeros(2),
+        np.zeros(3),
+        np.empty((0, 6)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
+        np.full((KEPT, 4), np.nan),
+    )
+
+
+def flashed(calibration: Calibration, plant: Plant) -> Calibration:
+    """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
+    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
+    _flash(calibration, cal, np.empty(3), plant.p)
+    return cal
+
+
+@in_place
+def _flash(built, cal, flash, p):
+    """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``."""
+    flash[0], flash[1], flash[2] = p[chain.SCHEDULE_ERROR, 0], p[chain.TREND_THRESHOLD_ERROR, 0], p[chain.CONTROLLER_GAIN_ERROR, 0]
+    for row in range(1, built.table.shape[0]):
+        for i in range(built.table.shape[1]):
+            cal.table[row, i] = schedule_error.step(built.table[row, i], flash[0])
+    for row in (TREND_RATE_ON, TREND_CHANGE):
+        cal.k[row] = trend_threshold_error.step(built.k[row], flash[1])
+    for row in (KP, KI, KFF):
+        cal.k[row] = controller_gain_error.step(built.k[row], flash[2])
+
+
+@in_place
+def _last_by(sent, then, now):
+    """Return the row of the last frame that came in the 10 ms ``then`` or before; of the first one kept if there is none."""
+    then = min(then, now)
+    for q in range(then, now - KEPT, -1):
+        if sent[q % KEPT, 0] == q:
+            return q % KEPT
+    first = now
+    for q in range(now, max(then, now - KEPT), -1):
+        if sent[q % KEPT, 0] == q:
+            first = q
+    return first % KEPT
+
+
+@in_place
+def arrive(k, a, n_dem, n_r, mode_request):
+    """Give the controller what it gets of a good frame of the ECU that comes at tick ``k``: the content of this one or of an older one."""
+    now = k // SLOW
+    at = now % KEPT
+    a.sent[at, 0], a.sent[at, 1], a.sent[at, 2], a.sent[at, 3] = now, n_dem, n_r, mode_request
+    delay, period = a.p[chain.CAN_DELAY, 0], a.p[chain.FRAME_HOLD, 0]
+    if delay > 0.0 or period > 0.0:
+        content = can_delay.step(now * SLOW * chain.TICK, delay)
+        content = frame_hold.step(content, period)
+        at = _last_by(a.sent, int(math.floor(content / FRAME + 1e-6)), now)
+    a.inputs[IN_N_DEM], a.inputs[IN_N_R], a.inputs[IN_MODE_REQUEST] = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
+
+
+@in_place
+def control(k, a, noise, row, t_oil):
+    """Sample the sensors and run the firmware at tick ``k``.
+
+    noise  float64[:, 5] standard normal numbers (LVDT, three potentiometers, speed), of this tick those in ``row``
+    """
+    s, p, inputs, sigma = a.s, a.p, a.inputs, a.sigma
+    if (
+        p[chain.SCHEDULE_ERROR, 0] != a.flash[0]
+        or p[chain.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
+        or p[chain.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
+    ):
+        _flash(a.built, a.calibration, a.flash, p)
+    inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
+    for q in range(3):
+        a.angles[q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
+        inputs[IN_VIGV + q] = a.angles[q]
+    if a.pots.shape[0] > 0:
+        r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
+        for q in range(3):
+            inputs[IN_VIGV + q] = a.pots[r, 2 * q] * inputs[IN_VIGV + q] + a.pots[r, 2 * q + 1]
+    tick(inputs, a.z, a.calibration)
+    a.mean[0] += a.z[I_CMD]
+    a.mean[1] += 1.0
+
+
+@in_place
+def mean_current(a):
+    """Return the mean current (A) of the ticks since it was last asked for."""
+    mean = a.mean[0] / a.mean[1]
+    a.mean[0], a.mean[1] = 0.0, 0.0
+    return mean
+
+
+@in_place
+def move(k, a, n_dem, n_r, p_s, t_oil):
+    """Let the machine move on from tick ``k`` to the next under the controller's current, at demand ``n_dem`` and speed ``n_r`` (%)."""
+    s, p = a.s, a.p
+    chain.rotor_step(s, p, 0, n_dem, chain.TICK)
+    chain.drive_step(s, p, 0, a.z[I_CMD], n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
+    chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)

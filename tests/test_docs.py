@@ -1,0 +1,311 @@
+"""Every command and every Python snippet of README.md and docs/*.md runs as it is written.
+
+A page's steps run in their order, in a folder of its own. What cannot run here as written stands in one of the tables, with the reason:
+`REPLACED` (smaller, or a placeholder filled in), `NOT_RUN` (only parsed), `LONG` (run by `make test-all`). An entry that no page has fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.main import COMMANDS, main
+from hil import cli
+from hil.logs import Channel, read_log, write_log
+from tests.conftest import ROOT
+
+PAGES = ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+EXAMPLE = "examples/hidden_effect.parquet"
+
+# words of a page's commands and snippets -> what is run instead, and why
+REPLACED: dict[str, dict[str, tuple[str, str]]] = {
+    "docs/your_own_model.md": {
+        "LOG": ("tank.csv", "the page's own example"),
+        "OTHER": ("other.csv", "the page's own example"),
+        "my_model.py": ("tank.py", "the page's own example"),
+        "u.dead_zone": ("level.square_root", "a law that the example lacks"),
+    },
+    "docs/diagnosis.md": {
+        "LOG": (EXAMPLE, "any log"),
+        "--logs 200": ("--logs 1 --duration 60", "200 logs of 300 s take an hour"),
+    },
+    "docs/replay.md": {"LOG": ("examples/engine_run.blf", "any log")},
+    "docs/bus.md": {"--frames 10000000": ("--frames 20000", "ten million frames take minutes")},
+    "docs/rig.md": {"manoeuvre(seed=7)": ("manoeuvre(seed=7, duration=30.0)", "300 s take long")},
+}
+
+DATA = "needs published data that are not ours to ship; tests/test_real_data.py runs it where they are"
+VCAN = "runs until Ctrl-C, on a kernel with vcan0; tests/test_socketcan.py, tests/test_realtime.py, tests/test_record.py"
+LIVE = "runs in real time until Ctrl-C, or beside such a run; tests/test_realtime.py, tests/test_record.py, tests/test_inject.py"
+# the beginning of a command or snippet that is parsed, not run -> why
+NOT_RUN: dict[str, str] = {
+    "make demo": "sets up an environment; its steps are the commands of this page",
+    "make test": "runs this test",
+    "vaneloop run --bus vcan0": VCAN,
+    "vaneloop ecu --bus vcan0": VCAN,
+    "vaneloop record run.mf4 --bus vcan0": VCAN,
+    "vaneloop record night.mf4 --bus vcan0": VCAN,
+    "candump vcan0": VCAN,
+    "vaneloop run --bus local --record run.mf4": LIVE,
+    "vaneloop run --bus lockstep --inputs run.mf4": "repeats the run before it",
+    "vaneloop replay run.mf4": "replays the run before it; tests/test_record.py",
+    "vaneloop inject masquerade --bus local": LIVE,
+    "python warm_play.py": "the page's snippet under that name, which is run as such",
+    "python -m can.logger": "runs until Ctrl-C; tests/test_bus.py",
+    "python -m can.player": "plays what the logger recorded; tests/test_bus.py",
+    "vaneloop fuzz --replay fuzz_failure.log": "needs a failure to repeat; tests/test_fuzz.py makes one",
+    "vaneloop diagnose DATA_EMPS.mat": DATA,
+    "vaneloop diagnose 0.5Hz36lbtension1amplitude.json": DATA,
+    "vaneloop diagnose ex_1.csv": DATA,
+    "vaneloop replay revlog.log --dbc": DATA,
+    "vaneloop replay log.mf4 --dbc": DATA,
+    "vaneloop replay rig.mf4": "a file with several groups of one channel name; tests/test_logs.py writes one",
+    "vaneloop extend warm_play.parquet --effect play_temperature": "after the page's change to the library",
+    "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
+    "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
+    "python -m benchmarks": "measures for minutes; no test judges time",
+    "python -m hil.replay LOG": "the same function as vaneloop replay; tests/test_replay.py",
+    "python -m hil.inject": "the same function as vaneloop inject; tests/test_exit_codes.py",
+    "vaneloop engine-test --profile": "names the option, not a run",
+    "vaneloop ecu --model": "names the option, not a run",
+    "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
+    "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",
+    "# tables/__init__.py": "signatures, not a program",
+}
+
+# the beginning of a step that takes long -> the quick test that covers what it does
+LONG: dict[str, str] = {
+    "vaneloop strategies --report": "tests/test_strategies.py",
+    "vaneloop design --report": "tests/test_design.py",
+    "vaneloop inject --all": "tests/test_inject.py",
+    "vaneloop spatial --report": "tests/test_spatial.py",
+    "vaneloop clearance --report": "tests/test_linkage.py",
+    "vaneloop hidden-effect": "tests/test_rig.py",
+    "vaneloop experiment": "tests/test_search_commands.py",
+    "vaneloop diagnose warm_play.parquet": "tests/test_search_commands.py",
+    "vaneloop compare tank.csv": "tests/test_your_own_model.py",  # each command compiles the model anew
+    "vaneloop locate tank.csv": "tests/test_your_own_model.py",
+    "vaneloop diagnose tank.csv --test": "tests/test_your_own_model.py",
+    "vaneloop schedule --geometry": "tests/test_schedule.py",
+    "vaneloop engine-test --tables": "tests/test_schedule.py",
+    f"vaneloop diagnose {EXAMPLE}": "tests/test_search_commands.py",
+    '"""A log of a machine whose play grows': "tests/test_rig.py",
+}
+OURS = ("vaneloop", "python", "make", "candump")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command line or one snippet of a page."""
+
+    line: int
+    kind: str  # command, python
+    text: str
+
+    def listed(self, table: dict[str, str]) -> str | None:
+        """The entry of ``table`` that this is, if any."""
+        def begins(words: str) -> bool:
+            return self.text.startswith(words if self.kind == "python" else f"{words} ")
+
+        return next((k for k in table if self.text == k or begins(k)), None)
+
+
+def commands_of(block: str) -> list[str]:
+    """Command lines of a fenced block, or of words in back-quotes; a comment and the prompt taken off."""
+    if (multi := re.match(r'python -c "\n(.*)"\s*$', block, re.S)) is not None:
+        return [block.strip()] if multi else []
+    out = []
+    for line in re.sub(r"\\\n\s*", "", block).splitlines():
+        words = line.strip().removeprefix("$ ").split("  #")[0].split(" # ")[0].strip()
+        if words.split(" ")[0] in OURS:
+            out.append(re.sub(r" +", " ", words.split(" > ")[0]))
+    return out
+
+
+def steps_of(page: str) -> list[Step]:
+    """Commands and snippets of a page, in their order."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    out = []
+    # fenced blocks, and back-quoted commands that have at least one word more than their name
+    for m in re.finditer(r"^```(\w*)\n(.*?)^```|`((?:vaneloop|python -m|python) [^`\n]+)`", text, re.M | re.S):
+        line = text[: m.start()].count("\n") + 1
+        if m[3] is not None:
+            if len(m[3].split()) > 2 or m[3].endswith(".py") or m[3].startswith("python -m"):
+                out += [Step(line, "command", c) for c in commands_of(m[3])]
+        elif m[1] == "python":
+            out.append(Step(line, "python", m[2]))
+        elif m[1] in ("", "sh"):
+            out += [Step(line, "command", c) for c in commands_of(m[2])]
+    return out
+
+
+def replaced(page: str, text: str) -> str:
+    """The step as it is run."""
+    for words, (instead, _) in REPLACED.get(page, {}).items():
+        text = re.sub(rf"(?<![\w.]){re.escape(words)}(?![\w(])", lambda _, x=instead: x, text)
+    return text
+
+
+ALL = {page: steps_of(page) for page in PAGES}
+REAL = [page for page in PAGES if ALL[page]]
+
+
+def test_the_pages_hold_what_this_test_is_for() -> None:
+    commands = [s.text for steps in ALL.values() for s in steps if s.kind == "command"]
+    assert len(commands) > 60 and sum(s.kind == "python" for steps in ALL.values() for s in steps) > 10
+    assert "vaneloop diagnose LOG --system my_model.py --model better.toml" in commands
+    used = {c.split(" ")[1] for c in commands if c.startswith("vaneloop ")}
+    assert {"replay", "compare", "locate", "diagnose", "extend", "run", "ecu", "record", "inject", "schedule"} <= used
+    assert used - {"--help"} <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("table", [NOT_RUN, LONG], ids=["not run", "long"])
+def test_every_exception_is_a_step_of_some_page(table: dict[str, str]) -> None:
+    steps = [t for page, steps in ALL.items() for s in steps for t in (s, Step(s.line, s.kind, replaced(page, s.text)))]
+    assert [k for k in table if not any(s.listed({k: ""}) for s in steps)] == []
+    assert all(reason for reason in table.values())
+    for reason in table.values():
+        for file in re.findall(r"tests/\w+\.py", reason):
+            assert (ROOT / file).is_file(), file
+
+
+@pytest.mark.parametrize("page", REPLACED)
+def test_every_replacement_is_used(page: str) -> None:
+    for words in REPLACED[page]:
+        assert any(replaced(page, s.text) != s.text and words in s.text for s in ALL[page]), words
+
+
+@pytest.mark.parametrize("page", REAL)
+def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for s in ALL[page]:
+        if s.kind == "command" and s.text.startswith("vaneloop ") and s.listed(NOT_RUN):
+            name, *words = shlex.split(s.text)[1:]
+            module = importlib.import_module(COMMANDS[name][0])
+            parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+            module.add_options(parser)
+            for option in (w.split("=")[0] for w in words if w.startswith("--")):
+                assert option in parser.format_help(), f"{page}:{s.line}: {s.text}: {option}"
+
+
+# ---- running -----------------------------------------------------------------------------------------------------------------------------
+
+
+def log_of(folder: Path, columns: dict[str, str], name: str = "run.csv", **factors: float) -> None:
+    """30 s of the example as a CSV with these columns (title -> signal)."""
+    log = read_log(ROOT / EXAMPLE, require=())
+    n = 3_000
+    values = {"t": log.channels["n_dem"].t[:n], **{k: c.values[:n] for k, c in log.channels.items()}}
+    rows = np.column_stack([values[signal] * factors.get(signal, 1.0) + factors.get(f"{signal}_0", 0.0) for signal in columns.values()])
+    np.savetxt(folder / name, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6f")
+
+
+OWN = {k: k for k in ("t", "n_dem", "n_r", "x_lvdt", "vigv", "p_s", "t_oil")}
+
+
+def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
+    """Put the files of a page's story where the step looks for them; return the names that a snippet takes for granted."""
+    text = step.text
+    if page == "docs/logs.md":
+        if "N1_DEM" in text and step.kind == "python":
+            log_of(folder, {"t": "t", "N1_DEM": "n_dem", "x_lvdt": "x_lvdt"}, n_dem=380.0)
+        elif "N1_DEM" in text:
+            log_of(folder, {"Zeit": "t", "N1_DEM": "n_dem", "N1_ACT": "n_r", "vigv": "vigv"})
+        elif "RPM" in text:
+            log_of(folder, {"t": "t", "RPM": "n_dem", "vigv": "vigv"})
+        elif "p_s=bar" in text:
+            log_of(folder, OWN, t=1e3, p_s=10.0, t_oil_0=273.15, vigv=np.pi / 180.0)
+        elif "n_dem=rpm" in text:
+            log_of(folder, OWN, n_dem=380.0, n_r=380.0 / 60.0)
+        else:
+            log_of(folder, OWN)
+    if page == "docs/your_own_model.md" and not (folder / "tank.csv").is_file():
+        run_command("python make_logs.py")
+    if page == "docs/your_own_model.md" and "record = " in text:
+        from discrepancy import Record
+
+        data = {n: np.loadtxt(folder / f"{n}.csv", delimiter=",", skiprows=1).T for n in ("tank", "other")}
+        t, pump, level = data["tank"]
+        other = Record("run 2", data["other"][0], {"pump": data["other"][1], "level": data["other"][2]})
+        return {"t": t, "pump": pump, "level": level, "other": other}
+    if page == "docs/bus.md":
+        none = np.zeros((0, 2), np.int64)
+        return {"received": none, "frames": none, "rows": none, "at": np.zeros(0, np.int64), "ticks": 20, "n_dem": np.full(100, 80.0)}
+    if page == "docs/injection.md":
+        toml = re.search(r"```toml\n(title.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S)
+        assert toml is not None
+        (folder / "my_day.toml").write_text(toml[1], encoding="utf-8")
+        shutil.copy(ROOT / "tables" / "calibration.toml", folder / "mine.toml")
+    if page == "docs/tables.md":
+        shutil.copy(ROOT / "tables" / "calibration.toml", folder / "my_calibration.toml")
+    if page == "docs/scheduling.md":
+        shutil.copy(ROOT / "tables" / "geometry.toml", folder / "engine7.toml")
+        shutil.copy(ROOT / "tables" / "schedules.toml", folder / "targets.toml")
+        c = read_log(ROOT / EXAMPLE, require=()).channels
+        write_log(folder / "loop.csv", {k: Channel(c[k].t[::10], c[k].values[::10]) for k in ("n_dem", "x_lvdt", "vigv", "vgv1", "vgv2")})
+    return {}
+
+
+def run_command(text: str) -> None:
+    """A command line, in this process where it is ours."""
+    words = shlex.split(text)
+    if words[0] == "vaneloop":
+        with pytest.MonkeyPatch.context() as m:
+            m.setattr(sys, "argv", words)
+            try:
+                code = main(words[1:])
+            except SystemExit as leaving:
+                code = int(leaving.code or 0)
+        assert code in (0, 1), f"{text}: exit code {code}"
+    else:
+        assert words[0] == "python", text
+        done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, f"{text}\n{done.stderr}"
+
+
+def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool) -> None:
+    """Run a page's steps; ``long``: also those that take long."""
+    (folder / "examples").symlink_to(ROOT / "examples")
+    for s in ALL[page]:
+        if s.kind == "python" and (name := re.match(r"# (\w+\.py)\n", s.text)):
+            (folder / name[1]).write_text(s.text, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as m:
+        m.chdir(folder)
+        m.syspath_prepend(str(ROOT))
+        for s in ALL[page]:
+            run = Step(s.line, s.kind, replaced(page, s.text))
+            if s.listed(NOT_RUN) or (run.listed(LONG) and not long) or re.match(r"# \w+\.py\n", s.text):
+                continue
+            given = before(page, run, folder)
+            try:
+                if run.kind == "command":
+                    run_command(run.text)
+                else:
+                    file = folder / f"line_{s.line}.py"  # numba caches compiled code beside a file
+                    file.write_text(run.text, encoding="utf-8")
+                    names = runpy.run_path(str(file), init_globals=given, run_name=f"line_{s.line}")
+                    for f in [f for n, f in names.items() if n.startswith("test_") and callable(f)]:
+                        f(request.getfixturevalue("sil"))
+            except Exception as e:
+                pytest.fail(f"{page}:{s.line}: {run.text.splitlines()[0]}: {type(e).__name__}: {e}")
+
+
+@pytest.mark.parametrize("page", REAL)
+def test_a_page_s_commands_and_snippets_run(page: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    run_page(page, tmp_path, request, long=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [p for p in REAL if any(Step(0, s.kind, replaced(p, s.text)).listed(LONG) for s in ALL[p])])
+def test_a_page_s_long_steps_run_too(page: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    run_page(page, tmp_path, request, long=True)

@@ -1,0 +1,118 @@
+"""Exit codes: what is ours to mend leaves with 70 and one line that says so, never with the 1 of "differs"."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app.main import COMMANDS, main
+from hil import cli
+from tables import InputError
+from tests.conftest import ROOT
+
+LOG = str(ROOT / "examples" / "hidden_effect.parquet")
+
+
+def broken(*_: object, **__: object) -> None:
+    raise KeyError("level.square_root")
+
+
+def complaint(err: str) -> str:
+    """The last line, which must be the only one of ours."""
+    *others, line = err.strip().splitlines()
+    assert not any("Traceback" in o or o.startswith("vaneloop:") for o in others), err
+    return line
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where tracebacks go in this test."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.delenv("VANELOOP_DEBUG", raising=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_internal_error_of_any_command_leaves_with_70(
+    name: str, kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.import_module(COMMANDS[name][0]), "add_options", broken)
+    assert main([name]) == cli.DEFECT == 70
+    line = complaint(capsys.readouterr().err)
+    assert "KeyError: 'level.square_root' (test_exit_codes.py:" in line and "defect of VaneLoop, not of your input" in line
+    (file,) = kept.glob("vaneloop-*.traceback")
+    assert str(file) in line and "in broken" in file.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["compare", "locate", "diagnose", "replay"])
+def test_an_error_deep_inside_leaves_with_70(
+    name: str, kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hil.logs.read_log", broken)
+    assert main([name, LOG, "--quiet"]) == 70
+    assert "internal error" in complaint(capsys.readouterr().err)
+
+
+def test_the_traceback_is_printed_where_asked_for(kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("VANELOOP_DEBUG", "1")
+    assert cli.run(lambda: broken() or 0) == 70
+    err = capsys.readouterr().err
+    assert "in broken" in err and "traceback above" in err and not list(kept.iterdir())
+
+
+def test_a_traceback_that_cannot_be_kept_is_no_second_error(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda *a, **k: (_ for _ in ()).throw(OSError("full")))
+    assert "VANELOOP_DEBUG=1 prints the traceback" in cli.defect(KeyError("x"))
+
+
+def test_bad_input_is_no_defect(capsys: pytest.CaptureFixture[str]) -> None:
+    def refuse() -> int:
+        raise InputError("n_dem (=-3 %) must be in [0, 120] %")
+
+    assert cli.run(refuse) == 2 and capsys.readouterr().err == "vaneloop: n_dem (=-3 %) must be in [0, 120] %\n"
+
+
+# every module that can be run; what breaks it, in its process
+MODULES = {
+    "app.main": ("hil.logs.read_log", ["locate", LOG]),
+    "app.demo": ("os.path.relpath", []),
+    "app.web.worker": ("", ["not a number"]),
+    "app.web.loop": ("", ["not a number"]),
+    "hil.replay": ("hil.logs.read_log", [LOG]),
+    "hil.inject": ("hil.scenario.library", ["--all"]),
+    "hil.recorder": ("", []),  # it lacks its words
+    "hil.broker": ("", []),
+}
+
+
+def test_every_module_that_can_be_run_is_in_the_list() -> None:
+    runs = {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts)
+        for top in ("app", "hil", "discrepancy", "controller", "tables")
+        for p in (ROOT / top).rglob("*.py") if '__name__ == "__main__"' in p.read_text(encoding="utf-8")
+    }  # fmt: skip
+    assert runs == set(MODULES)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_module_run_by_itself_leaves_with_70(module: str, tmp_path: Path) -> None:
+    """The module in a process of its own, in which one of our functions (or the word that starts it) is broken."""
+    what, words = MODULES[module]
+    home, _, function = what.rpartition(".")
+    script = (
+        "import importlib, runpy, sys\n"
+        "def broken(*a, **k): raise KeyError('level.square_root')\n"
+        f"if {function!r}: setattr(importlib.import_module({home!r}), {function!r}, broken)\n"
+        f"sys.argv = ['x', *{words!r}]\n"
+        f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
+    p = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert p.returncode == 70, p.stderr
+    assert "internal error" in complaint(p.stderr) and list(tmp_path.glob("vaneloop-*.traceback"))

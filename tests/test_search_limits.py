@@ -1,0 +1,344 @@
+"""The numbers that decide the search, each a fifth below and a quarter above: what is named, confirmed, called unknown, tried at all.
+
+The documented values stand in one place, `DOCUMENTED`, and must be those of the table in docs/diagnosis.md. The decisions are asked of the
+functions that make them, on errors made up to stand exactly where a number says; nothing is simulated.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from discrepancy import diagnose, fit, locate, workflow
+from discrepancy.fit import Fit, Judge
+from discrepancy.stage import Effect, Parameter, Stage
+from tests.conftest import ROOT
+
+DOCUMENTED = {
+    "NATS": 12.0, "SPREADS": 3.0, "BLOCK_SPREADS": 8.0, "LEAST_SHARE": 0.15, "FLOOR_KNOWN": 0.01, "TOLERATED": 1.05, "LEFT_FLOORS": 3.0,
+    "RIVAL_NATS": 3.0, "RIVAL_SPREADS": 0.3, "RIVAL_SHARE": 0.25,
+}  # fmt: skip
+BELOW, ABOVE = 0.81, 1.24  # just inside what a number wrong by a fifth or a quarter would let through
+SIDES = pytest.mark.parametrize(("times", "beyond"), [(BELOW, False), (0.99, False), (1.01, True), (ABOVE, True)])
+
+
+def test_the_page_documents_the_numbers_that_are_in_force():
+    page = (ROOT / "docs" / "diagnosis.md").read_text()
+    found: dict[str, set[float]] = {}
+    for names, values in re.findall(r"^\| ((?:`[A-Z_]+`(?:, )?)+) \| ([\d., ]+) \|", page, re.M):
+        for name, value in zip(re.findall(r"`([A-Z_]+)`", names), values.split(", "), strict=True):
+            found.setdefault(name, set()).add(float(value))
+    for name, value in DOCUMENTED.items():
+        assert found[name] == {value}, name
+        assert getattr(diagnose, name) == value, name
+
+
+# ---- made-up errors ------------------------------------------------------------------------------------------------------------------
+
+
+def judge_of(blocks: int, each: int) -> Any:
+    """What a decision asks of a `Judge`: how many samples, and where."""
+    return SimpleNamespace(n=blocks * each, samples=np.full(blocks, each), n_blocks=blocks, expected=lambda: np.ones(blocks))
+
+
+def fit_of(rms: Any, judge: Any, effects: tuple[str, ...] = ()) -> Fit:
+    """A fit that leaves an error of ``rms`` noise floors, the same in each block or one number for each."""
+    held = np.broadcast_to(np.asarray(rms, dtype=float) ** 2, judge.n_blocks) * judge.samples
+    none = np.zeros(0)
+    free = np.arange(len(effects))
+    return Fit(effects, np.zeros(len(effects)), free, held.copy(), held.copy(), none, none, none, none, none)
+
+
+def rms_after(judge: Any, nats: float) -> float:
+    """Error before, where the floor is reached after a gain of so many nats."""
+    return float(np.sqrt(1.0 + 2.0 * nats / judge.n))
+
+
+# ---- is an effect worth its place? ---------------------------------------------------------------------------------------------------
+
+
+@SIDES
+def test_an_effect_must_gain_twelve_nats(times: float, beyond: bool) -> None:
+    judge = judge_of(4, 2)  # so few samples that the nats decide
+    before = fit_of(rms_after(judge, 12.0 * times), judge)
+    assert diagnose.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
+
+
+@SIDES
+def test_an_effect_must_lower_the_error_by_three_spreads(times: float, beyond: bool) -> None:
+    judge = judge_of(20, 100)
+    before = fit_of(1.0 + 3.0 * times / np.sqrt(2.0 * judge.n), judge)
+    assert diagnose.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
+
+
+@SIDES
+def test_an_effect_that_acts_rarely_must_lower_its_two_blocks_by_eight_spreads(times: float, beyond: bool) -> None:
+    judge = judge_of(400, 100)
+    errors = np.ones(400)
+    errors[[7, 300]] += 8.0 * times / np.sqrt(200.0)
+    assert diagnose.significant(judge, fit_of(errors, judge), fit_of(1.0, judge, ("a",)), 1.0) == beyond
+
+
+@SIDES
+def test_an_effect_must_explain_a_seventh_of_the_excess(times: float, beyond: bool) -> None:
+    judge = judge_of(20, 10_000)
+    after = fit_of(np.sqrt(1.0 + 2.0 * (1.0 - 0.15 * times)), judge, ("a",))
+    assert diagnose.significant(judge, fit_of(np.sqrt(3.0), judge), after, 1.0) == beyond
+
+
+# ---- is anything missing? ------------------------------------------------------------------------------------------------------------
+
+
+@SIDES
+@pytest.mark.parametrize(("blocks", "each", "edge"), [(20, 100_000, 0.01), (20, 100, 3.0 / np.sqrt(4000.0))])
+def test_a_search_begins_one_per_cent_or_three_spreads_above_the_floor(
+    blocks: int, each: int, edge: float, times: float, beyond: bool
+) -> None:
+    judge = judge_of(blocks, each)
+    assert diagnose._above_floor(judge, fit_of(1.0 + edge * times, judge), 1.0) == beyond
+
+
+@SIDES
+def test_a_search_begins_where_one_block_stands_eight_spreads_above_the_floor(times: float, beyond: bool) -> None:
+    judge = judge_of(2000, 100)
+    errors = np.ones(2000)
+    errors[3] += 0.01 + 8.0 * times / np.sqrt(200.0)
+    assert diagnose._above_floor(judge, fit_of(errors, judge), 1.0) == beyond
+
+
+def verdict(monkeypatch: pytest.MonkeyPatch, before: float, after: float, effects: tuple[str, ...]) -> str:
+    judge = judge_of(20, 1_000_000)
+    judge.stage = SimpleNamespace(name="s", outputs=("x",), units=("mm",), parameters=())
+    judge.floor = np.ones(1)
+    monkeypatch.setattr(diagnose, "rms_per_output", lambda *_: np.ones(1))
+    monkeypatch.setattr(diagnose, "recalibrated", lambda *_: [])
+    said = diagnose._conclude(judge, fit_of(before, judge), fit_of(after, judge, effects), [], [], 1.0, [])
+    return said.verdict
+
+
+@SIDES
+def test_nothing_is_missing_up_to_five_per_cent_above_the_floor(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+    rms = 1.0 + 0.05 * times
+    assert verdict(monkeypatch, rms, rms, ()) == ("unknown" if beyond else "none")
+
+
+@SIDES
+def test_a_named_model_may_leave_a_seventh_of_the_excess(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+    after = float(np.sqrt(1.0 + 0.15 * times * 10.0))
+    assert verdict(monkeypatch, np.sqrt(11.0), after, ("a",)) == ("unknown" if beyond else "missing")
+
+
+@SIDES
+@pytest.mark.parametrize(("effects", "floors"), [(("a",), 3.0), (("a", "b"), 2.0), (("a", "b", "c"), 5.0 / 3.0)])
+def test_a_named_model_may_leave_three_floors_and_two_effects_two(
+    monkeypatch: pytest.MonkeyPatch, effects: tuple[str, ...], floors: float, times: float, beyond: bool
+) -> None:
+    after = 1.0 + (floors - 1.0) * times
+    assert verdict(monkeypatch, 1000.0, after, effects) == ("unknown" if beyond else "missing")
+
+
+# ---- does one of two beat the other? -------------------------------------------------------------------------------------------------
+
+
+@SIDES
+def test_a_rival_goes_at_odds_of_twenty_to_one(times: float, beyond: bool) -> None:
+    judge = judge_of(4, 2)
+    assert diagnose._worse(judge, fit_of(rms_after(judge, 3.0 * times), judge), fit_of(1.0, judge), 1.0, 0.0) == beyond
+
+
+@SIDES
+def test_a_rival_goes_where_it_needs_three_nats_more_freedom(times: float, beyond: bool) -> None:
+    judge = judge_of(4, 2)
+    assert diagnose._worse(judge, fit_of(1.0, judge), fit_of(1.0, judge), 1.0, 3.0 * times) == beyond
+
+
+@SIDES
+def test_a_rival_goes_for_a_third_of_a_spread_and_not_for_less(times: float, beyond: bool) -> None:
+    judge = judge_of(20, 10_000)
+    other = fit_of(1.0 + 0.3 * times / np.sqrt(2.0 * judge.n), judge)
+    nats = diagnose.gain(judge, other, fit_of(1.0, judge), 1.0)[0]
+    assert nats > 30.0
+    assert diagnose._worse(judge, other, fit_of(1.0, judge), 1.0, 0.0) == beyond
+
+
+@SIDES
+def test_a_rival_must_be_worse_by_a_quarter_of_what_is_left(times: float, beyond: bool) -> None:
+    judge = judge_of(20, 1000)
+    best = fit_of(2.0, judge)
+    left = 0.5 * judge.n * (4.0 - 1.01**2)
+    other = fit_of(np.sqrt(4.0 + 2.0 * 0.25 * left * times / judge.n), judge)
+    assert diagnose._worse(judge, other, best, 1.0, 0.0) == beyond
+
+
+# ---- how much is tried ---------------------------------------------------------------------------------------------------------------
+
+
+class Endless:
+    """A search in which every further effect helps; it notes what it was asked for."""
+
+    asked: list[list[tuple[str, ...]]]
+
+    def __init__(self, judge: Any, tick: Any = None):
+        self.judge, self.quiet, Endless.asked = judge, False, []
+        self.base = self._fit(())
+        self.reach = dict.fromkeys((e.name for e in judge.stage.effects), 1e9)
+
+    def _fit(self, effects: tuple[str, ...]) -> Fit:
+        return fit_of(100.0 * 0.5 ** len(effects) + 0.001 * sum(map(ord, "".join(effects))), self.judge, effects)
+
+    def singles(self, names: list[str]) -> dict[str, Fit]:
+        return {n: self._fit((n,)) for n in names}
+
+    def best_of(self, sets: list[tuple[str, ...]]) -> list[Fit]:
+        self.asked.append(list(sets))
+        return [self._fit(s) for s in sets]
+
+    def joined(self, effects: tuple[str, ...]) -> Fit:
+        return self._fit(effects)
+
+
+def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    effects = tuple(Effect(c, (Parameter("size", 0.0, "1"),), ((1.0,),)) for c in "abcdefgh")
+    stage: Any = SimpleNamespace(effects=effects, effect=lambda n: None)
+    judge = judge_of(20, 100)
+    judge.stage = stage
+    monkeypatch.setattr(diagnose, "Judge", lambda *_: judge)
+    monkeypatch.setattr(diagnose, "Search", Endless)
+    monkeypatch.setattr(diagnose, "correlation_of", lambda *_: 1.0)
+    _, current, candidates, _, _ = diagnose._search(stage, np.ones(1), None, None)
+    assert len(current.effects) == 4
+    leaders = [c.effect for c in candidates[:5]]
+    assert {frozenset(s) for s in Endless.asked[0]} == {frozenset(s) for s in itertools.combinations(leaders, 2)}
+
+
+def test_the_three_leading_sets_are_finished() -> None:
+    search: Any = object.__new__(diagnose.Search)
+    judge = judge_of(2, 10)
+    finished = []
+
+    def joined(effects: tuple[str, ...], whole: bool) -> Any:
+        if whole:
+            finished.append(effects)
+        return fit_of(float(ord(effects[0])), judge, effects)
+
+    search._joined, search.judge = joined, SimpleNamespace(together=list)
+    assert len(search.best_of([(c,) for c in "fedcba"])) == 6
+    assert finished == [("a",), ("b",), ("c",)]
+
+
+def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_pieces_of_four(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (diagnose.LONG, diagnose.SEARCHED, diagnose.PIECE) == (60_000, 40_000, 4_000)
+    seen = []
+    monkeypatch.setattr(diagnose, "_to_the_floor", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown"))
+    nothing = SimpleNamespace(theta=np.zeros(1))
+    monkeypatch.setattr(diagnose, "_confirm", lambda *_: SimpleNamespace(verdict="none", final=nothing))
+
+    def judge(stage: Any, *_: Any) -> Any:
+        return SimpleNamespace(stage=stage, fit=lambda *_: nothing, errors=lambda _: np.ones((1, 1, len(stage.t))))
+
+    monkeypatch.setattr(diagnose, "Judge", judge)
+    for n in (59_999, 60_000, 200_000):
+        whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, neutral=lambda: np.zeros(1))
+        whole.excerpt = lambda at: SimpleNamespace(t=at)
+        diagnose.diagnose_stage(whole, np.ones(1))
+    assert seen == [59_999, 40_000, 40_000]
+    at = diagnose._excerpt(judge(whole), nothing)  # type: ignore[arg-type]
+    assert np.diff(np.flatnonzero(np.diff(at, prepend=-9) > 1)).min() >= 4_000
+
+
+# ---- fits ----------------------------------------------------------------------------------------------------------------------------
+
+
+def straight(n: int, dt: float, noise: float = 0.1, tolerance: float = 0.0) -> Stage:
+    """A stage y = a + size u with hidden a = 0; what ``run`` was asked is in ``stage.asked``."""
+    t = dt * np.arange(n)
+    u = np.sin(t)
+    asked: list[np.ndarray] = []
+
+    def run(thetas: np.ndarray) -> np.ndarray:
+        asked.append(thetas.copy())
+        return (thetas[:, :1] + thetas[:, 1:] * u)[:, None, :]
+
+    stage = Stage(
+        "line", ("y",), ("mm",), (Parameter("a", 0.0, "mm", -9.0, 9.0, tolerance),),
+        (Effect("slope", (Parameter("size", 0.0, "1", -5.0, 5.0, scale=2.0),), ((1.0,),)),), run, t,
+        noise * np.random.default_rng(0).standard_normal((1, n)),
+    )  # fmt: skip
+    stage.asked = asked  # type: ignore[attr-defined]
+    return stage
+
+
+@pytest.mark.parametrize(("seconds", "blocks"), [(30.0, 12), (119.0, 12), (131.0, 13), (405.0, 40), (5000.0, 60)])
+def test_a_log_is_cut_into_blocks_of_ten_seconds_twelve_at_least_and_sixty_at_most(seconds: float, blocks: int) -> None:
+    assert Judge(straight(round(seconds / 0.1) + 1, 0.1), np.ones(1)).n_blocks == blocks
+
+
+@pytest.mark.parametrize(("n", "worth"), [(150, 150), (20_000, 200)])
+def test_a_log_is_worth_two_hundred_observations_at_most(n: int, worth: float) -> None:
+    """Interval of a slope over a sine: 1.645 sqrt(2 / N) noises, N no more than 200."""
+    found = Judge(straight(n, 40.0 * np.pi / n), np.array([0.1])).fit(("slope",), np.zeros(2))
+    assert found.high[0] - found.low[0] == pytest.approx(2.0 * 1.645 * 0.1 * np.sqrt(2.0 / worth), rel=0.07 if n > 1000 else 0.12)
+
+
+def test_derivatives_are_taken_over_a_thousandth_of_a_parameters_scale() -> None:
+    stage = straight(200, 0.1)
+    judge = Judge(stage, np.ones(1))
+    judge.linearise(np.zeros(2), np.array([1]))
+    steps = stage.asked[-1][:, 1]  # type: ignore[attr-defined]
+    assert np.allclose(np.sort(steps), [0.0, 2.0 * 1e-3], rtol=1e-12)
+
+
+# ---- where it fails ------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_condition_has_eight_bins_of_equal_population() -> None:
+    edges = locate._edges(np.random.default_rng(0).normal(size=8000))
+    assert len(edges) == 9
+    assert len(locate._edges(np.repeat(np.arange(8.0), 5))) == 9  # eight values: a bin each
+    assert len(locate._edges(np.repeat(np.arange(9.0), 5))) == 9
+
+
+@pytest.mark.parametrize(("chance", "significant"), [(0.0108, False), (0.0092, True)])
+def test_one_log_in_a_hundred_has_a_bin_called_significant_by_chance(chance: float, significant: bool) -> None:
+    n = 500
+    z = float(norm.isf(chance / 8))
+    condition = np.arange(8.0 * n)
+    squares = np.ones(8 * n)
+    squares[:n] = 1.0 + z * np.sqrt(2.0 / n)
+    stage = SimpleNamespace(outputs=("y",), units=("mm",), regimes={"u": condition}, regime_units={})
+    judge: Any = SimpleNamespace(
+        stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
+        lost=lambda: np.ones((1, 8 * n)),
+    )  # fmt: skip
+    found = locate.regimes(judge, SimpleNamespace(theta=np.zeros(1)), 1.0)[0]  # type: ignore[arg-type]
+    assert bool(found.significant[0]) == significant and not found.significant[1:].any()
+
+
+@SIDES
+def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+    said = SimpleNamespace(verdict="missing", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
+    monkeypatch.setattr(workflow, "_WORK", [SimpleNamespace()])
+    monkeypatch.setattr(workflow, "diagnose_stage", lambda *_: said)
+    monkeypatch.setattr(workflow, "floor_of", lambda *_: np.ones(1))
+    monkeypatch.setattr(workflow, "Judge", lambda *_: None)
+    monkeypatch.setattr(workflow, "shape", lambda *_: ["a shape"])
+    assert workflow._one(0) == (said, ["a shape"] if beyond else [])
+
+
+def test_the_limits_of_work_done_at_one_time_change_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = []
+    for sets, values in ((64, 8_000_000), (2, 500)):
+        monkeypatch.setattr(fit, "MAX_SETS", sets)
+        monkeypatch.setattr(fit, "MAX_VALUES", values)
+        judge = Judge(straight(300, 0.1), np.ones(1))
+        many = judge.together([judge.fitting(("slope",), np.array([0.0, s])) for s in (-1.0, 0.5, 2.0)])
+        answers.append([f.theta.tolist() for f in many])
+    assert answers[0] == answers[1]
+
+
