@@ -14,7 +14,7 @@ from discrepancy.fit import Judge
 from discrepancy.locate import shape
 from discrepancy.workflow import diagnose, diagnosis_json
 from tests.test_discrepancy import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
-from tests.test_search_limits import verdict
+from tests.test_search_limits import SIDES, verdict
 
 SMALL = Effect("null_bias", (replace(NULL_BIAS.parameters[0], low=-0.4, high=0.4),), ((-0.1,), (0.1,), (0.3,)), "any motion")
 
@@ -24,6 +24,11 @@ def test_an_effect_and_its_rivals_hold_nine_tenths_of_the_probability():
     assert with_rivals("a", [], shares) == ["b", "c"]
     assert with_rivals("a", ["d"], shares) == ["d", "b", "c"]
     assert with_rivals("a", [], {"a": 0.95, "b": 0.05}) == []
+
+
+@pytest.mark.parametrize(("own", "rivals"), [(0.73, ["b"]), (0.89, ["b"]), (0.91, [])])
+def test_nine_tenths_are_neither_less_nor_more(own, rivals):
+    assert with_rivals("a", [], {"a": own, "b": 0.98 - own, "c": 0.02}) == rivals
 
 
 @pytest.mark.parametrize(("truth", "said"), [(0.3, "missing"), (0.4002, "unknown")])
@@ -38,6 +43,12 @@ def test_a_size_at_its_bound_is_no_answer(truth, said):
 @pytest.mark.parametrize(("before", "after", "said"), [(1.048, 1.040, "none"), (1.08, 1.062, "unknown"), (1.04, 1.005, "missing")])
 def test_what_explains_less_than_half_of_the_excess_is_not_named(monkeypatch, before, after, said):
     assert verdict(monkeypatch, before, after, ("a",)) == said
+
+
+@SIDES
+def test_half_of_the_excess_is_the_limit(monkeypatch, times, beyond):
+    after = np.sqrt(1.048**2 - 0.5 * times * (1.048**2 - 1.01**2))
+    assert verdict(monkeypatch, 1.048, after, ("a",)) == ("missing" if beyond else "none")
 
 
 # ---- causes that go together ---------------------------------------------------------------------------------------------------------
@@ -117,6 +128,12 @@ def test_a_name_without_a_rival_that_another_stage_refutes_is_none():
 def test_a_name_that_another_stage_sees_too_stays():
     d = answers(reading("actuator", ("lvdt_bias", "end_stop"), 1.0), reading("linkage", ("lvdt_bias",), 1.0))["actuator"]
     assert [(f.effect, f.rivals) for f in d.effects] == [("lvdt_bias", [])]
+
+
+@SIDES
+def test_two_stages_may_differ_by_half_of_a_size(times, beyond):
+    d = answers(reading("actuator", ("lvdt_bias",), 1.0), reading("linkage", ("lvdt_bias",), 1.0 + 0.5 * times + (0.01 if beyond else -0.01)))
+    assert d["actuator"].verdict == ("unknown" if beyond else "missing")
 
 
 # ---- the tool's own rate -------------------------------------------------------------------------------------------------------------

@@ -304,20 +304,35 @@ def test_a_condition_has_eight_bins_of_equal_population() -> None:
     assert len(locate._edges(np.repeat(np.arange(9.0), 5))) == 9
 
 
-@pytest.mark.parametrize(("chance", "significant"), [(0.0108, False), (0.0092, True)])
-def test_one_log_in_a_hundred_has_a_bin_called_significant_by_chance(chance: float, significant: bool) -> None:
+def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
+    """A stage of pure noise, but for one of its eight bins, whose error so many independent samples exceed by that chance."""
     n = 500
-    z = float(norm.isf(chance / 8))
-    condition = np.arange(8.0 * n)
     squares = np.ones(8 * n)
-    squares[:n] = 1.0 + z * np.sqrt(2.0 / n)
-    stage = SimpleNamespace(outputs=("y",), units=("mm",), regimes={"u": condition}, regime_units={})
-    judge: Any = SimpleNamespace(
+    squares[:n] = 1.0 + float(norm.isf(chance / 8)) * np.sqrt(2.0 * correlation / n)
+    stage = SimpleNamespace(
+        name="s", outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)}, regime_units={}, neutral=lambda: np.zeros(1),
+    )  # fmt: skip
+    return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
         lost=lambda: np.ones((1, 8 * n)),
     )  # fmt: skip
-    found = locate.regimes(judge, SimpleNamespace(theta=np.zeros(1)), 1.0)[0]  # type: ignore[arg-type]
+
+
+AT_NOTHING: Any = SimpleNamespace(theta=np.zeros(1))
+
+
+@pytest.mark.parametrize(("chance", "significant"), [(0.0108, False), (0.0092, True)])
+def test_one_log_in_a_hundred_has_a_bin_called_significant_by_chance(chance: float, significant: bool) -> None:
+    found = locate.regimes(first_of_eight_bins_beyond(chance, 1.0), AT_NOTHING, 1.0)[0]
     assert bool(found.significant[0]) == significant and not found.significant[1:].any()
+
+
+@SIDES
+def test_two_samples_count_as_one_where_bins_are_judged(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+    monkeypatch.setattr(locate, "onset", lambda *_: None)
+    monkeypatch.setattr(locate, "rms_per_output", lambda *_: np.ones(1))
+    said = locate.locate(first_of_eight_bins_beyond(0.01, 2.0 * times), AT_NOTHING)
+    assert said.fails == beyond
 
 
 @SIDES
