@@ -57,11 +57,11 @@ EQUATIONS: dict[str, tuple[Callable[..., Any], list[tuple[float, ...]]]] = {
     ),
     "frame_hold": (
         lambda t, p: t if p == 0 else p * math.floor(t / p + 1e-6 / p),
-        each((0.0, 0.05, 0.0999995, 0.1, 0.19, 1.234), (0.0, 0.1, 0.03)),
+        each((0.0, 0.05, 0.0999989, 0.0999991, 0.1, 0.19, 1.234), (0.0, 0.1, 0.03)),
     ),
     "internal_leakage": (  # v = v0 - c (p + r v)
         lambda v, p, r, c: (v - c * p) / (1 + c * r),
-        each(V, (-3e6, 0.0, 2e6), (1.25e6,), (0.0, 1.5e-9, 2e-8)),
+        each(V, (-3e6, 0.0, 2e6), (1.25e6,), (0.0, 1.5e-9, 2e-8, 1.0)),
     ),
     "link_length_error": (lambda a, e: a + e, each((0.1,), (-0.001, 0.0, 0.002))),
     "linkage_backlash": (lambda w, e, r: np.clip(w + e * r, 0, None), each((0.02,), (-0.03, -0.01, 0.0, 0.03), (0.6, 1.4))),
@@ -73,33 +73,33 @@ EQUATIONS: dict[str, tuple[Callable[..., Any], list[tuple[float, ...]]]] = {
     "lvdt_lag": (lambda y, x, a: (1 - a) * y + a * x, each((0.01, 0.02), (0.01, 0.03), (0.1, 0.6, 1.0))),
     "lvdt_nonlinearity": (  # Legendre's third polynomial, held beyond the stroke
         lambda x, s, a, c: x - a * np.sin(2 * np.pi * x / s) + c * Legendre.basis(3)(np.clip(2 * x / s - 1, -1, 1)),
-        each((-0.001, 0.0, 0.011, 0.024, 0.04, 0.048, 0.05), (0.048,), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3)),
+        each((-0.001, 0.0, 0.011, 0.024, 0.04, 0.048, 0.05), (0.048,), (-1e-3, 0.0, 2e-3, 1.0), (-5e-4, 0.0, 1e-3, 1.0)),
     ),
-    "lvdt_thermal_drift": (lambda x, t, c: x + c * (t - 40.0), each((0.02,), (-20.0, 40.0, 90.0), (-1e-6, 0.0, 2e-6))),
+    "lvdt_thermal_drift": (lambda x, t, c: x + c * (t - 40.0), each((0.02,), (-20.0, 40.0, 90.0), (-1e-6, 0.0, 2e-6, 1.0))),
     "oil_compressibility": (
         lambda f, v, c, d: -(SOFT + c) * f - c * d * v,
         each((-2000.0, 0.0, 4000.0), (-0.1, 0.0, 0.05), (0.0, 5e-8), (0.0, 1500.0)),
     ),
     "oil_viscosity": (
         lambda g, t, c: g * np.clip(1 + c * (t - 40.0), 0.05, None),
-        each((0.15,), (-40.0, 0.0, 40.0, 90.0), (-0.02, -0.003, 0.0, 0.01, 0.02)),
+        each((0.15,), (-40.0, 0.0, 40.0, 90.0), (-0.02, -0.003, 0.0, 0.01, 0.02, 1.0)),
     ),
     "piston_friction": (
         lambda z, s, level, k: 0.0 if level == 0 else float(np.clip(z + s * k, -level, level)),
-        each((-800.0, 0.0, 900.0), (-1e-5, -1e-7, 0.0, 1e-6, 1e-4), (0.0, 900.0, 1000.0), (1e8,)),
+        each((-800.0, 0.0, 900.0), (-1e-5, -1e-7, 0.0, 1e-6, 1e-4), (0.0, 1.0, 900.0, 1000.0), (1e8,)),
     ),
-    "piston_stiction": (stribeck, each((500.0,), V, (0.0, 300.0), (0.005, 0.02))),
+    "piston_stiction": (stribeck, each((500.0,), V, (0.0, 1.0, 300.0), (0.005, 0.02))),
     "pot_bias": (lambda n, b: n + b, each((0.001,), (-0.01, 0.0, 0.01))),
     "pot_gain": (lambda v, f: v * f, each((-0.3, 0.2), (0.9, 1.0, 1.1))),
     "pot_lag": (lambda n, e: n + e, each((0.01,), (-0.005, 0.0, 0.1))),
-    "ring_eccentricity": (lambda th, a, ph: th + a * np.sin(th + ph), each((-0.1, 0.0, 0.15), (0.0, 0.01), (-2.0, 0.0, 1.0))),
+    "ring_eccentricity": (lambda th, a, ph: th + a * np.sin(th + ph), each((-0.1, 0.0, 0.15), (0.0, 0.01, 1.0), (-2.0, 0.0, 1.0))),
     "rotor_lag_error": (lambda n, e: n + e if n + e > 0.01 else 0.01, each((1.2,), (-1.5, -1.195, -0.3, 0.0, 2.0))),
     "schedule_error": (lambda x, e: x + e, each((0.01, 0.04), (-0.001, 0.0, 0.002))),
     "supply_pressure_droop": (  # v^2 = v0^2 (1 - droop |v| / p), its root of v0's sign
         lambda v0, p, d: float(np.sign(v0) * max(np.roots([1.0, v0 * v0 * d / p, -v0 * v0]).real)),
-        each(V, (5e5, 8e6, 21e6), (0.0, 2e6, 6e7)),
+        each(V, (5e5, 8e6, 21e6), (0.0, 1.0, 2e6, 6e7)),
     ),
-    "thermal_growth": (lambda th, t, c, r: th + c * r * (t - 40.0), each((0.1,), (-20.0, 40.0, 90.0), (-1e-3, 0.0, 2e-3), (0.6, 1.4))),
+    "thermal_growth": (lambda th, t, c, r: th + c * r * (t - 40.0), each((0.1,), (-20.0, 40.0, 90.0), (-1e-3, 0.0, 2e-3, 1.0), (0.6, 1.4))),
     "trend_threshold_error": (lambda a, f: a * f, each((0.06, 0.5), (0.5, 1.0, 3.0))),
     "valve_dead_band": (
         lambda u, h: float(np.sign(u) * np.clip(abs(u) - h, 0, None)),
@@ -120,6 +120,23 @@ def test_an_effect_is_its_equation(name: str) -> None:
     equation, inputs = EQUATIONS[name]
     for row in inputs:
         assert np.allclose(effect(name).step(*row), equation(*row), rtol=1e-9, atol=1e-15), row
+
+
+@pytest.mark.parametrize(("x", "amplitude", "cubic"), each((-0.001, 0.0007, 0.011, 0.024, 0.04, 0.05), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3)))
+def test_the_slope_of_the_reading_is_its_derivative(x: float, amplitude: float, cubic: float) -> None:
+    lvdt, h = effect("lvdt_nonlinearity"), 1e-7
+    derivative = (lvdt.step(x + h, 0.048, amplitude, cubic) - lvdt.step(x - h, 0.048, amplitude, cubic)) / (2 * h)
+    assert lvdt.slope(x, 0.048, amplitude, cubic) == pytest.approx(derivative, abs=1e-6)
+
+
+def test_the_ends_of_the_stroke_are_no_part_of_the_bend() -> None:
+    """At both ends the reading has two slopes; that beyond the stroke, where the piston strikes its stop, is given."""
+    assert [effect("lvdt_nonlinearity").slope(x, 0.048, 0.0, 1e-3) for x in (0.0, 0.048)] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(("v", "limit"), each((*V, 0.9, 3.0), (0.005, 0.05, 0.9, 1.0)))
+def test_a_passage_with_a_corner_lets_no_more_through(v: float, limit: float) -> None:
+    assert effect("valve_flow_saturation").corner(v, limit) == (v if limit >= 1 else np.clip(v, -limit, limit))
 
 
 def test_magnetic_hysteresis_is_four_plays_side_by_side() -> None:
