@@ -31,7 +31,7 @@ test: lint  ## lint, types, and every test but the slow ones
 	@$(SAY) 'pytest'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not slow and not socketcan'
+	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
 	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
 
 test-all: lint  ## lint, types, and every test, with the slow campaigns

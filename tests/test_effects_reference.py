@@ -122,7 +122,9 @@ def test_an_effect_is_its_equation(name: str) -> None:
         assert np.allclose(effect(name).step(*row), equation(*row), rtol=1e-9, atol=1e-15), row
 
 
-@pytest.mark.parametrize(("x", "amplitude", "cubic"), each((-0.001, 0.0007, 0.011, 0.024, 0.04, 0.05), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3)))
+@pytest.mark.parametrize(
+    ("x", "amplitude", "cubic"), each((-0.001, 0.0007, 0.011, 0.024, 0.04, 0.05), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3))
+)
 def test_the_slope_of_the_reading_is_its_derivative(x: float, amplitude: float, cubic: float) -> None:
     lvdt, h = effect("lvdt_nonlinearity"), 1e-7
     derivative = (lvdt.step(x + h, 0.048, amplitude, cubic) - lvdt.step(x - h, 0.048, amplitude, cubic)) / (2 * h)

@@ -132,7 +132,8 @@ def test_a_name_that_another_stage_sees_too_stays():
 
 @SIDES
 def test_two_stages_may_differ_by_half_of_a_size(times, beyond):
-    d = answers(reading("actuator", ("lvdt_bias",), 1.0), reading("linkage", ("lvdt_bias",), 1.0 + 0.5 * times + (0.01 if beyond else -0.01)))
+    there = 1.0 + 0.5 * times + (0.01 if beyond else -0.01)
+    d = answers(reading("actuator", ("lvdt_bias",), 1.0), reading("linkage", ("lvdt_bias",), there))
     assert d["actuator"].verdict == ("unknown" if beyond else "missing")
 
 
