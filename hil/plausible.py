@@ -195,7 +195,17 @@ def out_of_order(t: np.ndarray, slack: float = 0.0) -> np.ndarray | None:
 
 
 def _rising(t: np.ndarray) -> np.ndarray:
-    """A longest part of ``t`` that never falls, as bool[n] (patience sorting)."""
+    """A longest part of ``t`` that never falls, as bool[n]; of equally long ones one whose first and last rows lie near the others."""
+    keep, back = _longest(t), _longest(-t[::-1])[::-1]  # the first chooses well at the end, the second at the start
+    alike = np.flatnonzero(keep & back & (np.cumsum(keep) == np.cumsum(back)))
+    if alike.size:
+        middle = alike[alike.size // 2]
+        keep[:middle] = back[:middle]
+    return keep
+
+
+def _longest(t: np.ndarray) -> np.ndarray:
+    """A longest part of ``t`` that never falls, as bool[n]: the one that ends lowest (patience sorting)."""
     tails: list[float] = []
     rows: list[int] = []
     before = np.empty(t.size, np.int64)

@@ -294,19 +294,34 @@ def name_of(form: str) -> str:
     return form if form.startswith("bus") else f"a{form}"
 
 
-def well_read(file: Path, t: np.ndarray, wrong: list[int]) -> Log:
-    """The log without the rows ``wrong``, with a note that says so; its time still runs as ``t``."""
+def well_read(file: Path, t: np.ndarray, wrong: list[int], beyond: float = 0.0) -> Log:
+    """The log without the rows ``wrong``, with a note that says so; its time still runs as ``t``.
+
+    beyond  s, by how much wrong stamps of the first and last rows lie outside as if there were a gap, so that nobody can tell
+    """
     log = read_log(file)
     check(log)
     c = log.channels["n_dem"]
     right = np.setdiff1d(np.arange(t.size), wrong)
     assert c.t.size >= right.size - 2 * len(wrong), log.notes
-    assert c.t[-1] - c.t[0] < t.max() - t.min() + 1.0
+    assert c.t[-1] - c.t[0] < t.max() - t.min() + beyond + 1.0
     rows = np.rint((c.values - 60.0) * 0.1 * (t.size - 1)).astype(int)  # which row each value was
     late = c.t - t[rows]
     # a wrong stamp that is in order by chance cannot be told; all others keep their place
     assert np.count_nonzero(np.abs(late - np.median(late)) > 0.005) <= 2 * len(wrong)
     return log
+
+
+@pytest.mark.parametrize("wrong", [[1], [198], [1, 198], [2], [2, 3, 195, 196]])
+@pytest.mark.parametrize("form", [".csv", ".log"])
+def test_of_two_stamps_at_an_end_the_one_that_fits_the_others_is_kept(tmp_path: Path, form: str, wrong: list[int]) -> None:
+    t = 5.0 + np.arange(200) * 0.01
+    stamps = t.copy()
+    for k in wrong:
+        stamps[k] = 0.0 if k < 100 else 12.5
+    write_stamped(tmp_path / f"a{form}", stamps)
+    log = well_read(tmp_path / f"a{form}", t, wrong)
+    assert log.channels["n_dem"].t.size == 200 - len(wrong) and any(n.startswith("time") for n in log.notes)
 
 
 @given(st.data())
@@ -321,8 +336,10 @@ def test_wrong_time_stamps_anywhere_are_left_out(tmp_path: Path, draw: st.DataOb
     for k in wrong:
         stamps[k] = draw.draw(st.sampled_from([0.0, 1e9, 1e6, 9e4, start + 1e5, _T0 + 12.5]))
     write_stamped(tmp_path / f"a{form}", stamps)
-    log = well_read(tmp_path / f"a{form}", t, wrong)
-    visible = [k for k in wrong if abs(stamps[k] - t[k]) > 0.1]
+    before = {k: t[0] - stamps[k] for k in wrong if set(range(k)) <= set(wrong) and 0.0 < t[0] - stamps[k] <= plausible.JUMP}
+    after = {k: stamps[k] - t[-1] for k in wrong if set(range(k, n)) <= set(wrong) and 0.0 < stamps[k] - t[-1] <= plausible.JUMP}
+    log = well_read(tmp_path / f"a{form}", t, wrong, max(before.values(), default=0.0) + max(after.values(), default=0.0))
+    visible = [k for k in wrong if abs(stamps[k] - t[k]) > 0.1 and k not in before | after]
     assert not visible or any(n.startswith("time") for n in log.notes)
 
 
