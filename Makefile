@@ -24,7 +24,7 @@ help:  ## list the targets
 	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
 
 demo: $(READY)  ## replay a recorded engine run and the long engine test; writes demo/*.html
-	@$(PY) -m app.demo
+	@$(PY) -m vaneloop.cli.demo
 
 test: lint  ## lint, types, and every test but the slow ones
 	@$(need_chromium)

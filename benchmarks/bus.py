@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-import tables
 from benchmarks.measure import Row
 from benchmarks.ours import profile
+from vaneloop.base import tables
 
 __all__ = ["MEASUREMENTS"]
 
@@ -24,7 +24,7 @@ SAMPLE = 50_000  # frames that cantools decodes at a time
 
 def lockstep_with_frames() -> Iterator[Row]:
     """Controller, plant and ECU with every frame encoded, arbitrated bit by bit, decoded and checked, against the clock."""
-    from hil.lockstep_bus import run_lockstep
+    from hil.bus.lockstep_bus import run_lockstep
 
     run_lockstep(profile(1.0), seed=1)
     walls, cpu = [], []
@@ -46,8 +46,8 @@ def decoding() -> Iterator[Row]:
     import can
     import cantools
 
-    from hil import canlog
-    from hil.lockstep_bus import run_lockstep
+    from hil.bus.lockstep_bus import run_lockstep
+    from hil.logs import canlog
 
     run = run_lockstep(profile(FRAMES / 410 + 1.0), seed=1)
     rows = run.rows[:FRAMES]
@@ -121,7 +121,7 @@ def decoding() -> Iterator[Row]:
 
 def embedded_bus() -> Iterator[Row]:
     """The embedded bus between processes: time from one participant to another, and frames a second."""
-    from hil.bus import Port, open_bus
+    from hil.bus.port import Port, open_bus
 
     name = f"local:bench-{os.getpid()}"
     a, b = open_bus(name), open_bus(name)

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from discrepancy import fit as fitting
-from discrepancy.diagnose import Search, diagnose_stage
-from discrepancy.fit import DIFFERENCE, Fit, Judge
-from discrepancy.stage import Stage
+from vaneloop.discrepancy import fit as fitting
+from vaneloop.discrepancy.diagnose import Search, diagnose_stage
+from vaneloop.discrepancy.fit import DIFFERENCE, Fit, Judge
+from vaneloop.discrepancy.stage import Stage
 
 __all__ = ["in_scipy", "ours"]
 

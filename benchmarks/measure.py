@@ -24,7 +24,7 @@ from typing import Protocol
 import numpy as np
 
 from benchmarks.ours import COLUMNS, OurLoop, Setup, profile
-from hil.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep
 
 __all__ = ["MEASUREMENTS", "Row", "machine"]
 
@@ -115,8 +115,8 @@ def against_c() -> Iterator[Row]:
     bits = "every logged signal the same bits" if same else "THE SIGNALS DIFFER"
     yield Row("same, -ffp-contract=off", ours, _speed(LONG, best["bitwise"]), best["ours"] / best["bitwise"], "same bits", same, bits)
     for hashed, what, note in (
-        (False, "hil.lockstep, no hash", "wall clock"),
-        (True, "hil.lockstep, every tick hashed", "wall clock; the hash takes as long as the loop, beside it where a core is free"),
+        (False, "hil.loop.lockstep, no hash", "wall clock"),
+        (True, "hil.loop.lockstep, every tick hashed", "wall clock; the hash takes as long as the loop, beside it where a core is free"),
     ):
         wall = min(lockstep(setup.stimulus, hashed=hashed).wall_s for _ in range(5))
         yield Row(what, _speed(LONG, wall), note=note)
@@ -125,7 +125,7 @@ def against_c() -> Iterator[Row]:
 def interpreted() -> Iterator[Row]:
     """The same source without compilation, and whether it gives the same bits."""
     code = (
-        "from benchmarks.ours import profile; from hil.lockstep import Stimulus, lockstep;"
+        "from benchmarks.ours import profile; from hil.loop.lockstep import Stimulus, lockstep;"
         "r = lockstep(Stimulus.of(profile(2.5)[200:]), seed=1, duration=0.5); print(r.wall_s, r.state_hash)"
     )
     answers = []
@@ -192,7 +192,7 @@ def against_pathsim() -> Iterator[Row]:
 
 def _vaneloop() -> list[str]:
     script = Path(sys.executable).with_name("vaneloop")
-    return [str(script)] if script.exists() else [sys.executable, "-m", "app.main"]
+    return [str(script)] if script.exists() else [sys.executable, "-m", "vaneloop.cli.main"]
 
 
 def _wall(command: list[str], env: dict[str, str] | None = None) -> tuple[float, str]:
@@ -215,7 +215,8 @@ def command_start() -> Iterator[Row]:
 
 
 def _write_run(path: Path, seconds: float) -> None:
-    from hil.logs import UNITS, Channel, write_log
+    from hil.logs import Channel, write_log
+    from vaneloop.base.signals import UNITS
 
     run = lockstep(Stimulus.of(profile(seconds)), seed=1, hashed=False)
     write_log(path, {name: Channel(run.t, v) for name, v in run.columns.items() if name in UNITS})
@@ -251,9 +252,9 @@ def long_replay() -> Iterator[Row]:
 def against_least_squares() -> Iterator[Row]:
     """The search of a stage against scipy's least squares, one fit after the other, on the example log."""
     from benchmarks.in_scipy import in_scipy, ours
-    from discrepancy.adapter import build_chain
-    from discrepancy.workflow import diagnose
     from hil.logs import read_log
+    from vaneloop.discrepancy.models.vanes import build_chain
+    from vaneloop.discrepancy.workflow import diagnose
 
     chain = build_chain(read_log(ROOT / "examples" / "hidden_effect.parquet", require=()))
     stage = chain.stage("actuator")

@@ -8,8 +8,8 @@ import numpy as np
 
 from controller import Calibration, load_calibration
 from controller.firmware import FAULT_BITS
-from hil.lockstep import COLUMNS, WARM_UP, Stimulus, advance
-from hil.tick import new_loop
+from hil.loop.lockstep import COLUMNS, WARM_UP, Stimulus, advance
+from hil.loop.tick import new_loop
 from plant import Plant, build_plant
 
 __all__ = ["COLUMNS", "OurLoop", "Setup", "profile", "troubled"]
@@ -45,7 +45,7 @@ class Setup:
 
 
 class OurLoop:
-    """One closed loop of the product: `hil.lockstep` without its hash."""
+    """One closed loop of the product: `hil.loop.lockstep` without its hash."""
 
     def __init__(self, setup: Setup):
         self._setup = s = setup

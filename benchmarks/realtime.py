@@ -1,6 +1,6 @@
 """How late a tick of 1 ms begins: the product's whole tick with CAN against the plainest C loop (`realtime.c`), turn by turn in one run.
 
-Ours: controller and plant on the embedded bus, an ECU in a process of its own sends to it; what is measured is `hil.realtime.run_realtime`
+Ours: controller and plant on the embedded bus, an ECU in a process of its own sends to it; what is measured is `hil.loop.realtime.run_realtime`
 as ``vaneloop run`` calls it. C: ``clock_nanosleep`` to absolute deadlines, nothing else. Both stay on the first processor with the same
 scheduler, memory locked, timer slack 1 ns. The other processor is left alone (but for the ECU), or a busy loop runs on it.
 """
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from hil.realtime import Lateness
+    from hil.loop.realtime import Lateness
 
 __all__ = ["compare", "conditions", "total"]
 
@@ -59,7 +59,7 @@ class Turns:
 
 def total(turns: list[Lateness]) -> Lateness:
     """Return all turns as one."""
-    from hil.realtime import Lateness
+    from hil.loop.realtime import Lateness
 
     out = Lateness()
     for h in turns:
@@ -70,10 +70,10 @@ def total(turns: list[Lateness]) -> Lateness:
 
 def compare(priority: int, loaded: bool) -> Turns:
     """Measure, C and ours in turn."""
-    from hil.bus import Port, open_bus
-    from hil.frames import ECU_DEMAND, IDENT_MASK
-    from hil.node import Node
-    from hil.realtime import Lateness, run_realtime, undisturbed
+    from hil.bus.frames import ECU_DEMAND, IDENT_MASK
+    from hil.bus.port import Port, open_bus
+    from hil.loop.node import Node
+    from hil.loop.realtime import Lateness, run_realtime, undisturbed
 
     cpus = sorted(os.sched_getaffinity(0))
     ours_on, others_on = cpus[0], cpus[-1]
@@ -86,7 +86,7 @@ def compare(priority: int, loaded: bool) -> Turns:
         subprocess.run(["gcc", "-O2", "-o", str(program), str(source)], check=True, capture_output=True, text=True)
         bus = open_bus(name)
         stack.callback(bus.shutdown)
-        ecu = [sys.executable, "-m", "app.main", "ecu", "--bus", name, "--profile", "idle", "--duration", "1e6", "--timeout", "1e6"]
+        ecu = [sys.executable, "-m", "vaneloop.cli.main", "ecu", "--bus", name, "--profile", "idle", "--duration", "1e6", "--timeout", "1e6"]
         ecu += ["--wait", "1e6", "--quiet", "--cpu", str(others_on), "--spin-us", "0"]
         if priority:
             ecu += ["--realtime-priority", str(priority)]

@@ -65,7 +65,7 @@ def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
     chromium = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
     if chromium is None:
         raise RuntimeError("no chromium on this machine")
-    words = [sys.executable, "-m", "app.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder)]
+    words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder)]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert server.stdout is not None

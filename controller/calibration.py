@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import model_validator
 
 from controller import firmware
-from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
 
 __all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_inputs", "new_state"]
 

@@ -5,7 +5,7 @@ Data: DATA_EMPS.mat to fit, DATA_EMPS_PULSES.mat to test, from nonlinearbenchmar
     vaneloop diagnose DATA_EMPS.mat --test DATA_EMPS_PULSES.mat --system examples/emps.py --report emps.html
 """
 
-from discrepancy import System, unknown
+from vaneloop import System, unknown
 
 
 def force(u, p):

@@ -5,7 +5,7 @@ Data: ARTS-Laboratory, Dataset-Friction-Damper-with-Backlash (GitHub), the JSON 
     vaneloop diagnose *0.5Hz*.json --test *1Hz*.json --test *Kocaeli*.json --system examples/friction_damper.py --report damper.html
 """
 
-from discrepancy import System, unknown
+from vaneloop import System, unknown
 
 
 def force(u, p):

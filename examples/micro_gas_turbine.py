@@ -6,7 +6,7 @@ Data: UCI Machine Learning Repository, dataset 994, ex_1.csv to ex_24.csv.
         --system examples/micro_gas_turbine.py --report turbine.html
 """
 
-from discrepancy import System, unknown
+from vaneloop import System, unknown
 
 
 def power(u, p):

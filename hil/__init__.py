@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.logs import Channel, Log, LogError, read_log, write_log
+    from hil.loop.lockstep import Run, Stimulus
+    from hil.replay import ReplayResult
 
 _HOME = {
     "Channel": "hil.logs",
@@ -11,8 +16,8 @@ _HOME = {
     "LogError": "hil.logs",
     "read_log": "hil.logs",
     "write_log": "hil.logs",
-    "Run": "hil.lockstep",
-    "Stimulus": "hil.lockstep",
+    "Run": "hil.loop.lockstep",
+    "Stimulus": "hil.loop.lockstep",
     "ReplayResult": "hil.replay",
 }
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tables import InputError
+from vaneloop.base.errors import InputError
 
 __all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution"]
 
 Array = NDArray[np.float64]
 
-AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; discrepancy.locate has the same number
+AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; vaneloop.discrepancy.locate has the same number
 DESIGN_POINT = (99.0, 100.0)  # % of design speed, open interval: the range of the third figure of the paper's Table 5
 
 WINDOW_S = 1.0  # s; long against sensor lags (milliseconds), short against a dwell of an engine run (several seconds)

@@ -18,7 +18,7 @@ from numba import njit
 __all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached"]
 
 KEPT = 6
-_PACKAGES = ("controller", "plant", "hil", "discrepancy")
+_PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
 
 
 def _digest() -> str:

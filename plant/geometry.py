@@ -37,7 +37,8 @@ from plant.linkage import (
     stage_vane_angle,
     vane_angle_table,
 )
-from tables import Axis, Bound, Bounded, InputError, Quantity, Table, read
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
 
 __all__ = [
     "STANDS_FOR",

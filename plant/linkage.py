@@ -31,7 +31,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tables import InputError
+from vaneloop.base.errors import InputError
 
 __all__ = [
     "G_AX",

@@ -31,7 +31,8 @@ from plant.layout import PLAY
 from plant.linkage import STAGES
 from plant.machine import Plant, build_plant
 from plant.parameters import PlantTable, derive, nominal
-from tables import Bound, Finite, InputError, Table, read
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Bound, Finite, Table, read
 
 __all__ = ["Model", "load_model", "write_model"]
 

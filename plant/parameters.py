@@ -40,7 +40,7 @@ from plant.layout import (
 from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
-from tables import Bound, Bounded, Quantity, Table, read
+from vaneloop.base.tables import Bound, Bounded, Quantity, Table, read
 
 __all__ = [
     "ACCELERATION",

@@ -9,7 +9,7 @@ in space by Newton's method on its constraint equations, in the plane's x, y and
     L sin thl = Ld' tan theta5      z = L (1 - cos thl)            lever arms, equations (16) and (17)
 
 s2 and s5 are the places of crank and ring inside their clearance. With all of them zero this is the mechanism of the paper's multibody
-model; `app.multibody` solves the same joints with a general multibody library.
+model; `vaneloop.design.multibody` solves the same joints with a general multibody library.
 
 A ring hangs on two such chains, left and right, and each link takes one of its six freedoms: 6 (4 - 1) - 3 * 4 = 6 by equation (1), less
 two links' idle rotations, leaves 4. The second chain is taken for the first turned by 180 deg about the engine's axis, so that two equal
@@ -31,7 +31,7 @@ from scipy.optimize import brentq
 
 from plant.geometry import DEG, MM, Geometry
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, STAGES, crank, stage_ring_angle
-from tables import InputError
+from vaneloop.base.errors import InputError
 
 __all__ = [
     "Clearances",

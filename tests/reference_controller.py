@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-import tables
+from vaneloop.base import tables
 
 SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3, "deg": math.pi / 180.0, "deg/s": math.pi / 180.0}
 STEP = 0.01  # s, the slow part

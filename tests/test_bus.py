@@ -17,12 +17,12 @@ import can
 import numpy as np
 import pytest
 
-from hil import broker, frames
-from hil.bus import Port, open_bus
-from hil.lockstep_bus import Channel, LockstepBus
-from hil.node import Ecu, Node
-from tables import InputError
+from hil.bus import broker, frames
+from hil.bus.lockstep_bus import Channel, LockstepBus
+from hil.bus.port import Port, open_bus
+from hil.loop.node import Ecu, Node
 from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
 
 Join = Callable[..., can.BusABC]
 PATIENCE = 120.0  # s for what must come: a busy machine takes its time, and nothing here judges it
@@ -305,7 +305,7 @@ class TestLocal(BusTests):
 
     def test_a_killed_participant_leaves_the_others_undisturbed(self, join: Join, name: str) -> None:
         a, b = join(), join()
-        code = f"from hil.bus import open_bus; b = open_bus('local:{name}'); print('in', flush=True); b.recv(60)"
+        code = f"from hil.bus.port import open_bus; b = open_bus('local:{name}'); print('in', flush=True); b.recv(60)"
         other = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE)
         assert other.stdout is not None and other.stdout.readline() == b"in\n"
         other.kill()
@@ -317,7 +317,7 @@ class TestLocal(BusTests):
 
     def test_two_that_start_at_once_are_on_one_bus(self, name: str) -> None:
         code = (
-            f"from hil.bus import open_bus; import can, time; b = open_bus('local:{name}'); end = time.monotonic() + 120; heard = None\n"
+            f"from hil.bus.port import open_bus; import can, time; b = open_bus('local:{name}'); end = time.monotonic() + 120; heard = None\n"
             "while heard is None and time.monotonic() < end:\n"
             "    b.send(can.Message(arbitration_id=5, is_extended_id=False)); heard = b.recv(0.05)\n"
             "b.send(can.Message(arbitration_id=5, is_extended_id=False)); print(heard is not None)"

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.in_c import BITWISE, FAST, CLoop
 from benchmarks.ours import COLUMNS, OurLoop, Setup, profile, troubled
 from controller import MODES, load_calibration
-from hil.lockstep import Stimulus
+from hil.loop.lockstep import Stimulus
 
 SECONDS = 130.0
 

@@ -929,7 +929,7 @@ def test_a_million_ticks_of_insane_inputs_break_no_invariant_and_leave_no_state_
 def test_any_calibration_of_the_compensation_keeps_the_invariants_under_insane_inputs(seed):
     """Observer, crossing and learning with values anywhere within their bounds, ends included."""
     from controller.calibration import Adaptive, AngleTable, Inverse, Observer
-    from tables import Bound
+    from vaneloop.base.tables import Bound
 
     rng, scalars = np.random.default_rng(seed), ADAPTIVE.k.copy()
     for model in (Observer, Inverse, Adaptive, AngleTable):

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy.adapter import build_chain
-from discrepancy.diagnose import Search, StageDiagnosis
-from discrepancy.fit import Judge
-from discrepancy.workflow import diagnose
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
+from vaneloop.discrepancy.diagnose import Search, StageDiagnosis
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.discrepancy.workflow import diagnose
 
 
 def said(seed: int, effect: str, parameters: Mapping[str, float], stage: str) -> StageDiagnosis:

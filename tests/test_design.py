@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app import design as d
-from app import trend_filter as tf
-from tables import InputError
+from vaneloop.base.errors import InputError
+from vaneloop.design import servo as d
+from vaneloop.design import trend as tf
+from vaneloop.pages.design import design_page
 
 PLANT = d.ServoPlant()
 GAINS = d.Gains(16.0, 100.0, 0.2667)
@@ -252,7 +253,8 @@ def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: d.Des
 
 
 def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -> None:
-    result, code = d.evaluate(report=tmp_path / "design.html")
+    result, code = d.evaluate()
+    design_page(result, tmp_path / "design.html")
     assert code == 0 and result.ok
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["nominal"]["gain_margin_db"] > 8.0
     assert (tmp_path / "design.html").stat().st_size > 100_000
@@ -263,7 +265,8 @@ def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -
 
 
 def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
-    result, code = d.evaluate(kp=200.0, report=tmp_path / "unstable.html")
+    result, code = d.evaluate(kp=200.0)
+    design_page(result, tmp_path / "unstable.html")
     assert code == 1 and "stable" in result.checks[0].name
     json.dumps(result.to_dict(), allow_nan=False)
     assert d.summary(result)
@@ -311,7 +314,7 @@ def test_the_firmwares_filter_estimates_what_filterpy_estimates() -> None:
 
 def test_the_calibration_holds_the_recommended_values() -> None:
     from controller.calibration import CalibrationTable
-    from tables import read
+    from vaneloop.base.tables import read
 
     k = read("calibration.toml", CalibrationTable).trend
     assert k.trend_alpha.value == pytest.approx(TREND.alpha, rel=2e-3)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy.adapter import build_chain
-from discrepancy.diagnose import diagnose_stage
-from discrepancy.fit import Judge
-from discrepancy.stage import Effect, Parameter, Stage
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
+from vaneloop.discrepancy.diagnose import diagnose_stage
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 
 NOISE = 0.03
 PHASES = (-180, -159, -90, -20, 45, 120)

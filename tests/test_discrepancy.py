@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy import Effect, Parameter, Stage, StageError
-from discrepancy.diagnose import Found, StageDiagnosis, diagnose_stage
-from discrepancy.fit import Judge
-from discrepancy.locate import locate, onset, regimes, shape
-from discrepancy.stage import noise_of, reach_of
-from discrepancy.workflow import compare_stages, diagnose, diagnosis_json, extend_stage, locate_stages
-from hil.cli import plain
+from vaneloop.base.terminal import plain
+from vaneloop.discrepancy import Effect, Parameter, Stage, StageError
+from vaneloop.discrepancy.diagnose import Found, StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.locate import locate, onset, regimes, shape
+from vaneloop.discrepancy.stage import noise_of, reach_of
+from vaneloop.discrepancy.workflow import compare_stages, diagnose, diagnosis_json, extend_stage, locate_stages
 
 DT = 0.01  # s
 N = 10_000  # samples: 100 s
@@ -515,9 +515,9 @@ def test_a_stage_that_cannot_be_used_says_why(make: Callable[[], object], says: 
 
 def in_pieces(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> tuple[Stage, list[int]]:
     """A stage that is searched on a third of its samples, and a list that notes how many the search saw."""
-    monkeypatch.setattr("discrepancy.diagnose.LONG", N)
-    monkeypatch.setattr("discrepancy.diagnose.SEARCHED", N // 3)
-    monkeypatch.setattr("discrepancy.diagnose.PIECE", 400)
+    monkeypatch.setattr("vaneloop.discrepancy.diagnose.LONG", N)
+    monkeypatch.setattr("vaneloop.discrepancy.diagnose.SEARCHED", N // 3)
+    monkeypatch.setattr("vaneloop.discrepancy.diagnose.PIECE", 400)
     seen: list[int] = []
 
     def excerpt(at: np.ndarray) -> Stage:

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.main import COMMANDS, main
-from hil import cli
 from hil.logs import Channel, read_log, write_log
 from tests.conftest import ROOT
+from vaneloop.base import terminal
+from vaneloop.cli.main import COMMANDS, main
 
 PAGES = ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
 EXAMPLE = "examples/hidden_effect.parquet"
@@ -81,7 +81,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop ecu --model": "names the option, not a run",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
     "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",
-    "# tables/__init__.py": "signatures, not a program",
+    "# vaneloop/base/errors.py": "signatures, not a program",
 }
 
 # the beginning of a step that takes long -> the quick test that covers what it does
@@ -192,7 +192,7 @@ def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(page: str, 
         if s.kind == "command" and s.text.startswith("vaneloop ") and s.listed(NOT_RUN):
             name, *words = shlex.split(s.text)[1:]
             module = importlib.import_module(COMMANDS[name][0])
-            parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+            parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
             module.add_options(parser)
             for option in (w.split("=")[0] for w in words if w.startswith("--")):
                 assert option in parser.format_help(), f"{page}:{s.line}: {s.text}: {option}"
@@ -232,7 +232,7 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
     if page == "docs/your_own_model.md" and not (folder / "tank.csv").is_file():
         run_command("python make_logs.py")
     if page == "docs/your_own_model.md" and "record = " in text:
-        from discrepancy import Record
+        from vaneloop.discrepancy import Record
 
         data = {n: np.loadtxt(folder / f"{n}.csv", delimiter=",", skiprows=1).T for n in ("tank", "other")}
         t, pump, level = data["tank"]

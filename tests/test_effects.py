@@ -16,8 +16,8 @@ from scipy.optimize import brentq
 
 from controller import firmware as fw
 from controller import load_calibration, new_state
-from hil.lockstep import Stimulus, lockstep
-from hil.tick import flashed
+from hil.loop.lockstep import Stimulus, lockstep
+from hil.loop.tick import flashed
 from plant import Model, build_plant, chain, load_model, stages, write_model
 from plant import effects as library
 from plant.effect import DEG, STAGES
@@ -69,8 +69,8 @@ from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
 from plant.series import arctangent, tangent
 from plant.stages import SOME, W, actuator_run, engine_run, linkage_run, step_currents
-from tables import InputError
 from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
 
 NAMES = tuple(EFFECTS)
 # the library that docs and other people's tools count on
@@ -484,7 +484,7 @@ def test_stages_alone_reproduce_the_closed_loop_that_made_the_log() -> None:
 
 SHORT = """
 import numpy as np
-from hil.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep
 from tests.test_effects import everything_on
 print(lockstep(Stimulus.of(np.linspace(60.0, 63.0, 30)), seed=5, plant=everything_on()).state_hash)
 """

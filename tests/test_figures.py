@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from hil.figures import SignalError, error_figures, noise_floor, resolution
-from tables import InputError
+from vaneloop.base.errors import InputError
 
 
 def raster(duration=300.0, rate=100.0):

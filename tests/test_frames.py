@@ -13,14 +13,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-import tables
 from controller import load_calibration
-from hil import frames
-from hil.frames import ECU_DEMAND, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
-from hil.lockstep import COLUMNS, Stimulus, advance
-from hil.node import Ecu, Node, replay
-from hil.tick import new_loop
+from hil.bus import frames
+from hil.bus.frames import ECU_DEMAND, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
+from hil.loop.lockstep import COLUMNS, Stimulus, advance
+from hil.loop.node import Ecu, Node, replay
+from hil.loop.tick import new_loop
 from plant import build_plant
+from vaneloop.base import tables
 
 NONE = np.zeros((0, 2), np.int64)
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.main import main
 from controller.firmware import FAIL_SAFE, INIT, RUN, STANDBY
-from hil import fuzz
-from hil.frames import ERROR, REMOTE
-from hil.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
+from hil.bus.frames import ERROR, REMOTE
+from hil.inject import fuzz
+from hil.inject.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
 from tests.conftest import ROOT
+from vaneloop.cli.main import main
 
 
 def held(campaign: Campaign, frames: int) -> None:
@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_campaign_and_another_another() -> None:
 
 def test_attacks_are_what_they_are_said_to_be() -> None:
     """Each kind is judged as its description says, as far as it says something."""
-    from hil import frames
+    from hil.bus import frames
 
     rng = np.random.default_rng(5)
     rows, kinds = [], []
@@ -71,7 +71,7 @@ def test_attacks_are_what_they_are_said_to_be() -> None:
 
 
 SCRIPT = (
-    "from hil.fuzz import fuzz; c = fuzz({frames}, seed=21); print(c.failure, c.verdicts, c.transitions.tolist(), c.longest_recovery_s)"
+    "from hil.inject.fuzz import fuzz; c = fuzz({frames}, seed=21); print(c.failure, c.verdicts, c.transitions.tolist(), c.longest_recovery_s)"
 )
 
 
@@ -171,7 +171,7 @@ def test_a_broken_controller_is_caught_and_its_shrunk_log_replays(right: str, wr
 
     def broken(*options: str) -> subprocess.CompletedProcess[str]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
-        command = [sys.executable, "-m", "app.main", "fuzz", *options]
+        command = [sys.executable, "-m", "vaneloop.cli.main", "fuzz", *options]
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
 
     found = broken("--frames", "100000", "--json", "answer.json", "--out", "failure.log")

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from app.main import COMMANDS
-from hil import cli
 from tests.conftest import ROOT
+from vaneloop.base import terminal
+from vaneloop.cli.main import COMMANDS
 
 _FILE = re.compile(r"[\w./-]+\.(?:log|asc|blf|trc|mf4|csv|parquet|toml|dbc|html|py|json)|[\w./-]+/")
 _MAKES = {"--out", "--record", "--report", "--json"}
 
 
-def parser_of(name: str) -> cli.Parser:
+def parser_of(name: str) -> terminal.Parser:
     module = importlib.import_module(COMMANDS[name][0])
-    parser = cli.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+    parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
     module.add_options(parser)
     return parser
 

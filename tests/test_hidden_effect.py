@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 
-from app.hidden_effect import _too_easy, draw_case, judge_case
 from tests.rig import load_geometry
+from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case
 
 N = 200
 

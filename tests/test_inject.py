@@ -14,16 +14,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from app.main import main
 from controller import load_calibration
 from controller.firmware import DEMAND_TIMEOUT, MODES
-from hil import canlog, frames, inject
-from hil.frames import ECU_DEMAND, VERDICTS, new_receiver, receive
+from hil import inject
+from hil.bus import frames
+from hil.bus.frames import ECU_DEMAND, VERDICTS, new_receiver, receive
 from hil.inject import Expect, Outcome, Scenario, Trace, judge
-from hil.scenario import OnFrame, library, load_scenario
-from hil.tamper import Gateway, Intruder
-from tables import InputError
+from hil.inject.scenario import OnFrame, library, load_scenario
+from hil.inject.tamper import Gateway, Intruder
+from hil.logs import canlog
 from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
+from vaneloop.cli.main import main
 
 # ---- the shipped scenarios ----------------------------------------------------------------------------------------------------------
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy import laws
-from discrepancy.laws import FORCE_LAWS, PARAMETERS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.discrepancy import laws
+from vaneloop.discrepancy.laws import FORCE_LAWS, PARAMETERS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 
 T = np.arange(0.0, 10.0, 0.01)
 U = 2.0 * np.sin(1.3 * T) + 0.4 * np.sin(9.0 * T)

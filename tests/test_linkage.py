@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 import plant.linkage as lk
 from plant.geometry import Geometry, load_geometry, load_schedules, stroke_for_vigv, vane_angles
 from plant.linkage import STAGES
-from tables import InputError, path
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path
 
 MM, DEG = 1e-3, math.pi / 180
 STROKES = np.linspace(0.0, 48e-3, 481)

@@ -10,13 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from app.engine_test import engine_test, load_profile
-from hil.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep
 from tests.conftest import ROOT
+from vaneloop.cli.engine_test import engine_test, load_profile
 
 SHORT = """
 import numpy as np
-from hil.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep
 n = np.interp(np.arange(0.0, {seconds}, 0.01), [0, 0.5, 1.0, 1.5, 2.0], [60, 62, 70, 66, 60])
 print(lockstep(Stimulus.of(n), seed=5).state_hash)
 """

@@ -7,11 +7,11 @@ import functools
 import numpy as np
 import pytest
 
-from discrepancy.adapter import SETTLE, Chain, build_chain
-from discrepancy.workflow import diagnose
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
+from vaneloop.discrepancy.models.vanes import SETTLE, Chain, build_chain
+from vaneloop.discrepancy.workflow import diagnose
 
 DURATION = 120.0  # s
 FREE_RUNNING = ("demand", "servo", "engine")

@@ -15,10 +15,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import tables
-from hil import canlog, logs
-from hil.canlog import Frames, Message
-from hil.logs import UNITS, Channel, Log, LogError, read_log, write_log
+from hil.logs import Channel, Log, LogError, canlog, read_log, write_log
+from hil.logs import log as logs
+from hil.logs.canlog import Frames, Message
+from vaneloop.base import tables
+from vaneloop.base.signals import UNITS
 
 DBC = tables.path("vgv.dbc")
 DATA = Path(os.environ.get("VANELOOP_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -230,7 +231,7 @@ def test_a_multiplexed_signal_is_read_where_its_selector_says_so(tmp_path: Path)
 
 def test_every_format_has_a_test() -> None:
     assert set(logs._FORMATS) == {*TABLES, *BUSES, ".mf4"}
-    assert sorted(logs.__all__) == ["Channel", "Log", "LogError", "UNITS", "offered", "read_log", "write_log"]
+    assert sorted(logs.__all__) == ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
 
 
 @pytest.mark.parametrize("suffix", [*TABLES, ".mf4"])

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-import hil.mdf
-import tables
-from hil import canlog, logs
-from hil.logs import LogError, read_log, write_log
+import hil.logs.mdf
+from hil.logs import LogError, canlog, read_log, write_log
+from hil.logs import log as logs
 from tests.test_logs import check, run
+from vaneloop.base import tables
 
 DBC = tables.path("vgv.dbc")
 QUICK = {".csv": 250, ".parquet": 250, ".log": 400, ".asc": 400, ".blf": 400, ".trc": 400, ".mf4": 150}
@@ -93,7 +93,7 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
     if not hasattr(os, "fork"):
         pytest.skip("needs fork")
     code = (
-        "import os, sys, signal\nimport asammdf\nfrom hil.mdf import answer\n"
+        "import os, sys, signal\nimport asammdf\nfrom hil.logs.mdf import answer\n"
         "for line in sys.stdin.buffer:\n"
         "    name, _, request = line.partition(b' ')\n"
         "    pid = os.fork()\n"
@@ -134,21 +134,21 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
 def test_no_damage_takes_the_reader_down(
     tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
     campaign(tmp_path, suffix, range(QUICK[suffix]))
 
 
 def test_no_damage_takes_the_reader_of_bus_mdf_down(
     tmp_path: Path, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
     campaign(tmp_path, ".mf4", range(1000, 1000 + QUICK[".mf4"]), DBC)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs._FORMATS))
 def test_long_campaign(tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hil.mdf, "_child", quick_child)
+    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
     campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
 
 
@@ -172,7 +172,7 @@ def test_a_damaged_mdf_ends_the_child_and_not_the_reader(tmp_path: Path) -> None
 
 def test_a_child_that_never_answers_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_log(tmp_path / "a.mf4", run(50))
-    monkeypatch.setattr(hil.mdf, "_TIME", (0.01, 1e12))
+    monkeypatch.setattr(hil.logs.mdf, "_TIME", (0.01, 1e12))
     with pytest.raises(LogError, match="damaged"):
         read_log(tmp_path / "a.mf4")
 

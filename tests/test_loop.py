@@ -9,16 +9,17 @@ import pytest
 
 from controller import load_calibration
 from controller.firmware import IN_N_DEM, IN_N_R
-from hil import frames, inject
-from hil.frames import ECU_DEMAND
+from hil.bus import frames
+from hil.bus.frames import ECU_DEMAND
+from hil.bus.lockstep_bus import run_lockstep
 from hil.inject import Machine, Scenario
-from hil.lockstep import COLUMNS, Stimulus, advance, lockstep
-from hil.lockstep_bus import run_lockstep
+from hil.inject import injection as inject
 from hil.logs import Channel, Log
-from hil.node import Ecu, Node
-from hil.node import replay as repeat
+from hil.loop.lockstep import COLUMNS, Stimulus, advance, lockstep
+from hil.loop.node import Ecu, Node
+from hil.loop.node import replay as repeat
+from hil.loop.tick import arrive, new_loop
 from hil.replay import replay
-from hil.tick import arrive, new_loop
 from plant import Model, Plant, build_plant
 from plant.effects import EFFECTS
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy import Effect, Parameter, Stage
-from discrepancy.diagnose import StageDiagnosis, diagnose_stage, with_rivals
-from discrepancy.fit import Judge
-from discrepancy.locate import shape
-from discrepancy.workflow import diagnose, diagnosis_json
 from tests.test_discrepancy import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
 from tests.test_search_limits import SIDES, verdict
+from vaneloop.discrepancy import Effect, Parameter, Stage
+from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage, with_rivals
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.locate import shape
+from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
 SMALL = Effect("null_bias", (replace(NULL_BIAS.parameters[0], low=-0.4, high=0.4),), ((-0.1,), (0.1,), (0.3,)), "any motion")
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app import extend
-from discrepancy import workflow
-from discrepancy.adapter import Chain
-from discrepancy.diagnose import Search
-from discrepancy.fit import Judge
-from discrepancy.stage import Effect, Parameter, Stage
-from discrepancy.workflow import extend_stage, no_better
+from vaneloop.cli import extend
+from vaneloop.discrepancy import workflow
+from vaneloop.discrepancy.diagnose import Search
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.vanes import Chain
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.discrepancy.workflow import extend_stage, no_better
 
 N = 1200
 

@@ -20,9 +20,9 @@ from controller.firmware import (
     RUN_REQUEST,
     X_DEM,
 )
-from hil import frames
-from hil.frames import ECU_DEMAND, ERROR, PAUSE, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
-from hil.node import Ecu, Node, replay
+from hil.bus import frames
+from hil.bus.frames import ECU_DEMAND, ERROR, PAUSE, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
+from hil.loop.node import Ecu, Node, replay
 from plant import chain
 
 NONE = np.zeros((0, 2), np.int64)

@@ -17,11 +17,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil import page as page_module
 from hil.figures import error_figures
-from hil.page import THEMES, Line, Page, Panel, bars, decimate, heat, histogram, loop, number, overlay, ranking, waterfall
-from hil.report import PAPER_TABLE_5, engine_test_report, replay_report
-from tables import InputError
+from vaneloop.base.errors import InputError
+from vaneloop.pages import page as page_module
+from vaneloop.pages.page import THEMES, Line, Page, Panel, bars, decimate, heat, histogram, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.replay import PAPER_TABLE_5, engine_test_report, replay_report
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'\u2028"
 

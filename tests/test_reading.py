@@ -18,16 +18,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import hil.mdf
-import tables
-from app.main import main
-from hil import canlog, cli, logs, plausible
-from hil.canlog import Frames
-from hil.ecu import read_profile
-from hil.logs import UNITS, Channel, Log, LogError, offered, read_log, write_log
-from tables import InputError, load_toml
+import hil.logs.mdf
+from hil.logs import Channel, Log, LogError, canlog, offered, plausible, read_log, write_log
+from hil.logs.canlog import Frames
+from hil.loop.ecu import read_profile
 from tests.conftest import ROOT
 from tests.test_logs import check, refused
+from vaneloop.base import tables, terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.signals import UNITS
+from vaneloop.base.tables import load_toml
+from vaneloop.cli import options
+from vaneloop.cli.main import main
 
 NONE = np.zeros(0)
 
@@ -204,19 +206,19 @@ def test_every_command_refuses_a_wrong_unit_with_the_same_line(
     assert complaint == f"vaneloop: {caught.value}"
     assert "n_dem (n_dem)" in complaint and "--unit n_dem=rpm --design-rpm R" in complaint
     # what the line proposes is an option of this very command, and reads the log
-    parser = cli.Parser(prog="vaneloop")
+    parser = terminal.Parser(prog="vaneloop")
     import importlib
 
-    from app.main import COMMANDS as TABLE
+    from vaneloop.cli.main import COMMANDS as TABLE
 
     importlib.import_module(TABLE[words[0]][0]).add_options(parser)
     args = parser.parse_args([*words[1:], "--unit", "n_dem=rpm", "--design-rpm", "30000"])
-    options = cli.log_options(args, getattr(args, "profile", None))
-    assert 59.0 < read_log(file, **options).channels["n_dem"].values.min() < 61.0
+    reading = options.log_options(args, getattr(args, "profile", None))
+    assert 59.0 < read_log(file, **reading).channels["n_dem"].values.min() < 61.0
 
 
 def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
-    from app.web import worker
+    from vaneloop.web import worker
 
     file = tmp_path / "rpm.csv"
     write_log(file, as_if(a_run(8.0), n_dem=lambda v: v * 300))
@@ -231,7 +233,7 @@ def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="n_dem"):
         worker.schedule_step(silent, "loop", ["--log", str(file)], str(tmp_path), "")
     words = ["--log", str(file), "--unit", "n_dem=rpm", "--design-rpm", "30000"]
-    from app.schedule import log_of
+    from vaneloop.cli.schedule import log_of
 
     assert log_of(worker.parsed("schedule", words)).channels["n_dem"].values.max() < 100.0
 
@@ -255,13 +257,13 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
         pl.DataFrame({"t": t, "n_dem": n_dem}).write_parquet(file)
         return
     if suffix == ".mf4" and not file.name.startswith("bus"):
-        hil.mdf.write_groups(file, [(t, {"n_dem": (n_dem, "%")})])
+        hil.logs.mdf.write_groups(file, [(t, {"n_dem": (n_dem, "%")})])
         return
     message = next(m for m in canlog.load_dbc(tables.path("vgv.dbc"))[0] if m.layout.name == "ECU_DEMAND")
     data = canlog.encode(message, {"n_dem": n_dem, "n_r": n_dem}, t.size)
     frames = Frames(t, np.full(t.size, message.ident, np.uint32), np.zeros(t.size, np.int32), np.full(t.size, 8, np.uint8), data)
     if suffix == ".mf4":
-        hil.mdf.write_bus(file, frames)
+        hil.logs.mdf.write_bus(file, frames)
     else:
         raw_writer(file, frames)
 
@@ -443,7 +445,7 @@ def test_a_profile_of_any_length_is_refused(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text("t = [0, 1e9]\nn_dem = [60, 90]\n")
     with pytest.raises(InputError, match="spans 1e"):
         read_profile(tmp_path / "p.toml")
-    from app.engine_test import load_profile
+    from vaneloop.cli.engine_test import load_profile
 
     text = tables.path("engine_test.toml").read_text()
     head, dwell = text.split("[dwell]")
@@ -459,7 +461,7 @@ def limited(words: list[str], memory: int) -> subprocess.CompletedProcess[str]:
     """Run a command of ours with so much address space, and no more."""
     code = (
         f"import resource, sys; resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}));"
-        f"sys.argv = ['vaneloop', *{words!r}]; from app.main import run; run()"
+        f"sys.argv = ['vaneloop', *{words!r}]; from vaneloop.cli.main import run; run()"
     )
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
 
@@ -490,7 +492,8 @@ def test_no_toml_takes_much_memory_or_time(tmp_path: Path, what: str) -> None:
     file = tmp_path / "m.toml"
     file.write_text(TOMLS[what])
     code = (
-        f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)); from tables import load_toml, InputError\n"
+        f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)); from vaneloop.base.errors import InputError\n"
+        "from vaneloop.base.tables import load_toml\n"
         f"try: load_toml({str(file)!r}); print('read')\nexcept InputError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
@@ -503,7 +506,7 @@ def test_every_command_that_reads_a_toml_bounds_it(tmp_path: Path, capsys: pytes
     file.write_text(TOMLS["a key of 50,000 parts"])
     log, system = str(ROOT / "examples" / "hidden_effect.parquet"), tmp_path / "s.py"
     system.write_text(
-        "from discrepancy import System\n"
+        "from vaneloop import System\n"
         "system = System('s', 'static', lambda u, x, p: u.n_dem, outputs={'n_r': '%'}, inputs={'n_dem': '%'})\n"
     )
     for words in (
@@ -516,7 +519,7 @@ def test_every_command_that_reads_a_toml_bounds_it(tmp_path: Path, capsys: pytes
 
 
 def test_shipped_tables_are_far_below_the_bounds() -> None:
-    for file in [*ROOT.rglob("tables/*.toml"), *ROOT.rglob("hil/scenarios/*.toml")]:
+    for file in [*ROOT.rglob("tables/*.toml"), *ROOT.rglob("hil/inject/scenarios/*.toml")]:
         load_toml(file)
         assert file.stat().st_size < tables.MOST_BYTES / 20
 
@@ -586,13 +589,13 @@ def test_an_mdf_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
 def test_a_name_mapped_to_two_signals_serves_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.csv"
     file.write_text("t,RPM,B\n" + "".join(f"{k * 0.01:.2f},{60 + k * 0.001},{k}\n" for k in range(100)))
-    parser = cli.Parser(prog="x")
-    cli.add_log_options(parser)
+    parser = terminal.Parser(prog="x")
+    options.add_log_options(parser)
     args = parser.parse_args([str(file), "--map", "RPM=n_dem", "--map", "RPM=n_r"])
-    log = read_log(file, **cli.log_options(args))
+    log = read_log(file, **options.log_options(args))
     assert np.array_equal(log.channels["n_dem"].values, log.channels["n_r"].values)
     args = parser.parse_args([str(file), "--map", "RPM=n_dem", "--map", "RPM=n_r", "--map", "RPM=vigv"])
-    assert set(read_log(file, **cli.log_options(args)).channels) == {"n_dem", "n_r", "vigv"}
+    assert set(read_log(file, **options.log_options(args)).channels) == {"n_dem", "n_r", "vigv"}
     assert main(["replay", str(file), "--map", "RPM=n_dem", "--map", "B=n_dem"]) == 2
     assert "'RPM' and 'B' are mapped to n_dem" in capsys.readouterr().err
     assert main(["replay", str(file), "--map", "n_dem=RPM", "--map", "n_dem=B"]) == 2
@@ -634,12 +637,12 @@ def test_compiling_is_told_before_it_is_done_whatever_the_format(tmp_path: Path,
     """With no compiled code at all: each part that takes seconds is told of before its compiled code is written."""
     write_stamped(tmp_path / f"a{form}", np.arange(100) * 0.01)
     code = (
-        "import sys, pathlib\nfrom hil import cli\nimport app.main\n"
+        "import sys, pathlib\nfrom vaneloop.base import terminal\nimport vaneloop.cli.main\n"
         f"cache = pathlib.Path({str(tmp_path / 'cache')!r})\n"
         "def say(args, text):\n"
         "    print(text, '|', *sorted({f.name.split('-')[0] for f in cache.rglob('*.nbi')}), flush=True)\n"
-        "cli.say = say\n"
-        f"sys.exit(app.main.main(['replay', {str(tmp_path / f'a{form}')!r}]))\n"
+        "terminal.say = say\n"
+        f"sys.exit(vaneloop.cli.main.main(['replay', {str(tmp_path / f'a{form}')!r}]))\n"
     )
     import os
 
@@ -658,4 +661,3 @@ def test_names_on_offer_are_those_of_any_log(tmp_path: Path) -> None:
     """A log whose units are wrong still says what it holds: the workbench's form needs it."""
     write_log(tmp_path / "rpm.csv", as_if(a_run(8.0), n_dem=lambda v: v * 300))
     assert "n_dem" in offered(tmp_path / "rpm.csv")
-    assert logs.UNITS is UNITS

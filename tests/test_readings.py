@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy.adapter import Chain, build_chain
-from discrepancy.diagnose import StageDiagnosis, diagnose_stage
-from discrepancy.fit import Judge
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
+from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.vanes import Chain, build_chain
 
 
 def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
@@ -112,8 +112,8 @@ def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> 
 
 def test_many_effects_that_leave_much_are_an_imitation() -> None:
     """Three effects that bring an error from 6 to 2 floors: enough of it for one effect, not for three."""
-    from discrepancy import diagnose as search
-    from discrepancy.fit import Judge
+    from vaneloop.discrepancy import diagnose as search
+    from vaneloop.discrepancy.fit import Judge
 
     stage = chain_of(recorded([], 37, 100, 60.0)).stage("engine")
     assert stage.floor is not None

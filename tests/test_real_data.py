@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from app.main import main
+from vaneloop.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 

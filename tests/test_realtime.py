@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.main import main
-from hil import frames
-from hil.bus import Port, open_bus
-from hil.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, read_profile
+from hil.bus import frames
+from hil.bus.port import Port, open_bus
 from hil.logs import read_log
-from hil.node import Ecu, Node, replay
-from hil.realtime import TICK_NS, Lateness, Stop, Ticker, run_realtime, stop_on_signals, undisturbed
-from hil.recorder import FRAME, read_record
-from tables import InputError
+from hil.logs.recorder import FRAME, read_record
+from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, read_profile
+from hil.loop.node import Ecu, Node, replay
+from hil.loop.realtime import TICK_NS, Lateness, Stop, Ticker, run_realtime, stop_on_signals, undisturbed
 from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
+from vaneloop.cli.main import main
 
-COMMAND = [sys.executable, "-m", "app.main"]
+COMMAND = [sys.executable, "-m", "vaneloop.cli.main"]
 _number = count()
 
 
@@ -100,7 +100,7 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         self.now = 10**12
-        monkeypatch.setattr("hil.realtime.time", SimpleNamespace(monotonic_ns=self.read))
+        monkeypatch.setattr("hil.loop.realtime.time", SimpleNamespace(monotonic_ns=self.read))
 
     def read(self) -> int:
         self.now += 100
@@ -250,7 +250,7 @@ class StandingClock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> StandingClock:
     made = StandingClock()
-    monkeypatch.setattr("hil.realtime.time", made)
+    monkeypatch.setattr("hil.loop.realtime.time", made)
     return made
 
 
@@ -398,7 +398,7 @@ def test_ctrl_c_while_a_command_is_still_loading_is_one_word(monkeypatch: pytest
     def interrupted(name: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("app.main.importlib.import_module", interrupted)
+    monkeypatch.setattr("vaneloop.cli.main.importlib.import_module", interrupted)
     assert main(["record", "x.log"]) == 130
     assert capsys.readouterr().err == "stopped\n"
 

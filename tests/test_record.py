@@ -16,16 +16,16 @@ import numpy as np
 import polars as pl
 import pytest
 
-from hil import canlog
-from hil.logs import read_log
-from hil.recorder import ERROR, EXTENDED, FD, FRAME, REMOTE, Recorder, RecorderProcess, read_record
-from tables import InputError, path
+from hil.logs import canlog, read_log
+from hil.logs.recorder import ERROR, EXTENDED, FD, FRAME, REMOTE, Recorder, RecorderProcess, read_record
 from tests.conftest import ROOT
 from tests.test_bus import broker_of
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path
 
 FORMATS = (".log", ".blf", ".mf4", ".parquet")
 START = 1_700_000_000 * 10**9  # ns
-COMMAND = [sys.executable, "-m", "app.main"]
+COMMAND = [sys.executable, "-m", "vaneloop.cli.main"]
 
 
 def waited(pid: int) -> float:
@@ -161,8 +161,8 @@ def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: 
     file = tmp_path / f"run{suffix}"
     code = f"""
         import resource
-        from hil.recorder import Recorder
-        from tables import InputError
+        from hil.logs.recorder import Recorder
+        from vaneloop.base.errors import InputError
         from tests.test_record import some_frames
         recorder, k = Recorder({str(file)!r}), 0
         resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
@@ -188,8 +188,8 @@ def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str
     code = f"""
         import sys
         from pathlib import Path
-        from hil import columns
-        from hil.recorder import Recorder
+        from hil.logs import columns
+        from hil.logs.recorder import Recorder
         loaded = lambda: {{*sys.modules, *((f, s) for f in ("cut", "wrong_crc") for s in map(str, getattr(columns, f).signatures))}}
         recorder = Recorder({str(tmp_path / f"run{suffix}")!r})
         before = loaded()
@@ -232,7 +232,7 @@ def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> N
     file = tmp_path / "run.mf4"
     code = f"""
         import os, signal
-        from hil.recorder import RecorderProcess
+        from hil.logs.recorder import RecorderProcess
         from tests.test_record import some_frames
         recorder = RecorderProcess({str(file)!r})
         for k in range(500):

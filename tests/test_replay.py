@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.main import main
-from hil.lockstep import Stimulus, lockstep
 from hil.logs import Channel, write_log
+from hil.loop.lockstep import Stimulus, lockstep
 from tests.conftest import ROOT
+from vaneloop.cli.main import main
 
 
-def vaneloop(*args: str | Path, module: str = "app.main", cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+def vaneloop(*args: str | Path, module: str = "vaneloop.cli.main", cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", module, *map(str, args)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from discrepancy.diagnose import StageDiagnosis, diagnose_stage
-from discrepancy.workflow import diagnose
 from tests.rig import Hidden
 from tests.test_readings import chain_of, recorded
+from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.workflow import diagnose
 
 
 def said(hidden: list[Hidden], seed: int, stage: str) -> StageDiagnosis:

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.main import main
-from discrepancy import locate as core
-from discrepancy.adapter import Chain, build_chain
-from discrepancy.diagnose import diagnose_stage
-from discrepancy.workflow import compare_stages, extend_stage, locate_stages
 from hil import figures
 from hil.logs import Channel, Log
 from tests.conftest import ROOT
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
+from vaneloop.cli.main import main
+from vaneloop.discrepancy import locate as core
+from vaneloop.discrepancy.diagnose import diagnose_stage
+from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.discrepancy.workflow import compare_stages, extend_stage, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
 SENSOR = {"actuator": 0.00505}  # mm, the rig's LVDT: noise of 5 um, its converter's step, what its valve has beyond the model's
@@ -81,7 +81,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         page, answer = folder / f"{verb}.html", folder / f"{verb}.json"
         main([verb, str(LOG), *more, "--json", str(answer), "--report", str(page), "--quiet"])
         out[verb], out[f"{verb} page"] = json.loads(answer.read_text()), page.read_text(encoding="utf-8")
-    from app.web import worker
+    from vaneloop.web import worker
 
     out["web"] = worker.compare(lambda *_: None, [str(LOG)])
     return out

@@ -9,16 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.engine_test import engine_test, load_profile
-from app.main import main
-from app.scheduling import LinkChange, MeasuredLoop, ScheduleOptions, geometry_with, measure_loop, schedule, table_speeds, write_tables
 from controller import load_calibration
 from hil.logs import Channel, Log, LogError, write_log
 from plant import Geometry, build_plant, load_geometry, load_schedules
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, STAGES, stage_ring_angle, vane_angle
-from tables import InputError, path
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, Manoeuvre, simulate
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path
+from vaneloop.cli.engine_test import engine_test, load_profile
+from vaneloop.cli.main import main
+from vaneloop.design.scheduling import (
+    LinkChange,
+    MeasuredLoop,
+    ScheduleOptions,
+    geometry_with,
+    measure_loop,
+    schedule,
+    table_speeds,
+    write_tables,
+)
 
 GEOMETRY = load_geometry()
 SCHEDULES = load_schedules()

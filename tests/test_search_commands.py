@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.main import main
 from hil.logs import Channel, read_log, write_log
+from vaneloop.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 LOG = ROOT / "examples" / "hidden_effect.parquet"
@@ -36,7 +36,7 @@ class Answer:
 def vaneloop(*words: str | Path, folder: Path | None = None) -> Answer:
     """Run a command in a process of its own."""
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "app.main", *map(str, words)]
+    command = [sys.executable, "-m", "vaneloop.cli.main", *map(str, words)]
     p = subprocess.run(command, cwd=folder or ROOT, env=env, capture_output=True, text=True, timeout=300, check=False)
     return Answer(p.returncode, p.stdout, p.stderr)
 

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from discrepancy import diagnose, fit, locate, workflow
-from discrepancy.fit import Fit, Judge
-from discrepancy.stage import Effect, Parameter, Stage
 from tests.conftest import ROOT
+from vaneloop.discrepancy import diagnose, fit, locate, workflow
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 
 DOCUMENTED = {
     "NATS": 12.0, "SPREADS": 3.0, "BLOCK_SPREADS": 8.0, "LEAST_SHARE": 0.15, "FLOOR_KNOWN": 0.01, "TOLERATED": 1.05, "LEFT_FLOORS": 3.0,

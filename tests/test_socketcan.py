@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from controller import MODES
-from tables import path as table_path
 from tests.test_realtime import ON_TIME_US, check_run_and_ecu, priority
 from tests.vcan.run import INTERFACE
+from vaneloop.base.tables import path as table_path
 
 pytestmark = pytest.mark.socketcan
 
@@ -40,7 +40,7 @@ class Vaneloop:
     def __init__(self, folder: Path, *arguments: str, options: list[str] | None = None):
         self.name = arguments[0]
         self.json_file, self.text_file = folder / f"{self.name}.json", folder / f"{self.name}.txt"
-        command = [sys.executable, "-m", "app.main", *arguments, "--bus", INTERFACE, "--json", str(self.json_file)]
+        command = [sys.executable, "-m", "vaneloop.cli.main", *arguments, "--bus", INTERFACE, "--json", str(self.json_file)]
         command += priority() if options is None else options
         with self.text_file.open("w") as text:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=text, stderr=text)

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from app.clearance import FITS, clearance_study
-from app.main import main
-from app.multibody import multibody_angles
-from app.scheduling import geometry_with
 from plant import load_geometry
 from plant.geometry import vane_angles
 from plant.linkage import STAGES, clevis_axial, stage_ring_angle
 from plant.spatial import Clearances, clearance_for, clearance_loop, clearance_width, contributions, freedoms, plane_joints, spatial_angles
-from tables import InputError, path
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path
+from vaneloop.cli.main import main
+from vaneloop.design.clearance import FITS, clearance_study
+from vaneloop.design.multibody import multibody_angles
+from vaneloop.design.scheduling import geometry_with
 
 GEOMETRY = load_geometry()
 STROKE = np.linspace(0.0, 48.0, 25)

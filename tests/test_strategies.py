@@ -8,14 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from app import strategies as st
-from app.engine_test import load_profile
-from app.main import main
 from controller import firmware as fw
 from controller import load_calibration
 from controller.calibration import STRATEGIES
-from hil.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep
 from plant import build_plant
+from vaneloop.cli.engine_test import load_profile
+from vaneloop.cli.main import main
+from vaneloop.design import strategies as st
 
 ROWS = {s.name: s for s in st.scenarios()}
 CALIBRATIONS = {s: load_calibration(strategy=s) for s in STRATEGIES}

@@ -14,14 +14,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.engine_test import EngineTestTable
-from app.scheduling import stroke_tables, vane_angle_table, write_stroke_tables, write_vane_angles
 from controller import load_calibration
 from controller.calibration import AngleTable, CalibrationTable, StrokeTable
+from hil.engine_test import EngineTestTable
 from plant import build_plant
 from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
 from plant.parameters import PlantTable, load_plant
-from tables import Bound, InputError, Quantity, path, read
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Bound, Quantity, path, read
+from vaneloop.design.scheduling import stroke_tables, vane_angle_table, write_stroke_tables, write_vane_angles
 
 MODELS = {
     "calibration.toml": CalibrationTable,

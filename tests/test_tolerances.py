@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.adapter import build_chain
-from discrepancy.workflow import diagnose
 from hil.logs import Channel, Log
 from plant import build_plant
 from plant.geometry import STANDS_FOR, Geometry, length_tolerances, load_geometry, vane_angles
 from plant.linkage import STAGES
 from plant.model import Model
 from plant.parameters import nominal
-from tables import InputError
 from tests import rig
 from tests.firmware_on_rig import firmware
+from vaneloop.base.errors import InputError
+from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.discrepancy.workflow import diagnose
 
 STROKE = np.linspace(0.0, 48e-3, 49)  # m
 PARTS = ("crank", *STAGES)

@@ -36,7 +36,7 @@ class Server:
     """``vaneloop web`` as a user starts it."""
 
     def __init__(self, folder: Path, *options: str, **environment: str):
-        words = [sys.executable, "-m", "app.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder), *options]
+        words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder), *options]
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         self.folder, self.environment = folder, {**os.environ, "PYTHONPATH": path, **environment}
         self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=folder, env=self.environment)
@@ -219,7 +219,7 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
     alert.wait_for()
     said = alert.inner_text()
     assert said.startswith("vaneloop: broken.csv: ") and "\n" not in said and "Traceback" not in said
-    words = [sys.executable, "-m", "app.main", "compare", "broken.csv"]
+    words = [sys.executable, "-m", "vaneloop.cli.main", "compare", "broken.csv"]
     done = subprocess.run(words, cwd=server.folder, env=server.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.strip().splitlines()[-1] == said
 
@@ -335,9 +335,9 @@ def downloaded(page: Any, name: re.Pattern[str]) -> Path:
 def states_in(record: Path) -> tuple[set[str], set[int]]:
     """Modes that the controller said in a record, and the identifiers in it."""
     from controller import MODES
-    from hil.frames import IDENT_MASK
+    from hil.bus.frames import IDENT_MASK
     from hil.logs import read_log
-    from hil.recorder import read_record
+    from hil.logs.recorder import read_record
 
     state = read_log(record, require=("state",)).channels["state"].values
     return {MODES[int(v)] for v in state}, set((read_record(record).rows[:, 0] & IDENT_MASK).tolist())
@@ -394,9 +394,9 @@ def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None
 def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> None:
     import shlex
 
-    from app.web.run import Loop
-    from app.web.session import Session
-    from app.web.worker import parsed
+    from vaneloop.web.run import Loop
+    from vaneloop.web.session import Session
+    from vaneloop.web.worker import parsed
 
     loop = Loop(Session("x", tmp_path / "0123456789abcdef", []))
     asked: list[tuple[str, dict[str, Any]]] = []
@@ -557,7 +557,7 @@ def test_only_a_page_that_a_browser_goes_to_makes_a_session_and_a_seventh_ends_n
 def test_a_session_with_an_open_tab_never_gives_way() -> None:
     from collections import Counter
 
-    from app.web.server import MOST_SESSIONS, Sessions
+    from vaneloop.web.server import MOST_SESSIONS, Sessions
 
     class Made:
         def __init__(self, key: str):
@@ -601,7 +601,7 @@ TEXTS = st.one_of(
 
 def through_the_guard(kind: str, method: str, path: str, query: bytes, headers: list[tuple[bytes, bytes]], guard: Any = None) -> list[Any]:
     """What a guard in front of an application answers."""
-    from app.web.guard import Guard
+    from vaneloop.web.guard import Guard
 
     async def behind(scope: Any, receive: Any, send: Any) -> None:
         await receive()
@@ -739,7 +739,7 @@ def test_what_belongs_to_a_session_is_given_to_nobody_else(server: Server) -> No
 
 def test_elsewhere_than_on_loopback_the_token_is_the_users_own(tmp_path: Path) -> None:
     for host in ("0.0.0.0", "127.0.0.1"):
-        words = [sys.executable, "-m", "app.main", "web", "--host", host, "--port", "0", "--no-open"]
+        words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--host", host, "--port", "0", "--no-open"]
         short = subprocess.run(
             words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "VANELOOP_WEB_TOKEN": "short"}, capture_output=True, text=True,
             check=False,
@@ -765,8 +765,8 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
     """Every user of a machine may read the command line of a browser."""
     import webbrowser
 
-    from app.main import main
-    from app.web.guard import Guard
+    from vaneloop.cli.main import main
+    from vaneloop.web.guard import Guard
 
     def serve(sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any) -> None:
         nonlocal guard
@@ -777,7 +777,7 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
     guard: Any = None
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr("app.web.server.serve", serve)
+    monkeypatch.setattr("vaneloop.web.server.serve", serve)
     assert main(["web", "--port", "0", "--folder", str(tmp_path)]) == 0
     printed = capsys.readouterr().out.strip()
     assert printed.endswith(guard.token) and guard.loopback
@@ -796,7 +796,7 @@ def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_sta
     import stat
     import tempfile
 
-    from app.web.private import private_folder
+    from vaneloop.web.private import private_folder
 
     killed = Server(tmp_path, TMPDIR=str(tmp_path))
     assert ask(killed)[0] == 200
@@ -820,7 +820,7 @@ def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_sta
 def test_only_folders_of_this_user_whose_process_is_gone_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tempfile
 
-    from app.web.private import private_folder, sweep
+    from vaneloop.web.private import private_folder, sweep
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     elsewhere = tmp_path / "elsewhere"
@@ -852,7 +852,7 @@ def test_only_folders_of_this_user_whose_process_is_gone_are_swept(tmp_path: Pat
      ("a;rm -rf $HOME.csv", "a_rm -rf _HOME.csv"), ("\u202ecsv.exe", "_csv.exe"), ("", "file"), ("x" * 300 + ".csv", "x" * 80 + ".csv")],
 )  # fmt: skip
 def test_a_name_of_an_upload_is_a_name_and_no_path(name: str, kept: str) -> None:
-    from app.web.session import safe_name
+    from vaneloop.web.session import safe_name
 
     assert safe_name(name) == kept
 
@@ -866,7 +866,7 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
 
     import numpy as np
 
-    from app.web.charts import Curves, Panel, Trace, view
+    from vaneloop.web.charts import Curves, Panel, Trace, view
 
     t = np.arange(300_000) * 0.01
     y = np.sin(t / 50)

@@ -38,7 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     source.mkdir()
-    for name in PACKAGES:
+    for name in (*PACKAGES, "tables"):
         shutil.copytree(ROOT / name, source / name, ignore=JUNK)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         if (ROOT / name).is_file():
@@ -69,17 +69,17 @@ def run_installed(installed: Path, folder: Path, *arguments: str) -> str:
 
 def test_the_wheel_holds_every_source_and_table(wheel: Path) -> None:
     inside = set(zipfile.ZipFile(wheel).namelist())
-    kept = (p for name in PACKAGES for p in (ROOT / name).rglob("*") if p.is_file() and "__pycache__" not in p.parts)
-    wanted = {p.relative_to(ROOT).as_posix() for p in kept if p.suffix not in (".nbi", ".nbc")}
+    kept = [p for name in (*PACKAGES, "tables") for p in (ROOT / name).rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    here = [p.relative_to(ROOT).as_posix() for p in kept if p.suffix not in (".nbi", ".nbc")]
+    wanted = {f"vaneloop/{name}" if name.startswith("tables/") else name for name in here}
     assert wanted <= inside, f"not in the wheel: {sorted(wanted - inside)}"
+    assert {"vaneloop/tables/vgv.dbc", "vaneloop/tables/calibration.toml"} <= inside
     for name in PACKAGES:
         assert f"{name}/__init__.py" in inside
 
 
-def test_the_wheel_holds_the_calibration_and_the_bus_description(wheel: Path) -> None:
-    inside = zipfile.ZipFile(wheel).namelist()
-    assert any(name.startswith("tables/") and name.endswith(".toml") for name in inside), "no tables/*.toml in the wheel"
-    assert "tables/vgv.dbc" in inside
+def test_the_tables_are_data_only() -> None:
+    assert not list((ROOT / "tables").rglob("*.py"))
 
 
 def test_the_wheel_holds_nothing_else_at_its_top(wheel: Path) -> None:
@@ -94,7 +94,42 @@ def test_every_package_imports_from_the_installed_wheel(installed: Path, tmp_pat
 
 
 def test_replay_starts_from_the_installed_wheel_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
-    if not (ROOT / "hil" / "replay.py").is_file():
-        pytest.skip("hil/replay.py is not there")
     assert "LOG" in run_installed(installed, tmp_path, "-m", "hil.replay", "--help")
+    assert "SCENARIO" in run_installed(installed, tmp_path, "-m", "hil.inject", "--help")
+    assert "replay" in run_installed(installed, tmp_path, "-m", "vaneloop", "--help")
     assert not list(tmp_path.iterdir()), "--help left files behind"
+
+
+def test_the_wheel_writes_over_no_file_of_an_installed_package(wheel: Path) -> None:
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    for other in metadata.distributions():
+        if other.name.lower() != "vaneloop":
+            shared = inside & {str(f) for f in other.files or []}
+            assert not shared, f"{other.name} has these files too: {sorted(shared)[:5]}"
+
+
+def test_the_wheel_beside_pytables_leaves_both_in_order(wheel: Path, tmp_path: Path) -> None:
+    pytest.importorskip("tables", reason="PyTables is not installed (the test extra brings it)")
+    beside = tmp_path / "beside"  # PyTables first, then ours over it, as pip would
+    theirs = metadata.distribution("tables")
+    for file in theirs.files or []:
+        if ".." not in file.parts and file.suffix != ".pyc":
+            (beside / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(str(theirs.locate_file(file)), beside / file)
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+    run(*pip, "install", "--quiet", "--no-deps", "--no-index", "--target", str(beside), str(wheel), cwd=tmp_path)
+    code = """
+import numpy as np, tables
+with tables.open_file("x.h5", "w") as f:
+    f.create_array("/", "n_dem", np.arange(3.0))
+with tables.open_file("x.h5") as f:
+    print(tables.__file__, f.root.n_dem[:].sum())
+import vaneloop
+from controller import load_calibration
+from vaneloop.base.tables import path
+load_calibration()
+print(path("vgv.dbc"), path("vgv.dbc").is_file())
+"""
+    hdf5, ours = run_installed(beside, tmp_path, "-c", code).splitlines()
+    assert hdf5 == f"{beside / 'tables' / '__init__.py'} 3.0"
+    assert ours == f"{beside / 'vaneloop' / 'tables' / 'vgv.dbc'} True"

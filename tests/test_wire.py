@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import tables
-from hil import frames, wire
-from hil.lockstep_bus import Channel, LockstepBus, run_lockstep
-from hil.node import Ecu, Node
+from hil.bus import frames, wire
+from hil.bus.lockstep_bus import Channel, LockstepBus, run_lockstep
+from hil.loop.node import Ecu, Node
 from tests.conftest import ROOT
+from vaneloop.base import tables
 
 BIT = 1 / wire.BIT_RATE
 
@@ -334,7 +334,7 @@ def test_a_faulty_wire_is_noticed_and_survived() -> None:
 
 SCRIPT = """
 import numpy as np
-from hil.lockstep_bus import Channel, run_lockstep
+from hil.bus.lockstep_bus import Channel, run_lockstep
 r = run_lockstep(np.linspace(60, 70, 30), seed=3, channel=Channel(error_rate=0.05, loss=0.05, seed=1), hashed=True)
 print(r.state_hash, r.vgv.fingerprint(), hash(r.rows.tobytes()), r.error_frames)
 """

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.main import main
-from discrepancy import Parameter, Record, StageError, System, load_system, own_model, unknown
+from vaneloop.cli.main import main
+from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
+from vaneloop.discrepancy.models import own_model
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_model.md"
 RNG = np.random.default_rng(3)

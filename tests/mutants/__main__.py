@@ -31,17 +31,17 @@ TARGETS = (
     ),
     Target(
         "frames",
-        ("hil/frames.py",),
+        ("hil/bus/frames.py",),
         ("tests/test_frames.py",),
         "lockstep or recorded_run or one_wrong_frame or ecu_and or silence_is or health_tells or fifth_refused or speed_out",
     ),
-    Target("wire", ("hil/wire.py",), ("tests/test_wire.py",), "compiled or cantools_and_e2e or noticed or fast_loop"),
-    Target("node", ("hil/node.py",), ("tests/test_node.py",)),
+    Target("wire", ("hil/bus/wire.py",), ("tests/test_wire.py",), "compiled or cantools_and_e2e or noticed or fast_loop"),
+    Target("node", ("hil/loop/node.py",), ("tests/test_node.py",)),
     Target("effects", ("plant/effects/*.py",), ("tests/test_effects_reference.py",), constants=False),
     Target("drive", ("plant/chain.py",), ("tests/test_effects_reference.py",), constants=False, only="drive_substep"),
     Target(
         "search",
-        ("discrepancy/diagnose.py", "discrepancy/fit.py", "discrepancy/workflow.py", "discrepancy/locate.py"),
+        ("vaneloop/discrepancy/diagnose.py", "vaneloop/discrepancy/fit.py", "vaneloop/discrepancy/workflow.py", "vaneloop/discrepancy/locate.py"),
         (
             "tests/test_search_limits.py",
             "tests/test_names.py::test_nine_tenths_are_neither_less_nor_more",

@@ -168,7 +168,7 @@ def warm_up(*commands: list[str], settings: dict[str, str] | None = None) -> Non
 
 
 LOOPS = (
-    ["app.main", "run", "--bus", "lockstep", "--duration", "0.1", "--quiet"],
+    ["vaneloop.cli.main", "run", "--bus", "lockstep", "--duration", "0.1", "--quiet"],
     ["hil.inject", "demand_gap_40ms", "--quiet"],
     ["hil.replay", "examples/engine_run.blf", "--quiet"],
 )

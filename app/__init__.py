@@ -1,3 +1,0 @@
-"""The ``vaneloop`` command line."""
-
-__all__: list[str] = []

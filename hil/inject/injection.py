@@ -1,0 +1,354 @@
+"""Bad days on the bus, on purpose: run a scenario of frame and fault injection and say whether the controller reacted as it must.
+
+On ``lockstep`` (default) controller, ECU and bus run in simulated time: every action is possible and the same scenario gives the same run,
+bit for bit. On another bus (``local``, ``vcan0``) a controller and an ECU are running already and we are one more station on it, so only
+what an outsider can do is done, and only what the controller's frames show is judged.
+
+::
+
+    from hil import inject
+    outcome = inject.run("demand_stops")                       # a shipped scenario, a TOML file, or a Scenario made in Python
+    assert outcome.held, outcome.text()
+
+The schema of scenarios is `hil.inject.scenario`; its names are here, too.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from controller.firmware import MODES
+from hil.bus import frames
+from hil.inject.scenario import (
+    ACTIONS,
+    COUNTS,
+    Action,
+    Babble,
+    BusOff,
+    Corrupt,
+    Delay,
+    Drop,
+    Duplicate,
+    ErrorFrames,
+    Expect,
+    Flood,
+    Freeze,
+    Machine,
+    OnBus,
+    OnFrame,
+    Outsider,
+    Override,
+    Reorder,
+    Replay,
+    Scenario,
+    Send,
+    identifier,
+    library,
+    load_scenario,
+)
+from hil.inject.tamper import Gateway, Intruder, tick_of
+from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, judge, outcome_of
+from vaneloop.base.errors import InputError
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from hil.loop.node import Ecu, Node
+    from plant import Plant
+
+__all__ = [
+    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood",
+    "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library", "load_scenario",
+    "run",
+]  # fmt: skip
+
+TICK = 1e-3  # s
+SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES", "VGV_HEALTH")}
+
+# ---- lockstep: controller, ECU and bus in simulated time ----------------------------------------------------------------------------
+
+
+class MachineChange:
+    """What a `Machine` action does to the machine, undone at its end: the controller's plant and calibration, the ECU's engine."""
+
+    def __init__(self, action: Machine, node: Node, ecu: Ecu):
+        from plant.effects import EFFECTS, ROW
+
+        self.arrays, self.engine, self.first, self.end = node.arrays, ecu.arrays, tick_of(action.start), tick_of(action.end)
+        self.new: dict[int, float] = {}
+        if action.effect is not None:
+            for i, q in enumerate(EFFECTS[action.effect].parameters):
+                if q.name in action.parameters:
+                    self.new[ROW[action.effect] + i] = action.parameters[q.name] * q.si
+        self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
+        if 0 in self.supply:
+            self.supply[0] *= 1e6
+        self.old: tuple[dict[int, float], dict[int, float]] = ({}, {})
+
+    def tick(self, k: int) -> None:
+        """Change the machine at the first tick, and back at the end."""
+        if k == self.first:
+            self.old = {r: float(self.arrays.p[r, 0]) for r in self.new}, {i: float(self.arrays.supply[i]) for i in self.supply}
+            self._set(self.new, self.supply)
+        elif k == self.end:
+            self._set(*self.old)
+
+    def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
+        from controller.firmware import I_CMD
+        from plant import chain
+        from plant.parameters import derive
+
+        for i, v in supply.items():
+            self.arrays.supply[i] = v
+        if rows:
+            chain.wake(self.arrays.s, self.arrays.p, 0, self.arrays.z[I_CMD])
+            for p in (self.arrays.p, self.engine.p):
+                for r, v in rows.items():
+                    p[r, 0] = v
+                derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+
+
+class Disturber:
+    """What happens to the bus itself: error frames with a chance, nodes in bus-off."""
+
+    def __init__(self, actions: Sequence[Action], wire: Any, places: dict[str, int]):
+        self.wire, self.places = wire, places
+        self.errors = [(tick_of(a.start), tick_of(a.end), a.probability) for a in actions if isinstance(a, ErrorFrames)]
+        self.off = [(tick_of(a.start), tick_of(a.end), places[a.node]) for a in actions if isinstance(a, BusOff)]
+
+    def tick(self, k: int) -> None:
+        """Set the wire's state for tick ``k``."""
+        from hil.bus import wire as w
+
+        if self.errors:
+            well = 1.0
+            for first, end, probability in self.errors:
+                well *= 1.0 - probability if first <= k < end else 1.0
+            self.wire.chance[0] = 1.0 - well
+        for first, end, place in self.off:
+            node = self.wire.node[place]
+            if k == first:
+                node[w.TEC], node[w.MODE], node[w.TO_RECOVER] = 256, w.BUS_OFF, w.RECOVER
+                node[w.REFUSED] += node[w.TX_N]
+                node[w.TX_N] = 0
+                node[w.BUS_OFFS] += 1
+            if end < np.inf and first <= k <= end and node[w.MODE] == w.BUS_OFF:
+                node[w.TO_RECOVER] = w.RECOVER if k == end else 1 << 40
+
+
+def sender_of(action: Action) -> str:
+    """Return the node whose frames the action works on."""
+    return next(who for who, names in SENDER.items() if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names)
+
+
+def _lockstep(
+    name: str, scenario: Scenario, plant: Plant | None, calibration: Calibration | None, progress: Callable[[float], None] | None
+) -> Outcome:
+    """Run a scenario in simulated time."""
+    from controller.firmware import CURRENT_LIMIT, FAULT_BITS, I_CMD, MODE, N_DEM, N_R_RAW, STROKE_MAX, STROKE_MIN, X_DEM, X_MEAS
+    from hil.bus.lockstep_bus import Channel
+    from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
+    from hil.loop.node import Ecu, Node
+    from plant import chain
+
+    started = time.perf_counter()
+    points = np.array(scenario.demand)
+    node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
+    ecu = Ecu(plant, n_dem=float(points[0, 1]), seed=scenario.seed + 1)
+    ticks = round(scenario.duration * 1000.0)
+    of = {kind: [a for a in scenario.inject if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
+    chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
+    gateways = [Gateway([a for a in of[OnFrame] if sender_of(a) == who], c) for who, c in zip(("ECU", "VGV"), chance, strict=False)]
+    recorded: list[tuple[int, int, int]] = []
+    keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
+    intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
+    machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
+    channel = Channel(seed=scenario.seed)
+    wire, join = channel.wire, channel.join
+    places = {"ECU": join(), "VGV": join()}
+    outside = [join() for _ in intruders]
+    ears = join(silent=True) if keep else -1
+    disturber = Disturber(of[OnBus], wire, places)
+    rows = np.zeros((256, 2), np.int64)
+
+    z, s, a = node.arrays.z, node.arrays.s, node.arrays
+    mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
+    values = np.empty((ticks, 8))
+    counts = np.empty((ticks, len(COUNTS)), np.int64)
+    late = np.zeros((ticks, 4), bool)
+    to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * 3)])
+    for k in range(ticks):
+        if k % 10 == 0:
+            ecu.set_demand(float(np.interp(k * TICK, points[:, 0], points[:, 1])))
+        for m in machines:
+            m.tick(k)
+        disturber.tick(k)
+        from_ecu = ecu.tick(rows, take(wire, places["ECU"], rows)).tolist()
+        from_vgv = node.tick(rows, take(wire, places["VGV"], rows)).tolist()
+        mode[k], faults[k] = z[MODE], z[FAULT_BITS]
+        values[k] = z[X_DEM], z[X_MEAS], z[I_CMD], z[N_DEM], z[N_R_RAW], s[chain.POT, 0], s[chain.POT + 1, 0], s[chain.POT + 2, 0]
+        counts[k, :8] = a.receiver[:8]
+        counts[k, 8] = frames.refused(a.receiver)
+        if k % 10 == 0:
+            missed = ecu.stale()
+            late[k : k + 10] = [n in missed for n in SENDER["VGV"]]
+        for who, gateway, sent in zip(("ECU", "VGV"), gateways, (from_ecu, from_vgv), strict=True):
+            for head, data in gateway.feed(k, sent):
+                put(wire, places[who], head, data)
+        for place, intruder in zip(outside, intruders, strict=True):
+            if intruder.first <= k < intruder.end:
+                for head, data in intruder.tick(k, int(wire.node[place, TX_N])):
+                    put(wire, place, head, data)
+        run_wire(wire, (k + 1) * BITS_PER_TICK, -1)
+        if keep:
+            recorded += [(k, head, data) for head, data in rows[: take(wire, ears, rows)].tolist()]
+        if progress is not None and k % 1000 == 0:
+            progress(k / ticks)
+    cal = a.calibration.k
+    trace = Trace(
+        np.arange(ticks) * TICK,
+        mode,
+        faults,
+        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2"), (values * to_border).T, strict=True)),
+        dict(zip(COUNTS, counts.T, strict=True)),
+        dict(zip(SENDER["VGV"], late.T, strict=True)),
+        (float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
+        float(cal[CURRENT_LIMIT]) * 1e3,
+    )
+    wall = time.perf_counter() - started
+    return outcome_of(name, scenario, "lockstep", trace, notes=[], simulated_s=ticks * TICK, wall_s=wall, state_hash=node.fingerprint())
+
+
+# ---- another bus: one station among others, in real time ----------------------------------------------------------------------------
+
+
+class _Witness:
+    """What the controller's frames say, as a trace grows from them."""
+
+    NAMES = ("x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2")
+
+    def __init__(self) -> None:
+        self.receivers = {i: frames.new_receiver(i) for i in (frames.VGV_STATUS, frames.VGV_SERVO, frames.VGV_ANGLES, frames.VGV_HEALTH)}
+        self.now: dict[str, float] = {}
+        self.rows: list[tuple[float, ...]] = []
+
+    def hear(self, head: int, data: int, t: float) -> None:
+        """Take one frame that came at ``t`` s; a sample is due with each VGV_STATUS once all signals are known."""
+        ident = head & frames.IDENT_MASK
+        receiver = self.receivers.get(ident)
+        if receiver is None or frames.receive(receiver, head, data, int(t * 1000.0)) != frames.GOOD:
+            return
+        self.now |= frames.decode(head, data)
+        if ident == frames.VGV_ANGLES and all(n in self.now for n in (*self.NAMES, "state", "faults")):
+            self.rows.append((t, self.now["state"], self.now["faults"], *(self.now[n] for n in self.NAMES)))
+
+    def trace(self, begin: float) -> Trace:
+        """Return the samples from ``begin`` s on, with times from there."""
+        from controller import load_calibration
+        from controller.firmware import CURRENT_LIMIT, STROKE_MAX, STROKE_MIN
+
+        table = np.array(self.rows)
+        table = table[table[:, 0] >= begin]
+        cal = load_calibration().k
+        return Trace(
+            table[:, 0] - begin,
+            table[:, 1].astype(int),
+            table[:, 2].astype(np.int64),
+            dict(zip(self.NAMES, table[:, 3:].T, strict=True)),
+            stroke=(float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
+            current=float(cal[CURRENT_LIMIT]) * 1e3,
+            exact=False,
+        )
+
+
+LISTEN = 5.0  # s in which the controller must be heard in RUN
+
+
+def cannot(scenario: Scenario) -> str:
+    """Return why an outsider cannot do what the scenario asks for; empty if it can."""
+    inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})  # type: ignore[attr-defined]
+    return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
+
+
+def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float], None] | None) -> Outcome:
+    """Play a scenario in real time on a bus on which a controller and an ECU run."""
+    from hil.bus.port import Port, open_bus
+
+    why = cannot(scenario)
+    if why:
+        raise InputError(f"{name} on {bus}: {why}")
+    recorded: list[tuple[int, int, int]] = []
+    chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(scenario.inject))]
+    intruders = [Intruder(a, c, recorded) for a, c in zip(scenario.inject, chance, strict=True)]
+    keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
+    witness, rows = _Witness(), np.zeros((256, 2), np.int64)
+    opened = open_bus(bus)
+    try:
+        port = Port(opened)
+        started = time.perf_counter()
+        begin: float | None = None  # time at which the controller was first heard in RUN: the scenario's 0
+        k = 0
+        while True:
+            now = time.perf_counter() - started
+            for head, data in rows[: port.read(rows)].tolist():
+                witness.hear(head, data, now)
+                if keep and begin is not None:
+                    recorded.append((round((now - begin) * 1000.0), head, data))
+            if begin is None:
+                if witness.rows and MODES[int(witness.rows[-1][1])] == "RUN":
+                    begin = now
+                elif now > LISTEN:
+                    heard = f"it is in {MODES[int(witness.rows[-1][1])]}" if witness.rows else "none was heard"
+                    start = f"start vaneloop run --bus {bus} and vaneloop ecu --bus {bus}"
+                    raise InputError(f"{bus}: no controller in RUN within {LISTEN:g} s ({heard}); {start}")
+            else:
+                t = now - begin
+                if t >= scenario.duration:
+                    break
+                while k <= t * 1000.0:
+                    for intruder in intruders:
+                        port.write(np.array(intruder.tick(k, 0), np.int64).reshape(-1, 2))
+                    k += 1
+                if progress is not None:
+                    progress(t / scenario.duration)
+            time.sleep(0.0005)
+    finally:
+        opened.shutdown()
+    notes = [f"{port.refused} frames were not taken by the bus"] if port.refused else []
+    notes += [f"{port.lost} frames came faster than they could be read"] if port.lost else []
+    trace = witness.trace(begin)
+    if not len(trace.t):
+        raise InputError(f"{bus}: the controller was not heard again after {begin:.1f} s")
+    wall = time.perf_counter() - started
+    return outcome_of(name, scenario, bus, trace, notes=notes, simulated_s=scenario.duration, wall_s=wall, state_hash=None)
+
+
+# ---- commands -----------------------------------------------------------------------------------------------------------------------
+
+
+def run(
+    scenario: Scenario | str | Path,
+    *,
+    bus: str = "lockstep",
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
+    name: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Outcome:
+    """Run a scenario and judge it.
+
+    scenario  a `Scenario`, the name of a shipped one, or a TOML file
+    bus       ``lockstep``, or a bus on which a controller and an ECU run (``local``, ``vcan0``)
+    plant, calibration  on lockstep: other than the shipped tables
+    Raises InputError for what cannot be read, or cannot be done on this bus.
+    """
+    made = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    called = name or (Path(str(scenario)).stem if not isinstance(scenario, Scenario) else "scenario")
+    if bus == "lockstep":
+        return _lockstep(called, made, plant, calibration, progress)
+    return _on_bus(called, made, bus, progress)

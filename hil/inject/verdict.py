@@ -1,0 +1,208 @@
+"""The verdict on a scenario: what was seen, held against what must be seen.
+
+Every claim of the scenario is judged; besides them, safe limits of stroke demand and current, and the documented mode changes, always.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller.firmware import FAULTS, MODES
+from hil.inject.scenario import Expect, Scenario
+
+__all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "judge", "outcome_of"]
+
+# docs/controller.md, "Modes": these and no others
+TRANSITIONS = frozenset({
+    ("INIT", "STANDBY"), ("INIT", "FAIL_SAFE"), ("STANDBY", "RUN"), ("STANDBY", "FAIL_SAFE"), ("RUN", "STANDBY"), ("RUN", "DEGRADED"),
+    ("RUN", "FAIL_SAFE"), ("DEGRADED", "RUN"), ("DEGRADED", "FAIL_SAFE"), ("FAIL_SAFE", "RUN"), ("FAIL_SAFE", "STANDBY"),
+})  # fmt: skip
+SLACK = 0.05  # s: what frames every 10 ms, another clock and a busy machine may add to a time on a bus between processes
+
+# ---- what was seen ------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Trace:
+    """What a run showed: samples over time.
+
+    t        s, float64[n]
+    mode     int[n], number of the mode
+    faults   int64[n], bit mask
+    signals  name -> float64[n] in border units; missing where this bus does not show it
+    counts   name -> int64[n], `hil.inject.scenario.COUNTS`; empty where this bus does not show them
+    late     frame -> bool[n]; empty where this bus does not show it
+    stroke, current   what is safe: stroke demand (low, high) in mm, current in mA
+    """
+
+    t: np.ndarray
+    mode: np.ndarray
+    faults: np.ndarray
+    signals: dict[str, np.ndarray]
+    counts: dict[str, np.ndarray] = field(default_factory=dict)
+    late: dict[str, np.ndarray] = field(default_factory=dict)
+    stroke: tuple[float, float] = (0.0, 48.0)
+    current: float = 40.0
+    exact: bool = True  # every tick was seen, not only what frames say
+
+    def truth(self, claim: Expect) -> np.ndarray | None:
+        """Whether the claim's condition holds, sample by sample; None where this bus does not show it."""
+        if claim.mode is not None:
+            return self.mode == MODES.index(claim.mode)
+        if claim.fault == "any":
+            return self.faults != 0
+        if claim.fault is not None:
+            return (self.faults >> FAULTS.index(claim.fault)) & 1 == 1
+        if claim.late is not None:
+            return self.late.get(claim.late)
+        values = self.signals.get(claim.signal) if claim.signal is not None else self.counts.get(str(claim.count))
+        if values is None:
+            return None
+        low = -np.inf if claim.low is None else claim.low
+        high = np.inf if claim.high is None else claim.high
+        return (values >= low) & (values <= high)
+
+    def shown(self, claim: Expect, at: np.ndarray) -> str:
+        """What the samples ``at`` show of what the claim is about, in words."""
+        if not at.any():
+            return "nothing"
+        if claim.mode is not None:
+            modes = self.mode[at]
+            return " > ".join(MODES[m] for m in modes[np.flatnonzero(np.diff(modes, prepend=-1))])
+        if claim.fault is not None:
+            names = [f for i, f in enumerate(FAULTS) if (np.bitwise_or.reduce(self.faults[at]) >> i) & 1]
+            return ", ".join(names) or "no fault"
+        if claim.late is not None:
+            return "late at times" if self.late[claim.late][at].any() else "not late"
+        values = (self.signals[claim.signal] if claim.signal is not None else self.counts[str(claim.count)])[at]
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        return f"{claim.signal or claim.count} {low:.6g}" + (f" to {high:.6g}" if high > low else "")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One claim held against what was seen; ``held`` is None where this bus does not show it."""
+
+    expected: str
+    seen: str
+    held: bool | None
+    because: str = ""
+
+
+def _check(claim: Expect, trace: Trace, slack: float, lockstep: bool) -> Check:
+    truth = trace.truth(claim) if lockstep or claim.only is None else None
+    if truth is None:
+        why = "only lockstep has this timing" if claim.only else "the frames on this bus do not show it"
+        return Check(claim.words, why, None, claim.because)
+    t = trace.t
+    if claim.at is not None:
+        rises = t[truth & ~np.concatenate([[False], truth[:-1]])]
+        near = rises[np.abs(rises - claim.at) <= claim.tolerance + slack + 1e-9]
+        seen = ", ".join(f"{x:.3f}" for x in rises[:6]) + (f" and {len(rises) - 6} more" if len(rises) > 6 else "")
+        return Check(claim.words, f"from {seen} s on" if len(rises) else "never", bool(len(near)), claim.because)
+    if claim.by is not None:
+        when = t[truth & (t >= claim.after - 1e-9) & (t <= claim.by + slack + 1e-9)]
+        if len(when):
+            return Check(claim.words, f"at {when[0]:.3f} s", True, claim.because)
+        later = t[truth & (t >= claim.after)]
+        return Check(claim.words, f"not before {later[0]:.3f} s" if len(later) else "never", False, claim.because)
+    begin, end = claim.during or (0.0, float(t[-1]))
+    inside = (t >= begin + slack - 1e-9) & (t <= end - slack + 1e-9) if claim.during else np.ones(len(t), bool)
+    broken = inside & (truth if claim.never else ~truth)
+    if not inside.any():
+        return Check(claim.words, "nothing was seen then", False, claim.because)
+    if broken.any():
+        return Check(claim.words, f"broken at {t[broken][0]:.3f} s: {trace.shown(claim, broken)}", False, claim.because)
+    return Check(claim.words, trace.shown(claim, inside), True, claim.because)
+
+
+def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Check]:
+    """Hold every claim of a scenario against what was seen; then what is always demanded: safe limits and documented mode changes."""
+    slack = 0.0 if lockstep else SLACK
+    checks = [_check(claim, trace, slack, lockstep) for claim in scenario.expect]
+    low, high = trace.stroke
+    count = 1e-6 if trace.exact else 2e-3  # frames round
+    for name, least, most, unit in (("x_dem", low, high, "mm"), ("i_cmd", -trace.current, trace.current, "mA")):
+        values = trace.signals.get(name, np.empty(0))
+        good = bool(np.all((values >= least - count) & (values <= most + count)))  # NaN is not good
+        seen = f"{np.min(values):.4g} to {np.max(values):.4g} {unit}" if len(values) else "nothing"
+        checks.append(Check(f"always {least:g} <= {name} <= {most:g} {unit}", seen, good and len(values) > 0))
+    changes = [(MODES[a], MODES[b]) for a, b in zip(trace.mode, trace.mode[1:], strict=False) if a != b]
+    if trace.exact:
+        wrong = [f"{a} > {b}" for a, b in changes if (a, b) not in TRANSITIONS]
+        checks.append(Check("mode changes as documented", "not: " + ", ".join(wrong) if wrong else f"{len(changes)} changes", not wrong))
+    return checks
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a scenario.
+
+    held      whether every claim that this bus can show held
+    checks    the claims, then what is always demanded
+    modes     [(s, mode)], each mode from when on
+    counts    of the controller's receiver at the end
+    notes     what could not be done or seen
+    """
+
+    name: str
+    title: str
+    bus: str
+    checks: list[Check]
+    trace: Trace
+    modes: list[tuple[float, str]]
+    faults: list[tuple[float, str]]
+    counts: dict[str, int]
+    notes: list[str]
+    simulated_s: float
+    wall_s: float
+    state_hash: str | None
+
+    @property
+    def held(self) -> bool:
+        """Whether no claim was broken."""
+        return all(c.held is not False for c in self.checks)
+
+    @property
+    def mode(self) -> str:
+        """Mode at the end."""
+        return self.modes[-1][1]
+
+    def mode_at(self, t: float) -> str:
+        """Mode at ``t`` s."""
+        return MODES[int(self.trace.mode[max(int(np.searchsorted(self.trace.t, t + 1e-9)) - 1, 0)])]
+
+    def faults_seen(self) -> set[str]:
+        """Return the names of all faults that stood at any time."""
+        return {name for _, name in self.faults}
+
+    def text(self) -> str:
+        """Return the claims line by line, broken ones marked: what an assert should show."""
+        mark = {True: "held  ", False: "BROKEN", None: "unseen"}
+        lines = [f"{self.name}: {'held' if self.held else 'NOT held'} ({self.title})"]
+        lines += [f"  {mark[c.held]}  {c.expected}  |  seen: {c.seen}" for c in self.checks]
+        return "\n".join([*lines, "  modes: " + ", ".join(f"{m} {t:.3f} s" for t, m in self.modes)])
+
+    def json(self) -> dict[str, Any]:
+        """Return the outcome as plain data."""
+        return {
+            "name": self.name, "title": self.title, "held": self.held, "simulated_s": self.simulated_s, "wall_s": self.wall_s,
+            "state_hash": self.state_hash, "counts": self.counts, "notes": self.notes,
+            "modes": [{"t": t, "mode": m} for t, m in self.modes], "faults": [{"t": t, "fault": f} for t, f in self.faults],
+            "expectations": [{"expected": c.expected, "seen": c.seen, "held": c.held, "because": c.because} for c in self.checks],
+        }  # fmt: skip
+
+
+def outcome_of(name: str, scenario: Scenario, bus: str, trace: Trace, **rest: Any) -> Outcome:
+    """Judge a trace; ``rest`` are the other fields of `Outcome`."""
+    change = np.flatnonzero(np.diff(trace.mode, prepend=-1))
+    modes = [(float(trace.t[i]), MODES[int(trace.mode[i])]) for i in change]
+    before = np.concatenate([[0], trace.faults[:-1]])
+    rises = [(i, trace.faults[i] & ~before[i]) for i in np.flatnonzero(trace.faults & ~before)]
+    faults = [(float(trace.t[i]), f) for i, bits in rises for q, f in enumerate(FAULTS) if (bits >> q) & 1]
+    counts = {k: int(v[-1]) for k, v in trace.counts.items()}
+    checks = judge(scenario, trace, lockstep=bus == "lockstep")
+    return Outcome(name, scenario.title, bus, checks, trace, modes, faults, counts, **rest)

@@ -1,0 +1,238 @@
+"""The closed loop in simulated time: controller, plant and sensors, tick by tick, as fast as the machine can.
+
+Time is an integer number of ticks; no clock is read. The same stimulus, tables and seed give the same states, bit for bit, in any process;
+`Run.state_hash` is the proof. One tick k, at t = k ms::
+
+    every 10th tick: the ECU's frame (n_dem, n_r) arrives
+    the sensors' samples at t go into the controller's tick
+    what is logged at t is written down
+    the plant moves on to t + 1 ms under the new current
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from controller import Calibration, load_calibration
+from controller.firmware import (
+    BLEND,
+    DIRECTION,
+    FAULT_BITS,
+    IN_FRESH,
+    IN_REJECTED,
+    IN_X_LVDT,
+    MODE,
+    SLOW,
+    X_DEM,
+)
+from hil.loop.tick import FRAME, arrive, control, mean_current, move, new_loop
+from plant import Plant, build_plant, chain
+from plant.compiled import compiled_free
+
+__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
+
+CHUNK = 10_000  # ticks between two calls of the progress function
+WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller reaches RUN and the servo settles
+COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state", "n_engine")
+_BORDER = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3, 1e-6, 1.0, *[180.0 / np.pi] * 3, 1.0, 1.0])  # SI -> border units
+_BORDER.setflags(write=False)
+
+# columns of a stimulus
+S_N_DEM, S_N_R, S_P_S, S_T_OIL, S_FRESH, S_REJECTED, S_MODE_REQUEST, N_STIMULUS = range(8)
+
+
+@dataclass(frozen=True)
+class Stimulus:
+    """What the ECU sends and the hydraulic supply gives, one row every 10 ms.
+
+    n_dem   %, float64[n]
+    n_r     %, float64[n]; NaN where the plant's own engine supplies it
+    p_s     Pa, float64[n]
+    t_oil   degC, float64[n]
+    mode_request  float64[n], 1 run, 0 standby
+    """
+
+    rows: np.ndarray  # float64[n, N_STIMULUS]
+
+    @classmethod
+    def of(cls, n_dem, n_r=None, p_s=21e6, t_oil=40.0, mode_request=1.0) -> Stimulus:
+        """Build from arrays or constants; all frames arrive and are good."""
+        n_dem = np.atleast_1d(np.asarray(n_dem, dtype=np.float64))
+        rows = np.empty((len(n_dem), N_STIMULUS))
+        rows[:, S_N_DEM] = n_dem
+        rows[:, S_N_R] = np.nan if n_r is None else n_r
+        rows[:, S_P_S] = p_s
+        rows[:, S_T_OIL] = t_oil
+        rows[:, S_FRESH] = 1.0
+        rows[:, S_REJECTED] = 0.0
+        rows[:, S_MODE_REQUEST] = mode_request
+        return cls(rows)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulated run: ``columns`` of border-unit arrays on the raster ``t`` (s), and the digest of every tick's state."""
+
+    columns: dict[str, np.ndarray]
+    simulated_s: float
+    wall_s: float
+    state_hash: str
+    faults: int
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time from the start, s."""
+        return self.columns["t"]
+
+
+@compiled_free
+def advance(k0, ticks, stimulus, noise, a, every, out, snapshots):
+    """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
+
+    noise      float64[ticks or 1, 5] standard normal numbers (LVDT, three potentiometers, speed)
+    out        float64[rows or 0, 13] in SI, a row every ``every`` ticks
+    snapshots  float64[ticks or 0, n] copies of the whole state at each tick
+    """
+    z, s, inputs = a.z, a.s, a.inputs
+    noisy = noise.shape[0] > 1
+    keep = snapshots.shape[0] > 0
+    n_z, n_s = z.shape[0], s.shape[0]
+    last_frame = stimulus.shape[0] - 1
+    n_dem = n_r = 0.0
+    for i in range(ticks):
+        k = k0 + i
+        m = i if noisy else 0
+        frame = min(max(k // SLOW, 0), last_frame)
+        if k % SLOW == 0:
+            n_dem = stimulus[frame, S_N_DEM]
+            n_r = stimulus[frame, S_N_R]
+            if n_r != n_r:  # not logged: the plant's engine
+                n_r = s[chain.N_R, 0] + a.sigma[4] * noise[m, 4]
+            inputs[IN_FRESH] = stimulus[frame, S_FRESH]
+            inputs[IN_REJECTED] = stimulus[frame, S_REJECTED]
+            if inputs[IN_FRESH] > 0.5:
+                arrive(k, a, n_dem, n_r, stimulus[frame, S_MODE_REQUEST])
+        else:
+            inputs[IN_FRESH] = 0.0
+            inputs[IN_REJECTED] = 0.0
+        p_s, t_oil = stimulus[frame, S_P_S], stimulus[frame, S_T_OIL]
+        control(k, a, noise, m, t_oil)
+        if k % every == 0 and out.shape[0] > 0:
+            r = i // every
+            out[r, 0] = k * 1e-3
+            out[r, 1] = n_dem
+            out[r, 2] = n_r
+            out[r, 3] = z[X_DEM]
+            out[r, 4] = inputs[IN_X_LVDT]
+            out[r, 5] = mean_current(a)
+            out[r, 6] = p_s
+            out[r, 7] = t_oil
+            out[r, 8], out[r, 9], out[r, 10] = a.angles[0], a.angles[1], a.angles[2]
+            out[r, 11] = z[MODE]
+            out[r, 12] = s[chain.N_R, 0]
+        if keep:
+            for q in range(n_z):
+                snapshots[i, q] = z[q]
+            for q in range(n_s):
+                snapshots[i, n_z + q] = s[q, 0]
+        move(k, a, n_dem, n_r, p_s, t_oil)
+
+
+@lru_cache(maxsize=1)
+def _nominal() -> Plant:
+    return build_plant()
+
+
+def lockstep(
+    stimulus: Stimulus,
+    *,
+    calibration: Calibration | None = None,
+    plant: Plant | None = None,
+    seed: int | None = None,
+    every: int = 10,
+    angles: tuple[float, ...] | None = None,
+    stroke_demand: float | None = None,
+    duration: float | None = None,
+    hashed: bool = True,
+    pots: np.ndarray | None = None,
+    watch: Callable[[np.ndarray], None] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Run:
+    """Run controller and plant against ``stimulus``.
+
+    seed           of the sensors' noise; None = noise-free sensors
+    every          ticks (1 ms each) between logged samples; must divide 10,000
+    angles         rad, measured vane angles at t = 0, to start each stage's play where the machine's was
+    stroke_demand  m, logged stroke demand at t = 0: the controller starts on the curve that is nearer to it
+    duration       s, default the stimulus's length
+    pots           float64[frames, 6], what the controller gets of each stem potentiometer: share of its reading and offset (rad), stage by
+                   stage; share 0 = stuck, offset NaN = none. The log keeps the reading itself.
+    watch          called with the states of the controller and the plant at each of the next up to 10,000 ticks, side by side
+    progress       called with the fraction done
+    """
+    machine = plant or _nominal()
+    if CHUNK % every:
+        raise ValueError(f"every (={every}) must divide {CHUNK}")
+    rows = stimulus.rows
+    ticks = int(round((duration if duration is not None else len(rows) * FRAME) * 1000))
+    n_dem, t_oil = float(rows[0, S_N_DEM]), float(rows[0, S_T_OIL])
+    n0 = float(rows[0, S_N_R]) if np.isfinite(rows[0, S_N_R]) else n_dem
+    loop = new_loop(machine, calibration or load_calibration(), n_engine=n_dem, n_r=n0, t_oil=t_oil, noisy=seed is not None, pots=pots)
+    z, s = loop.z, loop.s
+    z[DIRECTION], z[BLEND] = _starting_curve(loop.calibration, n0, stroke_demand)
+    generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
+    silent = np.zeros((1, 5))
+    advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
+    loop.mean[:] = 0.0
+    if angles is not None:
+        machine.place_rings(s, angles, n0, t_oil)
+
+    out = np.empty((-(-ticks // every), len(COLUMNS)))
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(z) + len(s))) for _ in range(2)]
+    digest = hashlib.sha256()
+    started = time.perf_counter()
+    with ThreadPoolExecutor(1) as pool:
+        pending = None
+        for c, k0 in enumerate(range(0, ticks, CHUNK)):
+            n = min(CHUNK, ticks - k0)
+            noise = silent if seed is None else generator.standard_normal((n, 5))
+            snap = buffers[c % 2][:n]
+            advance(k0, n, rows, noise, loop, every, out[k0 // every :], snap)
+            if pending is not None:
+                pending.result()
+            if hashed:
+                pending = pool.submit(digest.update, memoryview(snap))  # type: ignore[arg-type]
+            if watch is not None:
+                watch(snap)
+            if progress is not None:
+                progress((k0 + n) / ticks)
+    wall = time.perf_counter() - started
+    columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
+    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(z[FAULT_BITS]))
+
+
+def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:
+    """Direction and blend whose curve is nearest to the logged stroke demand at speed ``n`` (%)."""
+    if stroke_demand is None:
+        return 1.0, 1.0
+    extension, retraction = (float(np.interp(n, cal.table[0], cal.table[r])) for r in (1, 2))
+    return (1.0, 1.0) if abs(extension - stroke_demand) <= abs(retraction - stroke_demand) else (-1.0, 0.0)
+
+
+def warm_up(say: Callable[[str], None]) -> None:
+    """Compile the loop once, telling the user before a wait of some seconds; silent when its compiled code is there already."""
+    from plant.compiled import is_cached
+
+    if is_cached("lockstep.advance"):
+        return
+    say("compiling the simulator for this machine (once, about 15 s) ...")
+    started = time.perf_counter()
+    lockstep(Stimulus.of(np.full(10, 60.0)))
+    say(f"compiled in {time.perf_counter() - started:.0f} s")

@@ -1,0 +1,5 @@
+"""``python -m vaneloop``: the command line."""
+
+from vaneloop.cli.main import run
+
+run()

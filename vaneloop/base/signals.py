@@ -1,0 +1,8 @@
+"""Names and units of the signals at every border: logs, CAN, tables, command line, plots (docs/architecture.md)."""
+
+__all__ = ["UNITS"]
+
+UNITS = {
+    "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "p_s": "MPa", "t_oil": "degC",
+    "vigv": "deg", "vgv1": "deg", "vgv2": "deg", "state": "-",
+}  # fmt: skip

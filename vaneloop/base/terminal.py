@@ -1,0 +1,222 @@
+"""What every command line of ours shares: one-line errors, exit codes, log options, JSON, progress bar.
+
+Exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop itself.
+Only the standard library is imported here, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+from vaneloop.base.errors import InputError
+
+__all__ = [
+    "DEFECT",
+    "Parser",
+    "add_output_options",
+    "defect",
+    "pairs",
+    "print_table",
+    "progress_bar",
+    "run",
+    "say",
+    "start",
+    "write_json",
+]
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaint is one line, and which does not guess abbreviated options."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        kwargs["allow_abbrev"] = False
+        super().__init__(*args, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the complaint in one line and exit 2."""
+        self.exit(2, f"{self.prog}: {message} ({self.prog} --help explains)\n")
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """Options that say where results go."""
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", metavar="FILE", help="write the result as JSON; - is standard output")
+    group.add_argument("--quiet", action="store_true", help="no text, no progress bar")
+
+
+def pairs(options: list[str], name: str, allowed: Callable[[str], bool] | None = None, known: str = "") -> dict[str, str]:
+    """Split ``a=b`` options into a dict. Raises InputError for anything else, and for an ``a`` that is given two values."""
+    out: dict[str, str] = {}
+    for option in options:
+        key, eq, value = option.partition("=")
+        if not (eq and key.strip() and value.strip()):
+            raise InputError(f"--{name} {option!r} must look like NAME=value")
+        if allowed is not None and not allowed(key.strip()):
+            raise InputError(f"--{name} {option!r}: {key.strip()!r} is not known; allowed: {known}")
+        before = out.setdefault(key.strip(), value.strip())
+        if before != value.strip():
+            raise InputError(f"--{name} {option!r}: {key.strip()!r} has been given {before!r} before; allowed: once")
+    return out
+
+
+
+
+
+
+
+
+
+
+def say(args: argparse.Namespace, text: str) -> None:
+    """Tell the user something, unless quiet; where JSON goes to standard output, text goes to standard error."""
+    if not args.quiet:
+        print(text, file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
+
+
+def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """Print rows of text as a table, numbers to the right."""
+    if args.quiet:
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    say(args, title)
+    table = Table(box=box.SIMPLE_HEAD)
+    for i, c in enumerate(columns):
+        cells = [r[i] for r in rows]
+        text = i == 0 or max(map(len, cells), default=0) > 30 or not any(ch.isdigit() for ch in "".join(cells))
+        table.add_column(c, justify="left" if text else "right", overflow="fold")
+    for r in rows:
+        table.add_row(*r)
+    console = Console(
+        file=sys.stderr if args.json == "-" else sys.stdout, soft_wrap=False, width=None if sys.stdout.isatty() else 150, markup=False
+    )
+    console.print(table)
+
+
+def write_json(args: argparse.Namespace, data: dict[str, Any]) -> None:
+    """Write ``data`` where ``--json`` says; NaN and infinity become null."""
+    if not args.json:
+        return
+    text = json.dumps(plain(data), indent=2, allow_nan=False)
+    if args.json == "-":
+        print(text, flush=True)
+        return
+    from pathlib import Path
+
+    try:
+        Path(args.json).write_text(text + "\n", encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"{args.json}: cannot be written ({e.strerror})") from None
+
+
+def plain(v: Any) -> Any:
+    """Turn numpy values into what JSON knows; NaN and infinity become None."""
+    if isinstance(v, dict):
+        return {str(k): plain(x) for k, x in v.items()}
+    if isinstance(v, list | tuple):
+        return [plain(x) for x in v]
+    if isinstance(v, str | bool | int | type(None)):
+        return v
+    if hasattr(v, "item") and getattr(v, "ndim", 1) == 0:
+        return plain(v.item())
+    if hasattr(v, "tolist"):
+        return plain(v.tolist())
+    f = float(v)
+    return f if f - f == 0.0 else None
+
+
+@contextmanager
+def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[float], None] | None]:
+    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no terminal."""
+    if args.quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(text, total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)
+
+
+DEFECT = 70  # exit code of sysexits.h for an internal error
+
+
+def start(prog: str, load: Callable[[], Any], argv: list[str] | None = None) -> int:
+    """Run a command from its words; return the exit code. ``load`` returns its module: DESCRIPTION, ``add_options``, ``command``."""
+
+    def command() -> int:
+        module = load()
+        parser = Parser(prog=prog, description=module.DESCRIPTION)
+        module.add_options(parser)
+        return int(module.command(parser.parse_args(argv)))
+
+    return run(command)
+
+
+def run(command: Callable[[], int]) -> int:
+    """Call ``command``; turn what users can cause into one line on standard error and an exit code, and so a defect of ours (`defect`)."""
+    try:
+        return command()
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except Exception as e:
+        if not isinstance(e, InputError):
+            print(f"vaneloop: {defect(e)}", file=sys.stderr)
+            return DEFECT
+        print(f"vaneloop: {e}", file=sys.stderr)
+        return 2
+
+
+def defect(e: BaseException) -> str:
+    """One line for an error that no input should cause. The traceback goes into a file, or to standard error with VANELOOP_DEBUG=1."""
+    import tempfile
+    import traceback
+    from pathlib import Path
+
+    if isinstance(e, MemoryError):
+        return "the machine's memory does not suffice for this"
+    lines = "".join(traceback.format_exception(e))
+    place = traceback.extract_tb(e.__traceback__)[-1:]
+    at = f" ({Path(place[0].filename).name}:{place[0].lineno})" if place else ""
+    what = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+    where = "VANELOOP_DEBUG=1 prints the traceback"
+    if os.environ.get("VANELOOP_DEBUG"):
+        print(lines, end="", file=sys.stderr)
+        where = "traceback above"
+    else:
+        try:
+            with tempfile.NamedTemporaryFile("w", prefix="vaneloop-", suffix=".traceback", delete=False, encoding="utf-8") as f:
+                f.write(lines)
+            where = f"traceback in {f.name}"
+        except OSError:
+            pass
+    return f"internal error: {what}{at}. This is a defect of VaneLoop, not of your input; {where}"

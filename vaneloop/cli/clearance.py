@@ -1,0 +1,95 @@
+"""``vaneloop clearance``: the hysteresis of each stage traced to clearances of its joints, in millimetres."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+from vaneloop.base import terminal
+from vaneloop.pages.mechanism import clearance_page
+
+if TYPE_CHECKING:
+
+    pass
+from vaneloop.design.clearance import FITS, WORDS, clearance_study, study_rows
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Where hysteresis comes from: clearance in the joints and a ring whose centre can wander, in the mechanism closed in space.
+Each joint rests on the side that carries the load; the vanes resist motion, so all of them change sides at a reversal. Given the
+fits of the pins, the command finds the ring's freedom that explains each stage's nominal width, and shows what each joint adds.
+
+examples:
+  vaneloop clearance --report clearance.html
+  vaneloop clearance --width vigv=2.4 --actuator 0.3
+  vaneloop clearance --ring 0.5 --vane 90
+
+exit codes: 0 good, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--geometry", metavar="F.toml", default="geometry.toml", help="the mechanism (default: the shipped one)")
+    parser.add_argument(
+        "--width", metavar="STAGE=DEG", action="append", default=[], help="width to explain (default: the hysteresis of the geometry)"
+    )
+    parser.add_argument(
+        "--vane",
+        metavar="DEG",
+        type=float,
+        default=-90.0,
+        help="the measured vane's place, from the right clevis (default -90: the lowest)",
+    )
+    group = parser.add_argument_group("total clearances, mm")
+    for joint, value in FITS.items():
+        group.add_argument(
+            f"--{joint.replace('_', '-')}", metavar="MM", type=float, default=value, help=f"{WORDS[joint]} (default {value:g})"
+        )
+    group.add_argument("--ring", metavar="MM", type=float, help=f"{WORDS['ring']} (default: found, so that the width comes out)")
+    terminal.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from plant import load_geometry
+    from plant.linkage import STAGES
+    from plant.spatial import Clearances
+    from vaneloop.base.errors import InputError
+
+    fits = Clearances(**{joint: getattr(args, joint) for joint in FITS})
+    fits.check()
+    if args.ring is not None:
+        replace(fits, ring=args.ring).check()
+    if not -360.0 <= args.vane <= 360.0:
+        raise InputError(f"--vane (={args.vane:g} deg) must be in [-360, 360]")
+    geometry = load_geometry(args.geometry)
+    widths = {s: getattr(geometry, s).hysteresis.value for s in STAGES}
+    for stage, text in terminal.pairs(args.width, "width", lambda k: k in STAGES, ", ".join(STAGES)).items():
+        try:
+            widths[stage] = float(text)
+        except ValueError:
+            widths[stage] = float("nan")
+        if not 0.0 <= widths[stage] <= 10.0:
+            raise InputError(f"--width {stage}={text}: must be a number in [0, 10] deg")
+    studies = []
+    with terminal.progress_bar(args, "crossing the clearances") as progress:
+        for i, s in enumerate(STAGES):
+            studies.append(clearance_study(geometry, s, widths[s], fits, args.vane, args.ring))
+            if progress is not None:
+                progress((i + 1) / len(STAGES))
+    rows = study_rows(studies)
+    rows.append(["together", *(t for s in studies for t in ("", f"{s.made:.3f}", ""))])
+    columns = ["joint", *(f"{s.stage} {w}" for s in studies for w in ("mm", "deg", "alone, mm"))]
+    where = f"at the vane {args.vane:g} deg from the right clevis"
+    terminal.print_table(args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows)
+    rows = [[name.replace("_", " "), *(f"{s.freedoms[name]:.4f}" for s in studies)] for name in studies[0].freedoms]
+    title = "the ring's four freedoms: change of the vane angle, deg for 1 mm, largest over the stroke"
+    terminal.print_table(args, title, ["freedom", *STAGES], rows)
+    unit = {"clearance": "mm", "width": "deg"}
+    terminal.write_json(args, {"schema": 1, "unit": unit, "vane": args.vane, "stages": [asdict(s) for s in studies]})
+    if args.report:
+        terminal.say(args, f"page: {clearance_page(studies, args.report, ' '.join(['vaneloop clearance', *sys.argv[2:]]), args.vane)}")
+    return 0

@@ -1,0 +1,69 @@
+"""``vaneloop compare``: by how much does the model miss, stage by stage and in the whole loop?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from vaneloop.base import terminal
+from vaneloop.cli import own_model, replay
+from vaneloop.cli.options import chain_of
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Compare the model with a log: the whole loop, as replay does, and each stage driven by its own logged inputs.
+
+In closed loop the controller hides what the model lacks; stage by stage it cannot. Errors are in the signal's unit and in multiples of the
+noise floor.
+
+examples:
+  vaneloop compare examples/hidden_effect.parquet
+  vaneloop compare examples/hidden_effect.parquet --model with_dead_band.toml --tolerance vigv=0.2 --report compare.html
+
+exit codes: 0 agrees (or no tolerance given), 1 a tolerance is exceeded, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options: those of replay."""
+    replay.add_options(parser)
+    own_model.add_options(parser)
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "compare")
+    from hil.logs import LogError
+    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.pages.diagnosis import compare_report, located_sentence
+
+    extra: dict[str, object] = {}
+    report, args.report = args.report, None
+    stages: list[dict[str, object]] = []
+    floors: dict[str, float] = {}
+    try:
+        chain = chain_of(args)
+    except LogError as e:
+        terminal.say(args, f"note: no stage by stage comparison: {e}")
+        extra["not_observed"] = {"all": str(e)}
+    else:
+        located = locate_stages(chain.stages)
+        figures = [f for x in located for f in x.signals]
+        stages = [f.json() for f in figures]
+        floors = {f.signal: f.noise_floor for f in figures}
+        rows = [
+            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), f"{f.ratio:.2f}", f"{f.rms_as_given:.4g}", f.unit,
+             f"{f.samples:,}"] for f in figures
+        ]  # fmt: skip
+        rows += [[name, "not observed: " + why, "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()]
+        columns = ["stage", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
+        terminal.print_table(args, "each stage on its own logged inputs, nominal parameters refitted within their tolerances", columns, rows)
+        terminal.say(args, located_sentence(located))
+        extra["not_observed"] = chain.not_observed
+        extra["verdict"] = "fails" if any(x.fails for x in located) else "agrees"
+        if report:
+            words = " ".join(["vaneloop compare", *sys.argv[2:]])
+            terminal.say(args, f"page: {compare_report(located, chain, report, words, args.log)}")
+            report = None
+    args.report = report
+    return replay.command(args, {"stages": stages, **extra}, floors)

@@ -1,0 +1,84 @@
+"""``vaneloop diagnose``: which physical effects is the model missing?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from vaneloop.base import terminal
+from vaneloop.cli import options, own_model
+from vaneloop.cli.options import add_model_option, chain_of
+
+__all__ = ["DESCRIPTION", "add_options", "command", "show"]
+
+DESCRIPTION = """Find the physical effects that the model lacks, from a log.
+
+Every stage of the machine (demand, servo, engine, actuator, linkage) is driven by its own logged inputs. Each effect of the library is
+fitted, the leaders in pairs; what earns its place on data that it was not fitted to is named, with its probability, its parameters and the
+rivals that this log cannot tell apart. Where the library does not suffice the answer is "unknown", with the shape of what is left.
+
+examples:
+  vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
+  vaneloop diagnose examples/hidden_effect.parquet --model with_dead_band.toml --json -
+
+exit codes: 0 nothing is missing, 1 something is missing or unknown, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    options.add_log_options(parser)
+    add_model_option(parser)
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
+    own_model.add_options(parser)
+    terminal.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "diagnose")
+    from vaneloop.base.errors import InputError
+    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    chain = chain_of(args)
+    with terminal.progress_bar(args, "searching the library of effects") as progress:
+        d = diagnose(chain.stages, chain.not_observed, progress, args.workers)
+    d.notes = list(chain.notes)
+    show(args, d)
+    terminal.write_json(args, diagnosis_json(d, args.log))
+    if args.report:
+        from vaneloop.pages.diagnosis import diagnosis_report
+
+        words = " ".join(["vaneloop diagnose", *sys.argv[2:]])
+        terminal.say(args, f"page: {diagnosis_report(d, chain, args.report, words, args.log)}")
+    return 0 if d.verdict == "none" else 1
+
+
+def show(args: argparse.Namespace, d: Any) -> None:
+    """Print the verdict, the stages and the effects."""
+    from vaneloop.pages.diagnosis import verdict_sentence
+
+    rows = []
+    for s in d.stages:
+        for k in range(len(s.floor)):
+            figures = [f"{v:.4g}" for v in (s.error_before[k], s.error_after[k], s.floor[k])]
+            rows.append([s.stage, s.verdict, s.outputs[k], *figures, s.units[k]])
+    for name, why in d.not_observed.items():
+        rows.append([name, "not observed", why, "-", "-", "-", ""])
+    columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
+    terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
+    for s in d.stages:
+        for f in s.effects:
+            values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
+            rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
+            cause = f"; this log cannot tell its cause from {' or '.join(f.inseparable)}" if f.inseparable else ""
+            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}")
+        for x in d.shapes.get(s.stage, []):
+            terminal.say(args, f"unknown in {s.stage}: {x.text}")
+        if s.verdict == "unknown" and s.nearest:
+            terminal.say(args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}")
+    terminal.say(args, verdict_sentence(d))

@@ -1,0 +1,77 @@
+"""``vaneloop experiment``: which demand profile would best tell the remaining rivals apart?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from vaneloop.base import terminal
+from vaneloop.cli import options
+from vaneloop.cli.options import add_model_option, chain_of
+from vaneloop.discrepancy.models.experiment import recommend
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot tell apart is simulated with
+its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the other's run. The profile under which
+even the best refit stays farthest from the truth separates them best.
+
+examples:
+  vaneloop experiment examples/hidden_effect.parquet --out next_demand.csv --report experiment.html
+
+exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profile separates them, 2 bad input"""
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    options.add_log_options(parser)
+    add_model_option(parser)
+    parser.add_argument("--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem)")
+    terminal.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from hil.logs import Channel, write_log
+    from vaneloop.discrepancy.workflow import diagnose
+
+    chain = chain_of(args)
+    with terminal.progress_bar(args, "searching the library of effects") as progress:
+        d = diagnose(chain.stages, chain.not_observed, progress)
+    with terminal.progress_bar(args, "trying profiles") as progress:
+        e = recommend(d, progress)
+    if e is None:
+        terminal.say(args, "nothing to separate: the log leaves no rivals")
+        terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": None, "profiles": []})
+    else:
+        rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
+        terminal.print_table(args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows)
+        terminal.say(args, e["text"])
+        best = {"profile": e["profile"], "nats": e["score"], "repeats": e["repeats"], "separates": e["separates"], "text": e["text"]}
+        terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": best, "profiles": e["table"]})
+        if args.out:
+            write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
+            terminal.say(args, f"profile: {args.out}")
+    if args.report:
+        from vaneloop.pages.diagnosis import diagnosis_report
+
+        words = " ".join(["vaneloop experiment", *sys.argv[2:]])
+        terminal.say(args, f"page: {diagnosis_report(d, chain, args.report, words, args.log, e)}")
+    return 1 if e is not None and not e["separates"] else 0

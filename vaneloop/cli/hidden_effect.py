@@ -1,0 +1,383 @@
+"""``vaneloop hidden-effect``: the blind benchmark. The rig hides an effect, the diagnosis sees the log only, and every answer is counted.
+
+The rig (``tests/rig``) is an independent simulator with other equations; it is part of a checkout, not of the installed package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base import terminal
+
+__all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
+
+DESCRIPTION = """Blind benchmark of the diagnosis: logs with fresh seeds are drawn (25 % clean, 25 % with an effect that the library does
+not have, 20 % with two effects, the rest with one, from undetectable to gross), written, and diagnosed knowing only the log.
+Every machine's links are drawn within their tolerance; a fifth of the logs lacks rows, in a fifth the controller is for some seconds
+in another mode.
+
+examples:
+  vaneloop hidden-effect --logs 40 --out out/blind.parquet
+  vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
+
+exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
+
+KINDS = ("clean", "outside", "pair", "single")
+SHARES = (0.25, 0.25, 0.20, 0.30)
+GAPS = 0.2  # of the logs lack rows
+MODES = 0.2  # of the logs have seconds in another mode
+LIKELY = 0.5  # a name less probable than this needs a rival
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--logs", type=int, default=40, metavar="N", help="number of logs (default 40)")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
+    parser.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of each log (default 300 s)")
+    parser.add_argument("--rate", type=int, default=100, choices=(10, 100, 1000), help="rows a second (default 100)")
+    parser.add_argument(
+        "--experiments", action="store_true", help="where rivals remain, run the recommended experiment too, and see whether it decides"
+    )
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
+    parser.add_argument(
+        "--out", metavar="F.parquet", default="out/hidden_effect.parquet", help="results, a row a log; an existing file is continued"
+    )
+    terminal.add_output_options(parser)
+
+
+def _rig() -> Any:
+    import importlib
+
+    from vaneloop.base.errors import InputError
+
+    root = str(Path(__file__).resolve().parents[2])  # the checkout, where this is one
+    if root not in sys.path:
+        sys.path.append(root)
+    try:
+        return importlib.import_module("tests.rig"), importlib.import_module("tests.firmware_on_rig")
+    except ImportError:
+        raise InputError("hidden-effect needs the independent rig in tests/rig: run it from a checkout of the repository") from None
+
+
+def draw_case(seed: int, index: int, duration: float = 300.0) -> dict[str, Any]:
+    """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing simulated yet."""
+    import numpy as np
+
+    rig, _ = _rig()
+    rng = np.random.default_rng([seed, index])
+    kind = str(rng.choice(KINDS, p=SHARES))
+    hidden = []
+    if kind == "single":
+        hidden = [rig.draw(str(rng.choice(list(rig.EFFECTS))), int(rng.integers(0, 5)), rng)]
+    elif kind == "outside":
+        hidden = [rig.draw(str(rng.choice(list(rig.OUTSIDE))), int(rng.integers(1, 5)), rng)]
+    elif kind == "pair":
+        two = rng.choice(list(rig.EFFECTS), size=2, replace=False)
+        hidden = [rig.draw(str(name), int(rng.integers(2, 5)), rng) for name in two]
+    machine_seed = int(rng.integers(1, 2**31))
+    geometry = rig.load_geometry(rng=rng)
+    longest = min(10.0, duration / 10.0)
+    gaps, modes = [], []
+    if rng.random() < GAPS:
+        gaps = [(float(rng.uniform(0.05, 0.9) * duration), float(rng.uniform(1.0, longest))) for _ in range(rng.integers(1, 4))]
+    if rng.random() < MODES:
+        kind_of = str(rng.choice(["standby", "deaf"]))
+        modes = [rig.Spell(kind_of, round(float(rng.uniform(0.2, 0.8) * duration), 2), round(float(rng.uniform(1.0, longest)), 2))]
+    return {
+        "index": index, "kind": kind, "hidden": hidden, "machine_seed": machine_seed, "geometry": geometry, "gaps": gaps, "modes": modes,
+    }  # fmt: skip
+
+
+def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]]:
+    """True size of every hidden effect that was named, in border units, beside its interval (where both know the parameter)."""
+    from plant.effects import EFFECTS
+
+    rig, _ = _rig()
+    out = []
+    for h in hidden:
+        named = next((e for e in answer["effects"] if e["effect"] == h.name), None)
+        if named is None:
+            continue
+        sizes = dict(h.parameters)
+        which = int(sizes["stage"]) if "stage" in sizes else -1
+        key = ("vigv", "vgv1", "vgv2")[which] if which >= 0 else rig.EFFECTS[h.name].main
+        declared = next((p for p in EFFECTS[h.name].parameters if p.name == key), None)
+        if declared is not None:
+            truth = sizes[rig.EFFECTS[h.name].main] / declared.si
+            out.append({"effect": h.name, "parameter": key, "truth": truth, **named["parameters"][key]})
+    return out
+
+
+def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
+    """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from vaneloop.cli.experiment import recommend
+    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+
+    e = recommend(d)
+    if e is None:
+        return None
+    out = {"profile": e["profile"], "nats": e["score"], "separable": e["separates"], "resolved": False}
+    if e["separates"]:
+        n = len(e["n_dem"])
+        supply = {k: np.pad(v, (0, max(0, n - len(v))), mode="reflect")[:n] for k, v in (("p_s", test.p_s), ("t_oil", test.t_oil))}
+        again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], **supply))
+        said = diagnosis_json(diagnose(again.stages, again.not_observed, workers=1), "")
+        found = {x["effect"]: x["rivals"] for x in said["effects"]}
+        # what both logs allow: the candidates for each effect of the first log that are candidates in the second
+        second = _all_named(said)
+        left = [{f.effect, *f.rivals} & second for s in d.stages for f in s.effects if f.rivals]
+        hidden = {h.name for h in case["hidden"]}
+        out |= {"resolved": all(len(c) == 1 and c <= hidden for c in left), "named": found}
+    return out
+
+
+def judge_case(seed: int, index: int, duration: float, rate: int, experiments: bool = False) -> dict[str, Any]:
+    """Simulate, write, diagnose and score one log; a flat record."""
+    import numpy as np
+
+    from hil.logs import Channel, read_log, write_log
+    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.models.vanes import build_chain
+    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+
+    rig, on_rig = _rig()
+    case = draw_case(seed, index, duration)
+    test = rig.manoeuvre(case["machine_seed"], duration)
+
+    def stages_of(hidden: list[Any], test: Any = test) -> Any:
+        run = rig.simulate(
+            test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"], gaps=case["gaps"],
+            spells=case["modes"],
+        )  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "log.parquet"
+            write_log(path, {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
+            return build_chain(read_log(path, require=()))
+
+    chain = stages_of(case["hidden"])
+    started = time.perf_counter()
+    d = diagnose(chain.stages, chain.not_observed, workers=1)
+    elapsed = time.perf_counter() - started
+    answer = diagnosis_json(d, f"case {index}")
+    truth = [h.name for h in case["hidden"]]
+    # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3 spreads of the floor
+    detectable = []
+    if truth:
+        clean = stages_of([])
+        for h in case["hidden"]:
+            alone = chain if len(truth) == 1 else stages_of([h])
+            best = 0.0
+            for with_it in alone.stages:
+                without = next((s for s in clean.stages if s.name == with_it.name), None)
+                if without is None or without.floor is None:
+                    continue
+                figures = []
+                for s in (with_it, without):
+                    judge = Judge(s, without.floor)
+                    figures.append(float(np.sqrt(judge.fit((), s.neutral()).held_out.sum() / judge.n)))
+                best = max(best, (figures[0] - figures[1]) * np.sqrt(2.0 * judge.n))
+            detectable.append(bool(best > 3.0))
+    named = [e["effect"] for e in answer["effects"]]
+    rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
+    tried = _experiment(d, case, test, stages_of) if experiments and any(h in _all_named(answer) for h in truth) else None
+    ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
+    return {
+        "seed": seed, "index": index, "kind": case["kind"], "truth": truth,
+        "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]), "geometry": json.dumps(asdict(case["geometry"])),
+        "gaps": json.dumps(case["gaps"]), "modes": json.dumps([asdict(s) for s in case["modes"]]),
+        "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
+        "probabilities": [e["probability"] for e in answer["effects"]],
+        "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
+        "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed, "answer": json.dumps(terminal.plain(answer)),
+        "intervals": json.dumps(terminal.plain(_intervals(case["hidden"], answer))), "experiment": json.dumps(terminal.plain(tried)),
+    }  # fmt: skip
+
+
+def _too_easy(effect: dict[str, Any]) -> bool:
+    """Whether an effect was named improbable and without rival, or with a size on a bound that is not its neutral value."""
+    from plant.effects import EFFECTS
+    from vaneloop.discrepancy.models.vanes import SHAPES
+
+    if effect["probability"] < LIKELY and not effect["rivals"]:
+        return True
+    declared = EFFECTS[effect["effect"]].parameters if effect["effect"] in EFFECTS else ()
+    for p in declared:
+        value = effect["parameters"].get(p.name, {}).get("value", p.neutral)
+        near = 1e-6 * (p.high - p.low)
+        if not p.period and p.name not in SHAPES and abs(value - p.neutral) > near and (value <= p.low + near or value >= p.high - near):
+            return True
+    return False
+
+
+# what is outside the library as a law of it with another cause
+OTHER_CAUSE = {"play_temperature": ("linkage_wear", "oil temperature")}
+
+
+def _told(row: dict[str, Any]) -> bool:
+    """Whether the answer says that it cannot tell the true law's cause from that of the one effect it names."""
+    effects, truth = json.loads(row["answer"])["effects"], row["truth"][0]
+    return len(effects) == 1 and truth in OTHER_CAUSE and (effects[0]["effect"], *effects[0]["inseparable"]) == OTHER_CAUSE[truth]
+
+
+def _all_named(answer: dict[str, Any]) -> set[str]:
+    return {name for e in answer["effects"] for name in (e["effect"], *e["rivals"])}
+
+
+def _hit(effect: str, row: dict[str, Any]) -> bool:
+    rivals = json.loads(row["rivals"])
+    return any(effect == n or effect in rivals[n] for n in row["named"])
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Count: shares with 90 % binomial (Wilson) intervals, and every miss."""
+    from statsmodels.stats.proportion import proportion_confint
+
+    def share(hits: list[bool]) -> dict[str, Any]:
+        n, k = len(hits), sum(hits)
+        low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
+        return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
+
+    single = [r for r in rows if r["kind"] == "single" and r["detectable"][0]]
+    alone = [r for r in single if r["verdict"] == "missing" and len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]]
+    pairs = [r for r in rows if r["kind"] == "pair" and all(r["detectable"])]
+    outside = [r for r in rows if r["kind"] == "outside"]
+    intervals = [i for r in rows for i in json.loads(r["intervals"])]
+    tried = [e for r in rows if (e := json.loads(r["experiment"]))]
+    found = [r for r in single if _hit(r["truth"][0], r) and r["after_over_floor"] is not None]
+    return {
+        "logs": len(rows),
+        "detectable single named or among rivals": share([_hit(r["truth"][0], r) for r in single]),
+        "single named verdict right": share([r["named"][0] == r["truth"][0] for r in alone]),
+        "single named verdict given": share([r in alone for r in single]),
+        "clean logs with a false alarm": share([r["verdict"] != "none" for r in rows if r["kind"] == "clean"]),
+        "clean logs with an effect named": share([bool(r["named"]) for r in rows if r["kind"] == "clean"]),
+        "both effects of a detectable pair": share([all(_hit(e, r) for e in r["truth"]) for r in pairs]),
+        "outside the library: unknown, or none where undetectable": share(
+            [("unknown" in (r["verdict"], *(["unknown"] if r["unknown_stages"] else [])) and not r["named"])
+             or (r["verdict"] == "none" and not r["detectable"][0]) or _told(r) for r in outside]
+        ),
+        "error after within 1.1 noise floors": share([r["after_over_floor"] <= 1.1 for r in found]),
+        "90 % interval covers the truth": share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
+        "parameter within 5 % of the truth": share([abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]),
+        "separable ties decided by the experiment": share([e["resolved"] for e in tried if e["separable"]]),
+        "effects named with P < 0.5 and no rival, or on a bound": share(
+            [_too_easy(e) for r in rows for e in json.loads(r["answer"])["effects"]]
+        ),
+        "median seconds": sorted(r["elapsed_s"] for r in rows)[len(rows) // 2] if rows else None,
+    }  # fmt: skip
+
+
+def reliability(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """How often effects named with a probability were hidden indeed: stated (mean), count, share right, 90 % interval."""
+    from statsmodels.stats.proportion import proportion_confint
+
+    said = [(p, n in r["truth"]) for r in rows for n, p in zip(r["named"], r["probabilities"], strict=True)]
+    out = []
+    for low, high in ((0.0, 0.4), (0.4, 0.6), (0.6, 0.9), (0.9, 1.01)):
+        inside = [(p, right) for p, right in said if low <= p < high]
+        if inside:
+            k, n = sum(right for _, right in inside), len(inside)
+            a, b = proportion_confint(k, n, 0.10, "wilson")
+            stated = sum(p for p, _ in inside) / n
+            out.append([f"{low:g} to {min(high, 1.0):g}", f"{stated:.2f}", f"{k} of {n}", f"{k / n:.2f}", f"{a:.2f} to {b:.2f}"])
+    return out
+
+
+def confusion(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """What was said of each hidden thing: a row a truth and an answer, with its count (answers: the names, none, unknown)."""
+    from collections import Counter
+
+    count: Counter[tuple[str, str]] = Counter()
+    for r in rows:
+        answers = r["named"] or [r["verdict"]]
+        for truth in r["truth"] or ["(clean)"]:
+            hit = truth if truth in answers else f"{answers[0]} (rival)" if _hit(truth, r) else " + ".join(answers)
+            count[truth, hit] += 1
+    return [[truth, said, str(n)] for (truth, said), n in sorted(count.items())]
+
+
+def misses(rows: list[dict[str, Any]]) -> list[str]:
+    """Every answer that is not what it should be, a line each."""
+    out = []
+    for r in rows:
+        what = f"#{r['index']} {r['kind']}: hidden {', '.join(r['truth']) or 'nothing'} {r['sizes']}, detectable {r['detectable']}"
+        said = f"said {r['verdict']} {r['named']} rivals {r['rivals']} unknown {r['unknown_stages']}"
+        wrong = (
+            (r["kind"] == "clean" and r["verdict"] != "none")
+            or (r["kind"] in ("single", "pair") and any(d and not _hit(e, r) for e, d in zip(r["truth"], r["detectable"], strict=True)))
+            or any(_too_easy(e) for e in json.loads(r["answer"])["effects"])
+            or (r["kind"] == "outside" and not _told(r) and (r["named"] or (r["verdict"] == "none" and r["detectable"][0])))
+        )
+        if wrong:
+            out.append(f"{what}; {said}")
+    return out
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    import secrets
+
+    import polars as pl
+
+    from hil.loop.lockstep import warm_up
+    from vaneloop.base.errors import InputError
+
+    _rig()
+    if not 1 <= args.logs <= 100_000 or not 1 <= args.workers <= 64 or not 30.0 <= args.duration <= 1e5:
+        raise InputError("--logs must be in [1, 100000], --workers in [1, 64], --duration in [30, 100000]")
+    path = Path(args.out)
+    rows: list[dict[str, Any]] = []
+    if path.exists():
+        try:
+            rows = pl.read_parquet(path).to_dicts()
+        except Exception as e:
+            raise InputError(f"{path}: not a result of hidden-effect ({type(e).__name__})") from None
+    seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
+    if rows and "gaps" not in rows[0]:
+        raise InputError(f"{path}: written by an older version, with one geometry for all; give another --out")
+    rows = [r for r in rows if r["seed"] == seed]
+    terminal.say(args, f"seed {seed}; {len(rows)} logs done before")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    warm_up(lambda text: terminal.say(args, text))
+    done = {r["index"] for r in rows}
+    todo = [i for i in range(args.logs) if i not in done]
+    with (
+        terminal.progress_bar(args, f"{args.logs} logs") as progress,
+        ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        jobs = [pool.submit(judge_case, seed, i, args.duration, args.rate, args.experiments) for i in todo]
+        for job in as_completed(jobs):
+            rows.append(job.result())
+            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
+            if progress:
+                progress(len(rows) / args.logs)
+    rows.sort(key=lambda r: r["index"])
+    s = summary(rows)
+    table = [
+        [k, f"{v['hits']} of {v['of']}", "-" if v["share"] is None else f"{v['share']:.3f}", f"{v['low']:.3f} to {v['high']:.3f}"]
+        for k, v in s.items()
+        if isinstance(v, dict)
+    ]
+    terminal.print_table(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", ["what", "count", "share", "90 % interval"], table)
+    terminal.print_table(args, "what was hidden, what was said", ["hidden", "said", "logs"], confusion(rows))
+    terminal.print_table(args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows))
+    for line in misses(rows):
+        terminal.say(args, "miss " + line)
+    terminal.write_json(
+        args,
+        {"schema": 1, "seed": seed, "summary": s, "confusion": confusion(rows), "reliability": reliability(rows), "misses": misses(rows)},
+    )
+    return 0

@@ -1,0 +1,51 @@
+"""``vaneloop locate``: which stage fails, under which conditions, since when?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from vaneloop.base import terminal
+from vaneloop.cli import options, own_model
+from vaneloop.cli.options import add_model_option, chain_of, say_located
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Find where the model fails: stage, direction of motion, speed, distance since reversal, stroke, rotor speed, oil
+temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first. Significance is corrected for the number
+of conditions looked at.
+
+examples:
+  vaneloop locate examples/hidden_effect.parquet --report locate.html
+  vaneloop locate examples/hidden_effect.parquet --model with_dead_band.toml --json -
+
+exit codes: 0 every stage agrees everywhere, 1 at least one fails, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    options.add_log_options(parser)
+    add_model_option(parser)
+    own_model.add_options(parser)
+    terminal.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    if own_model.asked(args):
+        return own_model.command(args, "locate")
+    from vaneloop.discrepancy.workflow import locate_stages
+
+    chain = chain_of(args)
+    located = locate_stages(chain.stages)
+    for x in located:
+        say_located(args, x)
+    stages = [x.json() for x in located]
+    terminal.write_json(args, {"schema": 1, "log": args.log, "stages": stages, "not_observed": chain.not_observed, "notes": chain.notes})
+    if args.report:
+        from vaneloop.pages.diagnosis import compare_report
+
+        words = " ".join(["vaneloop locate", *sys.argv[2:]])
+        terminal.say(args, f"page: {compare_report(located, chain, args.report, words, args.log)}")
+    return 1 if any(x.fails for x in located) else 0

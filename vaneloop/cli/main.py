@@ -1,0 +1,72 @@
+"""``vaneloop``: one verb, one function, one command. Each command's module is imported only when it is used."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from vaneloop.base import terminal
+
+__all__ = ["COMMANDS", "main", "run"]
+
+# command -> (module with add_options, command and DESCRIPTION; one line of help)
+COMMANDS = {
+    "replay": ("vaneloop.cli.replay", "run a logged engine run through firmware and plant; errors in figures and pictures"),
+    "compare": ("vaneloop.cli.compare", "the model against a log: the whole loop, and each stage on its own logged inputs"),
+    "locate": ("vaneloop.cli.locate", "which stage fails, under which conditions, since when"),
+    "diagnose": ("vaneloop.cli.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
+    "engine-test": ("vaneloop.cli.engine_test", "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures"),
+    "strategies": ("vaneloop.cli.strategies", "control strategies against each other on worn, hot, noisy engines: errors and cost"),
+    "extend": ("vaneloop.cli.extend", "add effects to the model, fitted to a log; writes a model file"),
+    "experiment": ("vaneloop.cli.experiment", "the demand profile that best tells the remaining rivals apart"),
+    "hidden-effect": ("vaneloop.cli.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
+    "schedule": ("vaneloop.cli.schedule", "links and stroke tables from geometry, schedules and a measured stroke-angle loop"),
+    "spatial": ("vaneloop.cli.spatial", "the planar linkage against the mechanism in space, by constraint equations"),
+    "clearance": ("vaneloop.cli.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
+    "inject": ("vaneloop.cli.inject", "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must"),
+    "fuzz": ("vaneloop.cli.fuzz", "safety campaign: random and mutated frames by the million; limits, transitions, recovery must hold"),
+    "run": ("vaneloop.cli.run", "controller and plant as a node on the CAN bus, in real time or in lockstep"),
+    "ecu": ("vaneloop.cli.ecu", "the engine control unit on the CAN bus: demand from a profile, a log or the keyboard"),
+    "record": ("vaneloop.cli.record", "all frames of a CAN bus into MDF4, BLF, candump or Parquet; survives kill -9"),
+    "design": ("vaneloop.cli.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
+    "web": ("vaneloop.web.command", "the workbench in the browser: missing physics, schedule, run"),
+}
+
+_HELP = f"""Real-time engine-controller firmware simulator: variable guide vanes, their controller, their bus.
+
+usage: vaneloop COMMAND [options]        vaneloop COMMAND --help explains a command
+
+{chr(10).join(f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items())}
+
+first steps:
+  vaneloop engine-test --report engine_test.html
+  vaneloop replay LOG --report replay.html
+
+exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop (VANELOOP_DEBUG=1 prints the traceback)"""
+
+
+def main(argv: list[str]) -> int:
+    """Run the command line ``argv`` (without the program's name); return the exit code."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_HELP)
+        return 0 if argv else 2
+    if argv[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"vaneloop {version('vaneloop')}")
+        return 0
+    name = argv[0]
+    if name not in COMMANDS:
+        print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    # a command's imports take half a second, in which Ctrl-C may come, too
+    return terminal.start(f"vaneloop {name}", lambda: importlib.import_module(COMMANDS[name][0]), argv[1:])
+
+
+def run() -> None:
+    """Entry point of the console script."""
+    sys.exit(main(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    run()

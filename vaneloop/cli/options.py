@@ -1,0 +1,151 @@
+"""Options that several commands share, and what they stand for: a log and how to read it, tables, a model file, stages."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+
+__all__ = ["CAN_SUFFIXES", "TABLES", "add_log_options", "add_model_option", "add_reading_options", "add_tables_option", "calibration_of", "chain_of", "log_options", "machine_of", "read_log_of", "say_located", "tables_of", "tell_search"]
+
+
+def add_model_option(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--model``."""
+    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects (written by vaneloop extend)")
+
+
+def tell_search(say: Callable[[str], None]) -> None:
+    """Tell the user that the first search compiles; silent when the compiled code is there already."""
+    from plant.compiled import is_cached
+
+    if not is_cached("stages.actuator_run"):
+        say("compiling the stages of the search for this machine (once, about 30 s) ...")
+
+
+def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
+    """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``) describes."""
+    from hil.logs import LogError
+    from hil.loop.lockstep import warm_up
+    from plant import load_model
+    from vaneloop.discrepancy.models.vanes import build_chain
+
+    if model is None and args.model:
+        model = load_model(args.model, machine_of(args))
+    log = read_log_of(args, require=())
+    warm_up(lambda text: terminal.say(args, text))
+    tell_search(lambda text: terminal.say(args, text))
+    chain = build_chain(log, machine_of(args, model), present=tuple(model.effects) if model is not None else ())
+    for note in chain.notes:
+        terminal.say(args, f"note: {note}")
+    if not chain.stages:
+        why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
+        raise LogError(f"{args.log}: no stage can be judged ({why})")
+    return chain
+
+
+def say_located(args: argparse.Namespace, located: Any, most: int = 4) -> None:
+    """Print where a stage (`vaneloop.discrepancy.locate.Located`) fails, under ``most`` conditions at most."""
+    terminal.say(args, f"{located.stage}: {located.verdict()}")
+    if located.onset is not None:
+        terminal.say(args, f"  begins at t = {located.onset:.0f} s")
+    for r in located.hot[:most]:
+        terminal.say(args, f"  {r.worst()}")
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Options that say how to read a log: the same for every command that takes one."""
+    parser.add_argument("log", metavar="LOG", help="candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
+    add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
+
+
+def add_reading_options(group: argparse._ArgumentGroup) -> None:
+    """Options that say which name and unit a log uses."""
+    group.add_argument("--dbc", metavar="F", help="database of a CAN log (default: the product's own vgv.dbc)")
+    group.add_argument(
+        "--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem"
+    )
+    group.add_argument("--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm")
+    group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
+
+TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
+
+
+def add_tables_option(group: Any) -> None:
+    """Declare ``--tables``."""
+    group.add_argument(
+        "--tables",
+        metavar="DIR",
+        help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule --out writes one",
+    )
+
+
+def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
+    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says which."""
+    files = {name: f"{name}.toml" for name in TABLES}
+    if getattr(args, "tables", None) is None:
+        return files
+    folder = Path(args.tables)
+    if not folder.is_dir():
+        raise InputError(f"--tables {folder}: is not a folder")
+    found = {name: str(folder / file) for name, file in files.items() if (folder / file).is_file()}
+    if not found:
+        raise InputError(f"--tables {folder}: holds none of {', '.join(files.values())}")
+    if tell:
+        terminal.say(args, f"tables from {folder}: {', '.join(found)}")
+    return {**files, **found}
+
+
+def machine_of(args: argparse.Namespace, model: Any = None) -> Any:
+    """The plant that ``--tables`` describes, with what ``model`` adds."""
+    from plant import build_plant
+
+    files = tables_of(args)
+    return build_plant(files["plant"], files["geometry"], files["schedules"], model)
+
+
+def calibration_of(args: argparse.Namespace, strategy: str | None = None) -> Any:
+    """The controller's calibration that ``--tables`` describes."""
+    from controller import load_calibration
+
+    files = tables_of(args)
+    return load_calibration(files["calibration"], files["stroke_tables"], strategy, files["vane_angles"])
+
+
+def _mapping(options: list[str]) -> dict[str, str]:
+    """``--map`` as name in the log -> signal; where a name serves several signals, signal -> name for all but the first."""
+    out: dict[str, str] = {}
+    for option in options:
+        for name, signal in terminal.pairs([option], "map").items():
+            pair = (name, signal) if out.get(name, signal) == signal else (signal, name)
+            if out.setdefault(*pair) != pair[1]:
+                terminal.pairs([f"{pair[0]}={out[pair[0]]}", "=".join(pair)], "map")  # says so
+    return out
+
+
+def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str, Any]:
+    """What the reading options say, as arguments of `hil.logs.read_log`; ``source`` is the file that they are for (default: the log).
+
+    Raises InputError for options without a file to read.
+    """
+    given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm}
+    if (source or args.log) is None and (idle := next((k for k, v in given.items() if v not in (None, [])), None)):
+        raise InputError(f"{idle} says how to read a log, but none is given (--log LOG)")
+    return {"dbc": args.dbc, "mapping": _mapping(args.map), "units": terminal.pairs(args.unit, "unit"), "design_rpm": args.design_rpm}
+
+CAN_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4")
+
+
+def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",)) -> Any:
+    """Read the log that ``args`` name; tell before code is compiled for it."""
+    from hil.logs import read_log
+
+    options = log_options(args)
+    if str(args.log).lower().endswith(CAN_SUFFIXES):
+        from hil.logs.columns import warm_up
+
+        warm_up(lambda text: terminal.say(args, text))
+    return read_log(args.log, **options, require=require)

@@ -1,0 +1,143 @@
+"""``vaneloop replay`` and ``python -m hil.replay``: a logged run through firmware and plant, in figures and a page."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from hil.replay import STAGE
+from vaneloop.base import terminal
+from vaneloop.cli import options
+
+if TYPE_CHECKING:
+
+    pass
+from hil.replay import STATISTICS, ReplayResult, replay, replay_json
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Replay a logged engine run through the controller's firmware and the plant.
+
+The log's speed demand (and measured speed, supply pressure, oil temperature where logged) drives the loop; every other signal that the log
+measured is compared with the simulated one, and the vane angles with their schedule.
+
+examples:
+  vaneloop replay examples/engine_run.blf --report replay.html
+  vaneloop replay examples/hidden_effect.parquet --tolerance vigv=0.6 --json -
+  vaneloop replay YOURS.log --dbc YOURS.dbc --map ENGINE_RPM=n_dem --unit n_dem=rpm --design-rpm 6000
+
+exit codes: 0 agrees (or no tolerance given), 1 a tolerance is exceeded, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of replay and of compare."""
+    options.add_log_options(parser)
+    group = parser.add_argument_group("the model and the judgement")
+    group.add_argument(
+        "--strategy", metavar="S", help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)"
+    )
+    group.add_argument("--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine")
+    options.add_tables_option(group)
+    group.add_argument(
+        "--tolerance",
+        metavar="signal=value",
+        action="append",
+        default=[],
+        help="largest RMS error allowed, in the signal's unit; signal.max_abs=value, signal.mean_abs=value for the other figures",
+    )
+    terminal.add_output_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    parser.add_argument("--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)")
+
+
+def command(args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None) -> int:
+    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit code."""
+    from pathlib import Path
+
+    from hil.logs import Channel, write_log
+    from vaneloop.base.errors import InputError
+
+    limits = _limits(args.tolerance)
+    options.tables_of(args, tell=True)
+    calibration = options.calibration_of(args, args.strategy)  # refuse a wrong name or table before reading a long log
+    model = None
+    if args.model is not None:
+        from plant import load_model
+
+        model = load_model(args.model, options.machine_of(args))
+    machine = options.machine_of(args, model)
+    log = options.read_log_of(args)
+    from hil.loop.lockstep import warm_up
+
+    warm_up(lambda text: terminal.say(args, text))
+    with terminal.progress_bar(args, f"replaying {Path(args.log).name}") as progress:
+        result = replay(log, plant=machine, calibration=calibration, progress=progress, floors=floors)
+    exceeded = _exceeded(result, limits)
+    rows = [
+        [s.signal, s.stage, s.reference, *(_figure(getattr(s, k)) for k in (*STATISTICS, "noise_floor")), s.unit, f"{s.samples:,}"]
+        for s in result.signals
+    ]
+    columns = ["signal", "stage", "against", "rms", "mean", "max", "mean 99-100 %", "noise floor", "unit", "samples"]
+    terminal.print_table(args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows)
+    for note in result.notes:
+        terminal.say(args, f"note: {note}")
+    for line in exceeded:
+        terminal.say(args, f"differs: {line}")
+    terminal.write_json(args, {**replay_json(result), "exceeded": exceeded, **(extra or {})})
+    if args.report:
+        from vaneloop.pages.replay import replay_report
+
+        words = " ".join(["vaneloop replay", args.log, *(a for a in sys.argv[2:] if a != args.log)])
+        terminal.say(args, f"page: {replay_report(result, args.report, command=words)}")
+    if args.out:
+        channels = {k: Channel(result.t, v) for k, v in result.model.items()}
+        try:
+            write_log(args.out, channels)
+        except OSError as e:
+            raise InputError(f"{args.out}: cannot be written ({e.strerror})") from None
+        terminal.say(args, f"simulated run: {args.out}")
+    return 1 if exceeded else 0
+
+
+def _figure(v: float | None) -> str:
+    return "-" if v is None else f"{v:.4g}"
+
+
+def _limits(options: list[str]) -> dict[tuple[str, str], float]:
+    """Parse ``--tolerance`` into {(signal, statistic): limit}."""
+    from vaneloop.base.errors import InputError
+
+    out = {}
+    for key, text in terminal.pairs(options, "tolerance").items():
+        signal, _, statistic = key.partition(".")
+        statistic = statistic or "rms"
+        if signal not in STAGE or statistic not in STATISTICS:
+            allowed = f"{', '.join(STAGE)}, each also with .{', .'.join(STATISTICS)}"
+            raise InputError(f"--tolerance {key}={text}: {key!r} is not known; allowed: {allowed}")
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not value >= 0.0 or value == float("inf"):
+            raise InputError(f"--tolerance {key}={text}: {text!r} must be a number of 0 or more")
+        out[signal, statistic] = value
+    return out
+
+
+def _exceeded(result: ReplayResult, limits: dict[tuple[str, str], float]) -> list[str]:
+    """Tolerances that are exceeded, in words. The measurement decides; the schedule where nothing was measured."""
+    from vaneloop.base.errors import InputError
+
+    out = []
+    for (signal, statistic), limit in limits.items():
+        of = [s for s in result.signals if s.signal == signal]
+        if not of:
+            raise InputError(f"--tolerance {signal}={limit:g}: {result.log} has no {signal} to compare with")
+        judged = next((s for s in of if s.reference == "measured"), of[0])
+        value = getattr(judged, statistic)
+        words = "measurement" if judged.reference == "measured" else "schedule"
+        if value is not None and value > limit:
+            out.append(f"{signal} {statistic} {value:.4g} {judged.unit} against the {words} exceeds {limit:g} {judged.unit}")
+    return out

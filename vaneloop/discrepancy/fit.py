@@ -1,0 +1,411 @@
+"""Fit a stage's parameters to its log, and judge a fit on data that it has not seen.
+
+Errors are divided by the noise floor and, where a stage integrates, freed of one constant per window. The fit is Levenberg-Marquardt with
+bounds; all difference steps and all damping trials of an iteration are one call of the stage's ``run`` (many parameter sets side by side).
+Nominal parameters carry a prior of the width of their tolerance.
+
+The log is cut into blocks. Leaving one block out changes the least-squares solution by a step that follows from the blocks' normal
+equations, so the held-out error of every block costs no further simulation (exact for a linear model, first order otherwise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = ["Fit", "Judge", "Task", "bounded_step", "recalibrate"]
+
+Answer = TypeVar("Answer")
+Task = Generator[Array, Array, Answer]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
+
+MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
+BLOCK_S = 10.0  # s, longer than the memory of any stage here
+MAX_SETS = 64  # parameter sets in one call of run
+MAX_VALUES = 8_000_000  # errors of several tasks held at one time
+# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an error of form does not
+# average out however long the log. Set on logs of the rig, so that intervals cover the truth as often as they say (docs/diagnosis.md).
+EVIDENCE = 200.0
+DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
+
+
+@dataclass
+class Fit:
+    """Parameters fitted with some effects present.
+
+    effects   names of the effects set free
+    theta     float64[all parameters]
+    free      columns of theta that were fitted
+    cost      whitened sum of squares of every block, float64[blocks], with the parameters fitted to all blocks
+    held_out  the same with the parameters fitted to the other blocks
+    low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the value is in
+    """
+
+    effects: tuple[str, ...]
+    theta: Array
+    free: Array
+    cost: Array
+    held_out: Array
+    gradients: Array
+    normals: Array
+    prior: Array
+    low: Array
+    high: Array
+
+
+class Judge:
+    """Everything that fits of one stage share: whitening, windows, blocks, base fit."""
+
+    def __init__(self, stage: Stage, floor: Array, keep: Array | None = None):
+        """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured ones)."""
+        self.stage, self.floor = stage, np.asarray(floor, dtype=float)
+        self.valid = np.isfinite(stage.measured)
+        if keep is not None:
+            self.valid &= keep
+        self.measured = np.where(self.valid, stage.measured, 0.0)
+        t = stage.t
+        span = t[-1] - t[0]
+        if stage.window:
+            w = np.minimum(((t - t[0]) / stage.window + 1e-9).astype(int), max(int(span / stage.window + 1e-9) - 1, 0))
+        else:
+            w = None
+        blocks = int(np.clip(span / BLOCK_S, MIN_BLOCKS, 60))
+        if w is not None:
+            per = max(1, round((w[-1] + 1) / blocks))
+            block_of = w // per
+            self.window_start: Array | None = np.flatnonzero(np.diff(w, prepend=-1))
+        else:
+            block_of = np.minimum(((t - t[0]) / span * blocks).astype(int), blocks - 1)
+            self.window_start = None
+        self.block_start = np.flatnonzero(np.diff(block_of, prepend=-1))
+        self.n_blocks = len(self.block_start)
+        self.samples = np.add.reduceat(self.valid.sum(axis=0), self.block_start)
+        self.n = int(self.samples.sum())
+        self.scale = self._scales()
+        self._counts: Array | None = None
+        if self.window_start is not None:
+            self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
+            self._lengths = np.diff(np.append(self.window_start, len(t)))
+        self._counted = self.valid.astype(float)  # numpy multiplies by it at twice the speed of booleans
+        self._per_floor = self._counted / self.floor[:, None]
+
+    def _scales(self) -> Array:
+        """Size of a usual change of each parameter, for difference steps and damping."""
+        s = self.stage
+        out = [p.tolerance or abs(p.value) or 1.0 for p in s.parameters]
+        for e in s.effects:
+            starts = np.array(e.starts, dtype=float)
+            for i, p in enumerate(e.parameters):
+                away = np.abs(starts[:, i] - p.value)
+                away = away[away > 0]
+                out.append(float(np.median(away)) if len(away) else abs(p.value) or 1.0)
+        return np.array([p.scale or v for p, v in zip(s.all_parameters(), out, strict=True)])
+
+    def errors(self, thetas: Array) -> Array:
+        """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""
+        thetas = np.atleast_2d(thetas)
+        out = np.empty((len(thetas), *self.measured.shape))
+        for i in range(0, len(thetas), MAX_SETS):
+            self._whiten(self.stage.run(thetas[i : i + MAX_SETS]), out[i : i + MAX_SETS])
+        return out
+
+    def lost(self) -> Array:
+        """Squared error that the log's raster makes expect in each sample, whitened: float64[outputs, samples], 1 on average."""
+        if self.stage.lost is None:
+            return np.ones_like(self.measured)
+        squares = self._whiten(self.measured - self.stage.lost[None])[0] ** 2
+        mean = squares.sum(axis=1) / np.maximum(self.valid.sum(axis=1), 1)
+        return 1.0 + squares - mean[:, None]
+
+    def expected(self) -> Array:
+        """Squared error that the log's raster makes expect in each block, whitened: float64[blocks], 1 on average."""
+        if self.stage.lost is None:
+            return np.ones(self.n_blocks)
+        lost = np.where(self.valid, self.lost(), 0.0).sum(axis=0)
+        return np.asarray(np.maximum(np.add.reduceat(lost, self.block_start) / np.maximum(self.samples, 1), 0.1))
+
+    def _whiten(self, model: Array, out: Array | None = None) -> Array:
+        """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the cache."""
+        out = np.empty(np.shape(model)) if out is None else out
+        for e, m in zip(out, model, strict=True):
+            np.subtract(self.measured, m, out=e)
+            with np.errstate(invalid="ignore", over="ignore"):
+                finite = np.isfinite(e.sum())  # tells it in one quick pass
+            if not finite:
+                e[~np.isfinite(e)] = 0.0
+            if self.window_start is not None and self._counts is not None:
+                e *= self._counted
+                e -= np.repeat(np.add.reduceat(e, self.window_start, axis=1) / self._counts, self._lengths, axis=1)
+            e *= self._per_floor
+        return out
+
+    def block_costs(self, e: Array) -> Array:
+        """Sum of squares per block: float64[sets, blocks]."""
+        return np.add.reduceat(np.einsum("soi,soi->si", e, e), self.block_start, axis=1)
+
+    def columns(self, effects: tuple[str, ...]) -> Array:
+        """Columns that a fit with these effects sets free."""
+        s = self.stage
+        free = [i for i, p in enumerate(s.parameters) if p.tolerance > 0]
+        index = s.index()
+        for name in effects:
+            sl = index[name]
+            free += list(range(sl.start, sl.stop))
+        return np.array(free, dtype=int)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself has no bound."""
+        s = self.stage
+        low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [p.low for e in s.effects for p in e.parameters]
+        high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [p.high for e in s.effects for p in e.parameters]
+        endless = np.array([p.period > 0.0 for p in s.all_parameters()], dtype=bool)
+        return np.where(endless, -np.inf, low), np.where(endless, np.inf, high)
+
+    def wrapped(self, theta: Array) -> Array:
+        """The same parameters, those that repeat themselves within one turn."""
+        for c, p in enumerate(self.stage.all_parameters()):
+            if p.period > 0.0:
+                theta[c] = p.wrapped(theta[c])
+        return theta
+
+    def totals(self, errors: Array, thetas: Array) -> Array:
+        """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior, float64[sets]."""
+        tolerance = np.array([p.tolerance for p in self.stage.all_parameters()])
+        prior = np.where(tolerance > 0.0, 3.0 / np.where(tolerance > 0.0, tolerance, 1.0) ** 2, 0.0)
+        prior = np.where(np.isfinite(prior), prior, 0.0)
+        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.neutral()) ** 2 @ prior)
+
+    def total_of(self, fit: Fit) -> float:
+        """What the fit has minimised."""
+        return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.neutral())[fit.free] ** 2))
+
+    def fit(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Fit:
+        """Fit the nominal parameters and those of ``effects`` from ``start``.
+
+        start    parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
+        weights  of every block, default 1; 0 leaves a block out
+        """
+        return self.together([self.fitting(effects, start, iterations, weights)])[0]
+
+    def together(self, tasks: Sequence[Task[Answer]]) -> list[Answer]:
+        """Run tasks side by side; return what each returns, in their order.
+
+        A task yields parameter sets and gets their whitened errors. What all tasks ask for at one time is simulated in few calls of the
+        stage's ``run``, many sets side by side.
+        """
+        answers: list[Any] = [None] * len(tasks)
+        asked: list[tuple[int, Array]] = []
+
+        def step(i: int, errors: Array | None) -> None:
+            try:
+                asked.append((i, tasks[i].send(errors)))  # type: ignore[arg-type]
+            except StopIteration as end:
+                answers[i] = end.value
+
+        for i in range(len(tasks)):
+            step(i, None)
+        size = self.stage.measured.size
+        while asked:
+            batch: list[tuple[int, Array]] = []
+            sets = 0
+            while asked and (not batch or (sets + len(asked[0][1])) * size <= MAX_VALUES):
+                batch.append(asked.pop(0))
+                sets += len(batch[-1][1])
+            errors = self.errors(np.concatenate([thetas for _, thetas in batch]))
+            at = 0
+            for i, thetas in batch:
+                step(i, errors[at : at + len(thetas)])
+                at += len(thetas)
+        return answers
+
+    def fitting(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Task[Fit]:
+        """`fit` as a task for `together`."""
+        s = self.stage
+        free = self.columns(effects)
+        low, high = self.bounds()
+        linear: tuple[Array, Array, Array] | None = None  # costs, gradients and normals of the blocks at theta
+        if isinstance(start, Fit):
+            if start.effects == effects:
+                linear = start.cost, start.gradients, start.normals
+            start = start.theta
+        theta = self.wrapped(np.clip(np.array(start, dtype=float), low, high))
+        nominal = s.neutral()
+        tolerance = np.array([p.tolerance for p in s.all_parameters()])
+        # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
+        prior = np.array([3.0 / tolerance[c] ** 2 if tolerance[c] > 0.0 else 0.0 for c in free])
+        scale = self.scale[free]
+        block_weights = np.ones(self.n_blocks) if weights is None else weights
+
+        def total(cost: Array, thetas: Array) -> Array:
+            return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
+
+        damping = 1e-3
+        best: float | None = None
+        known: Array | None = None  # errors at theta
+        for _ in range(iterations):
+            if linear is None:
+                thetas, derivative = self._differences(theta, free, scale, high, known)
+                linear = self._blocks(*derivative((yield thetas)))
+            cost, gradients, normals = linear
+            here = float(total(cost[None], theta[None])[0])
+            if best is not None and best - here < 0.2 * len(free) and best >= here:
+                break
+            best = here
+            if len(free) == 0:
+                break
+            a = np.tensordot(block_weights, normals, 1) + np.diag(prior * scale**2)
+            g = block_weights @ gradients - prior * scale * (theta[free] - nominal[free])
+            trials = []
+            for factor in (0.01, 1.0, 300.0):
+                lam = damping * factor
+                damped = a + lam * np.diag(np.maximum(np.diag(a), 1e-9))
+                step = bounded_step(damped, g, *((b[free] - theta[free]) / scale for b in (low, high)))
+                trial = theta.copy()
+                trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
+                trials.append((lam, self.wrapped(trial)))
+            thetas = np.array([t for _, t in trials])
+            errors = yield thetas
+            costs = total(self.block_costs(errors), thetas)
+            k = int(np.argmin(costs))
+            if not costs[k] < here:
+                break
+            damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
+            if here - costs[k] < 0.2 * max(1, len(free)):
+                break
+        if linear is None:
+            thetas, derivative = self._differences(theta, free, scale, high, known)
+            linear = self._blocks(*derivative((yield thetas)))
+        return self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear)
+
+    def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
+        """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives (`linearise`)."""
+        rows = np.concatenate([e[None], jac])
+        ends = np.append(self.block_start[1:], e.shape[1])
+        grams = np.zeros((self.n_blocks, len(rows), len(rows)))
+        for gram, i, j in zip(grams, self.block_start, ends, strict=True):
+            for o in range(len(e)):
+                gram += rows[:, o, i:j] @ rows[:, o, i:j].T
+        return grams[:, 0, 0], grams[:, 1:, 0], grams[:, 1:, 1:]
+
+    def linearise(self, theta: Array, free: Array) -> tuple[Array, Array]:
+        """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs, samples)."""
+        thetas, derivative = self._differences(theta, free, self.scale[free], self.bounds()[1])
+        return derivative(self.errors(thetas))
+
+    def _differences(
+        self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
+    ) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+        """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta, if they are."""
+        names = self.stage.outputs
+        owner = [names.index(p.output) if p.output in names else None for p in self.stage.all_parameters()]
+        row = np.zeros(len(free), dtype=int)
+        groups: list[list[int | None]] = []
+        for i, c in enumerate(free):  # parameters that move different outputs share a simulation
+            for g, taken in enumerate(groups):
+                if owner[c] is not None and None not in taken and owner[c] not in taken:
+                    taken.append(owner[c])
+                    row[i] = g
+                    break
+            else:
+                groups.append([owner[c]])
+                row[i] = len(groups) - 1
+        thetas = np.repeat(theta[None], len(groups) + 1, axis=0)
+        steps = np.empty(len(free))
+        for i, c in enumerate(free):
+            d = DIFFERENCE * scale[i]
+            if theta[c] + d > high[c]:
+                d = -d
+            thetas[row[i] + 1, c] += d
+            steps[i] = d / scale[i]
+
+        def derivative(e: Array) -> tuple[Array, Array]:
+            here, moved = (e[0].copy(), e[1:]) if known is None else (known, e)
+            jac = np.zeros((len(free), *here.shape))
+            for i, c in enumerate(free):
+                only = slice(None) if owner[c] is None else owner[c]
+                jac[i, only] = (here[only] - moved[row[i], only]) / steps[i]
+            return here, jac
+
+        return thetas if known is None else thetas[1:], derivative
+
+    def _finish(
+        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array,
+        cost: Array, gradients: Array, normals: Array,
+    ) -> Fit:  # fmt: skip
+        k = len(free)
+        # parameters at a bound do not move
+        scaled_prior = prior * scale**2
+        pinned = (theta[free] <= low[free]) | (theta[free] >= high[free])
+        held = cost.copy()
+        half = np.zeros(k)
+        move = ~pinned
+        if move.any():
+            nm, gm, pm = normals[:, move][:, :, move], gradients[:, move], scaled_prior[move]
+            # at the solution the blocks' pulls and the prior's cancel; what is left of the pull is rounding and bounds
+            pull = gm.sum(axis=0) - pm * ((theta[free] - nominal[free]) / scale)[move]
+            total = nm.sum(axis=0) + np.diag(pm)
+            a = total - nm + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
+            without = np.linalg.solve(a, (pull - gm)[:, :, None])[:, :, 0]
+            held = self._held_out(cost, theta, free, scale, low, high, move, gradients, normals)
+            centre = without.mean(axis=0)
+            spread = np.zeros(k)
+            spread[move] = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
+            # a nominal parameter at the edge of its tolerance is still as uncertain as its tolerance
+            loose = move | (scaled_prior > 0.0)
+            excess = max(1.0, cost.sum() / max(self.n, 1))
+            worth = min(1.0 / excess, EVIDENCE * len(self.stage.outputs) / max(self.n, 1))
+            info = normals.sum(axis=0)[np.ix_(loose, loose)] * worth + np.diag(scaled_prior[loose])
+            variance = np.zeros(k)
+            variance[loose] = np.diag(np.linalg.pinv(info))
+            half[move] = (1.645 * np.sqrt(np.maximum(variance, spread)) * scale)[move]
+            turn = np.array([p.period or np.inf for p in self.stage.all_parameters()])[free]
+            half = np.minimum(half, 0.5 * turn)
+        return Fit(
+            effects, theta, free, cost, np.maximum(held, cost * 0.5), gradients, normals, prior, theta[free] - half, theta[free] + half
+        )
+
+    def _held_out(
+        self, cost: Array, theta: Array, free: Array, scale: Array, low: Array, high: Array, move: Array, gradients: Array, normals: Array
+    ) -> Array:
+        """Cost of each block with the effects' parameters fitted to the other blocks.
+
+        Nominal parameters are calibrated on the whole log: a lag that only one manoeuvre shows is no reason to distrust the model.
+        """
+        mine = move & (free >= len(self.stage.parameters))
+        if not mine.any():
+            return cost.copy()
+        g, a = gradients[:, mine], normals[:, mine][:, :, mine]
+        total, pull = a.sum(axis=0), g.sum(axis=0)
+        ridge = 1e-6 * np.diag(np.maximum(np.diag(total), 1e-12))
+        columns, size = free[mine], scale[mine]
+        step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
+        step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
+        return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))
+
+
+def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
+    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest is solved again.
+
+    A step that is only cut off at the bounds is no descent where parameters can stand in for each other.
+    """
+    step = np.zeros(len(g))
+    moves = np.ones(len(g), dtype=bool)
+    for _ in range(len(g)):
+        step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
+        beyond = moves & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        step[beyond] = np.clip(step[beyond], low[beyond], high[beyond])
+        moves &= ~beyond
+        if not moves.any():
+            break
+    return step
+
+
+def recalibrate(judge: Judge) -> Fit:
+    """The stage with nothing added, its nominal parameters refitted within their tolerances: what every verb starts from."""
+    return judge.fit((), judge.stage.neutral())

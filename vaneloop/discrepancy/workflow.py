@@ -1,0 +1,316 @@
+"""Compare, diagnose and extend over all stages of a model, and the JSON of it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vaneloop.discrepancy.diagnose import (
+    NATS,
+    Search,
+    StageDiagnosis,
+    as_close,
+    correlation_of,
+    diagnose_stage,
+    found_of,
+    parameters_of,
+    recalibrated,
+    rms_per_output,
+    significant,
+)
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
+from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
+
+__all__ = [
+    "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage", "floor_of", "locate_stages",
+    "no_better",
+]  # fmt: skip
+
+
+@dataclass
+class Diagnosis:
+    """What all stages say together."""
+
+    verdict: str
+    stages: list[StageDiagnosis]
+    shapes: dict[str, list[Shape]]
+    not_observed: dict[str, str]
+    elapsed_s: float
+    notes: list[str] = field(default_factory=list)
+
+
+def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None] | None = None) -> list[Located]:
+    """Every stage with nothing added, driven by its own logged inputs: how large its error is, and under which conditions."""
+    out = []
+    for i, stage in enumerate(stages):
+        if progress:
+            progress(i / len(stages), stage.name)
+        out.append(locate(Judge(stage, floor_of(stage))))
+    return out
+
+
+def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
+    """Error of every output of every stage, driven by its own logged inputs, with nothing added."""
+    return [figures for located in locate_stages(stages) for figures in located.signals]
+
+
+def floor_of(stage: Stage) -> Array:
+    """The stage's noise floor, which whoever made the stage must have given."""
+    if stage.floor is None or not np.all(np.isfinite(stage.floor)):
+        raise StageError(f"stage {stage.name!r}: no noise floor")
+    return stage.floor
+
+
+_WORK: list[Stage] = []
+
+
+def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
+    stage = _WORK[i]
+    d = diagnose_stage(stage, floor_of(stage))
+    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" or not agrees(d.excess, 1.0) else []
+
+
+def diagnose(
+    stages: Sequence[Stage], not_observed: dict[str, str] | None = None, progress: Callable[[float], None] | None = None, workers: int = 2
+) -> Diagnosis:
+    """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can fork."""
+    started = time.perf_counter()
+    _WORK[:] = list(stages)
+    # the longest first
+    order = sorted(range(len(_WORK)), key=lambda i: -len(_WORK[i].effects) * len(_WORK[i].outputs))
+    done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
+    if workers > 1 and len(_WORK) > 1 and hasattr(os, "fork"):
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
+            jobs = {i: pool.submit(_one, i) for i in order}
+            for n, i in enumerate(order):
+                done[i] = jobs[i].result()
+                if progress:
+                    progress((n + 1) / len(order))
+    else:
+        for n, i in enumerate(order):
+            done[i] = _one(i)
+            if progress:
+                progress((n + 1) / len(order))
+    results = [done[i][0] for i in range(len(_WORK))]
+    _agree({s.name: s for s in stages}, results)
+    shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
+    verdicts = {d.verdict for d in results}
+    verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
+    return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
+    """Let the stages settle each other's answers: an effect that acts in two stages must do so in both by the same amount.
+
+    Among an effect and its rivals those go that another stage contradicts; those stay alone that another stage names too. Where all of
+    them are contradicted, with any size near theirs, the next best of those that were tried takes the place if it explains as much;
+    else the stage's answer is "unknown".
+    """
+    for d in results:
+        judge = Judge(stages[d.stage], d.floor)
+        for k, f in enumerate(d.effects):
+            elsewhere = {
+                m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()] for m in f.fits
+            }
+            options = [f.effect, *f.rivals]
+            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])]
+            if not left:
+                left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
+            beside = {g.effect: d.final for g in d.effects if g is not f}  # they may have changed since the rivals were fitted
+            refitted: dict[str, Fit] = {}
+            for m in () if left else sorted((m for m in f.shares if m not in options), key=lambda m: -f.shares[m]):
+                if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m]):
+                    refitted[m] = _with(judge, {**beside, m: f.fits[m]})  # where an excerpt was searched, to the whole log now
+                    if as_close(judge, d, refitted[m]):
+                        left = [m]
+                        break
+            if not left:
+                d.verdict, d.nearest, d.effects = "unknown", options[:3], []
+                d.refused = [f"{m} is contradicted by {elsewhere[m][0].stage}" for m in options if elsewhere[m]]
+                break
+            seconded = [m for m in left if any(m in (g.effect, *g.rivals) for o in elsewhere[m] for g in o.effects)]
+            left = seconded or left
+            if left == options:
+                continue
+            name, fit = left[0], d.final
+            if name != f.effect:
+                fit = refitted.get(name) or _with(judge, {**beside, name: f.fits[name]})
+                d.final, d.error_after = fit, rms_per_output(judge, fit)
+                d.recalibrated = recalibrated(stages[d.stage], fit)
+                for other in d.effects:
+                    if other is not f:
+                        other.parameters = parameters_of(stages[d.stage], fit, other.effect)
+            shares = {m: f.shares.get(m, 1.0) for m in left}
+            d.effects[k] = replace(
+                f, effect=name, rivals=left[1:], probability=shares[name] / max(sum(shares.values()), 1e-300),
+                parameters=parameters_of(stages[d.stage], fit, name),
+            )  # fmt: skip
+
+
+NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
+
+
+def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
+    """Fit exactly these effects, each started from its size in the fit given; the last one's nominal parameters too."""
+    index, start = judge.stage.index(), judge.stage.neutral()
+    for name, fit in sources.items():
+        nominal = slice(len(judge.stage.parameters))
+        start[nominal], start[index[name]] = fit.theta[nominal], fit.theta[index[name]]
+    return judge.fit(tuple(sources), start, 4)
+
+
+def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str, near: float = 0.0) -> bool:
+    """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too.
+
+    near  share of its size by which the interval is widened
+    """
+    stage = stages[other.stage]
+    mine, theirs = stages[d.stage].index()[effect], stage.index()[effect]
+    at = [int(np.flatnonzero(fit.free == c)[0]) for c in range(mine.start, mine.stop)]
+    there, turns = other.final.theta[theirs].copy(), [p.period for p in stage.effect(effect).parameters]
+    for i, turn in enumerate(turns):
+        if turn:
+            there[i] += turn * np.round((fit.theta[mine][i] - there[i]) / turn)
+    wider = near * np.abs(fit.theta[mine] - stages[d.stage].neutral()[mine])
+    size = np.clip(there, fit.low[at] - wider, fit.high[at] + wider)
+    if np.array_equal(size, there):
+        return True
+    judge = Judge(stage, other.floor)
+    start = other.final.theta.copy()
+    start[theirs] = size
+    held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
+    return not significant(judge, held, other.final, correlation_of(judge, other.final))
+
+
+def _one_by_one(
+    stage: Stage, floor: Array, effects: tuple[str, ...], tick: Callable[[], None] | None
+) -> tuple[Judge, Search, tuple[str, ...], list[Fit]]:
+    """Fits with no effect, one, two and so on up to all; the one that explains most first."""
+    judge = Judge(stage, floor)
+    search = Search(judge, tick)
+    search.singles(effects)
+    order: tuple[str, ...] = ()
+    while len(order) < len(effects):
+        order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
+    return judge, search, order, [search.base, *(search.joined(order[: k + 1]) for k in range(len(order)))]
+
+
+def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
+    """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
+
+    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step. Errors are held-out.
+    Raises StageError for an effect that the stage does not have.
+    """
+    for e in effects:
+        if all(e != x.name for x in stage.effects):
+            raise StageError(f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}")
+    floor = floor_of(stage)
+    for attempt in range(3):
+        judge, search, order, fits = _one_by_one(stage, floor, effects, tick)
+        if stage.noise is None or attempt == 2:
+            break
+        lower = noise_of(stage, fits[-1].theta)
+        if not np.any(lower < 0.9 * floor):
+            break
+        floor = np.minimum(lower, floor)  # the nominal model's error held motion that passed for noise
+    reach = reach_of(stage, floor, fits[-1].theta)
+    if np.any(reach > floor):
+        judge, search, order, fits = _one_by_one(stage, reach, effects, tick)
+    final = fits[-1]
+
+    def rms(fit: Fit) -> float:
+        return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1)))
+
+    names = ["nominal", *(f"+ {e}" for e in order)]
+    steps = list(zip(names, map(rms, fits), strict=True))
+    if stage.finer is not None:
+        d = judge.errors(final.theta[None]) - judge._whiten(stage.finer(final.theta[None]))
+        numerical = float(np.sqrt(np.sum(d * d) / max(judge.n, 1)))
+        steps.append(("without numerical error", float(np.sqrt(max(rms(final) ** 2 - numerical**2, 0.0)))))
+    found = found_of(judge, final, effects)
+    before, after = (rms_per_output(judge, f) for f in (search.base, final))
+    return StageDiagnosis(
+        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if effects else "none", floor=judge.floor,
+        base=search.base, final=final, error_before=before, error_after=after, effects=found, recalibrated=recalibrated(stage, final),
+        candidates=[], correlation=1.0, steps=steps, excess=rms(final),
+    )  # fmt: skip
+
+
+def no_better(r: StageDiagnosis) -> str | None:
+    """Say in one line that the effects of `extend_stage` or `extend_system` do not bring the model nearer to the log; None: they do.
+
+    Errors are held-out; on the data that it was fitted to, a model with more effects is never farther off.
+    """
+    before = r.steps[0][1]
+    if not r.final.effects or r.excess < before:
+        return None
+    on_bound = [f"{f.effect} {n}" for f in r.effects for n, p in f.parameters.items() if p["low"] == p["value"] == p["high"]]
+    why = f"; on a bound or neutral: {', '.join(on_bound)}" if on_bound else ""
+    return f"{r.stage}: {', '.join(r.final.effects)} takes the error from {before:.4g} to {r.excess:.4g} noise floors, no better{why}"
+
+
+def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
+    """Return the diagnosis as the JSON of the command."""
+    stages, effects, recalibrated, unknown, unobservable = [], [], [], [], []
+    for s in d.stages:
+        for k in range(len(s.floor)):
+            stages.append(
+                {
+                    "stage": s.stage,
+                    "verdict": s.verdict,
+                    "signal": s.outputs[k],
+                    "unit": s.units[k],
+                    "error_before": float(s.error_before[k]),
+                    "error_after": float(s.error_after[k]),
+                    "noise_floor": float(s.floor[k]),
+                }
+            )
+        for f in s.effects:
+            effects.append(
+                {
+                    "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals,
+                    "inseparable": f.inseparable,
+                }
+            )  # fmt: skip
+        recalibrated += s.recalibrated
+        if s.verdict == "unknown" or not agrees(s.excess, 1.0):
+            text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
+            text = "; ".join([text, *s.refused])
+            leaning = s.nearest or [c.effect for c in s.candidates if c.nats > NATS][:3]
+            unknown.append({"stage": s.stage, "shape": text, "nearest_effects": leaning})
+        unobservable += [{"effect": c.effect, "stage": s.stage, "needs": c.reason} for c in s.candidates if c.reason]
+    for name, why in d.not_observed.items():
+        stages.append(
+            {
+                "stage": name, "verdict": "not_observed", "signal": None, "unit": None, "error_before": None, "error_after": None,
+                "noise_floor": None, "reason": why,
+            }
+        )  # fmt: skip
+    effects.sort(key=lambda e: -float(str(e["probability"])))
+    # an effect that shows in two stages is one effect: the stage where it gains most speaks for it
+    best: dict[str, tuple[float, str]] = {}
+    for s in d.stages:
+        for f in s.effects:
+            if f.effect not in best or f.nats > best[f.effect][0]:
+                best[f.effect] = (f.nats, s.stage)
+    effects = [e for e in effects if best[str(e["effect"])][1] == e["stage"]]
+    return {
+        "schema": 1,
+        "log": log,
+        "verdict": d.verdict,
+        "stages": stages,
+        "effects": effects,
+        "recalibrated": recalibrated,
+        "unknown": unknown,
+        "not_observable": unobservable,
+        "notes": d.notes,
+        "elapsed_s": d.elapsed_s,
+    }

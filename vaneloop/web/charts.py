@@ -1,0 +1,172 @@
+"""Curves and figures of the pages: long time curves thinned on the server for the view that is asked for, small figures from Plotly.
+
+A view of n pixels gets about two points a pixel and line: the greatest and least of each stretch, chosen by tsdownsample's MinMax, so
+that no spike is lost at any zoom. The browser draws them with uPlot (chart.js).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from nicegui.element import Element
+from nicegui.elements import plotly as bundled
+from tsdownsample import MinMaxDownsampler
+
+from vaneloop.pages.page import THEMES, break_at_holes
+
+__all__ = ["Chart", "Curves", "Figure", "Panel", "Trace", "figure", "of_log", "painted", "view"]
+
+Array = np.ndarray
+MOST_POINTS = 4000  # a line and view, whatever the browser asks for
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One line of a panel; its colour by role (`vaneloop.pages.page.THEMES`)."""
+
+    name: str
+    y: Array
+    role: str = "measured"
+    width: float = 1.25
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero. least: smallest height of the y axis."""
+
+    title: str
+    unit: str
+    t: Array
+    traces: Sequence[Trace]
+    band: float | None = None
+    height: int = 110
+    least: float = 0.0
+
+
+@dataclass
+class Curves:
+    """What a chart shows. ``key`` changes where the old view makes no sense any more."""
+
+    panels: Sequence[Panel] = field(default_factory=list)
+    key: str = ""
+
+
+def view(curves: Curves, start: float | None, end: float | None, pixels: int) -> bytes:
+    """Answer a chart's question: head (JSON, its length before it), then x and lines of every panel as float64."""
+    n_out = int(np.clip(2 * pixels, 200, MOST_POINTS))
+    heads: list[dict[str, Any]] = []
+    body: list[bytes] = []
+    low, high = np.inf, -np.inf
+    for p in curves.panels:
+        if len(p.t):
+            low, high = min(low, float(p.t[0])), max(high, float(p.t[-1]))
+        i = 0 if start is None else max(0, int(np.searchsorted(p.t, start)) - 1)
+        j = len(p.t) if end is None else min(len(p.t), int(np.searchsorted(p.t, end)) + 1)
+        x, lines = _thin(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
+        names = [{"name": t.name, "role": t.role, "width": t.width} for t in p.traces]
+        heads.append({"title": p.title, "unit": p.unit, "band": p.band, "height": p.height, "least": p.least, "n": len(x), "lines": names})
+        body += [np.ascontiguousarray(a, dtype="<f8").tobytes() for a in (x, *lines)]
+    span = [low, high if high > low else low + 1.0] if np.isfinite(low) else [0.0, 1.0]
+    head = json.dumps({"panels": heads, "span": span, "key": curves.key}).encode()
+    return struct.pack("<I", len(head)) + head + bytes(-(4 + len(head)) % 8) + b"".join(body)
+
+
+def _thin(t: Array, lines: Sequence[Array], n_out: int) -> tuple[Array, list[Array]]:
+    """Points of all lines at the times that any of them needs."""
+    if len(t) > n_out:
+        t = np.ascontiguousarray(t)
+        share = max(100, n_out // max(1, len(lines))) // 2 * 2
+        keep = [MinMaxDownsampler().downsample(t, _whole(y), n_out=share) for y in lines]
+        pick = np.unique(np.concatenate(keep).astype(np.int64))
+        t, lines = t[pick], [y[pick] for y in lines]
+    return t, list(lines)
+
+
+def _whole(y: Array) -> Array:
+    """Values without NaN, for choosing points: a hole holds the value before it."""
+    bad = ~np.isfinite(y)
+    if not bad.any():
+        return np.ascontiguousarray(y, dtype=np.float64)
+    last = np.maximum.accumulate(np.where(bad, -1, np.arange(len(y))))
+    return np.where(last >= 0, np.asarray(y, dtype=np.float64)[np.maximum(last, 0)], 0.0)
+
+
+def of_log(channels: Mapping[str, tuple[str, Array, Array]], key: str) -> Curves:
+    """All channels of a log, one below the other, holes open."""
+    panels = []
+    for name, (unit, t, values) in channels.items():
+        x, y = break_at_holes(t, values)
+        panels.append(Panel(f"{name} [{unit}]", unit, np.asarray(x), [Trace(name, np.asarray(y), "measured")], height=74))
+    return Curves(panels, key)
+
+
+class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):
+    """Time curves in the browser; ``source`` names the curves at the server (`/curves/SOURCE`)."""
+
+    def __init__(self, source: str, live: float = 0.0):
+        """``live``: questions a second of a chart whose curves move on by themselves."""
+        super().__init__()
+        self._props["src"] = f"/curves/{source}"
+        self._props["version"] = 0
+        self._props["live"] = live
+
+    def refetch(self) -> None:
+        """Tell the browser that the curves have changed."""
+        self._props["version"] += 1
+        self.update()
+
+
+class Figure(Element, component="figure.js"):
+    """A figure in Plotly's JSON, drawn by the Plotly that NiceGUI bundles."""
+
+    needs = bundled.Plotly  # puts "nicegui-plotly" among the page's modules
+
+    def __init__(self, options: dict[str, Any]):
+        super().__init__()
+        self._props["options"] = options
+        self.classes("w-full")
+
+
+# ---- small figures ----------------------------------------------------------------------------------------------------------------------
+
+
+def painted(x: Any, theme: Mapping[str, str]) -> Any:
+    """``@role`` of vaneloop.pages.page's figures as this theme's colour."""
+    if isinstance(x, str) and x.startswith("@"):
+        role, _, alpha = x[1:].partition("/")
+        if role not in theme:
+            return x
+        return theme[role] + (f"{round(255 * float(alpha)):02x}" if alpha else "")
+    if isinstance(x, list | tuple):
+        return [painted(v, theme) for v in x]
+    if isinstance(x, dict):
+        return x if "bdata" in x else {k: painted(v, theme) for k, v in x.items()}
+    return x
+
+
+def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
+    """Show a figure of vaneloop.pages.page in the page's theme."""
+    c = THEMES["dark" if dark else "light"]
+    axis = {"gridcolor": c["grid"], "linecolor": c["muted"], "zerolinecolor": c["muted"], "tickcolor": c["muted"], "automargin": True}
+    layout = painted(f["layout"], c)
+    for key in [k for k in layout if k.startswith(("xaxis", "yaxis"))]:
+        layout[key] = {**axis, **layout[key]}
+    layout |= {
+        "font": {"family": "system-ui, sans-serif", "size": 12.5, "color": c["text"]},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "margin": {"l": 60, "r": 24, "t": 26, "b": 42},
+        "autosize": True,
+        "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"},
+        "hoverlabel": {"bgcolor": c["panel"], "bordercolor": c["muted"], "font": {"color": c["text"]}},
+        "colorway": [c["measured"], c["model"], c["target"], c["error"], c["other"]],
+    }
+    if height is not None:
+        layout["height"] = height
+    config = {"displayModeBar": False, "displaylogo": False, "plotlyServerURL": ""}
+    return Figure({"data": painted(f["data"], c), "layout": layout, "config": config})

@@ -1,0 +1,234 @@
+"""What all pages share: head, light and dark, lines of complaint, progress with cancel, the command to copy."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+from nicegui.element import Element
+
+from vaneloop.discrepancy.locate import agrees
+from vaneloop.pages.page import THEMES
+from vaneloop.web.charts import figure as figure_of
+from vaneloop.web.session import Session
+
+__all__ = ["PAGES", "Live", "card", "command_line", "figure_of", "frame", "opened", "table", "tone"]
+
+PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
+PRIMARY = "#1f6fc4"
+OFTEN = 0.05  # s between two looks at what has changed
+
+
+def styles() -> str:
+    """The pages' style sheet, in the colours of vaneloop.pages.page's reports."""
+    more = {"light": "--page:#f3f5f8;--lift:#eef2f6", "dark": "--page:#0f1419;--lift:#1d252e"}
+    themes = [f"body.body--{n}{{{''.join(f'--{k}:{v};' for k, v in c.items())}{more[n]}}}" for n, c in THEMES.items()]
+    return "\n".join([*themes, (Path(__file__).parent / "style.css").read_text(encoding="utf-8")])
+
+
+@contextmanager
+def frame(session: Session, here: str) -> Iterator[None]:
+    """Head, theme and the column in which a page's cards stand."""
+    ui.add_css(styles())
+    ui.add_head_html('<link rel="stylesheet" href="/assets/uPlot.css">')
+    ui.colors(primary=PRIMARY)
+    mode = ui.dark_mode(value=session.dark)
+    with ui.element("header").classes("head"):
+        ui.link("VaneLoop", "/").classes("brand")
+        for path, name in PAGES:
+            ui.link(name, path).classes("page" + (" here" if path == here else ""))
+        ui.element("div").classes("grow")
+
+        def flip() -> None:
+            session.dark = not dark(session)
+            mode.value = session.dark
+            session.touch("theme")
+
+        ui.button(icon="contrast", on_click=flip).props('flat round dense color=grey aria-label="light or dark"').tooltip("light or dark")
+
+    async def ask() -> None:
+        try:
+            prefers = bool(await ui.run_javascript("matchMedia('(prefers-color-scheme: dark)').matches", timeout=60.0))
+        except TimeoutError:  # the browser has gone, or is kept from answering
+            return
+        if session.extra.get("prefers_dark") != prefers:
+            session.extra["prefers_dark"] = prefers
+            session.touch("theme")
+
+    ui.timer(0.01, ask, once=True)
+    with ui.element("main").classes("main"):
+        yield
+
+
+def dark(session: Session) -> bool:
+    """Whether the page is dark now."""
+    return bool(session.extra.get("prefers_dark", False)) if session.dark is None else session.dark
+
+
+class Live:
+    """Redraws parts of a page when what they show has changed: part -> sections of the session that it watches.
+
+    A click on an element that has meanwhile been drawn anew is lost, so nothing is drawn anew for progress, and buttons stay.
+    """
+
+    def __init__(self, session: Session):
+        """Look soon after something has changed; nothing travels to the browser otherwise."""
+        self.session = session
+        self.parts: list[tuple[Callable[[], None], tuple[str, ...], Element | None]] = []
+        self.seen: dict[str, int] = dict(session.versions)
+        self.counted = time.monotonic()
+        self.looked, self.soon = 0.0, False
+        self.client = ui.context.client
+        ui.timer(0.5, self.look)
+        session.lookers.append(self.wake)
+        self.client.on_delete(lambda: session.lookers.remove(self.wake))
+
+    def wake(self) -> None:
+        """Look as soon as what goes on now has ended, but not more often than ``OFTEN`` allows."""
+        if not self.soon:
+            self.soon = True
+            wait = max(0.0, self.looked + OFTEN - time.monotonic())
+            asyncio.get_running_loop().call_later(wait, self.look)
+
+    def watch(self, draw: Callable[[], None], *sections: str, of: Element | None = None) -> None:
+        """Call ``draw`` when one of ``sections`` has changed, as long as the element that it is ``of`` is there."""
+        self.parts.append((draw, sections, of))
+
+    def part(self, draw: Callable[[], None], *sections: str, shows: Callable[[], tuple[Any, ...]], classes: str = "stackc") -> None:
+        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``shows`` differs from before."""
+        box = ui.element("div").classes(classes)
+        before = shows()
+
+        def again() -> None:
+            nonlocal before
+            now = shows()
+            if not _same(now, before):
+                before = now
+                box.clear()
+                with box:
+                    draw()
+
+        with box:
+            draw()
+        self.watch(again, *sections, of=box)
+
+    def shown(self, element: Element, when: Callable[[], bool], *sections: str) -> None:
+        """Show ``element`` only ``when`` that is so; it stays the same element."""
+
+        def show() -> None:
+            element.set_visibility(bool(when()))
+
+        show()
+        self.watch(show, *sections, of=element)
+
+    def complaint(self, *sections: str) -> None:
+        """Lines that the command line would print, where there are any."""
+
+        def draw() -> None:
+            for text in shows():
+                if text:
+                    ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props('role="alert"')
+
+        def shows() -> tuple[str, ...]:
+            return tuple(self.session.errors.get(s, "") for s in sections)
+
+        self.part(draw, *sections, shows=shows)
+
+    def progress(self, *names: str) -> None:
+        """A bar with what is being done in jobs of these names, and a button that stops it."""
+        with ui.element("div").classes("rowc").style("width:100%;flex-wrap:nowrap") as row:
+            with ui.element("div").classes("stackc").style("gap:3px"):
+                text = ui.label().classes("small soft")
+                bar = ui.linear_progress(0.0, show_value=False).props("rounded instant-feedback")
+            ui.button("Cancel", icon="close", on_click=lambda: self.session.stop(*names)).props("outline dense padding='2px 10px'").classes(
+                "cancel"
+            )
+
+        def show() -> None:
+            job = self.session.busy(*names)
+            row.set_visibility(job is not None and bool(job.text))
+            if job is not None:
+                share = f", {100 * job.fraction:.0f} %" if job.fraction is not None else ""
+                text.set_text(f"{job.text}{share} ({job.seconds:.0f} s)")
+                if (job.fraction is None) != ("indeterminate" in bar.props):
+                    bar.props(add="indeterminate") if job.fraction is None else bar.props(remove="indeterminate")
+                bar.set_value(round(job.fraction or 0.0, 3))
+
+        show()
+        self.watch(show, "jobs", of=row)
+
+    def look(self) -> None:
+        """Redraw what has changed."""
+        self.soon, self.looked = False, time.monotonic()
+        if self.client.is_deleted:
+            return
+        now = dict(self.session.versions)
+        changed = {k for k, v in now.items() if self.seen.get(k) != v}
+        self.seen = now
+        if self.session.jobs and time.monotonic() - self.counted > 0.5:
+            self.counted = time.monotonic()
+            changed.add("jobs")  # the seconds go on
+        if changed:
+            self.parts = [p for p in self.parts if p[2] is None or not p[2].is_deleted]
+            for draw, sections, of in list(self.parts):
+                if changed.intersection(sections) and (of is None or not of.is_deleted):
+                    draw()
+
+
+def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+    """Whether two answers of ``shows`` are one: plain values by value, anything else only as the same object."""
+    plain = (str, int, float, tuple)
+    return len(a) == len(b) and all(x is y or (isinstance(x, plain) and isinstance(y, plain) and x == y) for x, y in zip(a, b, strict=True))
+
+
+@contextmanager
+def card(title: str, about: str = "") -> Iterator[None]:
+    """A white box with a title."""
+    with ui.element("section").classes("vcard"):
+        ui.html(f"<h2>{html.escape(title)}</h2>", sanitize=False)
+        if about:
+            ui.label(about).classes("soft small").style("margin:-4px 0 8px;max-width:110ch")
+        yield
+
+
+def command_line(text: str, label: str = "the same as a command") -> None:
+    """The equivalent command with a button that copies it."""
+
+    def copy() -> None:
+        ui.clipboard.write(text)
+        ui.notify("copied")
+
+    with ui.element("div").classes("cmd").tooltip(label):
+        ui.html(f"<code>{html.escape(text)}</code>", sanitize=False).style("flex:1;min-width:0")
+        ui.button(icon="content_copy", on_click=copy).props('flat dense round size=sm aria-label="copy the command"')
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int] = ()) -> None:
+    """A small table; a cell that is a tuple ("html", text) is taken as it is."""
+
+    def cell(v: Any) -> str:
+        return str(v[1]) if isinstance(v, tuple) else html.escape(str(v))
+
+    head = "".join(f'<th class="{"num" if i in numbers else ""}">{html.escape(c)}</th>' for i, c in enumerate(columns))
+    body = "".join(
+        "<tr>" + "".join(f'<td class="{"num" if i in numbers else ""}">{cell(v)}</td>' for i, v in enumerate(r)) + "</tr>" for r in rows
+    )
+    ui.html(f'<div class="scroll"><table class="vtable"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>', sanitize=False)
+
+
+def opened(session: Session, title: str, now: bool = False) -> ui.expansion:
+    """A part that opens and closes, and stays as it is when it is drawn anew."""
+    kept: dict[str, bool] = session.extra.setdefault("opened", {})
+    box = ui.expansion(title, value=now or kept.get(title, False), on_value_change=lambda e: kept.__setitem__(title, bool(e.value)))
+    return box.classes("w-full").props("dense")
+
+
+def tone(ratio: float) -> str:
+    """Colour of an error in noise floors."""
+    return "good" if agrees(ratio, 1.0) else "mid" if ratio < 3.0 else "bad"

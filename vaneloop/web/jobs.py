@@ -1,0 +1,154 @@
+"""Long work in other processes, seen from the page's event loop: questions with progress, answers, cancelling."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+__all__ = ["Cancelled", "Job", "WorkError", "Worker"]
+
+
+SHOWN = 0.3  # s between two steps of a bar
+
+
+class WorkError(Exception):
+    """Work that failed: one line for the page."""
+
+
+class Cancelled(Exception):
+    """Work that the user stopped."""
+
+
+@dataclass
+class Job:
+    """One piece of work: ``fraction`` done (None: unknown), ``text`` says what goes on."""
+
+    number: int
+    name: str
+    text: str
+    future: asyncio.Future[Any]
+    fraction: float | None = None
+    started: float = field(default_factory=time.monotonic)
+    told: float = 0.0  # when the page was last told of its progress
+
+    @property
+    def seconds(self) -> float:
+        """Time since it was asked for."""
+        return time.monotonic() - self.started
+
+
+class Worker:
+    """One process with its own group. It starts with the first question, and again after it was stopped."""
+
+    def __init__(self, module: str = "vaneloop.web.worker", changed: Callable[[], None] | None = None):
+        self.module = module
+        self.changed = changed or (lambda: None)
+        self.news: Callable[[Any], None] | None = None  # takes what a task that runs on sends
+        self.jobs: dict[int, Job] = {}
+        self.process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+        self._next = 0
+
+    def start(self) -> None:
+        """Start the process where it is not running: importing what it needs takes a second or two."""
+        if self.process is not None and self.process.poll() is None:
+            return
+        ours, theirs = socket.socketpair()
+        # -P: nothing is imported from the folder in which the server happens to run
+        words = [sys.executable, "-P", "-m", self.module, str(theirs.fileno())]
+        self.process = subprocess.Popen(words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True)
+        theirs.close()
+        self._connection = Connection(ours.detach())
+        loop = asyncio.get_running_loop()
+        threading.Thread(target=self._listen, args=(self._connection, loop), daemon=True).start()
+        threading.Thread(target=self._watch, args=(self.process, loop), daemon=True).start()
+
+    async def call(self, name: str, text: str, **arguments: Any) -> Any:
+        """Ask; return the answer. Raises WorkError with one line, or Cancelled."""
+        self.start()
+        assert self._connection is not None
+        self._next += 1
+        job = Job(self._next, name, text, asyncio.get_running_loop().create_future())
+        self.jobs[job.number] = job
+        self.changed()
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, self._connection.send, (job.number, name, arguments))
+        except OSError:
+            self._end(job.number, WorkError("the worker process has ended"))
+        return await job.future
+
+    def tell(self, **content: Any) -> None:
+        """Say something to the task that is running; it is short and never waits long."""
+        if self._connection is not None:
+            with contextlib.suppress(OSError):
+                self._connection.send((0, "tell", content))
+
+    def stop(self) -> None:
+        """End the process and everything that it started; whoever waits for an answer gets Cancelled."""
+        process, self.process = self.process, None
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        self._connection = None  # the listening thread closes it
+        for number in list(self.jobs):
+            self._end(number, Cancelled("stopped"))
+
+    # ---- answers, from two threads
+
+    def _listen(self, connection: Connection, loop: asyncio.AbstractEventLoop) -> None:
+        with contextlib.suppress(EOFError, OSError, RuntimeError):  # the process has ended, or our loop
+            while True:
+                kind, number, content = connection.recv()
+                if kind == "progress":
+                    loop.call_soon_threadsafe(self._progress, number, *content)
+                else:
+                    loop.call_soon_threadsafe(self._end, number, WorkError(content) if kind == "failed" else content)
+        connection.close()
+
+    def _watch(self, process: subprocess.Popen[bytes], loop: asyncio.AbstractEventLoop) -> None:
+        process.wait()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # what it had started
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(self._lost, process)
+
+    def _progress(self, number: int, fraction: float | None, text: Any) -> None:
+        job = self.jobs.get(number)
+        if job is not None and not isinstance(text, str):
+            if self.news is not None:
+                self.news(text)
+        elif job is not None:
+            now, other = time.monotonic(), bool(text) and text != job.text
+            job.fraction, job.text = fraction, text or job.text
+            if other or now - job.told > SHOWN:  # the browser goes through its whole page for each change
+                job.told = now
+                self.changed()
+
+    def _end(self, number: int, content: Any) -> None:
+        job = self.jobs.pop(number, None)
+        if job is not None and not job.future.done():
+            if isinstance(content, Exception):
+                job.future.set_exception(content)
+            else:
+                job.future.set_result(content)
+            self.changed()
+
+    def _lost(self, process: subprocess.Popen[bytes]) -> None:
+        if process is not self.process:
+            return  # stopped on purpose
+        self.process, code = None, process.wait()
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        for number in list(self.jobs):
+            self._end(number, WorkError(f"the process that did this has ended ({how}); the log may need more memory than there is"))

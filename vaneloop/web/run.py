@@ -1,0 +1,536 @@
+"""Page 3, Run: the loop live. Demand, strip charts, lamps, the bus's trace, faults on purpose, lateness, and a record for page 1."""
+
+from __future__ import annotations
+
+import html
+import shlex
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from nicegui import events, ui
+
+from controller import FAULTS, MODES
+from hil.bus.frames import IDENT_MASK, NAMES
+from hil.inject.scenario import library, load_scenario
+from hil.loop.ecu import BUILTIN
+from vaneloop.pages.page import bars
+from vaneloop.web.charts import Chart, Curves, Panel, Trace
+from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame
+from vaneloop.web.jobs import Cancelled, Worker, WorkError
+from vaneloop.web.loop import COLUMNS, COMPILING
+from vaneloop.web.session import LogFile, Session
+
+__all__ = ["build"]
+
+KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
+SHOWN = 30.0  # s in the strip charts
+LIT = 1.5  # s that a lamp stays lit once it is shown, so that what passes quickly is seen
+TRACE_LINES = 40
+TRACED = 2000  # frames kept for the trace
+TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
+STRIPS: tuple[tuple[str, str, float, tuple[tuple[str, str], ...]], ...] = (  # title, unit, least height of the axis, lines
+    ("speed [%]", "%", 2.0, (("n_dem", "target"), ("n_r", "measured"))),
+    ("stroke [mm]", "mm", 0.5, (("x_dem", "target"), ("x_lvdt", "measured"))),
+    ("current [mA]", "mA", 2.0, (("i_cmd", "model"),)),
+    ("vanes [deg]", "deg", 1.0, (("vigv", "measured"), ("vgv1", "model"), ("vgv2", "target"))),
+)
+
+
+@dataclass
+class Loop:
+    """The loop that runs, or ran last, in one session."""
+
+    session: Session
+    bus: str = "lockstep"
+    speed: float = 1.0
+    demand: float = 70.0
+    profile: str | None = None
+    seed: int | None = 1
+    record: bool = True
+    running: bool = False
+    rows: np.ndarray = field(default_factory=lambda: np.empty((0, len(COLUMNS))))
+    filled: int = 0
+    trace: deque[tuple[float, int, int, dict[str, float]]] = field(default_factory=lambda: deque(maxlen=TRACED))
+    status: dict[str, Any] = field(default_factory=dict)
+    late: dict[str, Any] = field(default_factory=dict)
+    recorded: LogFile | None = None
+    events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
+    workers: dict[str, Worker] = field(default_factory=dict)
+    runs: int = 0
+    lit: dict[str, int] = field(default_factory=dict)  # lamp -> how often news came in which it was on
+
+    @property
+    def bus_name(self) -> str:
+        """The bus as a command names it: an embedded one is this session's own."""
+        return self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
+
+    def commands(self) -> list[tuple[str, list[str]]]:
+        """Commands for what Start does, each after what it leaves out ("" where nothing)."""
+        seed = ["--seed", str(self.seed)] if self.seed is not None else []
+        record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
+        profile = ["--profile", self.profile] if self.profile else []
+        if self.bus == "lockstep":
+            own = "The slider, the pace and the buttons are the page's own. " if profile else "By slider: the page's own. "
+            words = ["run", "--bus", "lockstep", *(profile or ["--profile", "ramp"]), "--start-speed", f"{self.demand:g}", *seed, *record]
+            return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
+        return [("", ["run", "--bus", self.bus_name, *seed, *record]), ("", ["ecu", "--bus", self.bus_name, *profile])]
+
+    # ---- begin and end
+
+    def start(self) -> None:
+        """Start as the page says."""
+        if self.running:
+            return
+        s = self.session
+        self.running, self.filled, self.status, self.late = True, 0, {}, {}
+        self.rows = np.empty((KEPT, len(COLUMNS)))
+        self.trace.clear()
+        self.events.clear()
+        self.runs += 1
+        s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
+        s.touch("loop")
+
+    def _worker(self, name: str) -> Worker:
+        w = self.workers.get(name)
+        if w is None:
+            w = self.workers[name] = Worker("vaneloop.web.loop", changed=lambda: self.session.touch("loop-jobs"))
+            w.news = self._news
+            self.session.extra.setdefault("closers", []).append(w.stop)
+        return w
+
+    def warm(self) -> None:
+        """Load the simulator before it is asked for."""
+        if not self.workers:
+            self.session.do("warm", self._warm())
+
+    async def _warm(self) -> None:
+        await self._worker("loop").call("ready", COMPILING)
+
+    def _record_path(self) -> str | None:
+        return str(self.session.folder / f"run{self.runs}.log") if self.record else None
+
+    async def _in_lockstep(self) -> None:
+        record = self._record_path()
+        try:
+            await self._worker("loop").call(
+                "lockstep", "running", demand=self.demand, speed=self.speed, record=record, seed=self.seed, profile=self.profile
+            )
+        finally:
+            self._ended(record)
+
+    async def _in_real_time(self) -> None:
+        import asyncio
+
+        record = self._record_path()
+        bus = self.bus_name
+        listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
+        calls = [
+            listener.call("listen", "running", bus=bus),
+            controller.call("node", "running", bus=bus, record=record, seed=self.seed),
+            engine.call("ecu", "running", bus=bus, demand=self.demand, profile=self.profile),
+        ]
+        tasks = [asyncio.ensure_future(c) for c in calls]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+            for t in done:
+                t.result()
+            self.late = {**self.late, **tasks[1].result()}
+        except (WorkError, Cancelled):
+            for w in (listener, controller, engine):
+                w.stop()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            raise
+        finally:
+            self._ended(record)
+
+    def _ended(self, record: str | None) -> None:
+        self.running = False
+        path = self.session.folder / f"run{self.runs}.log"
+        if record is not None and path.is_file() and path.stat().st_size:
+            self.recorded = LogFile(path, f"recorded: {path.name}", path.name)
+            self.session.files.append(self.recorded)
+            self.session.saved[f"run-{path.name}"] = path
+            self.session.touch("files")
+        self.session.touch("loop", "run")
+
+    def stop(self) -> None:
+        """Ask it to end; the record is complete then."""
+        for w in self.workers.values():
+            if w.jobs:
+                w.tell(stop=True)
+
+    # ---- while it runs
+
+    def tell(self, **content: Any) -> None:
+        """Say something to whoever it concerns."""
+        for name, w in self.workers.items():
+            if w.jobs and name != "listen":
+                w.tell(**content)
+
+    def inject(self, name: str) -> None:
+        """Start a scenario of the library now."""
+        if self.bus == "lockstep":
+            self.tell(inject=name)
+            self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
+            self.session.touch("events")
+        else:
+            self.session.do("inject", self._inject_outside(name))
+
+    async def _inject_outside(self, name: str) -> None:
+        bus = self.bus_name
+        w = Worker()
+        self.session.extra.setdefault("closers", []).append(w.stop)
+        try:
+            answer = await w.call("command", f"injecting {name}", words=["inject", name, "--bus", bus])
+            self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
+        finally:
+            w.stop()
+            self.session.touch("events")
+
+    def now(self) -> float:
+        """Time of the latest row, s."""
+        return float(self.rows[self.filled - 1, 0]) if self.filled else 0.0
+
+    def latest(self, name: str) -> float:
+        """Return the latest value of a column; NaN before the first."""
+        return float(self.rows[self.filled - 1, COLUMNS.index(name)]) if self.filled else float("nan")
+
+    def _news(self, news: dict[str, Any]) -> None:
+        if "late" in news:
+            self.late = news
+            return
+        first = not self.filled
+        rows = news.pop("rows")[-KEPT:]
+        over = self.filled + len(rows) - KEPT
+        if over > 0:
+            drop = max(over, KEPT // 10)
+            self.rows[: self.filled - drop] = self.rows[drop : self.filled].copy()
+            self.filled = max(0, self.filled - drop)
+        self.rows[self.filled : self.filled + len(rows)] = rows
+        self.filled += len(rows)
+        self.trace.extend(news.pop("trace"))
+        self._light(rows)
+        if first and self.filled:
+            self.session.touch("loop")
+        self.status = news
+        self._draw()
+
+    def _light(self, rows: np.ndarray) -> None:
+        for mode in set(rows[:, COLUMNS.index("state")].tolist()):
+            if mode == mode and 0 <= mode < len(MODES):
+                self.lit[MODES[int(mode)]] = self.lit.get(MODES[int(mode)], 0) + 1
+        faults = rows[:, COLUMNS.index("faults")]
+        bits = int(np.bitwise_or.reduce(faults[np.isfinite(faults)].astype(np.int64), initial=0))
+        for i, fault in enumerate(FAULTS):
+            if bits >> i & 1:
+                self.lit[fault] = self.lit.get(fault, 0) + 1
+
+    def _draw(self) -> None:
+        rows = self.rows[: self.filled]
+        if not len(rows):
+            self.session.curves["run"] = Curves()
+            return
+        rows = rows[np.searchsorted(rows[:, 0], rows[-1, 0] - SHOWN) :].copy()
+        keep = np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])
+        rows = rows[keep]
+        t = rows[:, 0]
+        panels = [
+            Panel(title, unit, t, [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines], height=120, least=least)
+            for title, unit, least, lines in STRIPS
+        ]
+        self.session.curves["run"] = Curves(panels, "run")
+
+
+def build(session: Session, most: int) -> None:
+    """Draw the page."""
+    if "loop" not in session.extra:
+        session.extra["loop"] = Loop(session)
+    session.extra["loop"].warm()
+    with frame(session, "/run"):
+        page = _Page(session, Live(session))
+        page.controls()
+        with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
+            page.strips()
+            page.inject()
+        with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
+            page.trace()
+            page.lateness()
+
+
+class _Page:
+    def __init__(self, session: Session, live: Live):
+        self.s, self.live = session, live
+        self.loop: Loop = session.extra["loop"]
+        self.traced: tuple[Any, str] = (None, "")
+        self.seen = {name: (n, time.monotonic() - LIT) for name, n in self.loop.lit.items()}  # lamp -> news counted, clock when shown
+
+    # ---- start, stop, demand
+
+    def controls(self) -> None:
+        """Bus, speed, start and stop; demand; the commands."""
+        with card("1  The loop", "Controller with its plant, the engine's ECU, and the CAN bus between them."):
+            lp = self.loop
+            self.live.part(self._start, "loop", "run", shows=lambda: (lp.running, lp.bus, lp.recorded), classes="rowc")
+            self.live.complaint("run", "inject")
+            with ui.element("div").classes("rowc").style("margin-top:10px;width:100%;flex-wrap:nowrap"):
+                ui.label("speed demand").classes("soft").style("white-space:nowrap")
+                slider = (
+                    ui.slider(min=30, max=102, step=0.5, value=self.loop.demand)
+                    .props('aria-label="speed demand"')
+                    .style("flex:1;max-width:560px")
+                )
+                self.demand = ui.label(f"{self.loop.demand:.1f} %").classes("mono").style("width:70px")
+
+                def turned(e: events.GenericEventArguments) -> None:
+                    self.loop.demand, self.loop.profile = float(e.args), None
+                    self.demand.set_text(f"{self.loop.demand:.1f} %")
+                    self.loop.tell(demand=self.loop.demand)
+                    if not self.loop.running:
+                        self.s.touch("loop")
+
+                slider.on("update:model-value", turned, throttle=0.05)
+
+                def chosen(e: events.ValueChangeEventArguments) -> None:
+                    self._set("profile", e.value or None)
+                    if e.value:
+                        self.loop.tell(profile=e.value)
+
+                options = {"": "by slider", **{n: f"{n}: {words}" for n, (words, _) in BUILTIN.items()}}
+                ui.select(options, value=self.loop.profile or "", label="or a profile", on_change=chosen).props(
+                    "outlined dense options-dense"
+                ).style("min-width:260px").classes("profile")
+
+                def ask(e: events.ValueChangeEventArguments) -> None:
+                    self.loop.tell(mode_request=int(e.value == "run"))
+
+                ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
+                    "dense unelevated no-caps padding='2px 10px'"
+                ).tooltip("mode that the ECU asks for")
+            self.live.part(self._waiting, "loop", "loop-jobs", "run", shows=lambda: (" ".join(self._waits()),))
+            self.live.part(self._commands, "loop", "run", shows=lambda: tuple(" ".join(w) for _, w in lp.commands()))
+
+    def _start(self) -> None:
+        lp = self.loop
+        if lp.running:
+            ui.button("Stop", icon="stop", on_click=lp.stop).props("unelevated color=negative padding='5px 18px'")
+        else:
+            ui.button("Start", icon="play_arrow", on_click=lp.start).props("unelevated padding='5px 18px'")
+        kinds = {"lockstep": "lockstep: simulated time", "local": "real time, embedded bus", "vcan0": "real time, vcan0"}
+
+        def join(e: events.ValueChangeEventArguments) -> None:
+            lp.bus = e.value
+            self.s.touch("loop")
+
+        bus = ui.select(kinds, value=lp.bus, on_change=join)
+        bus.props("outlined dense options-dense").style("min-width:220px").classes("bus")
+        if lp.running:
+            bus.disable()
+        if lp.bus == "lockstep":
+            speeds = {0.1: "0.1 x real time", 0.5: "0.5 x", 1.0: "1 x", 3.0: "3 x", 10.0: "10 x", 0.0: "as fast as it goes"}
+
+            def speed(e: events.ValueChangeEventArguments) -> None:
+                lp.speed = float(e.value)
+                lp.tell(speed=lp.speed)
+
+            ui.select(speeds, value=lp.speed, on_change=speed).props("outlined dense options-dense").style("min-width:150px").classes(
+                "pace"
+            )
+        noisy = ui.checkbox("noisy sensors", value=lp.seed is not None, on_change=lambda e: self._set("seed", 1 if e.value else None))
+        record = ui.checkbox("record", value=lp.record, on_change=lambda e: self._set("record", bool(e.value)))
+        if lp.running:
+            noisy.disable()
+            record.disable()
+        if lp.recorded is not None and not lp.running:
+            name = lp.recorded.path.name
+            ui.link(f"download {name}", f"/saved/run-{name}").props(f'download="{name}"').style("color:var(--measured)")
+
+            def find() -> None:
+                assert lp.recorded is not None
+                self.s.choose(lp.recorded)
+                ui.navigate.to("/")
+
+            ui.button("Open in missing physics", icon="arrow_forward", on_click=find).props("outline dense padding='4px 12px'").classes(
+                "open-record"
+            )
+
+    def _set(self, name: str, value: Any) -> None:
+        setattr(self.loop, name, value)
+        self.s.touch("loop")
+
+    def _waits(self) -> list[str]:
+        lp = self.loop
+        jobs = [j for w in lp.workers.values() for j in w.jobs.values()] if lp.running and not lp.filled else []
+        return [f"{j.name}: {j.text} ..." for j in jobs if j.text != "running"]
+
+    def _waiting(self) -> None:
+        for line in self._waits():
+            ui.label(line).classes("note")
+
+    def _commands(self) -> None:
+        for without, words in self.loop.commands():
+            if without:
+                ui.label(without).classes("note")
+            command_line(shlex.join(["vaneloop", *words]))
+
+    # ---- charts and lamps
+
+    def strips(self) -> None:
+        """Lamps, figures, strip charts."""
+        with card("2  Signals, as the bus has them"):
+            with ui.element("div").classes("rowc"):
+                self.lamps: dict[str, ui.element] = {}
+                for name in (*MODES, *FAULTS):
+                    with ui.element("span").classes("lamp").props(f'data-lamp="{name}"') as lamp:
+                        ui.element("i")
+                        ui.label(name if name in MODES else name.replace("_", " "))
+                    self.lamps[name] = lamp
+            with ui.element("div").classes("tiles").style("margin:8px 0"):
+                self.tiles: dict[str, ui.label] = {}
+                for name, words in (
+                    ("t", "time, s"),
+                    ("n_r", "speed, %"),
+                    ("x_lvdt", "stroke, mm"),
+                    ("vigv", "VIGV, deg"),
+                    ("p_s", "supply, MPa"),
+                    ("pace", "x real time"),
+                ):
+                    with ui.element("div").classes("tile"):
+                        self.tiles[name] = ui.label("-").classes("v")
+                        ui.label(words).classes("l")
+            Chart("run", live=8.0)
+            ui.timer(0.3, self._shown)
+
+    def _shown(self) -> None:
+        """Lamps, figures and trace together: the browser goes through the page once for all of them."""
+        self._lamps()
+        self._trace()
+
+    def _lamps(self) -> None:
+        lp = self.loop
+        state, now = lp.latest("state"), time.monotonic()
+        mode = MODES[int(state)] if state == state and 0 <= state < len(MODES) else ""
+        for name, lamp in self.lamps.items():
+            if lp.lit.get(name, 0) != self.seen.get(name, (0, 0.0))[0]:
+                self.seen[name] = lp.lit[name], now  # from now on, however late this page comes to show it
+            fresh = now - self.seen.get(name, (0, now - LIT))[1] < LIT or name == mode
+            tone = (TONES.get(name, "mid") if name in MODES else "bad") if fresh else ""
+            wanted = f"lamp {tone}".strip()
+            if getattr(lamp, "shown", None) != wanted:
+                lamp.classes(replace=wanted)
+                lamp.shown = wanted  # type: ignore[attr-defined]
+        for name, tile in self.tiles.items():
+            v = lp.status.get("speed", 1.0 if lp.bus != "lockstep" and lp.running else float("nan")) if name == "pace" else lp.latest(name)
+            tile.set_text("-" if v != v else f"{v:.1f}" if name in ("t", "pace") else f"{v:.2f}")
+
+    # ---- injection
+
+    def inject(self) -> None:
+        """A button for every scenario of the library."""
+        with card("3  A bad day, on purpose"):
+            find = ui.input(placeholder="find a scenario").props('outlined dense clearable aria-label="find a scenario"').classes("w-full")
+            with ui.element("div").classes("effects").style("max-height:330px"):
+                boxes = []
+                for name in library():
+                    title = load_scenario(name).title
+                    with ui.element("div").style("padding:3px 0;border-bottom:1px solid var(--grid)") as box:
+                        ui.button(name, on_click=lambda name=name: self._begin(name)).props(
+                            "flat dense no-caps align=left padding='1px 6px'"
+                        ).tooltip(title)
+                        ui.label(title).classes("note").style("padding-left:6px;line-height:1.3")
+                    boxes.append((box, f"{name} {title}".lower()))
+
+            def search(e: events.ValueChangeEventArguments) -> None:
+                for box, text in boxes:
+                    box.set_visibility((e.value or "").lower() in text)
+
+            find.on_value_change(search)
+            self.live.part(self._events, "events", "loop", shows=lambda: (*self.loop.events, self.loop.bus))
+
+    def _begin(self, name: str) -> None:
+        if self.loop.running:
+            self.loop.inject(name)
+        else:
+            ui.notify("start the loop first")
+
+    def _events(self) -> None:
+        for text in self.loop.events:
+            ui.label(text).classes("small mono")
+        if self.loop.events:
+            last = self.loop.events[-1].split("  ", 1)[1].split(":")[0]
+            if self.loop.bus == "lockstep":
+                ui.label("Here it begins in the loop that runs. By itself, and judged:").classes("note")
+            command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
+
+    # ---- trace
+
+    def trace(self) -> None:
+        """Decoded frames, with a filter."""
+        with card("4  The bus"):
+            with ui.element("div").classes("rowc"):
+                self.words = ui.input(placeholder="filter: name, 0B0, signal").props(
+                    'outlined dense clearable aria-label="filter of the trace"'
+                )
+                self.hold = ui.checkbox("hold")
+                self.counts = ui.label().classes("soft small")
+            self.trace_box = ui.html("", sanitize=False).classes("trace w-full").props('role="log"')
+
+    def _trace(self) -> None:
+        lp, text = self.loop, (self.words.value or "").lower()
+        s = lp.status
+        now = s.get("frames"), text
+        if self.hold.value or not s or now == self.traced:
+            return
+        self.traced = now
+        load = f", load {100 * s['load']:.0f} %" if "load" in s else ""
+        self.counts.set_text(f"{s.get('frames', 0):,} frames, {s.get('refused', 0):,} with a wrong CRC{load}")
+        lines = (_in_words(*f) for f in reversed(lp.trace))
+        kept = islice((x for x in lines if not text or text in x.lower()), TRACE_LINES)
+        self.trace_box.set_content(html.escape("\n".join(kept)))
+
+    # ---- lateness
+
+    def lateness(self) -> None:
+        """Lateness of the ticks in real time."""
+        with card("5  Real time"):
+            ui.label("How late each 1 ms tick of the controller began.").classes("soft small")
+            holder = ui.element("div").classes("stackc")
+            seen: dict[str, Any] = {"ticks": None, "dark": None}
+
+            def show() -> None:
+                late = self.loop.late
+                figures = late.get("late")
+                key = (late.get("ticks", (figures or {}).get("ticks")), dark(self.s), self.loop.bus, bool(figures))
+                if key == seen["ticks"]:
+                    return
+                seen["ticks"] = key
+                holder.clear()
+                with holder:
+                    if not figures:
+                        ui.label(
+                            "Lockstep is never late; start it in real time to see." if self.loop.bus == "lockstep" else "Not started yet."
+                        ).classes("soft")
+                        return
+                    ui.label(
+                        ", ".join(
+                            f"{n} {figures[k]:.0f} us"
+                            for n, k in (("p50", "p50_us"), ("p99", "p99_us"), ("p99.9", "p999_us"), ("max", "max_us"))
+                        )
+                    ).classes("mono")
+                    names, counts = zip(*late["histogram"], strict=True)
+                    f = bars(list(names), {"ticks": [max(c, 0) for c in counts]}, "ticks")
+                    f["layout"]["yaxis"] = {**f["layout"].get("yaxis", {}), "type": "log"}
+                    figure_of(f, dark(self.s), 300)
+
+            ui.timer(0.5, show)
+
+
+def _in_words(t: float, head: int, data: int, values: dict[str, float]) -> str:
+    ident = head & IDENT_MASK
+    name = NAMES.get(ident, "?") if not head >> 29 & 7 else "error frame" if head >> 29 & 1 else "remote" if head >> 30 & 1 else "extended"
+    raw = (data & (1 << 64) - 1).to_bytes(8, "little")[: min((head >> 32) & 0xFF, 8)].hex(" ").upper()
+    said = "  ".join(f"{k} {v:.6g}" for k, v in values.items()) or ("WRONG CRC" if name in NAMES.values() else "")
+    return f"{t:10.3f}  {ident:03X}  {name:<11} {raw:<24} {said}"

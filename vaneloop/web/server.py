@@ -1,0 +1,188 @@
+"""The server: one session a browser, the three pages, curves, saved files, behind the guard."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import secrets
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import FileResponse, PlainTextResponse
+from nicegui import Client, ui
+from nicegui import app as pages
+
+from vaneloop.web import missing, run, schedule
+from vaneloop.web.charts import Curves, view
+from vaneloop.web.guard import Guard
+from vaneloop.web.private import private_folder
+from vaneloop.web.session import LOG_SUFFIXES, LogFile, Session
+
+__all__ = ["serve"]
+
+MOST_SESSIONS = 6  # one without an open tab gives way
+RECONNECT = 60.0  # s that a tab may be out of reach and still counts as open: a browser on a busy machine answers late
+PAGES = ("/", "/schedule", "/run")
+FULL = f"""{MOST_SESSIONS} browsers are at work here, each with an open tab, and that is the limit.
+
+Close a tab of one of them; after {RECONNECT:.0f} s its place is free.
+"""
+HERE = Path(__file__).resolve().parent
+
+
+class Sessions:
+    """Sessions by the browser's cookie; their files live in one private folder."""
+
+    def __init__(self, make: Callable[[str], Session]):
+        self.make = make
+        self.of: dict[str, Session] = {}
+        self.tabs: dict[str, set[Client]] = {}  # pages that are open, being loaded or reconnecting
+        self.used: dict[str, float] = {}
+
+    def get(self, key: str, tab: Client) -> Session | None:
+        """Return the browser's session for one more tab; make it where there is none. None where others with open tabs take all places."""
+        if key not in self.of:
+            if len(self.of) >= MOST_SESSIONS and not self._give_way():
+                return None
+            self.of[key], self.tabs[key] = self.make(key), set()
+        self.tabs[key].add(tab)
+        self.used[key] = time.monotonic()
+        tab.on_delete(lambda: self._left(key, tab))
+        return self.of[key]
+
+    def _left(self, key: str, tab: Client) -> None:
+        if key in self.of:
+            self.tabs[key].discard(tab)
+            self.used[key] = time.monotonic()
+
+    def _give_way(self) -> bool:
+        """End the session without a tab that rested longest, one at work only where no other is."""
+        alone = [k for k, tabs in self.tabs.items() if not tabs]
+        if not alone:
+            return False
+        old = min(alone, key=lambda k: (self.of[k].working.total() > 0, self.used[k]))
+        del self.tabs[old]
+        self.of.pop(old).close()
+        return True
+
+    def close(self) -> None:
+        """End everything."""
+        for s in self.of.values():
+            s.close()
+        self.of.clear()
+        self.tabs.clear()
+
+
+def logs_in(folder: Path) -> list[LogFile]:
+    """Logs of the examples and of ``folder``, as the user would name them there."""
+    examples = HERE.parent.parent / "examples"
+    out = []
+    for place in dict.fromkeys([folder.resolve(), examples]):
+        if place.is_dir():
+            for f in sorted(place.iterdir())[:500]:
+                if f.suffix.lower() in LOG_SUFFIXES and f.is_file():
+                    out.append(LogFile(f, f.name if place != examples else f"example: {f.name}", os.path.relpath(f, folder)))
+    return out
+
+
+def serve(sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None]) -> None:
+    """Serve until Ctrl-C. ``sock`` listens already; ``most``: bytes of an upload; ``ready`` takes a word that does for the token once."""
+    with private_folder() as private:
+        tempfile.tempdir = str(private)  # uploads on their way are private too
+        _serve(sock, folder, token, most, loopback, ready, private)
+
+
+def _serve(
+    sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None], private: Path
+) -> None:  # fmt: skip
+    files = logs_in(folder)
+
+    def new(key: str) -> Session:
+        session = Session(key, private / secrets.token_hex(8), list(files))
+        session.search.start()  # ready by the time that a log is chosen
+        session.bench.start()
+        return session
+
+    sessions = Sessions(new)
+    port = sock.getsockname()[1]
+    api = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    def mine(request: Request) -> Session | None:
+        return sessions.of.get(str(request.session.get("id", "")))
+
+    def page(path: str, title: str, build: Callable[[Session, int], None]) -> None:
+        @ui.page(path, title=f"VaneLoop: {title}")
+        def _page() -> Response | None:
+            session = sessions.get(pages.storage.browser["id"], ui.context.client)
+            if session is None:
+                return PlainTextResponse(FULL, 429)
+            build(session, most)
+            return None
+
+    for path, title, module in zip(PAGES, ("missing physics", "schedule", "run"), (missing, schedule, run), strict=True):
+        page(path, title, module.build)
+
+    @pages.get("/curves/{name}")
+    async def _curves(name: str, request: Request) -> Response:
+        session = mine(request)
+        if session is None:
+            return PlainTextResponse("no session", 404)
+
+        def number(key: str) -> float | None:
+            text = request.query_params.get(key)
+            value = None if text is None else float(text)
+            if value is not None and not math.isfinite(value):
+                raise ValueError
+            return value
+
+        try:
+            start, end, n = number("from"), number("to"), number("n")
+        except ValueError:
+            return PlainTextResponse("from, to and n must be numbers", 422)
+        curves = session.curves.get(name, Curves())
+        pixels = 1000 if n is None else int(min(max(n, 0.0), 1e5))
+        body = await asyncio.get_running_loop().run_in_executor(None, view, curves, start, end, pixels)
+        return Response(body, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})
+
+    @pages.get("/saved/{key}")
+    async def _saved(key: str, request: Request) -> Response:
+        session = mine(request)
+        path = session.saved.get(key) if session is not None else None
+        if path is None or not path.is_file():
+            return PlainTextResponse("nothing saved", 404)
+        return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+
+    pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
+    pages.on_shutdown(sessions.close)
+    ui.run_with(
+        api, title="VaneLoop", dark=None, tailwind=False, storage_secret=secrets.token_hex(32), show_welcome_message=False,
+        reconnect_timeout=RECONNECT, session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},
+    )  # fmt: skip
+    guard = Guard(api, token, port, most, loopback=loopback, pages=PAGES)
+    config = uvicorn.Config(  # h11 bounds the headers of a request
+        guard, http="h11", log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2, lifespan="on"
+    )  # fmt: skip
+
+    class Told(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            ready(guard.ticket())
+
+    server = Told(config)
+    previous = signal.getsignal(signal.SIGTERM)
+    try:
+        server.run(sockets=[sock])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+        sessions.close()
+    sys.stderr.flush()

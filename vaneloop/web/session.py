@@ -1,0 +1,454 @@
+"""One user's work, apart from any page that shows it: a reload, or a second tab, finds everything as it was.
+
+Every action calls what the command line calls, in a process beside the server (worker.py), and says which command does the same, where
+there is one (docs/workbench.md).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shlex
+import shutil
+from collections import Counter
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base.signals import UNITS
+from vaneloop.web.charts import Curves, Panel, Trace, of_log
+from vaneloop.web.jobs import Cancelled, Job, Worker, WorkError
+
+__all__ = ["LOG_SUFFIXES", "LogFile", "Session", "safe_name"]
+
+LOG_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
+OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
+LEADERS = 4  # candidate effects whose fits are made ahead
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A file that may be chosen: where it is, what the user calls it, and how a command would name it."""
+
+    path: Path
+    name: str
+    word: str
+
+
+@dataclass
+class Choice:
+    """How the log is read: what the form says."""
+
+    file: LogFile | None = None
+    dbc: LogFile | None = None
+    model: LogFile | None = None
+    mapping: dict[str, str] = field(default_factory=dict)  # signal -> name in the log
+    units: dict[str, str] = field(default_factory=dict)  # signal -> unit in the log
+    design_rpm: str = ""
+
+    def words(self, real: bool) -> list[str]:
+        """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type them."""
+
+        def place(f: LogFile) -> str:
+            return str(f.path) if real else f.word
+
+        assert self.file is not None
+        out = [place(self.file)]
+        if self.dbc is not None:
+            out += ["--dbc", place(self.dbc)]
+        for signal, name in self.mapping.items():
+            out += ["--map", f"{name}={signal}"]
+        for signal, unit in self.units.items():
+            out += ["--unit", f"{signal}={unit}"]
+        if self.design_rpm.strip():
+            out += ["--design-rpm", self.design_rpm.strip()]
+        if self.model is not None:
+            out += ["--model", place(self.model)]
+        return out
+
+
+@dataclass(eq=False)
+class Fitted:
+    """One stage fitted with a set of effects."""
+
+    result: Any  # StageDiagnosis
+    curves: dict[str, Any]
+    theta: Any
+    floor: Any
+
+
+class Session:
+    """State of the pages of one browser. ``versions`` count what has changed, section by section."""
+
+    def __init__(self, number: str, folder: Path, files: list[LogFile]):
+        self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
+        folder.mkdir(mode=0o700, parents=True)
+        self.versions: dict[str, int] = {}
+        self.lookers: list[Callable[[], None]] = []  # pages that want to know
+        self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
+        self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.working: Counter[str] = Counter()  # sections whose work has not ended
+        self._fitting = asyncio.Lock()
+        self.dark: bool | None = None
+        self.errors: dict[str, str] = {}
+        self.curves: dict[str, Curves] = {}
+        self.extra: dict[str, Any] = {}  # what other pages keep
+        self.choice = Choice()
+        self.offered: list[str] = []
+        self.saved: dict[str, Path] = {}
+        self._clear_log()
+
+    def _clear_log(self) -> None:
+        self.preview: dict[str, Any] | None = None
+        self._clear_results()
+
+    def _clear_results(self) -> None:
+        self.compared: dict[str, Any] | None = None
+        self.diagnosis: dict[str, Any] | None = None
+        self.stage: str = ""
+        self.chosen: dict[str, tuple[str, ...]] = {}
+        self._last_fit: Fitted | None = None
+        self.fits: dict[tuple[str, frozenset[str]], Fitted] = {}
+        self.hand: dict[str, dict[str, float]] = {}
+        self.hand_rms: dict[str, float] = {}
+        self.experiment: dict[str, Any] | None = None
+        self.experiment_done = False
+        self._hand_wanted = False
+        self.saved = {k: v for k, v in self.saved.items() if k.startswith(("schedule-", "entered-", "run-"))}
+
+    # ---- housekeeping
+
+    def touch(self, *sections: str) -> None:
+        """Say that these sections have changed."""
+        for s in sections:
+            self.versions[s] = self.versions.get(s, 0) + 1
+        for wake in self.lookers:
+            wake()
+
+    def do(self, section: str, work: Coroutine[Any, Any, None]) -> None:
+        """Run ``work`` beside the page; its complaint becomes the section's line."""
+        self.errors.pop(section, None)
+
+        async def guarded() -> None:
+            try:
+                await work
+            except WorkError as e:
+                self.errors[section] = self.clean(str(e))
+            except Cancelled:
+                self.errors[section] = "stopped"
+
+        def ended(task: asyncio.Task[None]) -> None:
+            self.tasks.discard(task)
+            self.working[section] -= 1
+            self.touch(section, "jobs")
+
+        task = asyncio.get_running_loop().create_task(guarded())
+        self.tasks.add(task)
+        self.working[section] += 1
+        task.add_done_callback(ended)
+        self.touch(section)
+
+    def clean(self, text: str) -> str:
+        """Name files as the user does, not by their private folder."""
+        beside = [x for x in (self.choice.dbc, self.choice.model) if x is not None]
+        for f in [*self.files, *beside]:
+            text = text.replace(str(f.path), f.name)
+        return text.replace(str(self.folder) + "/", "")
+
+    def close(self) -> None:
+        """End the processes and remove the private folder."""
+        for task in list(self.tasks):
+            task.cancel()
+        for end in (self.search.stop, self.bench.stop, *self.extra.get("closers", [])):
+            end()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    @property
+    def jobs(self) -> list[Job]:
+        """What is being done."""
+        return [*self.search.jobs.values(), *self.bench.jobs.values()]
+
+    def busy(self, *names: str) -> Job | None:
+        """The first job of one of these names."""
+        return next((j for j in self.jobs if j.name in names), None)
+
+    def command(self, verb: str, *more: str) -> str:
+        """The equivalent command line."""
+        return shlex.join(["vaneloop", verb, *self.choice.words(real=False), *more])
+
+    # ---- the log
+
+    def choose(self, file: LogFile) -> None:
+        """Take a log; a database or a model file is taken beside it."""
+        if file.path.suffix.lower() == ".dbc":
+            self.choice.dbc = file
+        elif file.path.suffix.lower() == ".toml":
+            self.choice.model = file
+        else:
+            dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
+            self.choice = Choice(file=file, dbc=dbc)
+        if self.choice.file is not None:
+            self.read()
+        self.touch("log")
+
+    def read(self) -> None:
+        """Read the log as the form says, then compare it with the model."""
+        self.stop()
+        self._clear_log()
+        self.errors = {k: v for k, v in self.errors.items() if k not in ("log", "compare", "diagnose", "fit", "experiment", "save")}
+        self.touch("log", "compare", "diagnosis", "fit", "experiment")
+        self.do("log", self._read())
+
+    async def _read(self) -> None:
+        words = self.choice.words(real=True)
+        dbc = str(self.choice.dbc.path) if self.choice.dbc else None
+        self.offered = await self.search.call("offers", "opening the file", path=words[0], dbc=dbc)
+        self.touch("log")
+        self.preview = await self.search.call("preview", "reading the log", words=words)
+        self.curves["log"] = of_log(self.preview["channels"], words[0])
+        self.touch("log")
+        if self.preview["channels"]:
+            self.do("compare", self._compare())
+        else:
+            wanted = ", ".join(UNITS)
+            raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
+
+    async def _compare(self) -> None:
+        words = self.choice.words(real=True)
+        self.compared = await self.search.call("compare", "comparing", words=words)
+        worst = max(self.compared["figures"], key=lambda f: f.rms / f.noise_floor)
+        self.show(worst.stage)
+        self.touch("compare", "diagnosis")
+
+    def show(self, stage: str) -> None:
+        """Show this stage's curves."""
+        self.stage = stage
+        self._draw()
+        self.touch("compare", "diagnosis", "fit")
+
+    # ---- the search
+
+    def diagnose(self) -> None:
+        """Search for missing effects."""
+        if self.compared is not None and not self.working["diagnose"]:
+            self.do("diagnose", self._diagnose())
+
+    async def _diagnose(self) -> None:
+        words = self.choice.words(real=True)
+        self.touch("diagnosis")
+        self.diagnosis = await self.search.call("diagnose", "searching the library of effects", words=words)
+        self.experiment, self.experiment_done = None, False
+        d = self.diagnosis["diagnosis"]
+        self.chosen = {s.stage: tuple(f.effect for f in s.effects) for s in d.stages}
+        bad = [s for s in d.stages if s.verdict != "none"]
+        if bad:
+            self.stage = max(bad, key=lambda s: float((s.error_before / s.floor).max())).stage
+        self.touch("diagnosis", "compare")
+        self.do("fit", self._fit(self.stage))
+        self.do("ahead", self._ahead())
+
+    def stage_diagnosis(self) -> Any:
+        """What the diagnosis says about the stage shown; None without one."""
+        if self.diagnosis is None:
+            return None
+        return next((s for s in self.diagnosis["diagnosis"].stages if s.stage == self.stage), None)
+
+    def effects(self) -> list[str]:
+        """Effects of the stage shown, those found first, then by what they gain alone."""
+        s = self.stage_diagnosis()
+        if s is None:
+            return []
+        found = [f.effect for f in s.effects]
+        rivals = [r for f in s.effects for r in f.rivals]
+        rest = sorted(s.candidates, key=lambda c: -c.nats)
+        return list(dict.fromkeys([*found, *rivals, *(c.effect for c in rest)]))
+
+    async def _ahead(self) -> None:
+        """Fits that the user will ask for next: each found effect taken away, each leader added."""
+        d = self.diagnosis
+        assert d is not None
+        for s in sorted(d["diagnosis"].stages, key=lambda s: s.verdict == "none"):
+            found = tuple(f.effect for f in s.effects)
+            if s.verdict == "none":
+                continue
+            rivals = [r for f in s.effects for r in f.rivals]
+            leaders = [c.effect for c in sorted(s.candidates, key=lambda c: -c.nats) if c.nats > 0][:LEADERS]
+            sets: list[tuple[str, ...]] = [found, (), *(tuple(e for e in found if e != x) for x in found)]
+            sets += [(e,) for e in (*rivals, *leaders)] + [(*found, e) for e in (*rivals, *leaders)]
+            for effects in sets:
+                key = s.stage, frozenset(effects)
+                if self.diagnosis is d and key not in self.fits and len(set(effects)) == len(effects):
+                    await self._make(s.stage, effects, self.search)
+
+    async def _make(self, stage: str, effects: tuple[str, ...], worker: Worker) -> None:
+        words = self.choice.words(real=True)
+        d = self.diagnosis
+        text = f"fitting {' + '.join(effects) or 'the nominal model'}"
+        answer = await worker.call("refit" if worker is self.bench else "ahead", text, words=words, stage=stage, effects=effects)
+        if self.diagnosis is d:
+            self.fits[stage, frozenset(effects)] = Fitted(**answer)
+
+    def switch(self, effect: str, on: bool) -> None:
+        """Add an effect to the model of the stage shown, or take it away."""
+        stage = self.stage
+        now = [e for e in self.chosen.get(stage, ()) if e != effect]
+        self.chosen[stage] = tuple([*now, effect] if on else now)
+        self.hand, self.hand_rms = {}, {}
+        self.do("fit", self._fit(stage))
+
+    async def _fit(self, stage: str) -> None:
+        effects = self.chosen.get(stage, ())
+        if (stage, frozenset(effects)) not in self.fits:
+            async with self._fitting:
+                if effects != self.chosen.get(stage, ()):
+                    return  # switched again meanwhile
+                self.touch("fit")
+                await self._make(stage, effects, self.bench)
+        if stage == self.stage and effects == self.chosen.get(stage, ()):
+            self._draw()
+            self.touch("fit")
+
+    def fitted(self) -> Fitted | None:
+        """The fit of the effects that are switched on, if it is there."""
+        return self.fits.get((self.stage, frozenset(self.chosen.get(self.stage, ()))))
+
+    def shown_fit(self) -> Fitted | None:
+        """The fit that the page shows: the one of the switches, or while that is being made the one before."""
+        f = self.fitted()
+        if f is not None or not self.working["fit"]:
+            self._last_fit = f
+        return self._last_fit if self._last_fit is not None and self._last_fit.result.stage == self.stage else f
+
+    def values(self) -> dict[str, dict[str, float]]:
+        """Parameters of the effects that are on: as fitted, or as set by hand."""
+        f = self.fitted()
+        if f is None:
+            return {}
+        fitted = {e.effect: {k: float(v["value"]) for k, v in e.parameters.items()} for e in f.result.effects}
+        return {e: {**p, **self.hand.get(e, {})} for e, p in fitted.items()}
+
+    def turn(self, effect: str, parameter: str, value: float) -> None:
+        """Set a parameter by hand."""
+        self.hand.setdefault(effect, {})[parameter] = value
+        if not self._hand_wanted:
+            self._hand_wanted = True
+            if self.busy("hand") is None:
+                self.do("hand", self._turned())
+
+    def release(self) -> None:
+        """Back to the fitted parameters."""
+        self.hand, self.hand_rms = {}, {}
+        self._draw()
+        self.touch("fit", "hand")
+
+    async def _turned(self) -> None:
+        while self._hand_wanted:  # the latest position wins
+            self._hand_wanted = False
+            f, stage = self.fitted(), self.stage
+            if f is None or not self.hand:
+                return
+            answer = await self.bench.call(
+                "hand", "", words=self.choice.words(real=True), stage=stage, theta=f.theta, floor=f.floor, values=self.values()
+            )
+            if self.hand and stage == self.stage and f is self.fitted():
+                self.hand_rms = answer["rms"]
+                self._draw(answer["curves"])
+                self.touch("hand")
+
+    # ---- curves of the stage shown
+
+    def _draw(self, by_hand: dict[str, Any] | None = None) -> None:
+        f = self.fitted() if self.diagnosis else None
+        curves = f.curves if f is not None else (self.compared or {}).get("curves", {}).get(self.stage)
+        if curves is None:
+            self.curves["stage"] = Curves()
+            return
+        t, panels = curves["t"], []
+        for output, c in curves["outputs"].items():
+            measured = c["measured"]
+            over = [Trace("measured", measured, "measured", 1.5)]
+            left = []
+            roles = {"nominal model": "error", "with effects": "model"}
+            for name, e in c["errors"].items():
+                over.append(Trace(name, measured - e, roles[name]))
+                left.append(Trace(name, e, roles[name]))
+            if by_hand is not None:
+                e = by_hand["outputs"][output]["errors"]["by hand"]
+                over.append(Trace("by hand", measured - e, "target"))
+                left.append(Trace("by hand", e, "target"))
+            panels.append(Panel(f"{output} [{c['unit']}]", c["unit"], t, over, height=150))
+            panels.append(Panel(f"error [{c['unit']}]", c["unit"], t, left, band=3.0 * c["floor"], height=150))
+        self.curves["stage"] = Curves(panels, f"{self.choice.file.path if self.choice.file else ''} {self.stage}")
+
+    # ---- what comes next
+
+    def recommend(self) -> None:
+        """Look for the experiment that separates the rivals."""
+        if self.diagnosis is not None and not self.working["experiment"]:
+            self.do("experiment", self._recommend())
+
+    async def _recommend(self) -> None:
+        assert self.diagnosis is not None
+        self.touch("experiment")
+        self.experiment = await self.search.call("experiment", "trying demand profiles", diagnosis=self.diagnosis["diagnosis"])
+        self.experiment_done = True
+        self.touch("experiment")
+
+    def save_report(self) -> None:
+        """Write the report of the diagnosis."""
+        if self.diagnosis is not None:
+            self.do("save", self._save_report())
+
+    async def _save_report(self) -> None:
+        assert self.diagnosis is not None
+        path = self.folder / "diagnosis.html"
+        self.touch("save")
+        await self.search.call(
+            "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"], path=str(path),
+            command=self.command("diagnose", "--report", "diagnosis.html"), next_experiment=self.experiment,
+        )  # fmt: skip
+        self.saved["report"] = path
+        self.touch("save")
+
+    def all_chosen(self) -> list[str]:
+        """Effects that are switched on, over all stages."""
+        return list(dict.fromkeys(e for effects in self.chosen.values() for e in effects))
+
+    def extend_words(self) -> list[str]:
+        """Options of ``vaneloop extend`` beyond the log's."""
+        return [w for e in self.all_chosen() for w in ("--effect", e)] + ["--out", "extended.toml", "--report", "extended.html"]
+
+    def save_model(self) -> None:
+        """Run ``vaneloop extend`` with the effects that are switched on."""
+        if self.all_chosen():
+            self.do("save", self._save_model())
+
+    async def _save_model(self) -> None:
+        words = ["extend", *self.choice.words(real=True), *self.extend_words()]
+        for name in ("extended.toml", "extended.html"):
+            words[words.index(name)] = str(self.folder / name)
+        files = {"model": self.folder / "extended.toml", "extended": self.folder / "extended.html"}
+        for key, file in files.items():
+            file.unlink(missing_ok=True)
+            self.saved.pop(key, None)
+        self.touch("save")
+        await self.bench.call("command", "extending the model", words=words)
+        self.saved |= {key: file for key, file in files.items() if file.exists()}  # nothing is written that is no better
+        self.touch("save")
+
+    def stop(self, *names: str) -> None:
+        """End jobs of these names (or of any) and whatever else their processes do."""
+        for w in (self.search, self.bench):
+            if any(not names or j.name in names for j in w.jobs.values()):
+                w.stop()
+        self._hand_wanted = False
+        self.touch("jobs")
+
+
+def safe_name(name: str) -> str:
+    """A file name that is one: its last part, letters, digits and -_. only, not hidden."""
+    kept = re.sub(r"[^A-Za-z0-9._ -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")
+    stem, dot, suffix = kept.rpartition(".")
+    return (stem[:80].strip(" .") or "file") + dot + suffix[:10] if dot else kept[:80] or "file"

@@ -1,0 +1,365 @@
+"""A process beside the server that does the long work: reads logs, searches, refits. ``python -m vaneloop.web.worker FD`` speaks over a socket.
+
+It calls what the command line calls. Its own process group holds whatever it starts, so that ending the group ends everything; when the
+server is gone it ends itself. Answers come one by one, in the order of the questions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NoReturn
+
+from vaneloop.cli import options
+
+__all__ = ["STEPS", "TASKS"]
+
+Progress = Callable[[float | None, Any], None]
+MOST_MEMORY = 0.75  # of the machine's
+LEAST_MEMORY = 4 << 30  # bytes; compiled code reserves address space of its own
+
+
+# ---- what is kept between questions ---------------------------------------------------------------------------------------------------
+
+_CHAIN: dict[tuple[str, ...], Any] = {}  # of the latest log only
+
+
+def parsed(verb: str, words: list[str]) -> argparse.Namespace:
+    """Return the options of ``vaneloop VERB words`` as the command line parses them; InputError with its complaint."""
+    import importlib
+
+    from vaneloop.base import terminal
+    from vaneloop.base.errors import InputError
+    from vaneloop.cli.main import COMMANDS
+
+    module = importlib.import_module(COMMANDS[verb][0])
+    parser = terminal.Parser(prog=f"vaneloop {verb}", description=module.DESCRIPTION)
+    module.add_options(parser)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            args = parser.parse_args(words)
+    except SystemExit:
+        raise InputError(complaint.getvalue().strip().splitlines()[-1]) from None
+    args.quiet = True
+    return args
+
+
+def chain_for(words: list[str], progress: Progress) -> Any:
+    """Return the log that ``words`` name (with its options), as stages; read once."""
+    from hil.loop.lockstep import warm_up
+    from vaneloop.cli.options import chain_of, tell_search
+
+    key = tuple(words)
+    if key not in _CHAIN:
+        warm_up(lambda text: progress(None, text))
+        _CHAIN.clear()
+        progress(None, "reading the log")
+        tell_search(lambda text: progress(None, text))
+        _CHAIN[key] = chain_of(parsed("diagnose", words))
+    return _CHAIN[key]
+
+
+# ---- tasks ----------------------------------------------------------------------------------------------------------------------------
+
+
+def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
+    """Names that the log offers, to be mapped."""
+    from hil.logs import offered
+
+    return offered(path, dbc=dbc)
+
+
+def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Read the log: its channels in our names and units."""
+    from hil.logs.columns import warm_up
+    from vaneloop.base.signals import UNITS
+
+    if words[0].lower().endswith(options.CAN_SUFFIXES):
+        warm_up(lambda text: progress(None, text))
+    log = options.read_log_of(parsed("diagnose", words), require=())
+    return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in log.channels.items()}}
+
+
+def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Compare and locate: errors stage by stage and in the whole loop, failure maps, curves."""
+    from hil.replay import replay
+    from plant import build_plant, load_model
+    from vaneloop.base.errors import InputError
+    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.pages.diagnosis import located_sentence, located_tone
+
+    chain = chain_for(words, progress)
+    progress(0.1, "comparing")
+    located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.6 * share, f"locating: {name}"))
+    figures = [f for x in located for f in x.signals]
+    curves = {x.stage: curves_of(Judge(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta}) for x in located}
+    progress(0.7, "the whole loop")
+    args = parsed("diagnose", words)
+    loop: list[Any] = []
+    why = ""
+    try:
+        machine = build_plant(model=load_model(args.model)) if args.model else None
+        loop = replay(options.read_log_of(args), plant=machine, floors={f.signal: f.noise_floor for f in figures}).signals
+    except InputError as e:
+        why = str(e)
+    progress(1.0, "")
+    return {
+        "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located), "tone": located_tone(located),
+        "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes, "loop": loop, "loop_missing": why,
+        "span": float(chain.t[-1]), "samples": len(chain.t),
+    }  # fmt: skip
+
+
+def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
+    """Measured outputs of a stage and each model's error (in the output's unit), for plots. NaN where nothing counts."""
+    import numpy as np
+
+    stage = judge.stage
+    e = judge.errors(np.array(list(models.values()))) * judge.floor[None, :, None]
+    out = {}
+    for k, output in enumerate(stage.outputs):
+        valid = judge.valid[k]
+        out[output] = {
+            "unit": stage.units[k],
+            "floor": float(judge.floor[k]),
+            "measured": np.where(valid, stage.measured[k], np.nan),
+            "errors": {name: np.where(valid, e[i, k], np.nan) for i, name in enumerate(models)},
+        }
+    return {"t": stage.t, "outputs": out}
+
+
+def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Search every stage for missing effects, as ``vaneloop diagnose`` does."""
+    from vaneloop.discrepancy.workflow import diagnose as search
+    from vaneloop.discrepancy.workflow import diagnosis_json
+    from vaneloop.pages.diagnosis import verdict_sentence
+
+    chain = chain_for(words, progress)
+    progress(0.0, "searching the library of effects")
+    d = search(chain.stages, chain.not_observed, lambda f: progress(f, "searching the library of effects"), 2)
+    d.notes = list(chain.notes)
+    return {"diagnosis": d, "json": diagnosis_json(d, words[0]), "verdict": verdict_sentence(d)}
+
+
+def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
+    """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
+    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.workflow import extend_stage
+
+    chain = chain_for(words, progress)
+    s = chain.stage(stage)
+    expected = max(2.0, 1.5 * len(effects) * (len(effects) + 1))
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress(min(0.97, done / expected), f"fitting {' + '.join(effects) or 'the nominal model'}")
+
+    tick()
+    r = extend_stage(s, effects, tick)
+    judge = Judge(s, r.floor)
+    models = {"nominal model": r.base.theta}
+    if effects:
+        models["with effects"] = r.final.theta
+    return {"result": r, "curves": curves_of(judge, models), "theta": r.final.theta, "floor": r.floor}
+
+
+def hand(progress: Progress, words: list[str], stage: str, theta: Any, floor: Any, values: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared unit."""
+    import numpy as np
+
+    from vaneloop.discrepancy.fit import Judge
+
+    chain = chain_for(words, progress)
+    s = chain.stage(stage)
+    judge = Judge(s, np.asarray(floor))
+    by_hand = np.array(theta, dtype=float)
+    for effect, given in values.items():
+        at = s.index()[effect].start
+        for i, p in enumerate(s.effect(effect).parameters):
+            if p.name in given:
+                by_hand[at + i] = min(max(given[p.name], p.low), p.high)
+    curves = curves_of(judge, {"by hand": by_hand})
+    rms = {o: float(np.sqrt(np.nanmean(c["errors"]["by hand"] ** 2))) for o, c in curves["outputs"].items()}
+    return {"curves": curves, "rms": rms}
+
+
+def experiment(progress: Progress, diagnosis: Any) -> dict[str, Any] | None:
+    """Recommend the next experiment, as ``vaneloop experiment`` does."""
+    from vaneloop.cli.experiment import recommend
+
+    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"))
+
+
+def report(progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None) -> str:
+    """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
+    from vaneloop.pages.diagnosis import diagnosis_report
+
+    chain = chain_for(words, progress)
+    progress(None, "writing the page")
+    return str(diagnosis_report(diagnosis, chain, path, command, words[0], next_experiment))
+
+
+def command(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a defect of ours."""
+    from vaneloop.base import terminal
+    from vaneloop.base.errors import InputError
+    from vaneloop.cli.main import main
+
+    said, complained = io.StringIO(), io.StringIO()
+    sys.argv = ["vaneloop", *words]
+    progress(None, "vaneloop " + words[0])
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+        try:
+            code = main(words)
+        except SystemExit as e:
+            code = int(e.code or 0)
+    if code in (2, terminal.DEFECT):
+        lines = complained.getvalue().strip().splitlines()
+        raise InputError(lines[-1].removeprefix("vaneloop: ") if lines else "bad input")
+    return {"code": code, "text": said.getvalue()}
+
+
+def engine_part(progress: Progress, path: str) -> tuple[str, Any]:
+    """Read geometry or schedules: which of them the file is, and its content."""
+    from plant import load_geometry, load_schedules
+    from vaneloop.base.errors import InputError
+
+    try:
+        return "geometry", load_geometry(path)
+    except InputError as no_geometry:
+        try:
+            return "schedules", load_schedules(path)
+        except InputError as no_schedules:
+            looks = "speed" in Path(path).read_bytes()[:200_000].decode("utf-8", "replace").split("[vigv]")[0]
+            raise (no_schedules if looks else no_geometry) from None
+
+
+STEPS = ("mechanism", "stroke", "links", "loop", "tables")  # of the schedule page
+
+
+def schedule_step(progress: Progress, step: str, words: list[str], out: str, command: str) -> Any:
+    """One step of the scheduling method, by the functions of ``vaneloop schedule``."""
+    import numpy as np
+
+    from plant import load_geometry, load_schedules
+    from plant.geometry import vane_angles
+    from plant.linkage import STAGES
+    from plant.spatial import plane_joints
+    from vaneloop.cli.schedule import log_of
+    from vaneloop.design.scheduling import STROKE_LIMITS, ScheduleOptions, schedule, stroke_tables, table_speeds, write_tables
+    from vaneloop.pages.schedule import NAMES, schedule_page
+
+    args = parsed("schedule", words)
+    progress(None, "reading")
+    geometry, schedules = load_geometry(args.geometry), load_schedules(args.schedules)
+    if step == "mechanism":
+        strokes = np.linspace(*STROKE_LIMITS, 97)
+        angles = np.rad2deg(vane_angles(strokes * 1e-3, geometry))
+        stages = []
+        for k, name in enumerate(STAGES):
+            joints = [list(plane_joints(geometry, name, x * 1e-3).values()) for x in strokes]
+            places = [[[round(p.real * 1e3, 3), round(p.imag * 1e3, 3)] for p in j] for j in joints]
+            radius = float(getattr(geometry, name).ld.value)
+            stages.append({"key": name, "name": NAMES[name], "joints": places, "radius": radius, "angles": angles[:, k].tolist()})
+        return {"strokes": strokes.tolist(), "stages": stages}
+    if step == "stroke":
+        speed = table_speeds(schedules)
+        return {"speed": speed, "table": stroke_tables(geometry, schedules, speed)}
+    asked = ScheduleOptions(args.step, args.lb_range, args.lc_range, ("lb", "lc"), args.criterion, args.limit)
+    result = schedule(geometry, schedules, log_of(args), asked, lambda f: progress(f, "scheduling"))
+    if step != "tables":
+        return result
+    files = [str(f) for f in write_tables(result, out)]
+    return {"result": result, "files": [*files, str(schedule_page(result, Path(out) / "schedule.html", command))]}
+
+
+TASKS: dict[str, Callable[..., Any]] = {
+    **{f.__name__: f for f in (offers, preview, compare, diagnose, refit, hand, experiment, report, command, engine_part, schedule_step)},
+    "ahead": refit,  # the same, before the user asks for it
+}
+
+
+# ---- the process ----------------------------------------------------------------------------------------------------------------------
+
+
+def _limit_memory() -> None:
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    most = max(LEAST_MEMORY, int(MOST_MEMORY * whole))
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+INBOX: queue.Queue[dict[str, Any]] = queue.Queue()  # what the server tells a task that is running
+
+
+def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> NoReturn:
+    """Answer questions with ``tasks`` until the server is gone."""
+    connection = Connection(fd)
+    _limit_memory()
+    questions: queue.Queue[Any] = queue.Queue()
+
+    def listen() -> None:
+        try:
+            while True:
+                number, name, arguments = connection.recv()
+                if name == "tell":
+                    INBOX.put(arguments)
+                else:
+                    questions.put((number, name, arguments))
+        except (EOFError, OSError):
+            os.killpg(os.getpgrp(), signal.SIGKILL)  # the server is gone, and so is whatever this process has started
+
+    threading.Thread(target=listen, daemon=True).start()
+    sending = threading.Lock()
+    while True:
+        number, name, arguments = questions.get()
+        last = 0.0
+
+        def progress(fraction: float | None, text: Any, number: int = number) -> None:
+            """Tell the page: a fraction and words, or any news of a task that runs on."""
+            nonlocal last
+            now = time.monotonic()
+            if fraction is None or fraction in (0.0, 1.0) or now - last > 0.05:
+                last = now
+                with sending:
+                    connection.send(("progress", number, (fraction, text)))
+
+        try:
+            answer = ("done", number, tasks[name](progress, **arguments))
+        except BaseException as e:
+            answer = ("failed", number, _line(e))
+        with sending:
+            connection.send(answer)
+
+
+def _line(e: BaseException) -> str:
+    """One line for the page: what the command line would say, or the kind of the mistake where it is ours."""
+    from vaneloop.base.errors import InputError
+
+    if isinstance(e, InputError):
+        return str(e)
+    from vaneloop.base.terminal import defect
+
+    return defect(e)
+
+
+if __name__ == "__main__":
+    from vaneloop.base import terminal
+
+    os.nice(10)  # the page answers first
+    sys.exit(terminal.run(lambda: main(int(sys.argv[1]), TASKS)))
