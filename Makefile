@@ -55,6 +55,7 @@ bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'ruff'
 	@$(PY) -m ruff check --output-format concise .
+	@$(PY) -m ruff format --check --quiet --diff .
 	@$(SAY) 'mypy'
 	@$(PY) -m mypy
 

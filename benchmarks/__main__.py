@@ -1,4 +1,6 @@
-"""``python -m benchmarks``: measure, print a table, write benchmarks/results/latest.json. Never fails for a slow figure."""
+"""``python -m benchmarks``: measure, print a table, write benchmarks/results/latest.json. Never fails for a slow
+figure.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def main() -> None:
     path = ROOT / "benchmarks" / "results" / "latest.json"
     try:
         path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps({"machine": host, "rows": [asdict(r) for r in rows]}, indent=2) + "\n", encoding="utf-8")
+        path.write_text(
+            json.dumps({"machine": host, "rows": [asdict(r) for r in rows]}, indent=2) + "\n", encoding="utf-8"
+        )
         console.print(f"written: {path.relative_to(ROOT)}")
     except OSError as e:
         console.print(f"{path}: cannot be written ({e.strerror})")

@@ -23,7 +23,9 @@ SAMPLE = 50_000  # frames that cantools decodes at a time
 
 
 def lockstep_with_frames() -> Iterator[Row]:
-    """Controller, plant and ECU with every frame encoded, arbitrated bit by bit, decoded and checked, against the clock."""
+    """Controller, plant and ECU with every frame encoded, arbitrated bit by bit, decoded and checked, against the
+    clock.
+    """
     from hil.bus.lockstep_bus import run_lockstep
 
     run_lockstep(profile(1.0), seed=1)
@@ -37,8 +39,19 @@ def lockstep_with_frames() -> Iterator[Row]:
     heard = run.vgv.counts["good"] + int(run.ecu.arrays.receiver[:, 0].sum())
     # of the last round some are still on the wire, and each receiver's first only shows the counter
     whole = run.frames == len(run.rows) and run.frames - 10 <= heard <= run.frames and run.vgv.mode == "RUN"
-    note = f"{run.frames:,} frames kept, noisy sensors, wire busy {run.load:.1%}; on the wall clock {LONG / min(walls):,.0f} s/s"
-    yield Row("lockstep with all CAN frames", f"{speed:,.0f} s/s", "real time 1 s/s", speed, ">= 300", bool(speed >= 300 and whole), note)
+    note = (
+        f"{run.frames:,} frames kept, noisy sensors, wire busy {run.load:.1%}; on the wall clock "
+        f"{LONG / min(walls):,.0f} s/s"
+    )
+    yield Row(
+        "lockstep with all CAN frames",
+        f"{speed:,.0f} s/s",
+        "real time 1 s/s",
+        speed,
+        ">= 300",
+        bool(speed >= 300 and whole),
+        note,
+    )
 
 
 def decoding() -> Iterator[Row]:
@@ -67,7 +80,9 @@ def decoding() -> Iterator[Row]:
         return out
 
     def theirs(start: int) -> list[dict[str, Any]]:
-        pairs = zip(ident[start : start + SAMPLE].tolist(), [d.tobytes() for d in data[start : start + SAMPLE]], strict=True)
+        pairs = zip(
+            ident[start : start + SAMPLE].tolist(), [d.tobytes() for d in data[start : start + SAMPLE]], strict=True
+        )
         return [db.decode_message(i, d, decode_choices=False) for i, d in pairs]
 
     ours(log)
@@ -148,8 +163,13 @@ def embedded_bus() -> Iterator[Row]:
             heard += two.read(got)
         wall = time.perf_counter() - started
         missing = n - one.refused - heard - two.lost
-        note = f"{one.refused:,} refused (told to the sender), {two.lost:,} told to the reader as lost, {missing:,} lost silently"
-        yield Row("embedded bus, flood", f"{heard / wall:,.0f} frames/s", target="none silently", held=missing == 0, note=note)
+        note = (
+            f"{one.refused:,} refused (told to the sender), {two.lost:,} told to the reader as lost, {missing:,} "
+            f"lost silently"
+        )
+        yield Row(
+            "embedded bus, flood", f"{heard / wall:,.0f} frames/s", target="none silently", held=missing == 0, note=note
+        )
     finally:
         a.shutdown()
         b.shutdown()

@@ -1,4 +1,6 @@
-"""The hand-written C loop (`loop.c`), built with gcc and called through ctypes, on the same arrays as the compiled Python."""
+"""The hand-written C loop (`loop.c`), built with gcc and called through ctypes, on the same arrays as the compiled
+Python.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,17 @@ BITWISE = (*FAST, "-ffp-contract=off")  # no fused multiply-add: every operation
 
 # the product's parameters in the order of loop.c's `Parameters`
 _PARAMETERS = [
-    *(par.LAG, par.ACCELERATION, par.DECELERATION, par.RATED_CURRENT, par.BANDWIDTH, par.DAMPING, par.FLOW_GAIN, par.AREA, par.STROKE),
+    *(
+        par.LAG,
+        par.ACCELERATION,
+        par.DECELERATION,
+        par.RATED_CURRENT,
+        par.BANDWIDTH,
+        par.DAMPING,
+        par.FLOW_GAIN,
+        par.AREA,
+        par.STROKE,
+    ),
     *(par.P_REF, par.LVDT_LAG, par.POT_LAG, *range(par.PLAY, par.PLAY + 3), *range(par.POT_BIAS, par.POT_BIAS + 3)),
     *range(par.GEOMETRY, par.GEOMETRY + N_GEOMETRY),
     *(par.LVDT_STEP, par.VALVE_A11, par.VALVE_A12, par.VALVE_A21, par.VALVE_A22, par.LVDT_FACTOR, par.POT_FACTOR),
@@ -64,14 +76,20 @@ class CLoop:
         self._c = build(flags, gcc)
         s = self._setup = setup
         # kept: the C side reads the table where it is
-        self._arrays = [np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[_PARAMETERS, 0], s.sigma)]
+        self._arrays = [
+            np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[_PARAMETERS, 0], s.sigma)
+        ]
         k, table, p, sigma = self._arrays
         expected = [len(k), len(p), s.stimulus.rows.shape[1], len(sigma)]
         found = [self._c.loop_layout(i) for i in range(4)]
         if found != expected:
-            raise RuntimeError(f"loop.c has calibration, parameters, frame, noise of {found} numbers; the product has {expected}")
+            raise RuntimeError(
+                f"loop.c has calibration, parameters, frame, noise of {found} numbers; the product has {expected}"
+            )
         start = [s.stroke, s.stimulus.rows[0, 0], 1.0, 1.0]
-        self._loop = self._c.loop_new(_pointer(k), _pointer(table), table.shape[1], _pointer(p), _pointer(sigma), *start)
+        self._loop = self._c.loop_new(
+            _pointer(k), _pointer(table), table.shape[1], _pointer(p), _pointer(sigma), *start
+        )
         first = np.ascontiguousarray(s.stimulus.rows[:1])
         self._c.loop_advance(self._loop, -s.warm_up, s.warm_up, _pointer(first), 1, None, 10, None)
 
@@ -79,7 +97,9 @@ class CLoop:
         """Run the stimulus from its start into ``out`` (SI, a row every 10 ticks)."""
         rows, ticks = self._setup.stimulus.rows, ticks or self._setup.ticks
         assert out.shape == (-(-ticks // self._setup.every), len(COLUMNS))
-        self._c.loop_advance(self._loop, 0, ticks, _pointer(rows), len(rows), _pointer(noise), self._setup.every, _pointer(out))
+        self._c.loop_advance(
+            self._loop, 0, ticks, _pointer(rows), len(rows), _pointer(noise), self._setup.every, _pointer(out)
+        )
 
     @property
     def faults(self) -> int:

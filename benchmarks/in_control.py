@@ -1,7 +1,9 @@
-"""The closed loop as a user of python-control writes it: two discrete-time blocks, interconnected, and `input_output_response`.
+"""The closed loop as a user of python-control writes it: two discrete-time blocks, interconnected, and
+`input_output_response`.
 
-The library's best case: one block for the controller, one for the machine, one sampling time of 1 ms (the ten plant steps of 0.1 ms run
-inside the machine's block), and blocks that call the product's own compiled functions, so that what is measured is the library's share.
+The library's best case: one block for the controller, one for the machine, one sampling time of 1 ms (the ten plant
+steps of 0.1 ms run inside the machine's block), and blocks that call the product's own compiled functions, so that what
+is measured is the library's share.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ def run(setup: Setup) -> np.ndarray:
         return s[:, 0]
 
     def machine_output(t, s, u, params):
-        return np.array([s[chain.N_R], lvdt_sample(s.reshape(-1, 1), p), s[chain.POT], s[chain.POT + 1], s[chain.POT + 2]])
+        return np.array(
+            [s[chain.N_R], lvdt_sample(s.reshape(-1, 1), p), s[chain.POT], s[chain.POT + 1], s[chain.POT + 2]]
+        )
 
     firmware = control.NonlinearIOSystem(
         lambda t, z, u, params: ticked(z, u),
@@ -79,7 +83,10 @@ def run(setup: Setup) -> np.ndarray:
         dt=chain.TICK,
     )
     loop = control.interconnect(
-        [firmware, machine], inputs=["n_dem", "fresh"], outputs=["n_r", "x_dem", "x_lvdt", "vigv", "vgv1", "vgv2"], name="loop"
+        [firmware, machine],
+        inputs=["n_dem", "fresh"],
+        outputs=["n_r", "x_dem", "x_lvdt", "vigv", "vgv1", "vgv2"],
+        name="loop",
     )
     t = np.arange(setup.ticks) * chain.TICK
     fresh = (np.arange(setup.ticks) % 10 == 0).astype(float)

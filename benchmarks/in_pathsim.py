@@ -1,7 +1,8 @@
 """The closed loop as a user of pathsim writes it: blocks, connections, a solver with a fixed step.
 
-Engine, valve with actuator and LVDT are differential equations; firmware and linkage are sampled blocks of 1 ms. The library's best case:
-few blocks, compiled right-hand sides, and sampled blocks that call the product's own compiled functions.
+Engine, valve with actuator and LVDT are differential equations; firmware and linkage are sampled blocks of 1 ms. The
+library's best case: few blocks, compiled right-hand sides, and sampled blocks that call the product's own compiled
+functions.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ def rotor(x, u, lag, acceleration, deceleration):
 @njit(cache=True)
 def drive(x, u, rated, w, damping, gain, lvdt_lag):
     """Rates of spool, spool rate, stroke, LVDT; the spool stays off its stops at small currents."""
-    return np.array([x[1], w * w * (u[0] / rated - x[0]) - 2.0 * damping * w * x[1], gain * x[0], (x[2] - x[3]) / lvdt_lag])
+    return np.array(
+        [x[1], w * w * (u[0] / rated - x[0]) - 2.0 * damping * w * x[1], gain * x[0], (x[2] - x[3]) / lvdt_lag]
+    )
 
 
 @njit(cache=True)
@@ -55,7 +58,13 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
     n_dem, inputs, ticks = rows[:, 0], new_inputs(), [0]
     gain = p[par.FLOW_GAIN, 0] * math.sqrt(rows[0, 2] / p[par.P_REF, 0])
     engine_values = [float(v) for v in p[[par.LAG, par.ACCELERATION, par.DECELERATION], 0]]
-    drive_values = [float(p[par.RATED_CURRENT, 0]), 2.0 * math.pi * p[par.BANDWIDTH, 0], p[par.DAMPING, 0], gain, p[par.LVDT_LAG, 0]]
+    drive_values = [
+        float(p[par.RATED_CURRENT, 0]),
+        2.0 * math.pi * p[par.BANDWIDTH, 0],
+        p[par.DAMPING, 0],
+        gain,
+        p[par.LVDT_LAG, 0],
+    ]
 
     def firmware(demand, n_r, lvdt):
         lvdt = math.floor(lvdt / p[par.LVDT_STEP, 0] + 0.5) * p[par.LVDT_STEP, 0]
@@ -73,7 +82,9 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
 
     source = Source(lambda t: n_dem[min(int(t * 100.0 + 1e-6), len(n_dem) - 1)])
     engine = ODE(lambda x, u, t: rotor(x, u, *engine_values), np.array([s[chain.N_R, 0]]))
-    actuator = ODE(lambda x, u, t: drive(x, u, *drive_values), s[[chain.SPOOL, chain.SPOOL_RATE, chain.X, chain.X_LVDT], 0])
+    actuator = ODE(
+        lambda x, u, t: drive(x, u, *drive_values), s[[chain.SPOOL, chain.SPOOL_RATE, chain.X, chain.X_LVDT], 0]
+    )
     servo, vanes = Wrapper(firmware, T=1e-3), Wrapper(linkage, T=1e-3)
     scope = Scope(sampling_period=1e-2)
     connections = [

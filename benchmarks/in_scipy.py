@@ -1,8 +1,10 @@
-"""The search of one stage beside `scipy.optimize.least_squares`, one parameter set after the other, on the same compiled stage.
+"""The search of one stage beside `scipy.optimize.least_squares`, one parameter set after the other, on the same
+compiled stage.
 
-The peer does the same work: the same starts are screened, and every fit that the search made is made again, from the same start, with the
-same difference steps, scales, bounds and prior, and at most as many iterations. Its linear algebra runs in one thread: in two, which
-wait for each other on tall matrices of five columns, it took twice to three times as long on a machine that did other work.
+The peer does the same work: the same starts are screened, and every fit that the search made is made again, from the
+same start, with the same difference steps, scales, bounds and prior, and at most as many iterations. Its linear algebra
+runs in one thread: in two, which wait for each other on tall matrices of five columns, it took twice to three times as
+long on a machine that did other work.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ def _recorded() -> Iterator[list[Any]]:
 
 
 def ours(stage: Stage) -> tuple[float, float, list[Any], list[float]]:
-    """Search the stage: wall seconds, processor seconds, what was done, and the cost of the nominal model and of the best."""
+    """Search the stage: wall seconds, processor seconds, what was done, and the cost of the nominal model and of the
+    best.
+    """
     assert stage.floor is not None
     started, busy = time.perf_counter(), time.process_time()
     diagnose_stage(stage, stage.floor)
@@ -60,7 +64,9 @@ def ours(stage: Stage) -> tuple[float, float, list[Any], list[float]]:
 
 @threadpool_limits.wrap(limits=1)
 def in_scipy(stage: Stage, jobs: list[Any]) -> tuple[float, float, int, list[float]]:
-    """Do the same one after the other: wall seconds, processor seconds, fits made, highest and lowest cost among them."""
+    """Do the same one after the other: wall seconds, processor seconds, fits made, highest and lowest cost
+    among them.
+    """
     nominal = stage.neutral()
     tolerance = np.array([p.tolerance for p in stage.all_parameters()])
     costs, fits = [], 0
@@ -78,7 +84,9 @@ def in_scipy(stage: Stage, jobs: list[Any]) -> tuple[float, float, int, list[flo
         low, high = (b[free] for b in judge.bounds())
         pull = np.array([np.sqrt(3.0) / tolerance[c] if c < len(stage.parameters) else 0.0 for c in free])
 
-        def residuals(z: np.ndarray, judge: Judge = judge, start: np.ndarray = start, free: Any = free, pull: Any = pull) -> np.ndarray:
+        def residuals(
+            z: np.ndarray, judge: Judge = judge, start: np.ndarray = start, free: Any = free, pull: Any = pull
+        ) -> np.ndarray:
             theta = start.copy()
             theta[free] = z
             return np.concatenate([judge.errors(theta[None])[0].ravel(), pull * (z - nominal[free])])
@@ -86,7 +94,13 @@ def in_scipy(stage: Stage, jobs: list[Any]) -> tuple[float, float, int, list[flo
         inside = np.clip(start[free], np.nextafter(low, np.inf), np.nextafter(high, -np.inf))
         step = DIFFERENCE * judge.scale[free] / np.maximum(np.abs(inside), 1e-12)  # relative, as scipy wants it
         found = least_squares(
-            residuals, inside, bounds=(low, high), x_scale=judge.scale[free], diff_step=step, max_nfev=iterations + 1, ftol=1e-5
+            residuals,
+            inside,
+            bounds=(low, high),
+            x_scale=judge.scale[free],
+            diff_step=step,
+            max_nfev=iterations + 1,
+            ftol=1e-5,
         )
         costs.append(2.0 * found.cost)
         fits += 1

@@ -1,7 +1,7 @@
 """The measurements behind ``python -m benchmarks``: each gives rows of what, ours, peer, ratio, target.
 
-This machine may be busy and its clock may change: opponents run in turn, and the fastest run of each counts (the median where whole
-processes are started). Loops are timed in processor time, processes on the wall clock.
+This machine may be busy and its clock may change: opponents run in turn, and the fastest run of each counts (the median
+where whole processes are started). Loops are timed in processor time, processes on the wall clock.
 """
 
 from __future__ import annotations
@@ -32,8 +32,14 @@ ROOT = Path(__file__).resolve().parent.parent
 LONG = 300.0  # s simulated where only compiled loops run
 ROUNDS = 15
 REPLAYED = 3000.0  # s
-# largest difference to a peer that integrates the same equations with another method: one count of the LVDT is 0.00076 mm
-TOLERANCE = {"n_engine": 0.005, "x_dem": 2e-6, "x_lvdt": 2e-6, **dict.fromkeys(("vigv", "vgv1", "vgv2"), np.deg2rad(2e-3))}  # %, m, rad
+# largest difference to a peer that integrates the same equations with another method: one count of the LVDT is 0.00076
+# mm
+TOLERANCE = {
+    "n_engine": 0.005,
+    "x_dem": 2e-6,
+    "x_lvdt": 2e-6,
+    **dict.fromkeys(("vigv", "vgv1", "vgv2"), np.deg2rad(2e-3)),
+}  # %, m, rad
 
 
 @dataclass(frozen=True)
@@ -57,14 +63,20 @@ def machine() -> dict[str, str]:
         cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         pass
-    found = {"cpu": f"{cpu}, {os.cpu_count()} cores", "system": platform.platform(), "python": platform.python_version()}
+    found = {
+        "cpu": f"{cpu}, {os.cpu_count()} cores",
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
     for package in ("numpy", "numba", "control", "pathsim"):
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             found[package] = "not installed"
     try:
-        found["gcc"] = subprocess.run(["gcc", "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
+        found["gcc"] = subprocess.run(
+            ["gcc", "-dumpfullversion"], capture_output=True, text=True, check=True
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         found["gcc"] = "not installed"
     found["load"] = f"{os.getloadavg()[0]:.1f}"
@@ -94,7 +106,7 @@ def _rows(setup: Setup) -> np.ndarray:
     return np.zeros((-(-setup.ticks // setup.every), len(COLUMNS)))
 
 
-# ---- compiled loops -----------------------------------------------------------------------------------------------------------------
+# ---- compiled loops --------------------------------------------------------------------------------------------------
 
 
 def against_c() -> Iterator[Row]:
@@ -113,10 +125,22 @@ def against_c() -> Iterator[Row]:
     ratio = best["ours"] / best["fast"]
     yield Row("loop, C -O3 -march=native", ours, _speed(LONG, best["fast"]), ratio, "<= 1.3", ratio <= 1.3)
     bits = "every logged signal the same bits" if same else "THE SIGNALS DIFFER"
-    yield Row("same, -ffp-contract=off", ours, _speed(LONG, best["bitwise"]), best["ours"] / best["bitwise"], "same bits", same, bits)
+    yield Row(
+        "same, -ffp-contract=off",
+        ours,
+        _speed(LONG, best["bitwise"]),
+        best["ours"] / best["bitwise"],
+        "same bits",
+        same,
+        bits,
+    )
     for hashed, what, note in (
         (False, "hil.loop.lockstep, no hash", "wall clock"),
-        (True, "hil.loop.lockstep, every tick hashed", "wall clock; the hash takes as long as the loop, beside it where a core is free"),
+        (
+            True,
+            "hil.loop.lockstep, every tick hashed",
+            "wall clock; the hash takes as long as the loop, beside it where a core is free",
+        ),
     ):
         wall = min(lockstep(setup.stimulus, hashed=hashed).wall_s for _ in range(5))
         yield Row(what, _speed(LONG, wall), note=note)
@@ -134,17 +158,21 @@ def interpreted() -> Iterator[Row]:
         answers.append(_wall([sys.executable, "-c", code], env)[1].split())
     same = answers[0][1] == answers[1][1]
     speed = _speed(0.5, float(answers[1][0]))
-    yield Row("loop without compilation", speed, target="same hash", held=same, note="NUMBA_DISABLE_JIT=1, 500 noisy ticks")
+    yield Row(
+        "loop without compilation", speed, target="same hash", held=same, note="NUMBA_DISABLE_JIT=1, 500 noisy ticks"
+    )
 
 
-# ---- other simulators ---------------------------------------------------------------------------------------------------------------
+# ---- other simulators ------------------------------------------------------------------------------------------------
 
 
 Peer = Callable[[Setup], np.ndarray]
 
 
 def _against(name: str, run: Peer, signals: tuple[str, ...], seconds: float, least: float | None, repeat: int) -> Row:
-    """Time a peer on a rise and a fall, check that it simulates the same system, and compare with the product on the very same run."""
+    """Time a peer on a rise and a fall, check that it simulates the same system, and compare with the product on the
+    very same run.
+    """
     half = int(seconds * 50)
     ramp = np.linspace(60.0, 60.0 + 3.0 * seconds, half)
     setup = Setup(Stimulus.of(np.concatenate([ramp, ramp[::-1]])))
@@ -165,7 +193,15 @@ def _against(name: str, run: Peer, signals: tuple[str, ...], seconds: float, lea
     if outside:
         note = f"NOT THE SAME SYSTEM: {', '.join(outside)} outside the tolerance; {note}"
     held = None if least is None else bool(ratio >= least and not outside)
-    return Row(name, _speed(half / 50, ours), _speed(half / 50, best), ratio, "" if least is None else f">= {least:,.0f}", held, note)
+    return Row(
+        name,
+        _speed(half / 50, ours),
+        _speed(half / 50, best),
+        ratio,
+        "" if least is None else f">= {least:,.0f}",
+        held,
+        note,
+    )
 
 
 def against_control() -> Iterator[Row]:
@@ -187,7 +223,7 @@ def against_pathsim() -> Iterator[Row]:
         yield _against(name, partial(in_pathsim.run, step=step, solver=solver), in_pathsim.SIGNALS, 4.0, least, 3)
 
 
-# ---- commands -----------------------------------------------------------------------------------------------------------------------
+# ---- commands --------------------------------------------------------------------------------------------------------
 
 
 def _vaneloop() -> list[str]:
@@ -233,8 +269,17 @@ def first_run() -> Iterator[Row]:
         told = "compiling" in said
         again, _ = _wall([*_vaneloop(), "replay", str(log)], {**os.environ, "NUMBA_CACHE_DIR": str(cache)})
     busy = after.children_user + after.children_system - before.children_user - before.children_system
-    note = f"{busy:.0f} s of processor time; {'says' if told else 'DOES NOT SAY'} that it compiles; the second run takes {again:.1f} s"
-    yield Row("first replay, nothing compiled yet", f"{wall:.1f} s", target="< 30 s, told", held=wall < 30.0 and told, note=note)
+    note = (
+        f"{busy:.0f} s of processor time; {'says' if told else 'DOES NOT SAY'} that it compiles; the second run "
+        f"takes {again:.1f} s"
+    )
+    yield Row(
+        "first replay, nothing compiled yet",
+        f"{wall:.1f} s",
+        target="< 30 s, told",
+        held=wall < 30.0 and told,
+        note=note,
+    )
 
 
 def long_replay() -> Iterator[Row]:
@@ -245,7 +290,10 @@ def long_replay() -> Iterator[Row]:
             _write_run(log, REPLAYED)
             wall = min(_wall([*_vaneloop(), "replay", str(log), "--json", str(answer)])[0] for _ in range(2))
             result = json.loads(answer.read_text(encoding="utf-8"))
-            note = f"{result['simulated_s']:,.0f} s, {log.stat().st_size / 2**20:.0f} MiB; the loop itself {result['wall_s']:.1f} s"
+            note = (
+                f"{result['simulated_s']:,.0f} s, {log.stat().st_size / 2**20:.0f} MiB; the loop itself "
+                f"{result['wall_s']:.1f} s"
+            )
             yield Row(f"vaneloop replay of a long {what} log", f"{wall:.1f} s", note=note)
 
 
@@ -262,9 +310,19 @@ def against_least_squares() -> Iterator[Row]:
     mine, busy, jobs, (_, reached) = ours(stage)
     theirs, theirs_busy, fits, (_, least) = in_scipy(stage, jobs)
     mine = min(mine, ours(stage)[0])  # after the peer, too: the load may have changed
-    note = f"{fits} fits; lowest cost {reached:,.0f} and {least:,.0f}; processor time {busy:.1f} and {theirs_busy:.1f} s"
+    note = (
+        f"{fits} fits; lowest cost {reached:,.0f} and {least:,.0f}; processor time {busy:.1f} and {theirs_busy:.1f} s"
+    )
     note += f"; load of the machine {os.getloadavg()[0]:.1f}"
-    yield Row("search of the actuator, scipy", f"{mine:.1f} s", f"{theirs:.1f} s", theirs / mine, "at least 8", theirs / mine >= 8.0, note)
+    yield Row(
+        "search of the actuator, scipy",
+        f"{mine:.1f} s",
+        f"{theirs:.1f} s",
+        theirs / mine,
+        "at least 8",
+        theirs / mine >= 8.0,
+        note,
+    )
     took = diagnose(chain.stages).elapsed_s
     yield Row("diagnose, 200 s, two effects", f"{took:.1f} s", note="two processes")
 
@@ -276,20 +334,30 @@ def strategies() -> Iterator[Row]:
         wall, _ = _wall([*_vaneloop(), "strategies", "--json", str(answer)])
         j = json.loads(answer.read_text(encoding="utf-8"))
     last = j["rows"][-1]["scenario"]
-    dual, best = (next(r for r in j["rows"] if r["scenario"] == last and r["strategy"] == s) for s in ("dual", j["best"]))
+    dual, best = (
+        next(r for r in j["rows"] if r["scenario"] == last and r["strategy"] == s) for s in ("dual", j["best"])
+    )
     a, b = best["vigv"]["mean_abs"], dual["vigv"]["mean_abs"]
-    yield Row(f"VIGV error, {j['best']} and dual, {last}", f"{a:.3f} deg", f"{b:.3f} deg", b / a, "at least 3", b / a >= 3.0)
+    yield Row(
+        f"VIGV error, {j['best']} and dual, {last}", f"{a:.3f} deg", f"{b:.3f} deg", b / a, "at least 3", b / a >= 3.0
+    )
     a, b = best["travel_mm"], dual["travel_mm"]
     yield Row("travel of the actuator, the same", f"{a:,.0f} mm", f"{b:,.0f} mm", a / b, "<= 1.15", a / b <= 1.15)
     step = max(f["step"] for f in j["failures"])
     yield Row("largest step, potentiometers failing", f"{step:.3f} deg", target="<= 0.2 deg", held=step <= 0.2)
     held = sum(g["held"] for g in j["goals"])
     note = f"{len(j['rows']) + len(j['failures'])} runs of {j['simulated_s']:,.0f} s"
-    yield Row("goals of vaneloop strategies", f"{held} of {len(j['goals'])}", target="all", held=held == len(j["goals"]), note=note)
+    yield Row(
+        "goals of vaneloop strategies",
+        f"{held} of {len(j['goals'])}",
+        target="all",
+        held=held == len(j["goals"]),
+        note=note,
+    )
     yield Row("vaneloop strategies", f"{wall:.0f} s", note="wall clock")
 
 
-# ---- real time ----------------------------------------------------------------------------------------------------------------------
+# ---- real time -------------------------------------------------------------------------------------------------------
 
 
 def real_time() -> Iterator[Row]:
@@ -305,19 +373,44 @@ def real_time() -> Iterator[Row]:
         c, begin, end = total(turns.c), total(turns.begin), total(turns.end)
         a, b, e = begin.figures(), c.figures(), end.figures()
         ratio = a["p99_us"] / b["p99_us"]
-        note = f"p50 {a['p50_us']:.1f}, p99.9 {a['p999_us']:.0f}, max {a['max_us']:.0f} us; C {b['p50_us']:.1f}, {b['p999_us']:.0f}, "
+        note = (
+            f"p50 {a['p50_us']:.1f}, p99.9 {a['p999_us']:.0f}, max {a['max_us']:.0f} us; C {b['p50_us']:.1f}, "
+            f"{b['p999_us']:.0f}, "
+        )
         note += f"{b['max_us']:.0f} us; load of the machine {os.getloadavg()[0]:.1f}; {turns.received:,} frames came"
-        yield Row(f"tick with CAN late, p99, {name}", f"{a['p99_us']:.1f} us", f"{b['p99_us']:.1f} us", ratio, "<= 2", ratio <= 2.0, note)
+        yield Row(
+            f"tick with CAN late, p99, {name}",
+            f"{a['p99_us']:.1f} us",
+            f"{b['p99_us']:.1f} us",
+            ratio,
+            "<= 2",
+            ratio <= 2.0,
+            note,
+        )
         ours, theirs, surely = turns.late_more(500.0)
         note = f"{ours} of {begin.count:,} ticks; C {theirs} of {c.count:,}"
         held = True if ours <= 2 * theirs else False if surely > 2.0 else None
         if held is None:
             note += f"; undecided: other programs come in bursts, and only a ratio of {surely:.2f} is sure to 95 %"
         share = ours / theirs if theirs else None
-        yield Row("  later than 500 us", f"{100 * ours / begin.count:.3f} %", f"{100 * theirs / c.count:.3f} %", share, "<= 2", held, note)
+        yield Row(
+            "  later than 500 us",
+            f"{100 * ours / begin.count:.3f} %",
+            f"{100 * theirs / c.count:.3f} %",
+            share,
+            "<= 2",
+            held,
+            note,
+        )
         note = f"p50 {e['p50_us']:.1f} us: wait, receive, tick, send; C has done nothing by then"
         ratio = e["p99_us"] / b["p99_us"]
-        yield Row("  its frames sent, after the deadline, p99", f"{e['p99_us']:.1f} us", f"{b['p99_us']:.1f} us", ratio, note=note)
+        yield Row(
+            "  its frames sent, after the deadline, p99",
+            f"{e['p99_us']:.1f} us",
+            f"{b['p99_us']:.1f} us",
+            ratio,
+            note=note,
+        )
 
 
 MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {

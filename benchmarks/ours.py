@@ -59,7 +59,9 @@ class OurLoop:
 
     def advance(self, out: np.ndarray, noise: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Run the stimulus from its start into ``out`` (SI, a row every 10 ticks)."""
-        self._advance(0, ticks or self._setup.ticks, self._setup.stimulus.rows, _SILENT if noise is None else noise, out)
+        self._advance(
+            0, ticks or self._setup.ticks, self._setup.stimulus.rows, _SILENT if noise is None else noise, out
+        )
 
     @property
     def faults(self) -> int:
@@ -77,8 +79,8 @@ def profile(seconds: float) -> np.ndarray:
 def troubled(seconds: float) -> Stimulus:
     """The profile with everything that a controller can meet on the bus and in the supply.
 
-    Lost and refused frames, a demand out of range and one that is no number, standby asked for and withdrawn, a measured speed that comes
-    and goes, and a supply pressure that fails for a while.
+    Lost and refused frames, a demand out of range and one that is no number, standby asked for and withdrawn, a
+    measured speed that comes and goes, and a supply pressure that fails for a while.
     """
     n = profile(seconds)
     t = np.arange(len(n)) * 1e-2

@@ -1,8 +1,10 @@
-"""How late a tick of 1 ms begins: the product's whole tick with CAN against the plainest C loop (`realtime.c`), turn by turn in one run.
+"""How late a tick of 1 ms begins: the product's whole tick with CAN against the plainest C loop (`realtime.c`), turn by
+turn in one run.
 
-Ours: controller and plant on the embedded bus, an ECU in a process of its own sends to it; what is measured is `hil.loop.realtime.run_realtime`
-as ``vaneloop run`` calls it. C: ``clock_nanosleep`` to absolute deadlines, nothing else. Both stay on the first processor with the same
-scheduler, memory locked, timer slack 1 ns. The other processor is left alone (but for the ECU), or a busy loop runs on it.
+Ours: controller and plant on the embedded bus, an ECU in a process of its own sends to it; what is measured is
+`hil.loop.realtime.run_realtime` as ``vaneloop run`` calls it. C: ``clock_nanosleep`` to absolute deadlines, nothing
+else. Both stay on the first processor with the same scheduler, memory locked, timer slack 1 ns. The other processor is
+left alone (but for the ECU), or a busy loop runs on it.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ def conditions() -> Iterator[tuple[str, int, bool]]:
 
 @dataclass
 class Turns:
-    """Lateness in each turn: of C's wake-ups, of our ticks' begins, and the time from our deadlines until the tick's frames were sent."""
+    """Lateness in each turn: of C's wake-ups, of our ticks' begins, and the time from our deadlines until the tick's
+    frames were sent.
+    """
 
     c: list[Lateness]
     begin: list[Lateness]
@@ -47,9 +51,11 @@ class Turns:
     received: int = 0  # frames of the ECU
 
     def late_more(self, us: float, seed: int = 1) -> tuple[int, int, float]:
-        """Return our and C's number of ticks later than ``us``, and the ratio that ours exceeds with 95 % (turns drawn again and again).
+        """Return our and C's number of ticks later than ``us``, and the ratio that ours exceeds with 95 % (turns drawn
+        again and again).
 
-        Lateness comes in bursts, since one program that takes the processor delays many ticks: turns are drawn, not ticks.
+        Lateness comes in bursts, since one program that takes the processor delays many ticks: turns are drawn, not
+        ticks.
         """
         ours, theirs = (np.array([h.share_over(us) * h.count for h in turns]).round() for turns in (self.begin, self.c))
         draws = np.random.default_rng(seed).integers(len(ours), size=(4000, len(ours)))
@@ -86,7 +92,20 @@ def compare(priority: int, loaded: bool) -> Turns:
         subprocess.run(["gcc", "-O2", "-o", str(program), str(source)], check=True, capture_output=True, text=True)
         bus = open_bus(name)
         stack.callback(bus.shutdown)
-        ecu = [sys.executable, "-m", "vaneloop.cli.main", "ecu", "--bus", name, "--profile", "idle", "--duration", "1e6", "--timeout", "1e6"]
+        ecu = [
+            sys.executable,
+            "-m",
+            "vaneloop.cli.main",
+            "ecu",
+            "--bus",
+            name,
+            "--profile",
+            "idle",
+            "--duration",
+            "1e6",
+            "--timeout",
+            "1e6",
+        ]
         ecu += ["--wait", "1e6", "--quiet", "--cpu", str(others_on), "--spin-us", "0"]
         if priority:
             ecu += ["--realtime-priority", str(priority)]

@@ -21,15 +21,19 @@ __all__ = ["MEASUREMENTS"]
 REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
 PATIENCE = 240_000  # ms
 
-# One step on the chart of all channels: ms until the browser has drawn the moved view, and until the points of that view are there.
+# One step on the chart of all channels: ms until the browser has drawn the moved view, and until the points of that
+# view are there.
 STEP = """async ({dx, dy, at}) => {
-  const chart = document.querySelector('.curves'), over = chart.querySelector('.u-over'), box = over.getBoundingClientRect();
+  const chart = document.querySelector('.curves'), over = chart.querySelector('.u-over');
+  const box = over.getBoundingClientRect();
   const answers = chart.dataset.answers, frame = () => new Promise(requestAnimationFrame), began = performance.now();
-  over.dispatchEvent(new WheelEvent('wheel', {deltaX: dx, deltaY: dy, clientX: box.left + at * box.width, clientY: box.top + 20,
+  over.dispatchEvent(new WheelEvent('wheel', {deltaX: dx, deltaY: dy, clientX: box.left + at * box.width,
+    clientY: box.top + 20,
     bubbles: true, cancelable: true}));
   await frame(); await frame();
   const moved = performance.now() - began;
-  while (chart.dataset.answers === answers && performance.now() - began < 20000) await new Promise((r) => setTimeout(r, 1));
+  while (chart.dataset.answers === answers && performance.now() - began < 20000)
+    await new Promise((r) => setTimeout(r, 1));
   await frame();
   return [moved, performance.now() - began, Number(chart.dataset.points)];
 }"""
@@ -40,7 +44,8 @@ PRESS = """async (name) => {
   const began = performance.now();
   button.click();
   while (![...document.querySelectorAll('.soft.small')].some((x) => x.innerText.startsWith('The ' + name)) &&
-         performance.now() - began < 20000) await new Promise((r) => setTimeout(r, 1));
+         performance.now() - began < 20000)
+    await new Promise((r) => setTimeout(r, 1));
   return performance.now() - began;
 }"""
 
@@ -62,10 +67,23 @@ def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
     """A browser, and the address of ``vaneloop web``."""
     from playwright.sync_api import sync_playwright
 
-    chromium = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    chromium = next(
+        (p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None
+    )
     if chromium is None:
         raise RuntimeError("no chromium on this machine")
-    words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder)]
+    words = [
+        sys.executable,
+        "-m",
+        "vaneloop.cli.main",
+        "web",
+        "--port",
+        "0",
+        "--no-open",
+        "--quiet",
+        "--folder",
+        str(folder),
+    ]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert server.stdout is not None
@@ -83,7 +101,9 @@ def row(what: str, seconds: list[float], limit: float, note: str) -> Row:
     """Median against ``limit``, the worst beside it."""
     ours, worst = float(np.median(seconds)), max(seconds)
     note = f"worst of {len(seconds)}: {worst * 1e3:,.0f} ms; {note}"
-    return Row(what, f"{ours * 1e3:,.0f} ms", f"limit {limit * 1e3:,.0f} ms", limit / ours, ">= 1", bool(ours <= limit), note)
+    return Row(
+        what, f"{ours * 1e3:,.0f} ms", f"limit {limit * 1e3:,.0f} ms", limit / ours, ">= 1", bool(ours <= limit), note
+    )
 
 
 def web() -> Iterator[Row]:
@@ -117,7 +137,12 @@ def web() -> Iterator[Row]:
             moved, fresh, points = map(list, zip(*(page.evaluate(STEP, s) for s in steps), strict=True))
             note = f"3,000 s, 100 Hz, 11 signals and the time; {max(points):,.0f} points drawn at most"
             yield row("web: zoom and pan, the view moves", [m / 1e3 for m in moved], 0.1, note)
-            yield row("web: zoom and pan, the points of the view are there", [f / 1e3 for f in fresh], 0.2, "thinned on the server")
+            yield row(
+                "web: zoom and pan, the points of the view are there",
+                [f / 1e3 for f in fresh],
+                0.2,
+                "thinned on the server",
+            )
 
             page.get_by_role("button", name="Find the missing physics").click()
             page.get_by_text("searching the library").wait_for()
@@ -128,7 +153,9 @@ def web() -> Iterator[Row]:
                 time.sleep(0.3)
             running = page.get_by_role("button", name="Cancel").first.is_visible()
             zooms = [page.evaluate(STEP, s)[1] / 1e3 for s in steps[:10]]
-            yield row("web: another stage, while a diagnosis runs", answers, 0.2, "" if running else "THE DIAGNOSIS HAD ENDED")
+            yield row(
+                "web: another stage, while a diagnosis runs", answers, 0.2, "" if running else "THE DIAGNOSIS HAD ENDED"
+            )
             yield row("web: zoom, while a diagnosis runs", zooms, 0.2, "until the points of the view are there")
 
 

@@ -16,7 +16,13 @@ __all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_inputs", "new_s
 
 STRATEGIES = firmware.STRATEGIES
 _DEG = np.pi / 180.0
-_SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3, "deg": _DEG, "deg/s": _DEG}  # mA/mm = A/m and the other ratios need no factor
+_SI = {
+    "mm": 1e-3,
+    "mm/s": 1e-3,
+    "mA": 1e-3,
+    "deg": _DEG,
+    "deg/s": _DEG,
+}  # mA/mm = A/m and the other ratios need no factor
 
 
 class Calibration(NamedTuple):
@@ -60,7 +66,9 @@ class Schedule(Bounded):
         if self.table_input not in ("n_r", "n_dem"):
             raise ValueError(f"table_input (={self.table_input!r}) must be n_r or n_dem")
         if not self.stroke_min.value < self.stroke_max.value:
-            raise ValueError(f"stroke_min (={self.stroke_min.value:g} mm) must be below stroke_max (={self.stroke_max.value:g} mm)")
+            raise ValueError(
+                f"stroke_min (={self.stroke_min.value:g} mm) must be below stroke_max (={self.stroke_max.value:g} mm)"
+            )
         return self
 
 
@@ -173,12 +181,32 @@ class CalibrationTable(Table):
         d, m = self.demand_monitor, self.lvdt_monitor
         stroke, current = self.fail_safe.fail_safe_stroke.value, self.fail_safe.fail_safe_current.value
         for good, key, value, unit, allowed in (
-            (low <= stroke <= high, "fail_safe.fail_safe_stroke", stroke, "mm", f"in [{low:g}, {high:g}], stroke_min to stroke_max"),
-            (abs(current) <= limit, "fail_safe.fail_safe_current", current, "mA", f"in [{-limit:g}, {limit:g}], the current_limit"),
-            (d.demand_low.value < d.demand_high.value, *_named(d, "demand_low"), f"below demand_high (={d.demand_high.value:g} %)"),
+            (
+                low <= stroke <= high,
+                "fail_safe.fail_safe_stroke",
+                stroke,
+                "mm",
+                f"in [{low:g}, {high:g}], stroke_min to stroke_max",
+            ),
+            (
+                abs(current) <= limit,
+                "fail_safe.fail_safe_current",
+                current,
+                "mA",
+                f"in [{-limit:g}, {limit:g}], the current_limit",
+            ),
+            (
+                d.demand_low.value < d.demand_high.value,
+                *_named(d, "demand_low"),
+                f"below demand_high (={d.demand_high.value:g} %)",
+            ),
             (m.lvdt_low.value < low, *_named(m, "lvdt_low"), f"below stroke_min (={low:g} mm)"),
             (m.lvdt_high.value > high, *_named(m, "lvdt_high"), f"above stroke_max (={high:g} mm)"),
-            (m.stuck_margin.value < half, *_named(m, "stuck_margin"), f"below {half:g}, half the way from stroke_min to stroke_max"),
+            (
+                m.stuck_margin.value < half,
+                *_named(m, "stuck_margin"),
+                f"below {half:g}, half the way from stroke_min to stroke_max",
+            ),
             (
                 self.adaptive.pot_low.value < self.adaptive.pot_high.value,
                 *("adaptive.pot_low", self.adaptive.pot_low.value, "deg"),
@@ -216,10 +244,16 @@ class StrokeTable(Bounded):
             strokes = getattr(self, key).values
             for i, (a, b) in enumerate(zip(strokes, strokes[1:], strict=False)):
                 if b < a:
-                    raise ValueError(f"{key}.values[{i + 1}] (={b:g}) must not be less than the value before it (={a:g})")
-        for i, (e, m, r) in enumerate(zip(self.extension.values, self.single.values, self.retraction.values, strict=True)):
+                    raise ValueError(
+                        f"{key}.values[{i + 1}] (={b:g}) must not be less than the value before it (={a:g})"
+                    )
+        for i, (e, m, r) in enumerate(
+            zip(self.extension.values, self.single.values, self.retraction.values, strict=True)
+        ):
             if not e >= m >= r:
-                raise ValueError(f"single.values[{i}] (={m:g}) must lie between retraction (={r:g}) and extension (={e:g})")
+                raise ValueError(
+                    f"single.values[{i}] (={m:g}) must lie between retraction (={r:g}) and extension (={e:g})"
+                )
         return self
 
 
@@ -272,8 +306,14 @@ def load_calibration(
                 flat[key] = q.value * _SI.get(q.unit, 1.0)
     flat |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
     k = np.array([flat[name] for name in firmware.SCALARS])
-    table = np.array([stroke.speed.values] + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")])
-    vanes = [np.array(angle.stroke.values) * 1e-3, *(np.deg2rad(getattr(angle, s).values) for s in ("vigv", "vgv1", "vgv2"))]
+    table = np.array(
+        [stroke.speed.values]
+        + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]
+    )
+    vanes = [
+        np.array(angle.stroke.values) * 1e-3,
+        *(np.deg2rad(getattr(angle, s).values) for s in ("vigv", "vgv1", "vgv2")),
+    ]
     return Calibration(k, table, np.array(vanes))
 
 

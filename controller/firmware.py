@@ -6,8 +6,8 @@ Signal flow of one tick (Kim & Ki 2020, figure 7)::
     n_r ----> filter (10 ms) ------------------+--> stroke tables --> x_dem --> PI (1 ms) --> i_cmd
     x_lvdt -> range, rate, stuck (1 ms) ---------------------------------------^
 
-`tick` has no clock, no file and no bus: the same inputs and state give the same state, bit for bit. It writes into ``state`` in place and
-allocates nothing. Every threshold is calibration (`controller.calibration`).
+`tick` has no clock, no file and no bus: the same inputs and state give the same state, bit for bit. It writes into
+``state`` in place and allocates nothing. Every threshold is calibration (`controller.calibration`).
 
 Units: SI, speeds in % of design speed. Positive current extends.
 
@@ -20,12 +20,14 @@ import math
 
 from numba import njit
 
-# Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a tick.
+# Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a
+# tick.
 compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  # type: ignore[call-overload]
-# The strategies inverse and adaptive are not inlined: that would double the time that compiling takes, for all strategies.
+# The strategies inverse and adaptive are not inlined: that would double the time that compiling takes, for all
+# strategies.
 apart = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 
-# ---- inputs -------------------------------------------------------------------------------------------------------------------------
+# ---- inputs ----------------------------------------------------------------------------------------------------------
 INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2", "pause")
 N_INPUTS = len(INPUTS)
 (
@@ -41,15 +43,15 @@ N_INPUTS = len(INPUTS)
     IN_PAUSE,  # s for which the controller stood still before this tick, as its supervisor says; 0 = it ran on time
 ) = range(N_INPUTS)
 
-# ---- strategies: how the stroke demand follows from the speed, docs/strategies.md ---------------------------------------------------
+# ---- strategies: how the stroke demand follows from the speed, docs/strategies.md ------------------------------------
 STRATEGIES = ("single", "dual", "inverse", "adaptive")
 SINGLE, DUAL, INVERSE, ADAPTIVE = range(4)
 
-# ---- modes --------------------------------------------------------------------------------------------------------------------------
+# ---- modes -----------------------------------------------------------------------------------------------------------
 INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE = range(5)
 MODES = ("INIT", "STANDBY", "RUN", "DEGRADED", "FAIL_SAFE")
 
-# ---- fault codes: bit numbers in the state's `faults` and in the frame VGV_SERVO ----------------------------------------------------
+# ---- fault codes: bit numbers in the state's `faults` and in the frame VGV_SERVO -------------------------------------
 FAULTS = (
     "demand_stale",
     "demand_rejected",
@@ -62,9 +64,11 @@ FAULTS = (
     "paused",
 )
 N_FAULTS = len(FAULTS)
-(F_STALE, F_REJECTED, F_LVDT_RANGE, F_LVDT_RATE, F_LVDT_STUCK, F_TRACKING, F_SATURATED, F_DEMAND_RANGE, F_PAUSED) = range(N_FAULTS)
+(F_STALE, F_REJECTED, F_LVDT_RANGE, F_LVDT_RATE, F_LVDT_STUCK, F_TRACKING, F_SATURATED, F_DEMAND_RANGE, F_PAUSED) = (
+    range(N_FAULTS)
+)
 
-# ---- calibration scalars ------------------------------------------------------------------------------------------------------------
+# ---- calibration scalars ---------------------------------------------------------------------------------------------
 SCALARS = (
     "strategy",  # of `STRATEGIES`
     "table_input",  # 0 table entered with filtered n_r, 1 with n_dem
@@ -195,7 +199,7 @@ N_SCALARS = len(SCALARS)
     WIDTH_LIMIT,
 ) = range(N_SCALARS)
 
-# ---- state --------------------------------------------------------------------------------------------------------------------------
+# ---- state -----------------------------------------------------------------------------------------------------------
 STATE = (
     "mode",
     "ticks",
@@ -366,7 +370,7 @@ SLOW = 10  # ticks: demand, trend and schedule run every 10 ms
 SLOW_TICK = 1e-2  # s
 HALF_TICK = 0.5 * TICK  # s: timers are sums of ticks; half a tick keeps their rounding from costing a whole one
 
-# ---- rows of the stroke table -------------------------------------------------------------------------------------------------------
+# ---- rows of the stroke table ----------------------------------------------------------------------------------------
 ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
 
 ANGLE_STROKE, ANGLE_VIGV = 0, 1  # rows of the angle table; VGV1 and VGV2 follow
@@ -382,7 +386,10 @@ SOFT_END = 0.25  # of what is left of the gap in 10 ms
 POT_SHARE = 0.1  # of 1 ms: a lag of 10 ms
 STROKE_SHARE = 0.1
 OVERSHOT = 3e-5  # m: six times the LVDT's noise
-SUSPICION, FORGIVEN = 0.2, 0.02  # of 10 ms: five implausible readings cost the trust, one plausible takes back a tenth of one
+SUSPICION, FORGIVEN = (
+    0.2,
+    0.02,
+)  # of 10 ms: five implausible readings cost the trust, one plausible takes back a tenth of one
 QUIET_MOTION, QUIET_ERROR = 2e-5, 1e-4  # m in 10 ms, m: the stroke is at rest
 SETTLED = 0.1  # s at rest
 UNSETTLED, MOVING = 0.004, 60.0  # rad, rad/m: what lags may add while the stroke moves: three steps at 20 rad/m
@@ -417,10 +424,11 @@ def trend_step(z, k, n_dem):
 
         n- = n + rate T,   r = n_dem - n-,   n = n- + alpha r,   rate = rate + beta r / T
 
-    ``back`` is how far the demand has come back from its farthest point along the present direction. The direction turns once the demand
-    has been moving against it (rate beyond ``trend_rate_on``) and is back by half of ``trend_change``, or has crept back by the whole of
-    it, and this has stood without a gap for ``trend_hold``. The turning point is taken from the demand itself: the filter overshoots after
-    a slam and would turn falsely at its end. It takes two steps in a row to move it, so that one wrong demand moves nothing.
+    ``back`` is how far the demand has come back from its farthest point along the present direction. The direction
+    turns once the demand has been moving against it (rate beyond ``trend_rate_on``) and is back by half of
+    ``trend_change``, or has crept back by the whole of it, and this has stood without a gap for ``trend_hold``. The
+    turning point is taken from the demand itself: the filter overshoots after a slam and would turn falsely at its end.
+    It takes two steps in a row to move it, so that one wrong demand moves nothing.
     """
     predicted = z[TREND_N] + z[TREND_RATE] * SLOW_TICK
     r = n_dem - predicted
@@ -449,8 +457,8 @@ def trend_step(z, k, n_dem):
 def schedule_step(z, k, table):
     """Strategies `SINGLE` and `DUAL`: stroke demand from the speed by curves, one 10 ms step.
 
-    The extension curve serves a rising demand, the retraction curve a falling one. Between them ``blend`` moves at a limited rate, so the
-    change of table is bumpless; the demand itself is limited to ``stroke_rate``.
+    The extension curve serves a rising demand, the retraction curve a falling one. Between them ``blend`` moves at a
+    limited rate, so the change of table is bumpless; the demand itself is limited to ``stroke_rate``.
     """
     n = z[N_DEM] if k[TABLE_INPUT] == 1.0 else z[N_R]
     if k[STRATEGY] == 0.0:
@@ -474,9 +482,9 @@ def observe_speed(z, k):
         rate = clip((n_dem - n) / engine_lag, -engine_deceleration, engine_acceleration) + drift
         n- = n + rate T,   e = n_r - n-,   n = n- + observer_alpha e,   drift = drift + observer_beta e / T
 
-    The engine's model is driven by the demand, so the rate is there before the speed has moved. ``drift`` takes up what the model does not
-    know. Whatever the model says, n stays within ``observer_band`` of the filtered measurement. Without a new frame the model goes on
-    alone; without one for ``demand_timeout`` the speed stands.
+    The engine's model is driven by the demand, so the rate is there before the speed has moved. ``drift`` takes up what
+    the model does not know. Whatever the model says, n stays within ``observer_band`` of the filtered measurement.
+    Without a new frame the model goes on alone; without one for ``demand_timeout`` the speed stands.
     """
     if k[TABLE_INPUT] == 1.0:
         z[SPEED], z[SPEED_RATE] = z[N_DEM], z[TREND_RATE]
@@ -512,8 +520,8 @@ def scheduled_angle(table, angles, n):
 def follow_play(z, stage, drive, width):
     """Where in its gap is a stage? One step of the play operator, with the ``drive`` angle and total ``width`` (rad).
 
-    The stage stands at ``farthest - engaged width / 2``: pushed there by the farthest drive on the engaged side, until the drive has come
-    back by the whole width and pushes from the other side.
+    The stage stands at ``farthest - engaged width / 2``: pushed there by the farthest drive on the engaged side, until
+    the drive has come back by the whole width and pushes from the other side.
     """
     side = z[ENGAGED + stage]
     if side == 0.0:
@@ -530,11 +538,13 @@ def follow_play(z, stage, drive, width):
 
 @apart
 def inverse_step(z, k, table, angles):
-    """Strategies `INVERSE` and `ADAPTIVE`: the stroke demand that brings the VIGV to its target through the play, one 10 ms step.
+    """Strategies `INVERSE` and `ADAPTIVE`: the stroke demand that brings the VIGV to its target through the play, one
+    10 ms step.
 
-    The stroke pushes on one side of the gap while the target moves on along it; it stands while the target comes back by less than a
-    band; beyond, it crosses the gap and pushes from the other side. The vane's present angle comes from the play followed along the
-    stroke demand, or the measured stroke where that is clearly elsewhere; the target from the observed speed, ahead by the servo's delay.
+    The stroke pushes on one side of the gap while the target moves on along it; it stands while the target comes back
+    by less than a band; beyond, it crosses the gap and pushes from the other side. The vane's present angle comes from
+    the play followed along the stroke demand, or the measured stroke where that is clearly elsewhere; the target from
+    the observed speed, ahead by the servo's delay.
     """
     observe_speed(z, k)
     stroke = z[X_DEM] + max(z[X_SLOW] - z[X_DEM] - OVERSHOT, 0.0) + min(z[X_SLOW] - z[X_DEM] + OVERSHOT, 0.0)
@@ -567,7 +577,9 @@ def inverse_step(z, k, table, angles):
 
 @apart
 def filter_pots(z, k, inputs):
-    """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts against it."""
+    """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts
+    against it.
+    """
     for stage in range(3):
         y = inputs[IN_VIGV + stage]
         if k[POT_LOW] <= y <= k[POT_HIGH]:
@@ -583,9 +595,9 @@ def filter_pots(z, k, inputs):
 def _judge_pot(z, k, stage, expected, plausible):
     """Is a potentiometer trusted? One 10 ms step.
 
-    It is once its readings have followed the linkage over ``pot_trust`` without a doubt: one that is stuck may be right by chance where
-    it stands, not over a motion. What was learned until then is proved, and kept. With the doubts of some readings in a row the trust is
-    lost, and what was learned since the last proof goes back.
+    It is once its readings have followed the linkage over ``pot_trust`` without a doubt: one that is stuck may be right
+    by chance where it stands, not over a motion. What was learned until then is proved, and kept. With the doubts of
+    some readings in a row the trust is lost, and what was learned since the last proof goes back.
     """
     if plausible:
         z[SUSPECT + stage] = max(z[SUSPECT + stage] - FORGIVEN, 0.0)
@@ -610,15 +622,17 @@ def _judge_pot(z, k, stage, expected, plausible):
 def learn(z, k):
     """Learn offset and play of each stage from its potentiometer: one 10 ms step.
 
-    With the stroke at rest, the reading less the angle expected, r, is put into the side on which the stage is engaged::
+    With the stroke at rest, the reading less the angle expected, r, is put into the side on which the stage is
+    engaged::
 
         expected = farthest + offset - engaged (play + width) / 2
         offset = offset + share g r,   width = width - 2 engaged (1 - share) g r
 
-    share is 1/2 as long as one side is little known (each side is then learned on its own) and rises to 0.9: what moves later is growth
-    rather than wear. g r is limited to ``learn_rate``, up to twelve times that on a side that is new or seen again. A reading farther than
-    ``pot_gate`` from its expected value (while a side is new: than the limits allow) is implausible. Once both sides are known, offset
-    and width stay within ``learn_budget`` of what was proved last (`_judge_pot`). Without trust nothing is learned: the values stand.
+    share is 1/2 as long as one side is little known (each side is then learned on its own) and rises to 0.9: what moves
+    later is growth rather than wear. g r is limited to ``learn_rate``, up to twelve times that on a side that is new or
+    seen again. A reading farther than ``pot_gate`` from its expected value (while a side is new: than the limits allow)
+    is implausible. Once both sides are known, offset and width stay within ``learn_budget`` of what was proved last
+    (`_judge_pot`). Without trust nothing is learned: the values stand.
     """
     quiet = z[MODE] == RUN and abs(z[X_DEM] - z[X_FROM]) < QUIET_MOTION and abs(z[X_DEM] - z[X_MEAS]) < QUIET_ERROR
     z[QUIET] = min(z[QUIET] + SLOW_TICK, 1.0) if quiet else 0.0
@@ -674,7 +688,8 @@ def servo_step(z, k, x_ref, dx_ref):
 
         e = x_ref - x_meas,   i = kp e + integral + kff dx_ref,   d(integral)/dt = ki e
 
-    The current is limited to +-``current_limit``; while it is, the integral does not grow further into the limit (anti-windup).
+    The current is limited to +-``current_limit``; while it is, the integral does not grow further into the limit
+    (anti-windup).
     """
     e = x_ref - z[X_MEAS]
     limit = k[CURRENT_LIMIT]
@@ -720,9 +735,9 @@ def _debounce(z, timer, bad, bit, rise, heal):
 def _condition_lvdt(z, k, x, pause):
     """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one.
 
-    A sample is plausible if the piston can have come there from the last plausible one at ``lvdt_rate``, however long ago that was: a
-    spike costs one sample, a gap none after it, and a lasting step is refused until it is a fault. ``pause`` (s): time before this tick in
-    which no sample was taken.
+    A sample is plausible if the piston can have come there from the last plausible one at ``lvdt_rate``, however long
+    ago that was: a spike costs one sample, a gap none after it, and a lasting step is refused until it is a fault.
+    ``pause`` (s): time before this tick in which no sample was taken.
     """
     in_range = k[LVDT_LOW] <= x <= k[LVDT_HIGH]  # False for NaN
     z[X_REACH] = min(z[X_REACH] + k[LVDT_RATE] * (TICK + pause), FAR)
@@ -734,12 +749,14 @@ def _condition_lvdt(z, k, x, pause):
     else:
         z[LVDT_GOOD] = 0.0
     _debounce_leaky(z, T_LVDT_RANGE, not in_range, F_LVDT_RANGE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
-    # each jump counts as five samples of the debounce time: a lasting step of more than 2 mm (the tracking limit) is a fault
+    # each jump counts as five samples of the debounce time: a lasting step of more than 2 mm (the tracking limit) is a
+    # fault
     if jump:
         z[T_LVDT_RATE] += 4.0 * TICK
     _debounce_leaky(z, T_LVDT_RATE, jump, F_LVDT_RATE, k[LVDT_DEBOUNCE], k[LVDT_HEAL])
 
-    # stuck: a current that must move the piston, and no motion, away from the end stops; then stuck until there is motion
+    # stuck: a current that must move the piston, and no motion, away from the end stops; then stuck until there is
+    # motion
     inside = k[STROKE_MIN] + k[STUCK_MARGIN] < z[X_MEAS] < k[STROKE_MAX] - k[STUCK_MARGIN]
     stuck = z[STUCK_TIMER] >= k[STUCK_TIME] - HALF_TICK
     asked = abs(z[I_CMD]) > k[STUCK_CURRENT] and inside
@@ -767,10 +784,16 @@ def _debounce_leaky(z, timer, bad, bit, rise, heal):
 
 @compiled
 def _monitor_demand(inputs, z, k, pause):
-    """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too. It aged by ``pause`` (s), too."""
+    """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too. It aged by
+    ``pause`` (s), too.
+    """
     n_dem, n_r, request = inputs[IN_N_DEM], inputs[IN_N_R], inputs[IN_MODE_REQUEST]
     fresh = inputs[IN_FRESH] > 0.5
-    in_range = (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH]) and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH]) and 0.0 <= request <= 1.0  # not NaN
+    in_range = (
+        (k[DEMAND_LOW] <= n_dem <= k[DEMAND_HIGH])
+        and (k[DEMAND_LOW] <= n_r <= k[DEMAND_HIGH])
+        and 0.0 <= request <= 1.0
+    )  # not NaN
     good = fresh and in_range
     rejected = inputs[IN_REJECTED]
     if not (rejected >= 0.0):
@@ -864,7 +887,8 @@ def tick(inputs, state, calibration):
     state        float64[N_STATE], changed in place, see `STATE`; start from `controller.new_state()`
     calibration  `controller.Calibration` (scalars ``k``, stroke ``table``, vane ``angles``)
 
-    Invariants: ``state[I_CMD]`` within +-current_limit, ``state[X_DEM]`` within [stroke_min, stroke_max], mode one of `MODES`.
+    Invariants: ``state[I_CMD]`` within +-current_limit, ``state[X_DEM]`` within [stroke_min, stroke_max], mode one of
+    `MODES`.
     """
     z, k = state, calibration.k
     pause = min(inputs[IN_PAUSE], 1e6) if inputs[IN_PAUSE] > 0.0 else 0.0  # not NaN
@@ -896,7 +920,9 @@ def tick(inputs, state, calibration):
 
     servo_on = mode != INIT and not (mode == FAIL_SAFE and (int(z[FAULT_BITS]) & LVDT_MASK) != 0)
     if not servo_on:
-        z[X_DEM] = min(max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX])  # bumpless: the servo starts from where the piston is
+        z[X_DEM] = min(
+            max(z[X_MEAS], k[STROKE_MIN]), k[STROKE_MAX]
+        )  # bumpless: the servo starts from where the piston is
         z[X_FROM] = z[X_DEM]
     # the servo's reference runs straight through the 10 ms from the last demand to the new one
     dx_ref = (z[X_DEM] - z[X_FROM]) / SLOW_TICK
@@ -909,7 +935,14 @@ def tick(inputs, state, calibration):
         z[I_CMD] = 0.0 if mode == INIT else min(max(k[FAIL_SAFE_CURRENT], -limit), limit)
         z[INTEGRAL] = 0.0
         z[SATURATED] = 0.0
-    _debounce(z, T_TRACKING, servo_on and abs(x_ref - z[X_MEAS]) > k[TRACKING_LIMIT], F_TRACKING, k[TRACKING_TIME], k[RECOVER_TIME])
+    _debounce(
+        z,
+        T_TRACKING,
+        servo_on and abs(x_ref - z[X_MEAS]) > k[TRACKING_LIMIT],
+        F_TRACKING,
+        k[TRACKING_TIME],
+        k[RECOVER_TIME],
+    )
     _debounce(z, T_SATURATED, servo_on and z[SATURATED] == 1.0, F_SATURATED, k[SATURATED_TIME], k[RECOVER_TIME])
     z[TICKS] += 1.0
     _choose_mode(z, k)

@@ -1,4 +1,5 @@
-"""Electro-mechanical positioning system (Janot, Gautier, Brunot 2019): mass and viscous friction are known of, nothing else.
+"""Electro-mechanical positioning system (Janot, Gautier, Brunot 2019): mass and viscous friction are known of, nothing
+else.
 
 Data: DATA_EMPS.mat to fit, DATA_EMPS_PULSES.mat to test, from nonlinearbenchmark.org.
 

@@ -2,7 +2,8 @@
 
 Data: ARTS-Laboratory, Dataset-Friction-Damper-with-Backlash (GitHub), the JSON files of dataset-2.
 
-    vaneloop diagnose *0.5Hz*.json --test *1Hz*.json --test *Kocaeli*.json --system examples/friction_damper.py --report damper.html
+    vaneloop diagnose *0.5Hz*.json --test *1Hz*.json --test *Kocaeli*.json --system examples/friction_damper.py --report
+    damper.html
 """
 
 from vaneloop import System, unknown
@@ -21,7 +22,12 @@ def read(path):
 
     with open(path) as f:
         data = np.array(json.load(f)["data"])
-    return {"t": data[:, 0], "displacement": 25.4 * data[:, 1], "force": 4.4482216 * data[:, 2], "speed": 25.4 * data[:, 3]}  # mm, kN, mm/s
+    return {
+        "t": data[:, 0],
+        "displacement": 25.4 * data[:, 1],
+        "force": 4.4482216 * data[:, 2],
+        "speed": 25.4 * data[:, 3],
+    }  # mm, kN, mm/s
 
 
 system = System(

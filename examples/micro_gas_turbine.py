@@ -21,5 +21,10 @@ system = System(
     model=power,
     inputs={"input_voltage": "V"},
     outputs={"el_power": "W"},
-    parameters=[unknown("middle", 2000.0, "W"), unknown("slope", 1000.0, "W"), unknown("bend", 100.0, "W"), unknown("twist", 100.0, "W")],
+    parameters=[
+        unknown("middle", 2000.0, "W"),
+        unknown("slope", 1000.0, "W"),
+        unknown("bend", 100.0, "W"),
+        unknown("twist", 100.0, "W"),
+    ],
 )

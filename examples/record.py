@@ -1,7 +1,8 @@
-"""Record the shipped example logs: the firmware drives the independent rig of tests/rig, and the bus or the rig's logger writes.
+"""Record the shipped example logs: the firmware drives the independent rig of tests/rig, and the bus or the rig's
+logger writes.
 
-``python -m examples.record`` from a checkout makes them anew. The machine behind them is not the plant model of this project: other
-equations, randomised parameters, noisy and quantised sensors.
+``python -m examples.record`` from a checkout makes them anew. The machine behind them is not the plant model of this
+project: other equations, randomised parameters, noisy and quantised sensors.
 """
 
 from __future__ import annotations
@@ -32,7 +33,19 @@ def channels(log: dict[str, np.ndarray]) -> dict[str, Channel]:
     return {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}
 
 
-RESOLUTION = {"x_dem": 3, "x_lvdt": 3, "i_cmd": 3, "n_dem": 3, "n_r": 3, "p_s": 3, "t_oil": 1, "vigv": 3, "vgv1": 3, "vgv2": 3, "state": 0}
+RESOLUTION = {
+    "x_dem": 3,
+    "x_lvdt": 3,
+    "i_cmd": 3,
+    "n_dem": 3,
+    "n_r": 3,
+    "p_s": 3,
+    "t_oil": 1,
+    "vigv": 3,
+    "vgv1": 3,
+    "vgv2": 3,
+    "state": 0,
+}
 
 
 def hidden_run() -> dict[str, np.ndarray]:

@@ -44,7 +44,9 @@ class EngineTestTable(Bounded):
 
 
 def load_profile(source: str | Path = "engine_test.toml", dwells: float = 1.0) -> np.ndarray:
-    """Return the speed demand (%) of a profile table, one value every 10 ms; each dwell for the share ``dwells`` of its time."""
+    """Return the speed demand (%) of a profile table, one value every 10 ms; each dwell for the share ``dwells`` of its
+    time.
+    """
     table = read(source, EngineTestTable)
     times, speeds = [0.0], [table.start.value]
     for speed, rate, dwell in zip(table.speed.values, table.rate.values, table.dwell.values, strict=True):
@@ -73,7 +75,8 @@ def engine_test(
     plant       the machine; default: the shipped tables
     calibration of the controller, with this strategy; default: the shipped tables
 
-    Vane angles are what the (noisy) potentiometers measure, held against the schedule at the measured speed: Table 5 of the paper.
+    Vane angles are what the (noisy) potentiometers measure, held against the schedule at the measured speed: Table 5 of
+    the paper.
     """
     machine = plant or build_plant()
     if hysteresis is not None:
@@ -95,8 +98,17 @@ def engine_test(
     target = dict(zip(("vigv", "vgv1", "vgv2"), np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
     noise = machine.table.sensors.pot_noise.value
     signals = [
-        error_figures(name, "linkage", "deg", "schedule", run.t, run.columns[name], values, speed, noise) for name, values in target.items()
+        error_figures(name, "linkage", "deg", "schedule", run.t, run.columns[name], values, speed, noise)
+        for name, values in target.items()
     ]
     return ReplayResult(
-        f"engine test, {strategy}", run.simulated_s, run.wall_s, run.state_hash, signals, run.t, dict(run.columns), target, {}
+        f"engine test, {strategy}",
+        run.simulated_s,
+        run.wall_s,
+        run.state_hash,
+        signals,
+        run.t,
+        dict(run.columns),
+        target,
+        {},
     )

@@ -13,14 +13,18 @@ __all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution"
 
 Array = NDArray[np.float64]
 
-AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; vaneloop.discrepancy.locate has the same number
+# noise floors up to which an error counts as noise: floors are known to some per cent; vaneloop.discrepancy.locate has
+# the same number
+AGREES = 1.1
 DESIGN_POINT = (99.0, 100.0)  # % of design speed, open interval: the range of the third figure of the paper's Table 5
 
 WINDOW_S = 1.0  # s; long against sensor lags (milliseconds), short against a dwell of an engine run (several seconds)
 WINDOW_SAMPLES = (64, 2048)  # fewest: a stable mean square; most: bounded work on fast rasters
 MAX_WINDOWS = 600  # a mean of this many windows is known to better than 1 %
 PLATEAU_GROWTH = 1.08  # growth per doubling of the lag below which the noise counts as uncorrelated
-MOTION_GROWTH = 2.1  # noise behind a lag grows at most 1.5-fold per doubling, held samples twofold, smooth motion eightfold
+MOTION_GROWTH = (
+    2.1  # noise behind a lag grows at most 1.5-fold per doubling, held samples twofold, smooth motion eightfold
+)
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,8 @@ def error_figures(
     """Error of ``model_values`` against ``reference_values``, both on the raster ``t`` (s).
 
     n_r          rotor speed in % on the same raster, for the figure between 99 and 100 %
-    noise_floor  in ``unit``; None: estimated by `noise_floor`, from ``reference_values`` or from the error, which holds less motion where
-                 the model moves as the machine does: each is an upper bound
+    noise_floor  in ``unit``; None: estimated by `noise_floor`, from ``reference_values`` or from the error, which holds
+                 less motion where the model moves as the machine does: each is an upper bound
 
     Samples with a NaN or an infinity on either side do not count. Raises InputError when none is left,
     or when the arrays differ in length.
@@ -73,7 +77,10 @@ def error_figures(
     good = np.isfinite(model) & np.isfinite(ref)
     samples = int(good.sum())
     if samples == 0:
-        raise InputError(f"signal {signal!r}: no sample in which the model and the {reference} value are both finite; at least 1 is needed")
+        raise InputError(
+            f"signal {signal!r}: no sample in which the model and the {reference} value are both finite; at least 1 "
+            f"is needed"
+        )
     error = np.abs(model[good] - ref[good])
     at_design = None
     if speed is not None:
@@ -104,20 +111,21 @@ def noise_floor(t: ArrayLike, values: ArrayLike) -> float:
 
         d_k[i] = y[i + 3k] - 3 y[i + 2k] + 3 y[i + k] - y[i],      s_k = sqrt(mean(d_k^2) / 20),
 
-    remove any motion that is a parabola over 3k samples, and for white noise s_k is its RMS at every k (1 + 9 + 9 + 1 = 20).
+    remove any motion that is a parabola over 3k samples, and for white noise s_k is its RMS at every k (1 + 9 + 9 + 1 =
+    20).
 
     1. The log is cut into windows of about 1 s. Windows with a gap or a NaN, and constant ones (a switched-off
        sensor), do not count. The half that moves least from its first to its last third holds the dwells.
     2. s_k is the median over these windows, so steps and spikes, which sit in a few windows, do not count.
     3. A sensor's lag correlates its noise, and s_1 is then too small (0.36 of the truth at 1 kHz behind a lag of 5 ms).
-       The lag doubles until s_k stops growing: that plateau is the answer. Correlated noise grows at most 1.5-fold per doubling,
-       a channel that holds each sample for several rows twofold, motion eightfold: where growth exceeds 2.1 motion has taken
-       over, and the last level before it is the answer.
+       The lag doubles until s_k stops growing: that plateau is the answer. Correlated noise grows at most 1.5-fold per
+       doubling, a channel that holds each sample for several rows twofold, motion eightfold: where growth exceeds 2.1
+       motion has taken over, and the last level before it is the answer.
     4. A quantised channel cannot be known better than q / sqrt(12): the answer is never below it.
 
-    Limits: in a log that never dwells and whose raster is too slow for its motion, the answer is an upper bound. Noise correlated
-    over more than about 1/16 of a window (0.06 s) is seen only in part. A motion as fast as the raster (limit
-    cycle, vibration at a few samples per period) counts as noise. A constant channel gives 0.
+    Limits: in a log that never dwells and whose raster is too slow for its motion, the answer is an upper bound. Noise
+    correlated over more than about 1/16 of a window (0.06 s) is seen only in part. A motion as fast as the raster
+    (limit cycle, vibration at a few samples per period) counts as noise. A constant channel gives 0.
     """
     times, y = np.asarray(t, dtype=float), np.asarray(values, dtype=float)
     if times.shape != y.shape:
@@ -143,7 +151,9 @@ _noise_floor = noise_floor  # `error_figures` has a parameter of that name
 
 
 def resolution(values: ArrayLike) -> float:
-    """Step q of a quantised channel: the spacing of which all differences between its values are multiples; 0 where there is none."""
+    """Step q of a quantised channel: the spacing of which all differences between its values are multiples; 0 where
+    there is none.
+    """
     y = np.asarray(values, dtype=float)
     levels = np.unique(y[np.isfinite(y)])
     if levels.size < 2:

@@ -1,9 +1,9 @@
 """Replay a logged engine run through the controller's firmware and the plant, and say where they agree with it.
 
-``python -m hil.replay LOG`` and ``vaneloop replay LOG`` are the same command. What the firmware gets is what the log's ECU sent: ``n_dem``
-and, where logged, ``n_r``; otherwise the plant's engine supplies the speed. Supply pressure and oil temperature are taken from the log too.
-Everything behind is simulated in closed loop and held against what the log measured; vane angles also against the schedule's target at the
-measured speed, as in the paper's Table 5.
+``python -m hil.replay LOG`` and ``vaneloop replay LOG`` are the same command. What the firmware gets is what the log's
+ECU sent: ``n_dem`` and, where logged, ``n_r``; otherwise the plant's engine supplies the speed. Supply pressure and oil
+temperature are taken from the log too. Everything behind is simulated in closed loop and held against what the log
+measured; vane angles also against the schedule's target at the measured speed, as in the paper's Table 5.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ STATISTICS = ("rms", "mean_abs", "max_abs", "mean_abs_99_100")
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """A replayed log: figures per signal and the curves behind them. Units as at every border (docs/architecture.md)."""
+    """A replayed log: figures per signal and the curves behind them. Units as at every border
+    (docs/architecture.md).
+    """
 
     log: str
     simulated_s: float
@@ -84,7 +86,9 @@ def replay(
         raise LogError(f"{log.path}: n_dem: lasts {end:g} s; at least 0.1 s is needed")
     raster = float(np.median(np.diff(demand.t))) if len(demand.t) > 1 else end
     frames = np.arange(int(end * 100.0 + 1e-6) + 1) * 1e-2
-    held = {name: _hold(log.channels[name], frames) for name in ("n_dem", "n_r", "p_s", "t_oil") if name in log.channels}
+    held = {
+        name: _hold(log.channels[name], frames) for name in ("n_dem", "n_r", "p_s", "t_oil") if name in log.channels
+    }
     supply = machine.table.supply
     stimulus = Stimulus.of(
         held["n_dem"],
@@ -92,11 +96,21 @@ def replay(
         held["p_s"] * 1e6 if "p_s" in held else supply.pressure.value * 1e6,
         held.get("t_oil", supply.temperature.value),
     )
-    angles = tuple(np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in ("vigv", "vgv1", "vgv2"))
+    angles = tuple(
+        np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in ("vigv", "vgv1", "vgv2")
+    )
     start = float(log.channels["x_dem"].values[0]) * 1e-3 if "x_dem" in log.channels else None
     outputs = [log.channels[s] for s in STAGE if s in log.channels]
     fine = min((float(np.median(np.diff(c.t))) for c in outputs if len(c.t) > 1), default=1e-2) < 5e-3
-    run = lockstep(stimulus, calibration=cal, plant=machine, angles=angles, stroke_demand=start, every=1 if fine else 10, progress=progress)
+    run = lockstep(
+        stimulus,
+        calibration=cal,
+        plant=machine,
+        angles=angles,
+        stroke_demand=start,
+        every=1 if fine else 10,
+        progress=progress,
+    )
 
     t, model = run.t, {name: run.columns[name] for name in UNITS}
     model["n_r"] = run.columns["n_engine"]
@@ -106,7 +120,10 @@ def replay(
     gap = max(0.5, 5.0 * raster)
     holes = np.diff(demand.t) > gap
     if holes.any():
-        notes.append(f"n_dem: {int(holes.sum())} gaps longer than {gap:g} s; the last value is held and errors there do not count")
+        notes.append(
+            f"n_dem: {int(holes.sum())} gaps longer than {gap:g} s; the last value is held and errors there do not "
+            f"count"
+        )
     signals = []
     for name, stage in STAGE.items():
         if name in log.channels:
@@ -116,7 +133,14 @@ def replay(
                 values = _model_at(name, t, model[name], c.t)
                 signals.append(
                     error_figures(
-                        name, stage, UNITS[name], "measured", c.t[use], values[use], c.values[use], np.interp(c.t[use], t, speed),
+                        name,
+                        stage,
+                        UNITS[name],
+                        "measured",
+                        c.t[use],
+                        values[use],
+                        c.values[use],
+                        np.interp(c.t[use], t, speed),
                         known.get(name),
                     )  # fmt: skip
                 )
@@ -125,8 +149,14 @@ def replay(
         if name in target:
             use = ~_in_hole(t, demand.t, gap)
             noise = known.get(name, float(machine.sigma[1]) * 180.0 / np.pi)
-            signals.append(error_figures(name, stage, "deg", "schedule", t[use], model[name][use], target[name][use], speed[use], noise))
-    return ReplayResult(log.path, run.simulated_s, run.wall_s, run.state_hash, signals, t, model, target, dict(log.channels), notes)
+            signals.append(
+                error_figures(
+                    name, stage, "deg", "schedule", t[use], model[name][use], target[name][use], speed[use], noise
+                )
+            )
+    return ReplayResult(
+        log.path, run.simulated_s, run.wall_s, run.state_hash, signals, t, model, target, dict(log.channels), notes
+    )
 
 
 def _hold(channel: Channel, t: np.ndarray) -> np.ndarray:
@@ -146,7 +176,9 @@ def _in_hole(t: np.ndarray, known: np.ndarray, gap: float) -> np.ndarray:
 
 
 def _model_at(name: str, t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """The model's signal at the log's times: a current as its mean since the log's last sample, as it is logged; the rest in between."""
+    """The model's signal at the log's times: a current as its mean since the log's last sample, as it is logged; the
+    rest in between.
+    """
     import numpy as np
 
     if name != "i_cmd" or len(when) < 2:
@@ -170,18 +202,7 @@ def replay_json(result: ReplayResult) -> dict[str, Any]:
     }
 
 
-# ---- command line -------------------------------------------------------------------------------------------------------------------
-
-
-
-
-
-
-
-
-
-
-
+# ---- command line ----------------------------------------------------------------------------------------------------
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,9 +1,12 @@
-"""The plant, part by part in the order of the signal flow, every effect in its place. The same code serves lockstep, real time, diagnosis.
+"""The plant, part by part in the order of the signal flow, every effect in its place. The same code serves lockstep,
+real time, diagnosis.
 
-State ``s`` and parameters ``p`` are float64[n, lanes]; lane ``j`` is one plant, so that many parameter sets run side by side. Units: SI.
+State ``s`` and parameters ``p`` are float64[n, lanes]; lane ``j`` is one plant, so that many parameter sets run side by
+side. Units: SI.
 
-To add an effect: its file in `plant.effects`, one constant below, one call where it acts. Where all effects of a part are neutral, the part
-takes a short way that holds the nominal equations only; both ways give the same bits then, which a test checks.
+To add an effect: its file in `plant.effects`, one constant below, one call where it acts. Where all effects of a part
+are neutral, the part takes a short way that holds the nominal equations only; both ways give the same bits then, which
+a test checks.
 """
 
 from __future__ import annotations
@@ -182,7 +185,8 @@ def rotor_step(s, p, j, n_dem, dt=TICK):
 
 @in_place
 def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
-    """Valve, actuator and LVDT: one step ``dt`` (s) under the current ``i_cmd`` (A), at ``n_r`` (%), ``p_s`` (Pa), ``t_oil`` (degC).
+    """Valve, actuator and LVDT: one step ``dt`` (s) under the current ``i_cmd`` (A), at ``n_r`` (%), ``p_s`` (Pa),
+    ``t_oil`` (degC).
 
     The derived rows of ``p`` must be those of dt/substeps.
     """
@@ -206,14 +210,16 @@ def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
 @inlined
 def drive_substep(
     u, du, v, x, y, lagged, z, off, give, reading,
-    i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop, limit, roundness,
+    i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop,
+    limit, roundness,
     leakage, force, excess, stribeck, stiffness, compliance, drag, per_stroke, low, high, lvdt_factor, lvdt_share, dt,
     loaded, lossy, sticky,
 ):  # fmt: skip
     """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
 
     loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
-    lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where these are neutral
+    lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where
+            these are neutral
     """
     lagged = valve_lag.step(lagged, i, share)
     u, du = valve_step(u, du, lagged / rated, a11, a12, a21, a22)
@@ -268,7 +274,8 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
     for _ in range(substeps):
         u, du, v, x, y, lagged, z, off, give, reading = drive_substep(
             u, du, v, x, y, lagged, z, off, give, reading,
-            i, p[RATED_CURRENT, j], p[VALVE_SHARE, j], p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j], p[VALVE_A22, j],
+            i, p[RATED_CURRENT, j], p[VALVE_SHARE, j], p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j],
+            p[VALVE_A22, j],
             overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, p[SUPPLY_PRESSURE_DROOP, j],
             p[VALVE_FLOW_SATURATION, j], p[VALVE_FLOW_SATURATION + 1, j], p[INTERNAL_LEAKAGE, j],
             p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
@@ -282,7 +289,8 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
 
 @in_place
 def wake(s, p, j, i_cmd):
-    """Set what only the effects remember to where it would be had they been followed: before ``p`` changes while the plant runs.
+    """Set what only the effects remember to where it would be had they been followed: before ``p`` changes while the
+    plant runs.
 
     i_cmd  A, the current of the last tick
     """
@@ -310,7 +318,9 @@ def straight_reading(x, gain, drift, bias, t_oil):
 
 @in_place
 def true_stroke(reading, p, j, t_oil):
-    """Return the resting stroke (m) that the LVDT gives as ``reading`` (m): the inverse of `measured_stroke`, to 1e-9 m."""
+    """Return the resting stroke (m) that the LVDT gives as ``reading`` (m): the inverse of `measured_stroke`, to 1e-9
+    m.
+    """
     off = straight_reading(0.0, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
     x = target = (reading - off) / p[LVDT_GAIN, j]
     sine, cubic = p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j]
@@ -346,7 +356,9 @@ def unloaded_ring_angle(p, j, k, c, d, n_r, t_oil):
 
 @in_place
 def stem_angle(s, p, j, k, c, d, n_r, t_oil, t):
-    """Turn ring ``k`` after the crank direction (c, d) at time ``t`` (s); return the angle (rad) for its potentiometer, bias included."""
+    """Turn ring ``k`` after the crank direction (c, d) at time ``t`` (s); return the angle (rad) for its potentiometer,
+    bias included.
+    """
     o = GEOMETRY + N_CRANK + k * N_PER_STAGE
     ratio = p[o + G_L, j] / p[o + G_LDP, j]
     drive = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
@@ -366,7 +378,8 @@ def stem_angle(s, p, j, k, c, d, n_r, t_oil, t):
 
 @in_place
 def vane_step(s, p, j, n_r, t_oil, t=0.0):
-    """Linkage, play and stem potentiometers: one step at the present stroke, at time ``t`` (s) from the start of the log.
+    """Linkage, play and stem potentiometers: one step at the present stroke, at time ``t`` (s) from the start of the
+    log.
 
     How long the step is stands in the derived rows of ``p`` (`plant.parameters.derive`, its tick).
     """

@@ -1,7 +1,8 @@
 """How the plant's functions are compiled, and where the compiled code is kept.
 
-numba keeps compiled code beside a source file and throws it away when that file changes, but not when a file that it calls changes. The
-folder used here carries a digest of all sources in its name, so that an edited effect is never served from stale code.
+numba keeps compiled code beside a source file and throws it away when that file changes, but not when a file that it
+calls changes. The folder used here carries a digest of all sources in its name, so that an edited effect is never
+served from stale code.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ def cache_folder() -> Path:
 if not os.environ.get("NUMBA_CACHE_DIR"):
     _folder = cache_folder()
     # code of other sources goes, but for the latest: a run that was started before an edit may still be using it
-    for old in sorted(_folder.parent.glob("compiled-*"), key=lambda f: -f.stat().st_mtime if f.exists() else 0.0)[KEPT:]:
+    for old in sorted(_folder.parent.glob("compiled-*"), key=lambda f: -f.stat().st_mtime if f.exists() else 0.0)[
+        KEPT:
+    ]:
         if old != _folder:
             shutil.rmtree(old, ignore_errors=True)
     numba.config.CACHE_DIR = str(_folder)  # type: ignore[attr-defined]
@@ -58,13 +61,16 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
 compiled = njit(cache=True, error_model="numpy")
 # The same for a loop that runs long on arrays of its own: several may run side by side in threads.
 compiled_free = njit(cache=True, error_model="numpy", nogil=True)
-# The same for functions that work in place on their caller's arrays and allocate nothing: without counting references to those arrays,
-# which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes an array does not compile under it.
+# The same for functions that work in place on their caller's arrays and allocate nothing: without counting references
+# to those arrays, which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes
+# an array does not compile under it.
 in_place = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 # For loop bodies of many scalars: a call would pass them on the stack.
 inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # type: ignore[call-overload]
 
 
 def is_cached(name: str) -> bool:
-    """Whether compiled code of the function ``name`` (MODULE.FUNCTION) of these sources is there already; compiling takes seconds."""
+    """Whether compiled code of the function ``name`` (MODULE.FUNCTION) of these sources is there already; compiling
+    takes seconds.
+    """
     return any(Path(numba.config.CACHE_DIR).rglob(f"{name}-*.nbi"))  # type: ignore[attr-defined]

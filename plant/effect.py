@@ -1,7 +1,9 @@
-"""What an effect of the library declares about itself: where it acts, its parameters with units and bounds, where it shows.
+"""What an effect of the library declares about itself: where it acts, its parameters with units and bounds, where it
+shows.
 
-An effect is one file in `plant.effects`: a docstring, `EFFECT` (this module's `Effect`), and a compiled scalar ``step``. Parameters are
-declared in the units of the borders (mm, mA, MPa, deg, ...); ``step`` and the plant's arrays are in SI.
+An effect is one file in `plant.effects`: a docstring, `EFFECT` (this module's `Effect`), and a compiled scalar
+``step``. Parameters are declared in the units of the borders (mm, mA, MPa, deg, ...); ``step`` and the plant's arrays
+are in SI.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ UNITS = {  # border unit -> factor into SI (speeds stay in %, temperatures in de
 class Parameter:
     """One number of an effect, in ``unit``: its neutral value, physical bounds and meaning. ``si`` turns it into SI.
 
-    ``period``: after which it repeats itself, as an angle does; from ``low`` to ``high`` is then one turn. 0: it does not.
+    ``period``: after which it repeats itself, as an angle does; from ``low`` to ``high`` is then one turn. 0: it does
+    not.
     """
 
     name: str
@@ -56,7 +59,9 @@ class Parameter:
         if self.unit not in UNITS:
             raise ValueError(f"{self.name}: unit (={self.unit!r}) must be one of {', '.join(UNITS)}")
         if not self.low <= self.neutral <= self.high:
-            raise ValueError(f"{self.name}: neutral (={self.neutral:g} {self.unit}) must be in [{self.low:g}, {self.high:g}]")
+            raise ValueError(
+                f"{self.name}: neutral (={self.neutral:g} {self.unit}) must be in [{self.low:g}, {self.high:g}]"
+            )
         if self.period and self.period != self.high - self.low:
             raise ValueError(f"{self.name}: period (={self.period:g} {self.unit}) must be high - low")
 
@@ -103,7 +108,9 @@ class Effect:
         raise KeyError(f"{self.name}.{name}")
 
 
-def per_vane_stage(unit: str, neutral: float, low: float | tuple[float, float, float], high: float, meaning: str) -> tuple[Parameter, ...]:
+def per_vane_stage(
+    unit: str, neutral: float, low: float | tuple[float, float, float], high: float, meaning: str
+) -> tuple[Parameter, ...]:
     """Return the same parameter for VIGV, VGV1 and VGV2, fitted jointly; ``low`` may differ."""
     lows = low if isinstance(low, tuple) else (low, low, low)
     return tuple(Parameter(name, unit, neutral, a, high, meaning) for name, a in zip(VANE_STAGES, lows, strict=True))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import textwrap
 
 from plant.effect import Effect, Parameter
 from plant.effects import EFFECTS
@@ -15,11 +16,12 @@ __all__ = ["page"]
 
 HEAD = """# Effects
 
-Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral values the machine
-is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop diagnose` looks for them in a log.
+Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral
+values the machine is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop
+diagnose` looks for them in a log.
 
-This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders (docs/architecture.md);
-inside the code everything is SI.
+This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
+(docs/architecture.md); inside the code everything is SI.
 
 | effect | site | shows in | what | parameters |
 |---|---|---|---|---|
@@ -45,17 +47,29 @@ def _section(e: Effect) -> str:
     parts = re.split(r"^(Symbols|Limits|In a log|Source): ", rest, flags=re.MULTILINE)
     equation = re.sub(r"::\n\n", ":\n\n", parts[0]).strip()
     words = {label: _sentence(text) for label, text in zip(parts[1::2], parts[2::2], strict=True)}
-    table = "| parameter | unit | neutral | from | to | meaning |\n|---|---|---|---|---|---|\n" + "".join(map(_row, e.parameters))
-    symbols = parts[parts.index("Symbols") + 1].strip()
-    return (
-        f"\n## {e.name}\n\n{what}\n\n{equation}\n\nSymbols: {symbols}\n\n{table}\n**In a log.** {words['In a log']}\n\n"
-        f"**What excites it.** {_sentence(e.excites)}.\n\n**Limits.** {words['Limits']}\n\n**Source.** {words['Source']}\n"
-    )
+    table = "| parameter | unit | neutral | from | to | meaning |\n|---|---|---|---|---|---|\n"
+    table += "".join(map(_row, e.parameters))
+    sentences = {
+        "In a log.": words["In a log"],
+        "What excites it.": _sentence(e.excites) + ".",
+        "Limits.": words["Limits"],
+        "Source.": words["Source"],
+    }
+    told = "".join(f"{_filled(f'**{head}** {text}')}\n\n" for head, text in sentences.items())
+    return f"\n## {e.name}\n\n{what}\n\n{equation}\n\nSymbols: {_symbols(parts)}\n\n{table}\n{told.rstrip()}\n"
+
+
+def _symbols(parts: list[str]) -> str:
+    return parts[parts.index("Symbols") + 1].strip()
 
 
 def _sentence(text: str) -> str:
     words = " ".join(text.split())
     return words[0].upper() + words[1:]
+
+
+def _filled(text: str) -> str:
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _row(p: Parameter) -> str:

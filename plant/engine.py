@@ -4,8 +4,8 @@ Equation::
 
     dn/dt = clip((n_dem - n) / lag, -deceleration, acceleration)
 
-Symbols: n, n_dem in % of design speed, lag in s, limits in %/s. The step is explicit Euler; at 1 ms and a lag of 1.2 s its error is below
-0.05 % of the change.
+Symbols: n, n_dem in % of design speed, lag in s, limits in %/s. The step is explicit Euler; at 1 ms and a lag of 1.2 s
+its error is below 0.05 % of the change.
 """
 
 from __future__ import annotations

@@ -95,9 +95,11 @@ class Geometry(Table):
         return self.vigv, self.vgv1, self.vgv2
 
     def arrays(self, initial: bool = False) -> NDArray[np.float64]:
-        """Flat geometry of `plant.linkage`, SI: the crank, then each stage. ``initial`` takes the lower arms as first built.
+        """Flat geometry of `plant.linkage`, SI: the crank, then each stage. ``initial`` takes the lower arms as first
+        built.
 
-        Layout: [Lx0, x1, y1, Le], then for each stage [Lb, Lc, Ld, Ld', L, Ax, Ay, hysteresis] with A = La exp(i (3 pi/2 + th6)).
+        Layout: [Lx0, x1, y1, Le], then for each stage [Lb, Lc, Ld, Ld', L, Ax, Ay, hysteresis] with A = La exp(i (3
+        pi/2 + th6)).
         """
         g = np.zeros(N_GEOMETRY)
         c = self.crank
@@ -144,7 +146,9 @@ class Schedules(Bounded):
             for i in range(1, len(a)):
                 works = n[i - 1] < WORKING_SPEED[1] and n[i] > WORKING_SPEED[0]
                 if a[i] < a[i - 1] or (works and a[i] == a[i - 1]):
-                    raise ValueError(f"{key}.values[{i}] (={a[i]:g}) must be greater than the value before it (={a[i - 1]:g})")
+                    raise ValueError(
+                        f"{key}.values[{i}] (={a[i]:g}) must be greater than the value before it (={a[i - 1]:g})"
+                    )
         return self
 
     def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -160,7 +164,9 @@ class Schedules(Bounded):
 
 
 def load_geometry(source: str | Path = "geometry.toml") -> Geometry:
-    """Read the linkage's geometry; InputError names file, key, value and what is allowed, or the stroke at which it does not assemble."""
+    """Read the linkage's geometry; InputError names file, key, value and what is allowed, or the stroke at which it
+    does not assemble.
+    """
     return read(source, Geometry)
 
 
@@ -173,12 +179,14 @@ STANDS_FOR = ("lc", "l")  # an offset and a slope of the vane's angle over strok
 
 
 def length_tolerances(geometry: Geometry) -> dict[str, float]:
-    """How far ``lc`` and ``l`` of each stage may be from the table, mm, when they stand for every length that has a tolerance there.
+    """How far ``lc`` and ``l`` of each stage may be from the table, mm, when they stand for every length that has a
+    tolerance there.
 
-    A length off within its tolerance moves a stage's angle over stroke by an offset, a slope and a bow that goes with the offset: nothing
-    else is seen of twelve numbers (the crank's four, the stage's eight). The vertical link Lc gives the offset, the lever arm L the slope.
-    Each number's change over the stroke is laid out in these two and a constant, by least squares. Errors within tolerance are
-    independent and even, so the sums' standard deviations s add in squares; the tolerance is 3 s, at most the plain sum.
+    A length off within its tolerance moves a stage's angle over stroke by an offset, a slope and a bow that goes with
+    the offset: nothing else is seen of twelve numbers (the crank's four, the stage's eight). The vertical link Lc gives
+    the offset, the lever arm L the slope. Each number's change over the stroke is laid out in these two and a constant,
+    by least squares. Errors within tolerance are independent and even, so the sums' standard deviations s add in
+    squares; the tolerance is 3 s, at most the plain sum.
 
     Returns ``{"vigv_lc": ..., "vigv_l": ..., ...}``.
     """
@@ -197,7 +205,9 @@ def length_tolerances(geometry: Geometry) -> dict[str, float]:
         if any(b not in shapes for b in basis):
             continue  # a table that calls them exact
         parts = np.linalg.lstsq(
-            np.column_stack([*(shapes[b] for b in basis), np.ones(len(stroke))]), np.column_stack(list(shapes.values())), rcond=None
+            np.column_stack([*(shapes[b] for b in basis), np.ones(len(stroke))]),
+            np.column_stack(list(shapes.values())),
+            rcond=None,
         )[0]
         for (_, key), row in zip(basis, parts, strict=False):
             tolerance = getattr(getattr(geometry, stage), key).tolerance
@@ -221,8 +231,11 @@ def vane_angles(stroke: ArrayLike, geometry: Geometry | NDArray[np.float64]) -> 
 def stroke_for_vigv(angle: float, geometry: Geometry | NDArray[np.float64]) -> float: ...
 @overload
 def stroke_for_vigv(angle: NDArray[np.float64], geometry: Geometry | NDArray[np.float64]) -> NDArray[np.float64]: ...
-def stroke_for_vigv(angle: float | NDArray[np.float64], geometry: Geometry | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Stroke, m, that gives the VIGV's angle, rad, without play: the inverse of the linkage, one root by Brent's method.
+def stroke_for_vigv(
+    angle: float | NDArray[np.float64], geometry: Geometry | NDArray[np.float64]
+) -> float | NDArray[np.float64]:
+    """Stroke, m, that gives the VIGV's angle, rad, without play: the inverse of the linkage, one root by Brent's
+    method.
 
     Raises InputError for an angle that no stroke from -2 to 50 mm gives.
     """
@@ -232,6 +245,11 @@ def stroke_for_vigv(angle: float | NDArray[np.float64], geometry: Geometry | NDA
     out = np.empty(a.shape)
     for i, target in enumerate(a.flat):
         if not low <= target <= high:
-            raise InputError(f"vigv angle (={target / DEG:g} deg) must be in [{low / DEG:.4g}, {high / DEG:.4g}], what the stroke can give")
-        out.flat[i] = brentq(lambda x, t=target: stage_vane_angle(x, g, 0) - t, STROKE_LOW, STROKE_HIGH, xtol=1e-12, rtol=1e-14)
+            raise InputError(
+                f"vigv angle (={target / DEG:g} deg) must be in [{low / DEG:.4g}, {high / DEG:.4g}], what the stroke "
+                f"can give"
+            )
+        out.flat[i] = brentq(
+            lambda x, t=target: stage_vane_angle(x, g, 0) - t, STROKE_LOW, STROKE_HIGH, xtol=1e-12, rtol=1e-14
+        )
     return float(out[0]) if np.ndim(angle) == 0 else out

@@ -1,4 +1,5 @@
-"""Where every number of the nominal plant stands in its two flat arrays: parameters p[row, lane] and state s[row, lane], SI.
+"""Where every number of the nominal plant stands in its two flat arrays: parameters p[row, lane] and state s[row,
+lane], SI.
 
 The rows of the effects follow behind (`plant.effects`).
 """

@@ -11,15 +11,16 @@ Source: Kim & Ki, Appl. Sci. 2020, 10, 6643, equations (3) to (17), figures 2 an
 
 Units and signs: m, rad; angles count anticlockwise; a longer stroke turns crank, ring and vane the positive way.
 Points of the plane are complex numbers below: e = exp(i (th0 + th1)) is the direction of the upper arm from J1 to J2,
-w = exp(i (th0 + th1 + th3 + th4)) that of the ring radius from J4 to J5, A = La exp(i (3 pi/2 + th6)) the place of J5 seen from J2 in the
-frame of (11), La^2 = dx^2 + dy^2.
+w = exp(i (th0 + th1 + th3 + th4)) that of the ring radius from J4 to J5, A = La exp(i (3 pi/2 + th6)) the place of J5
+seen from J2 in the frame of (11), La^2 = dx^2 + dy^2.
 
-Two forms of the same equations. The runtime form intersects circles with square roots; of the transcendental functions it needs one
-arctangent for a ring angle, one tangent and one arcsine for a vane angle. The documentary form (`paper_*`) follows (6) to (15) as printed,
-and says where the printed principal values do not suffice. Tests hold both against a third, independent one.
+Two forms of the same equations. The runtime form intersects circles with square roots; of the transcendental functions
+it needs one arctangent for a ring angle, one tangent and one arcsine for a vane angle. The documentary form (`paper_*`)
+follows (6) to (15) as printed, and says where the printed principal values do not suffice. Tests hold both against a
+third, independent one.
 
-No NaN comes out for finite arguments: where the linkage cannot be assembled the nearest stretched or folded position is returned;
-`check_assembly` refuses such a geometry beforehand. NaN in gives NaN out.
+No NaN comes out for finite arguments: where the linkage cannot be assembled the nearest stretched or folded position is
+returned; `check_assembly` refuses such a geometry beforehand. NaN in gives NaN out.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ STAGES = ("vigv", "vgv1", "vgv2")  # order of the stages in every array
 STROKE_LOW = -2e-3  # m; the linkage is used a little beyond the stops (0 and 48 mm): play and end-stop effects
 STROKE_HIGH = 50e-3  # m
 
-# Flat geometry: float64[N_GEOMETRY], SI. Four numbers of the crank, then N_PER_STAGE for each stage at N_CRANK + k * N_PER_STAGE.
+# Flat geometry: float64[N_GEOMETRY], SI. Four numbers of the crank, then N_PER_STAGE for each stage at N_CRANK + k *
+# N_PER_STAGE.
 G_LX0, G_X1, G_Y1, G_LE = 0, 1, 2, 3
 N_CRANK = 4
 G_LB = 0  # lower arm
@@ -97,7 +99,7 @@ N_PER_STAGE = 8
 N_GEOMETRY = N_CRANK + 3 * N_PER_STAGE
 
 
-# --- runtime form -----------------------------------------------------------------------------------------------------------
+# --- runtime form -----------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, error_model="numpy")
@@ -106,7 +108,8 @@ def crank(stroke, lx0, x1, y1, le):
 
     e = (x1 + i y1) (m + i sqrt(D^2 Le^2 - m^2)) / (D^2 Le),   D^2 = x1^2 + y1^2,   m = (D^2 + Le^2 - Lx^2) / 2
 
-    (law of cosines at J2). The positive root is the assembly with 0 <= th1 <= pi, as the arccosine of (6) has it. All lengths in m.
+    (law of cosines at J2). The positive root is the assembly with 0 <= th1 <= pi, as the arccosine of (6) has it. All
+    lengths in m.
     """
     lx = lx0 + stroke
     d2 = x1 * x1 + y1 * y1
@@ -134,7 +137,8 @@ def crank_angle(stroke, lx0, x1, y1, le):
 def _ring_direction(c, s, ax, ay, lb, lc, ld):
     """Components (cos th5, sin th5) of the ring's rotation.
 
-    Q = A + Lb e = Lc exp(i (th0 + th1 + th3)) + Ld w closes the loop J2 J3 J4 J5. With u = (|Q|^2 + Ld^2 - Lc^2) / (2 Ld),
+    Q = A + Lb e = Lc exp(i (th0 + th1 + th3)) + Ld w closes the loop J2 J3 J4 J5. With u = (|Q|^2 + Ld^2 - Lc^2) / (2
+    Ld),
 
     w = Q (u - i sqrt(|Q|^2 - u^2)) / |Q|^2,   exp(i th5) = -i w   since -810 deg is -90 deg.
 
@@ -174,7 +178,9 @@ def ring_tangent(c, s, ax, ay, lb, lc, ld):
 
 @njit(cache=True, error_model="numpy")
 def vane_angle(theta5, ldp, l):  # noqa: E741
-    """Vane angle thl = asin(Ld' tan th5 / L), rad, equation (16). th5 in rad, Ld' and L in m; held at +-pi/2 beyond the lever's reach."""
+    """Vane angle thl = asin(Ld' tan th5 / L), rad, equation (16). th5 in rad, Ld' and L in m; held at +-pi/2 beyond the
+    lever's reach.
+    """
     q = ldp * math.tan(theta5) / l
     if q > 1.0:
         q = 1.0
@@ -197,7 +203,9 @@ def ring_angle_of_vane(thetal, ldp, l):  # noqa: E741
 
 @njit(cache=True, error_model="numpy")
 def vane_per_ring(theta5, ldp, l):  # noqa: E741
-    """Slope d thl / d th5 = Ld' (1 + tan^2 th5) / (L cos thl), rad/rad: turns a width at the ring into one at the vane."""
+    """Slope d thl / d th5 = Ld' (1 + tan^2 th5) / (L cos thl), rad/rad: turns a width at the ring into one at
+    the vane.
+    """
     t = math.tan(theta5)
     q = ldp * t / l
     r = 1.0 - q * q
@@ -239,7 +247,8 @@ def vane_slope(stroke, g, k):
     """Slope d thl / d stroke of stage k, rad/m: turns a width in stroke into one at the vane and back.
 
     d(th0 + th1)/dLx = Lx / sqrt(D^2 Le^2 - m^2)                      from the law of cosines at J2
-    d th5 = Lb Re(conj(p) i e) / Re(conj(p) i w) / Ld d(th0 + th1)   p = Q - Ld w along the link: its length does not change
+    d th5 = Lb Re(conj(p) i e) / Re(conj(p) i w) / Ld d(th0 + th1)   p = Q - Ld w along the link: its length does not
+                                                                     change
     d thl = `vane_per_ring` d th5
     0 where the linkage is held stretched or folded.
     """
@@ -277,12 +286,14 @@ def vane_angle_table(stroke, g, out):
         out[i, 2] = vane_angle(d, g[o + G_LDP], g[o + G_L])
 
 
-# --- documentary form: equations (6) to (16) as printed ---------------------------------------------------------------------
+# --- documentary form: equations (6) to (16) as printed ---------------------------------------------------------------
 
 
 @njit(cache=True, error_model="numpy")
 def paper_theta1(lx, x1, y1, le):
-    """Equation (6): th1 = acos((x1^2 + y1^2 - Le^2 - Lx^2) / (2 Lx Le)), rad. The printed principal value is the branch used."""
+    """Equation (6): th1 = acos((x1^2 + y1^2 - Le^2 - Lx^2) / (2 Lx Le)), rad. The printed principal value is the branch
+    used.
+    """
     return math.acos((x1 * x1 + y1 * y1 - le * le - lx * lx) / (2.0 * lx * le))
 
 
@@ -299,8 +310,8 @@ def paper_theta0(lx, x1, y1, le, theta1):
 def paper_ring(dx, dy, theta6, theta0, theta1):
     """Equations (11) and (12): ring centre (x5, y5) seen from J2 in the frame of the crank, m.
 
-    x5 + i y5 = sqrt(dx^2 + dy^2) exp(i (3 pi/2 + th6 - th0 - th1)). As printed, J5 is straight below J2 (3 pi/2): the inclination
-    of the line from J2 to J5, where dx is not 0, is a part of th6.
+    x5 + i y5 = sqrt(dx^2 + dy^2) exp(i (3 pi/2 + th6 - th0 - th1)). As printed, J5 is straight below J2 (3 pi/2): the
+    inclination of the line from J2 to J5, where dx is not 0, is a part of th6.
     """
     la = math.sqrt(dx * dx + dy * dy)
     a = 1.5 * math.pi + theta6 - theta0 - theta1
@@ -309,10 +320,12 @@ def paper_ring(dx, dy, theta6, theta0, theta1):
 
 @njit(cache=True, error_model="numpy")
 def paper_theta4(x5, y5, lb, lc, ld):
-    """Equation (13): cos th4 = ((x5 + Lb)^2 + y5^2 - Ld^2 - Lc^2) / (2 Ld Lc), rad, on the branch th4 = 2 pi - acos(...).
+    """Equation (13): cos th4 = ((x5 + Lb)^2 + y5^2 - Ld^2 - Lc^2) / (2 Ld Lc), rad, on the branch th4 = 2 pi -
+    acos(...).
 
-    The principal value alone gives the mirrored assembly, with the clevis on the other side of the ring's centre. There a longer link
-    raises the vane angle; published is that it lowers it (1.6 deg for 1 mm), so the other branch is meant.
+    The principal value alone gives the mirrored assembly, with the clevis on the other side of the ring's centre. There
+    a longer link raises the vane angle; published is that it lowers it (1.6 deg for 1 mm), so the other branch is
+    meant.
     """
     b = x5 + lb
     return 2.0 * math.pi - math.acos((b * b + y5 * y5 - ld * ld - lc * lc) / (2.0 * ld * lc))
@@ -322,9 +335,10 @@ def paper_theta4(x5, y5, lb, lc, ld):
 def paper_theta3(x5, y5, lb, lc, ld, theta4):
     """Equation (14): sin th3 = (y5 Ld cos th4 + y5 Lc - (x5 + Lb) Ld sin th4) / ((x5 + Lb)^2 + y5^2), rad.
 
-    The arcsine alone does not suffice: a link square to the lower arm has th3 = 90 deg. The linkage starts there at stroke 0 (VGV1 passes
-    it at -0.2 mm), where the arcsine folds back and keeps half of the digits. The cosine from the same rows of (10) decides the quadrant:
-    cos th3 = ((x5 + Lb) (Ld cos th4 + Lc) + y5 Ld sin th4) / ((x5 + Lb)^2 + y5^2).
+    The arcsine alone does not suffice: a link square to the lower arm has th3 = 90 deg. The linkage starts there at
+    stroke 0 (VGV1 passes it at -0.2 mm), where the arcsine folds back and keeps half of the digits. The cosine from the
+    same rows of (10) decides the quadrant: cos th3 = ((x5 + Lb) (Ld cos th4 + Lc) + y5 Ld sin th4) / ((x5 + Lb)^2 +
+    y5^2).
     """
     b = x5 + lb
     d2 = b * b + y5 * y5
@@ -361,14 +375,16 @@ def paper_vane(stroke, lx0, x1, y1, le, dx, dy, theta6, lb, lc, ld, ldp, l):  # 
     return theta5, math.asin(ldp * math.tan(theta5) / l)
 
 
-# --- assembly ---------------------------------------------------------------------------------------------------------------
+# --- assembly ---------------------------------------------------------------------------------------------------------
 
 _OK, _CRANK, _RING, _TURN, _VANE, _FALLS = 0, 1, 2, 3, 4, 5
 
 
 @njit(cache=True, error_model="numpy")
 def _fault(stroke, g, k):
-    """Code of what keeps stage k from being assembled at a stroke (m), with the value and its limits: (code, value, low, high)."""
+    """Code of what keeps stage k from being assembled at a stroke (m), with the value and its limits: (code, value,
+    low, high).
+    """
     x1, y1, le = g[G_X1], g[G_Y1], g[G_LE]
     o = N_CRANK + k * N_PER_STAGE
     lx = g[G_LX0] + stroke
@@ -403,10 +419,13 @@ _SAYS: dict[int, tuple[str, float, str]] = {
 }
 
 
-def check_assembly(g: NDArray[np.float64], low: float = STROKE_LOW, high: float = STROKE_HIGH, step: float = 1e-4) -> None:
+def check_assembly(
+    g: NDArray[np.float64], low: float = STROKE_LOW, high: float = STROKE_HIGH, step: float = 1e-4
+) -> None:
     """Refuse a flat geometry that does not close, or whose vane angle does not rise, somewhere from low to high (m).
 
-    Raises InputError naming stage, stroke, the quantity, its value and what is allowed there. Strokes are tried every ``step``.
+    Raises InputError naming stage, stroke, the quantity, its value and what is allowed there. Strokes are tried every
+    ``step``.
     """
     for k, stage in enumerate(STAGES):
         for stroke in np.linspace(low, high, max(2, int(round((high - low) / step)) + 1)):

@@ -12,7 +12,19 @@ from plant import chain
 from plant.effect import T_REF
 from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain
 from plant.geometry import Geometry, Schedules, load_schedules
-from plant.linkage import G_L, G_LDP, G_LE, G_LX0, G_X1, G_Y1, N_CRANK, N_PER_STAGE, crank, ring_angle_of_vane, vane_angle
+from plant.linkage import (
+    G_L,
+    G_LDP,
+    G_LE,
+    G_LX0,
+    G_X1,
+    G_Y1,
+    N_CRANK,
+    N_PER_STAGE,
+    crank,
+    ring_angle_of_vane,
+    vane_angle,
+)
 from plant.parameters import GEOMETRY, PLAY, POT_BIAS, PlantTable, derive, load_plant
 
 if TYPE_CHECKING:
@@ -37,7 +49,9 @@ class Plant:
     sigma: np.ndarray
 
     def start(self, stroke: float, n_r: float, t_oil: float = T_REF) -> np.ndarray:
-        """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of its play."""
+        """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of
+        its play.
+        """
         p = self.p[:, 0]
         s = np.zeros((chain.N_STATE, 1))
         s[chain.N_R, 0] = n_r
@@ -83,7 +97,9 @@ def build_plant(
     schedules: str | Path = "schedules.toml",
     model: Model | None = None,
 ) -> Plant:
-    """Read the plant's tables and return the machine they describe, with what ``model`` adds. InputError for what cannot be used."""
+    """Read the plant's tables and return the machine they describe, with what ``model`` adds. InputError for what
+    cannot be used.
+    """
     table, geo, p = load_plant(source, geometry)
     derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
     deg = np.pi / 180.0

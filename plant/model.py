@@ -1,11 +1,13 @@
-"""A model file: the nominal machine with some parameters recalibrated and some effects added. TOML, taken by every command as ``--model``.
+"""A model file: the nominal machine with some parameters recalibrated and some effects added. TOML, taken by every
+command as ``--model``.
 
 ::
 
     [meta]                                  # free text; `extend` keeps its history here
     history = ["extend run.csv --effect valve_dead_band"]
 
-    [parameters]                            # in the unit of plant.toml; widths of the play at the vane, as in geometry.toml
+    [parameters]                            # in the unit of plant.toml; widths of the play at the vane, as in
+                                            geometry.toml
     "actuator.flow_gain" = 0.147
 
     [effects.valve_dead_band]               # in the units of docs/effects.md; what is not named stays neutral
@@ -56,7 +58,9 @@ class Model(Table):
         known = {n.name: n for n in nominal(plant.table, plant.geometry)}
         for name, value in self.parameters.items():
             if name not in known:
-                raise InputError(f"{source}: parameters: {name!r} is unknown{_meant(name, known)}; allowed: {', '.join(known)}")
+                raise InputError(
+                    f"{source}: parameters: {name!r} is unknown{_meant(name, known)}; allowed: {', '.join(known)}"
+                )
             n, bound = known[name], _bound(name)
             low, high = bound.low, bound.high
             if n.tolerance > 0.0:
@@ -64,11 +68,16 @@ class Model(Table):
             _within(value, low, high, n.unit, f"{source}: parameters: {name}")
         for effect, values in self.effects.items():
             if effect not in EFFECTS:
-                raise InputError(f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them")
+                raise InputError(
+                    f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
+                )
             allowed = [p.name for p in EFFECTS[effect].parameters]
             for key, value in values.items():
                 if key not in allowed:
-                    raise InputError(f"{source}: effects.{effect}: {key!r} is unknown{_meant(key, allowed)}; allowed: {', '.join(allowed)}")
+                    raise InputError(
+                        f"{source}: effects.{effect}: {key!r} is unknown{_meant(key, allowed)}; allowed: "
+                        f"{', '.join(allowed)}"
+                    )
                 p = EFFECTS[effect][key]
                 _within(value, p.low, p.high, p.unit, f"{source}: effects.{effect}.{key}")
 
@@ -95,7 +104,8 @@ class Model(Table):
 
 
 def load_model(path: str | Path, plant: Plant | None = None) -> Model:
-    """Read a model file; ``plant`` (default: the shipped tables) gives the nominal values that its parameters must be near to.
+    """Read a model file; ``plant`` (default: the shipped tables) gives the nominal values that its parameters must be
+    near to.
 
     Raises InputError in one line: file, key, value, what is allowed.
     """
@@ -113,7 +123,11 @@ def write_model(path: str | Path, model: Model) -> None:
         lines += ["[parameters]", *(f"{_key(k)} = {float(v)!r}" for k, v in model.parameters.items()), ""]
     for effect, values in model.effects.items():
         units = {p.name: p.unit for p in EFFECTS[effect].parameters} if effect in EFFECTS else {}
-        lines += [f"[effects.{_key(effect)}]", *(f"{_key(k)} = {float(v)!r}  # {units.get(k, '?')}" for k, v in values.items()), ""]
+        lines += [
+            f"[effects.{_key(effect)}]",
+            *(f"{_key(k)} = {float(v)!r}  # {units.get(k, '?')}" for k, v in values.items()),
+            "",
+        ]
     try:
         Path(path).write_text("\n".join(lines), encoding="utf-8")
     except OSError as e:
@@ -121,7 +135,11 @@ def write_model(path: str | Path, model: Model) -> None:
 
 
 def _key(name: str) -> str:
-    return name if name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name) else json.dumps(name, ensure_ascii=False)
+    return (
+        name
+        if name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
+        else json.dumps(name, ensure_ascii=False)
+    )
 
 
 def _meant(name: str, known: Iterable[str]) -> str:

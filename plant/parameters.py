@@ -148,7 +148,9 @@ class PlantTable(Table):
 
 @dataclass(frozen=True)
 class Nominal:
-    """One parameter as an engineer knows it. ``value``, ``tolerance`` in ``unit``; ``si`` turns them into SI; ``row`` of the plant's p."""
+    """One parameter as an engineer knows it. ``value``, ``tolerance`` in ``unit``; ``si`` turns them into SI; ``row``
+    of the plant's p.
+    """
 
     name: str
     value: float
@@ -189,7 +191,9 @@ _VANE_ROWS = rows_at("linkage", "pot")
 
 
 def derive(p: np.ndarray, dt: float, tick: float) -> None:
-    """Work out the rows that follow from others: the valve's and the sensors' exact steps over ``dt`` and ``tick`` (s)."""
+    """Work out the rows that follow from others: the valve's and the sensors' exact steps over ``dt`` and
+    ``tick`` (s).
+    """
     for j in range(p.shape[1]):
         p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
         p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
@@ -202,7 +206,9 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
         p[flag] = np.any(p[rows] != _NEUTRAL[rows], axis=0)
 
 
-def load_plant(source: str | Path = "plant.toml", geometry: str | Path = "geometry.toml") -> tuple[PlantTable, Geometry, np.ndarray]:
+def load_plant(
+    source: str | Path = "plant.toml", geometry: str | Path = "geometry.toml"
+) -> tuple[PlantTable, Geometry, np.ndarray]:
     """Read, check and flatten the plant's tables.
 
     Returns the two tables and p, float64[N_PARAMETERS, 1] in SI, without the derived rows (`derive`).
@@ -219,5 +225,5 @@ def load_plant(source: str | Path = "plant.toml", geometry: str | Path = "geomet
         o = N_CRANK + k * N_PER_STAGE
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
     p[N_NOMINAL:DERIVED, 0] = NEUTRAL
-    p[LVDT_STEP, 0] = table.sensors.lvdt_range.value * 1e-3 / 2.0 ** table.sensors.lvdt_bits.value
+    p[LVDT_STEP, 0] = table.sensors.lvdt_range.value * 1e-3 / 2.0**table.sensors.lvdt_bits.value
     return table, geo, p

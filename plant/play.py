@@ -18,6 +18,8 @@ __all__ = ["play_step"]
 
 @compiled
 def play_step(y, u, width):
-    """Return the new output (rad) of a play of total ``width`` (rad) whose output was ``y`` and whose input is ``u``."""
+    """Return the new output (rad) of a play of total ``width`` (rad) whose output was ``y`` and whose input is
+    ``u``.
+    """
     half = 0.5 * width
     return min(max(y, u - half), u + half)

@@ -1,7 +1,8 @@
-"""Arctangent and tangent from sums, products and one division: a compiler can put several of them into one vector instruction.
+"""Arctangent and tangent from sums, products and one division: a compiler can put several of them into one vector
+instruction.
 
-Rational approximations of the Cephes library (Moshier 1989; atan.c, tan.c), within 2 units in the last place of the C library's; without
-branches. They serve lanes side by side; the chain itself calls the C library.
+Rational approximations of the Cephes library (Moshier 1989; atan.c, tan.c), within 2 units in the last place of the C
+library's; without branches. They serve lanes side by side; the chain itself calls the C library.
 """
 
 from __future__ import annotations
@@ -37,5 +38,7 @@ def tangent(x):
     x = min(max(x, -QUARTER), QUARTER)
     z = x * x
     p = (-1.30936939181383734205e4 * z + 1.15351664838587416140e6) * z - 1.79565251976484877988e7
-    q = (((z + 1.36812963470692954678e4) * z - 1.32089234440210967447e6) * z + 2.50083801823357915839e7) * z - 5.38695755929454629881e7
+    q = (
+        ((z + 1.36812963470692954678e4) * z - 1.32089234440210967447e6) * z + 2.50083801823357915839e7
+    ) * z - 5.38695755929454629881e7
     return x + x * (z * p / q)

@@ -1,22 +1,25 @@
 """The mechanism in space, and what clearance in its joints does to the vane angle.
 
-The planar model neglects that the lever arms pull the ring along the engine's axis while it turns, equation (17). Here the loop is closed
-in space by Newton's method on its constraint equations, in the plane's x, y and the engine's axis z (m), for one stage:
+The planar model neglects that the lever arms pull the ring along the engine's axis while it turns, equation (17). Here
+the loop is closed in space by Newton's method on its constraint equations, in the plane's x, y and the engine's axis z
+(m), for one stage:
 
     |J1 - J0| = Lx + g1             J1 = J2 + s2 + R(alpha) a1     actuator; g1 its clearance taken up, + in tension
     |J4 - J3| = Lc + g3             J3 = J2 + s2 + R(alpha) a3     vertical link; g3 likewise
                                     J4 = J5 + s5 + R(theta5) a4 + z e_z
     L sin thl = Ld' tan theta5      z = L (1 - cos thl)            lever arms, equations (16) and (17)
 
-s2 and s5 are the places of crank and ring inside their clearance. With all of them zero this is the mechanism of the paper's multibody
-model; `vaneloop.design.multibody` solves the same joints with a general multibody library.
+s2 and s5 are the places of crank and ring inside their clearance. With all of them zero this is the mechanism of the
+paper's multibody model; `vaneloop.design.multibody` solves the same joints with a general multibody library.
 
-A ring hangs on two such chains, left and right, and each link takes one of its six freedoms: 6 (4 - 1) - 3 * 4 = 6 by equation (1), less
-two links' idle rotations, leaves 4. The second chain is taken for the first turned by 180 deg about the engine's axis, so that two equal
-strokes close exactly. What remains: a shift of the ring across its links (its centre wanders), one along the engine's axis, two tilts.
+A ring hangs on two such chains, left and right, and each link takes one of its six freedoms: 6 (4 - 1) - 3 * 4 = 6 by
+equation (1), less two links' idle rotations, leaves 4. The second chain is taken for the first turned by 180 deg about
+the engine's axis, so that two equal strokes close exactly. What remains: a shift of the ring across its links (its
+centre wanders), one along the engine's axis, two tilts.
 
-Under load each joint rests on the side that carries the load. The vanes resist motion, so the load turns round with it and every joint
-crosses its clearance: that is the hysteresis. Between the two the ring stays where friction holds it: the play operator (`plant.play`).
+Under load each joint rests on the side that carries the load. The vanes resist motion, so the load turns round with it
+and every joint crosses its clearance: that is the hysteresis. Between the two the ring stays where friction holds it:
+the play operator (`plant.play`).
 """
 
 from __future__ import annotations
@@ -48,7 +51,8 @@ Array = NDArray[np.float64]
 
 
 def plane_joints(geometry: Geometry, stage: str, stroke: float) -> dict[str, complex]:
-    """Places J0 to J5 of one stage's joints in the plane, x + i y in m, at a stroke (m); the actuator's mount J0 is the origin.
+    """Places J0 to J5 of one stage's joints in the plane, x + i y in m, at a stroke (m); the actuator's mount J0 is the
+    origin.
 
     The angle between the crank's arms is theta6 less the inclination of the line from J2 to J5 (docs/linkage.md).
     """
@@ -68,7 +72,8 @@ def plane_joints(geometry: Geometry, stage: str, stroke: float) -> dict[str, com
 
 @dataclass(frozen=True)
 class Clearances:
-    """Total clearance of each joint, mm: of a pin the difference of the diameters, of the ring how far its centre can wander across.
+    """Total clearance of each joint, mm: of a pin the difference of the diameters, of the ring how far its centre can
+    wander across.
 
     actuator      both ends of the actuator together, along it
     crank_pivot   bearing of the bell crank
@@ -118,8 +123,12 @@ class _Loop:
         long = (s.lc.value * MM, s.ld_prime.value * MM, s.l.value * MM)
         return cls(c.lx0.value * MM, j2, j2 + complex(dx, dy), a1, a3, a4, *long, offset * MM)
 
-    def places(self, alpha: float, theta5: float, s2: complex, s5: complex, rise: float) -> tuple[complex, complex, complex, float]:
-        """J1, J3, J4 in the plane and the clevis' place along z; ``rise`` (m) is what the ring has beside equation (17)."""
+    def places(
+        self, alpha: float, theta5: float, s2: complex, s5: complex, rise: float
+    ) -> tuple[complex, complex, complex, float]:
+        """J1, J3, J4 in the plane and the clevis' place along z; ``rise`` (m) is what the ring has beside equation
+        (17).
+        """
         crank, ring = cmath.exp(1j * alpha), cmath.exp(1j * theta5)
         sine = self.ldp * math.tan(theta5) / self.lever
         z = self.lever * (1.0 - math.sqrt(max(0.0, 1.0 - sine * sine)))
@@ -143,7 +152,8 @@ class _Loop:
         across: float = 0.0,
         rises: tuple[float, float] = (0.0, 0.0),
     ) -> Array:
-        """Newton's method from q = (alpha right, alpha left, theta5, shift along y), the ring's centre held at ``across`` (m) along x.
+        """Newton's method from q = (alpha right, alpha left, theta5, shift along y), the ring's centre held at
+        ``across`` (m) along x.
 
         The left chain is the right one turned by 180 deg: in its own frame the ring's centre is shifted the other way.
         InputError with the stroke where the loop does not close.
@@ -152,7 +162,9 @@ class _Loop:
 
         def residual(p: Array) -> Array:
             s5 = complex(across, p[3])
-            return np.array(self.chain(p[0], p[2], lx, gaps, s2, s5, rises[0]) + self.chain(p[1], p[2], lx, gaps, s2, -s5, rises[1]))
+            return np.array(
+                self.chain(p[0], p[2], lx, gaps, s2, s5, rises[0]) + self.chain(p[1], p[2], lx, gaps, s2, -s5, rises[1])
+            )
 
         scale = np.array([1.0, 1.0, 1.0, 0.1])  # rad, rad, rad, m
         r = residual(q)
@@ -169,10 +181,15 @@ class _Loop:
             if not (np.isfinite(q).all() and float(np.max(np.abs(q))) < math.pi):
                 break
         missing = float(np.abs(r).max()) / MM
-        raise InputError(f"{stage}: the mechanism does not close in space at stroke {stroke / MM:.4g} mm: {missing:.3g} mm are missing")
+        raise InputError(
+            f"{stage}: the mechanism does not close in space at stroke {stroke / MM:.4g} mm: {missing:.3g} mm are "
+            f"missing"
+        )
 
     def vane(self, theta5: float, sideways: float = 0.0) -> float:
-        """Vane angle, rad, where the ring's slot is ``sideways`` (m) along the circumference from where a centred ring has it."""
+        """Vane angle, rad, where the ring's slot is ``sideways`` (m) along the circumference from where a centred ring
+        has it.
+        """
         return math.asin((self.ldp * math.tan(theta5) + sideways / math.cos(theta5)) / self.lever)
 
     def sideways(self, q: Array, across: float, vane: float) -> float:
@@ -181,7 +198,9 @@ class _Loop:
         return across * along.real + float(q[3]) * along.imag
 
     def forces(self, q: Array, s2: complex, s5: complex, motion: float) -> tuple[float, float, complex]:
-        """Tension of link and actuator, and the sum of both on the crank, for a unit torque on the ring against the motion."""
+        """Tension of link and actuator, and the sum of both on the crank, for a unit torque on the ring against the
+        motion.
+        """
         j1, j3, j4, z = self.places(q[0], q[2], s2, s5, 0.0)
         pull = (j3 - j4) / math.sqrt(abs(j3 - j4) ** 2 + z * z)  # of the link on the clevis, its part in the plane
         link = motion / _cross(j4 - self.j5 - s5, pull)
@@ -205,8 +224,11 @@ def spatial_angles(geometry: Geometry, stage: str, stroke: ArrayLike, offset: fl
     return np.array(out)
 
 
-def freedoms(geometry: Geometry, stage: str, stroke: float, vane: float = -90.0, amount: float = 1.0) -> dict[str, float]:
-    """Change of a vane's angle, deg, by each of the four freedoms that two links leave the ring; both actuators stay at ``stroke`` (mm).
+def freedoms(
+    geometry: Geometry, stage: str, stroke: float, vane: float = -90.0, amount: float = 1.0
+) -> dict[str, float]:
+    """Change of a vane's angle, deg, by each of the four freedoms that two links leave the ring; both actuators stay at
+    ``stroke`` (mm).
 
     across       the ring's centre shifted by ``amount`` (mm) square to the links
     along        shifted along the engine's axis
@@ -232,14 +254,16 @@ def freedoms(geometry: Geometry, stage: str, stroke: float, vane: float = -90.0,
 def clearance_loop(
     geometry: Geometry, stage: str, stroke: ArrayLike, clearances: Clearances, vane: float = -90.0, offset: float = 0.0
 ) -> tuple[Array, Array]:
-    """Vane angles (extension, retraction), deg, at strokes (mm) with clearance in the joints and vanes that resist the motion.
+    """Vane angles (extension, retraction), deg, at strokes (mm) with clearance in the joints and vanes that resist the
+    motion.
 
     vane    deg along the ring from the right clevis to the vane that is measured; -90 is the lowest
 
-    Link and actuator carry force along themselves; statics of ring and crank give their signs, and the side on which the crank's bearing
-    rests: it takes what link and actuator leave. Two equal links load the ring with a couple only and do not move its centre; what does
-    is friction where the ring rests by its weight, at its lowest place: against the motion there, square to the links. So a ring turning
-    with a longer stroke lags at the bottom and leads at the top: the lowest vane feels all of it, vanes beside the clevises nothing.
+    Link and actuator carry force along themselves; statics of ring and crank give their signs, and the side on which
+    the crank's bearing rests: it takes what link and actuator leave. Two equal links load the ring with a couple only
+    and do not move its centre; what does is friction where the ring rests by its weight, at its lowest place: against
+    the motion there, square to the links. So a ring turning with a longer stroke lags at the bottom and leads at the
+    top: the lowest vane feels all of it, vanes beside the clevises nothing.
     """
     clearances.check()
     loop = _Loop.of(geometry, stage, offset)
@@ -266,8 +290,12 @@ def _cross(a: complex, b: complex) -> float:
     return a.real * b.imag - a.imag * b.real
 
 
-def clearance_width(geometry: Geometry, stage: str, clearances: Clearances, vane: float = -90.0, offset: float = 0.0) -> float:
-    """Width of the loop, deg, mean over the stroke: the ring's, times Ld'/L, as `hysteresis` in geometry.toml means it."""
+def clearance_width(
+    geometry: Geometry, stage: str, clearances: Clearances, vane: float = -90.0, offset: float = 0.0
+) -> float:
+    """Width of the loop, deg, mean over the stroke: the ring's, times Ld'/L, as `hysteresis` in geometry.toml
+    means it.
+    """
     s = geometry.stages()[STAGES.index(stage)]
     ratio = s.l.value / s.ld_prime.value
     loop = clearance_loop(geometry, stage, np.linspace(0.0, 48.0, 13), clearances, vane, offset)
@@ -275,17 +303,26 @@ def clearance_width(geometry: Geometry, stage: str, clearances: Clearances, vane
     return float(np.mean(at_ring[1] - at_ring[0]) / (ratio * DEG))
 
 
-def contributions(geometry: Geometry, stage: str, clearances: Clearances, vane: float = -90.0, offset: float = 0.0) -> dict[str, float]:
+def contributions(
+    geometry: Geometry, stage: str, clearances: Clearances, vane: float = -90.0, offset: float = 0.0
+) -> dict[str, float]:
     """Width, deg, that each joint's clearance makes alone."""
     clearances.check()
     none = Clearances()
     return {
-        f.name: clearance_width(geometry, stage, replace(none, **{f.name: getattr(clearances, f.name)}), vane, offset) for f in fields(none)
+        f.name: clearance_width(geometry, stage, replace(none, **{f.name: getattr(clearances, f.name)}), vane, offset)
+        for f in fields(none)
     }
 
 
 def clearance_for(
-    geometry: Geometry, stage: str, width: float, clearances: Clearances, joint: str, vane: float = -90.0, offset: float = 0.0
+    geometry: Geometry,
+    stage: str,
+    width: float,
+    clearances: Clearances,
+    joint: str,
+    vane: float = -90.0,
+    offset: float = 0.0,
 ) -> float:
     """Clearance, mm, of one joint that brings the loop to ``width`` (deg) beside the given ones of the others.
 
@@ -298,7 +335,7 @@ def clearance_for(
     low, high = miss(0.0), miss(5.0)
     if not low <= 0.0 <= high:
         raise InputError(
-            f"{stage}: no clearance of {joint} gives a width of {width:g} deg: the others alone make {low + width:.3g} deg, 5 mm of it "
-            f"{high + width:.3g} deg"
+            f"{stage}: no clearance of {joint} gives a width of {width:g} deg: the others alone make {low + width:.3g} "
+            f"deg, 5 mm of it {high + width:.3g} deg"
         )
     return float(brentq(miss, 0.0, 5.0, xtol=1e-6))

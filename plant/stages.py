@@ -1,9 +1,10 @@
 """One stage alone, driven by what the log says went into it, for many parameter sets side by side.
 
-Engine, actuator and linkage of `plant.chain`, with the same functions and effects, on the log's own raster. Parameters and state are
-p[row, lane], s[row, lane]; a lane is one parameter set. A few lanes run one after the other, through the chain; more run in blocks, step by
-step together, so that the compiler can use vector instructions. Both ways agree to rounding. A lane with an effect that the blocks do not
-call, as one just added to `plant.chain`, runs alone: right, but some five times slower. SI; times in s.
+Engine, actuator and linkage of `plant.chain`, with the same functions and effects, on the log's own raster. Parameters
+and state are p[row, lane], s[row, lane]; a lane is one parameter set. A few lanes run one after the other, through the
+chain; more run in blocks, step by step together, so that the compiler can use vector instructions. Both ways agree to
+rounding. A lane with an effect that the blocks do not call, as one just added to `plant.chain`, runs alone: right, but
+some five times slower. SI; times in s.
 
 The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps, dt)``.
 """
@@ -133,12 +134,15 @@ WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would b
 SOME = 5  # so few lanes or fewer are quicker one by one there
 # effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
 ACTUATOR_BLOCKS = (
-    "aero_load", "end_stop_shift", "internal_leakage", "oil_compressibility", "oil_viscosity", "piston_friction", "piston_stiction",
-    "supply_pressure_droop", "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry", "valve_hysteresis", "valve_lag",
+    "aero_load", "end_stop_shift", "internal_leakage", "oil_compressibility", "oil_viscosity", "piston_friction",
+    "piston_stiction",
+    "supply_pressure_droop", "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry", "valve_hysteresis",
+    "valve_lag",
     "valve_null_bias",
 )  # fmt: skip
 LINKAGE_BLOCKS = (
-    "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "pot_bias",
+    "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction",
+    "linkage_wear", "pot_bias",
     "pot_gain", "pot_lag", "ring_eccentricity", "thermal_growth",
 )  # fmt: skip
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
@@ -148,15 +152,18 @@ _plain = njit(cache=True, nogil=True, error_model="numpy")
 
 
 def engine_run(n_dem, dt, p, s, out):
-    """Fill out[k, lane] with the rotor speed (%) at sample k; n_dem[k] (%) holds until sample k + 1. ``s`` is moved on."""
+    """Fill out[k, lane] with the rotor speed (%) at sample k; n_dem[k] (%) holds until sample k + 1. ``s`` is
+    moved on.
+    """
     _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
 
 
 def step_currents(i_cmd, dt, substeps, behind=chain.TICK):
-    """Return the current (A) of every step of `actuator_run`, float64[n, substeps]: [k, m] in step m after sample k - 1.
+    """Return the current (A) of every step of `actuator_run`, float64[n, substeps]: [k, m] in step m after sample k -
+    1.
 
-    i_cmd     [k]: mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO carries it; or [k, m]:
-              the current in each of the equal parts of that time
+    i_cmd     [k]: mean current (A) of the ticks after sample k - 1, up to and with the one at sample k, as VGV_SERVO
+              carries it; or [k, m]: the current in each of the equal parts of that time
     behind    s: how much later than logged the current acts; that of the tick at sample k drives the next millisecond
 
     No step leads to sample 0: its row is the mean, under which the valve rests there.
@@ -175,11 +182,12 @@ def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0)
     current           A in every step, of `step_currents`
     n_r, p_s, t_oil   %, Pa, degC; their mean over the step is used
     out               quickest where a lane's samples lie side by side in memory
-    x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT saw it, so that
-                      a small error of speed does not carry it away; without them it starts from ``s`` and runs free
+    x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT
+                      saw it, so that a small error of speed does not carry it away; without them it starts from ``s``
+                      and runs free
 
-    The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where the share of a
-    constant input, 1 - exp(-h / tau), would be early by h / 2.
+    The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where
+    the share of a constant input, 1 - exp(-h / tau), would be early by h / 2.
     """
     if window and x_lvdt is None:
         raise ValueError(f"window (={window}) needs x_lvdt")
@@ -209,14 +217,21 @@ def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0)
 
 
 def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
-    """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise. ``s`` is moved on.
+    """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise.
+    ``s`` is moved on.
 
-    x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading moves all three stages
+    x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading
+             moves all three stages
     n_r, t_oil, t   %, degC, s from the start of the log
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
-    reach = max(1, round(1e-2 / dt))  # samples over which the speed is taken: shorter, and the noise of the LVDT would come through its lag
-    ahead, behind = np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1), np.maximum(np.arange(len(x_lvdt)) - reach, 0)
+    reach = max(
+        1, round(1e-2 / dt)
+    )  # samples over which the speed is taken: shorter, and the noise of the LVDT would come through its lag
+    ahead, behind = (
+        np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1),
+        np.maximum(np.arange(len(x_lvdt)) - reach, 0),
+    )
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
     alone = _elsewhere(p, ("linkage", "pot"), LINKAGE_BLOCKS)
     order = np.argsort(alone, kind="stable")
@@ -229,7 +244,8 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
 
 @_plain
 def _currents(mean, dt, substeps, behind):
-    """Currents (n, substeps) between the samples, from the logged means: linear in each interval, of its mean, its slope the neighbours'.
+    """Currents (n, substeps) between the samples, from the logged means: linear in each interval, of its mean, its
+    slope the neighbours'.
 
     Interval k begins ``behind`` after sample k - 1; a step that begins in the interval before takes its share of both.
     """
@@ -251,7 +267,9 @@ def _currents(mean, dt, substeps, behind):
 
 
 def _late(parts, dt, substeps, behind):
-    """Currents (n, substeps) between the samples, from those of equal ``parts`` of the time between them that act ``behind`` later."""
+    """Currents (n, substeps) between the samples, from those of equal ``parts`` of the time between them that act
+    ``behind`` later.
+    """
     n, many = parts.shape
     edges = np.arange(n * many + 1) * (dt / many) + behind - dt
     charge = np.concatenate([[0.0], np.cumsum(parts.ravel())]) * (dt / many)
@@ -267,7 +285,12 @@ def _in_blocks(lanes, width, few):
 
 def _elsewhere(p, sites, called):
     """Return bool[lane]: whether the lane has an effect of these ``sites`` that is not among the ``called`` ones."""
-    rows = [ROW[e.name] + i for e in EFFECTS.values() if e.site in sites and e.name not in called for i in range(len(e.parameters))]
+    rows = [
+        ROW[e.name] + i
+        for e in EFFECTS.values()
+        if e.site in sites and e.name not in called
+        for i in range(len(e.parameters))
+    ]
     return (p[rows] != np.array([[NEUTRAL[r - N_NOMINAL]] for r in rows]).reshape(-1, 1)).any(axis=0)
 
 
@@ -281,7 +304,7 @@ def _rest(p, s, i, n_r):
         s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
 
 
-# ---- engine -------------------------------------------------------------------------------------------------------------------------
+# ---- engine ----------------------------------------------------------------------------------------------------------
 
 
 @_plain
@@ -308,7 +331,7 @@ def _engine_run(n_dem, dt, steps, p, s, out):
             s[N_R, j0 + j] = b[0, j]
 
 
-# ---- actuator -----------------------------------------------------------------------------------------------------------------------
+# ---- actuator --------------------------------------------------------------------------------------------------------
 
 
 @inlined
@@ -345,7 +368,9 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 
 # rows of a block's scratch array: state, what the step needs, what the sample needs
 (_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _H1, _H2, _H3, _H4) = range(13)
-(_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = range(13, 27)
+(_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = (
+    range(13, 27)
+)
 (_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
 (_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _FLOW, _VISCOSITY, _ASYMMETRY, _P_REF, _AERO) = range(37, 47)
 (_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _ROUNDNESS, _N_ROWS) = range(47, 55)
@@ -363,31 +388,67 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
-            lossy |= p[SUPPLY_PRESSURE_DROOP, q] != 0.0 or p[INTERNAL_LEAKAGE, q] != 0.0 or p[VALVE_FLOW_SATURATION + 1, q] != 0.0
+            lossy |= (
+                p[SUPPLY_PRESSURE_DROOP, q] != 0.0
+                or p[INTERNAL_LEAKAGE, q] != 0.0
+                or p[VALVE_FLOW_SATURATION + 1, q] != 0.0
+            )
             sticky |= p[PISTON_STICTION, q] != 0.0
             memory |= p[VALVE_HYSTERESIS, q] != 0.0
             viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
-            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q]
+            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = (
+                s[SPOOL, q],
+                s[SPOOL_RATE, q],
+                s[SPEED, q],
+                s[X, q],
+                s[X_LVDT, q],
+            )
             b[_LAGGED, j], b[_Z, j], b[_OFF, j] = s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q]
             b[_GIVE, j], b[_READING, j] = s[GIVE, q], s[READING, q]
-            b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
-            b[_BIAS, j], b[_WIDTH, j], b[_SPREAD, j] = p[VALVE_NULL_BIAS, q], p[VALVE_HYSTERESIS, q], p[VALVE_HYSTERESIS + 1, q]
+            b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = (
+                s[CURRENT, q],
+                s[CURRENT + 1, q],
+                s[CURRENT + 2, q],
+                s[CURRENT + 3, q],
+            )
+            b[_BIAS, j], b[_WIDTH, j], b[_SPREAD, j] = (
+                p[VALVE_NULL_BIAS, q],
+                p[VALVE_HYSTERESIS, q],
+                p[VALVE_HYSTERESIS + 1, q],
+            )
             b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
-            b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = p[VALVE_A11, q], p[VALVE_A12, q], p[VALVE_A21, q], p[VALVE_A22, q]
+            b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = (
+                p[VALVE_A11, q],
+                p[VALVE_A12, q],
+                p[VALVE_A21, q],
+                p[VALVE_A22, q],
+            )
             b[_OVERLAP, j] = p[VALVE_DEAD_BAND, q] / p[RATED_CURRENT, q]
             b[_LIMIT, j], b[_ROUNDNESS, j] = p[VALVE_FLOW_SATURATION, q], p[VALVE_FLOW_SATURATION + 1, q]
             b[_LOW, j], b[_HIGH, j] = end_stop_shift.step(p[STROKE, q], p[END_STOP_SHIFT, q])
             b[_LVDT, j], b[_LVDT_SHARE, j] = p[LVDT_FACTOR, q], p[LVDT_SHARE, q]
             b[_DROOP, j], b[_LEAK, j] = p[SUPPLY_PRESSURE_DROOP, q], p[INTERNAL_LEAKAGE, q]
-            b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j] = p[PISTON_FRICTION, q], p[PISTON_STICTION, q], p[PISTON_STICTION + 1, q]
+            b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j] = (
+                p[PISTON_FRICTION, q],
+                p[PISTON_STICTION, q],
+                p[PISTON_STICTION + 1, q],
+            )
             b[_STIFFNESS, j] = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, q])
             b[_COMPLIANCE, j], b[_DRAG, j] = p[OIL_COMPRESSIBILITY, q], p[OIL_COMPRESSIBILITY + 1, q]
             b[_PER_P_REF, j], b[_PER_AREA, j] = 1.0 / p[P_REF, q], 1.0 / p[AREA, q]
-            b[_FLOW, j], b[_VISCOSITY, j], b[_ASYMMETRY, j] = p[FLOW_GAIN, q], p[OIL_VISCOSITY, q], p[VALVE_GAIN_ASYMMETRY, q]
+            b[_FLOW, j], b[_VISCOSITY, j], b[_ASYMMETRY, j] = (
+                p[FLOW_GAIN, q],
+                p[OIL_VISCOSITY, q],
+                p[VALVE_GAIN_ASYMMETRY, q],
+            )
             b[_P_REF, j], b[_AERO, j], b[_PER_STROKE, j] = p[P_REF, q], p[AERO_LOAD, q], 1.0 / p[STROKE, q]
-            b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
+            b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j] = (
+                p[LVDT_GAIN, q],
+                p[LVDT_THERMAL_DRIFT, q],
+                p[LVDT_BIAS, q],
+            )
         for k in range(n):
             if k > 0:
                 supply, warm, speed = _between(p_s, k), _between(t_oil, k), _between(n_r, k)
@@ -439,30 +500,49 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
                     )
             if sensed:
                 for j in range(W):
-                    b[_LOGGED, j] = chain.straight_reading(b[_LOGGED, j], b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j], t_oil[k])
+                    b[_LOGGED, j] = chain.straight_reading(
+                        b[_LOGGED, j], b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j], t_oil[k]
+                    )
             for j in range(last):
                 out[order[j0 + j], k] = b[_LOGGED, j]
         for j in range(last):
             q = order[j0 + j]
-            s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j]
+            s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = (
+                b[_U, j],
+                b[_DU, j],
+                b[_V, j],
+                b[_X, j],
+                b[_Y, j],
+            )
             s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q] = b[_LAGGED, j], b[_Z, j], b[_OFF, j]
             s[GIVE, q], s[READING, q] = b[_GIVE, j], b[_READING, j]
-            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j]
+            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = (
+                b[_H1, j],
+                b[_H2, j],
+                b[_H3, j],
+                b[_H4, j],
+            )
 
 
 @inlined
 def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
-    """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see `chain.drive_substep`."""
+    """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see
+    `chain.drive_substep`.
+    """
     for j in range(W):
         i = valve_null_bias.step(i_cmd, b[_BIAS, j])
         y1 = y2 = y3 = y4 = i
         if memory:
-            y1, y2, y3, y4 = valve_hysteresis.step(b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j])
+            y1, y2, y3, y4 = valve_hysteresis.step(
+                b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j]
+            )
             i = valve_hysteresis.mean(y1, y2, y3, y4)
         u, du, v, x, y, lagged, z, off, give, reading = chain.drive_substep(
-            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j],
+            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j],
+            b[_READING, j],
             i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
-            b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j], b[_DROOP, j],
+            b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j],
+            b[_DROOP, j],
             b[_LIMIT, j], b[_ROUNDNESS, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j],
             b[_COMPLIANCE, j], b[_DRAG, j], b[_PER_STROKE, j], b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j],
             h, loaded, lossy, sticky,
@@ -472,12 +552,14 @@ def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
         b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j] = lagged, z, off, give, reading
 
 
-# ---- linkage ------------------------------------------------------------------------------------------------------------------------
+# ---- linkage ---------------------------------------------------------------------------------------------------------
 
 
 @inlined
 def _ramp_lag(tau, dt):
-    """Return (e, b) of a first-order lag over ``dt`` for an input that goes straight from u0 to u1: y1 = e y0 + (b - e) u0 + (1 - b) u1."""
+    """Return (e, b) of a first-order lag over ``dt`` for an input that goes straight from u0 to u1: y1 = e y0 + (b - e)
+    u0 + (1 - b) u1.
+    """
     if tau <= 0.0:
         return 0.0, 0.0
     e = math.exp(-dt / tau)
@@ -506,7 +588,25 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
 
 # rows of a block's scratch array: of the lane, then of each stage
 (_LX0, _X1, _Y1, _LE, _BEND, _PHASE, _DISTANCE, _LATE, _STROKE, _C, _D, _N_LANE) = range(12)
-(_RING, _BRISTLE, _DRIVEN, _POT, _BEFORE, _THETA, _AX, _AY, _LB, _LC, _LD, _RATIO, _PLAY, _WEAR, _FRICTION, _AMPLITUDE, _WARM) = range(17)
+(
+    _RING,
+    _BRISTLE,
+    _DRIVEN,
+    _POT,
+    _BEFORE,
+    _THETA,
+    _AX,
+    _AY,
+    _LB,
+    _LC,
+    _LD,
+    _RATIO,
+    _PLAY,
+    _WEAR,
+    _FRICTION,
+    _AMPLITUDE,
+    _WARM,
+) = range(17)
 (_LEVER, _GAIN, _OFFSET, _E, _B, _N_STAGE) = range(17, 23)
 
 
@@ -521,15 +621,29 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
         rubbed = eccentric = False
         for j in range(WIDE):
             q = order[j0 + min(j, last - 1)]
-            b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
+            b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j] = (
+                p[g + G_LX0, q],
+                p[g + G_X1, q],
+                p[g + G_Y1, q],
+                p[g + G_LE, q],
+            )
             b[_BEND, j], b[_PHASE, j] = p[LINKAGE_COMPLIANCE, q], p[RING_ECCENTRICITY + 3, q]
             b[_DISTANCE, j], b[_LATE, j] = p[LINKAGE_FRICTION + 3, q], max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
             for k in range(3):
                 o = g + N_CRANK + k * N_PER_STAGE
                 ratio = p[o + G_L, q] / p[o + G_LDP, q]
-                w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j] = s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q]
+                w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j] = (
+                    s[RING + k, q],
+                    s[BRISTLE + k, q],
+                    s[DRIVEN + k, q],
+                )
                 w[k, _POT, j] = s[POT + k, q]
-                w[k, _AX, j], w[k, _AY, j], w[k, _LD, j], w[k, _RATIO, j] = p[o + G_AX, q], p[o + G_AY, q], p[o + G_LD, q], ratio
+                w[k, _AX, j], w[k, _AY, j], w[k, _LD, j], w[k, _RATIO, j] = (
+                    p[o + G_AX, q],
+                    p[o + G_AY, q],
+                    p[o + G_LD, q],
+                    ratio,
+                )
                 w[k, _LB, j] = crank_length_error.step(p[o + G_LB, q], p[CRANK_LENGTH_ERROR + k, q])
                 w[k, _LC, j] = link_length_error.step(p[o + G_LC, q], p[LINK_LENGTH_ERROR + k, q])
                 w[k, _PLAY, j] = linkage_backlash.step(p[PLAY + k, q], p[LINKAGE_BACKLASH + k, q], ratio)
@@ -548,7 +662,9 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
                 b[_C, j], b[_D, j] = _crank(b[_STROKE, j], b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j])
             for k in range(3):
                 for j in range(WIDE):
-                    w[k, _THETA, j] = _ring(b[_C, j], b[_D, j], w[k, _AX, j], w[k, _AY, j], w[k, _LB, j], w[k, _LC, j], w[k, _LD, j])
+                    w[k, _THETA, j] = _ring(
+                        b[_C, j], b[_D, j], w[k, _AX, j], w[k, _AY, j], w[k, _LB, j], w[k, _LC, j], w[k, _LD, j]
+                    )
                 if eccentric:
                     for j in range(WIDE):
                         w[k, _THETA, j] = ring_eccentricity.step(w[k, _THETA, j], w[k, _AMPLITUDE, j], b[_PHASE, j])
@@ -569,7 +685,9 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
                 for j in range(WIDE):
                     vane = pot_gain.step(_vane(w[k, _THETA, j], w[k, _LEVER, j]), w[k, _GAIN, j]) + w[k, _OFFSET, j]
                     before = vane if m == 0 else w[k, _BEFORE, j]
-                    slow = w[k, _E, j] * w[k, _POT, j] + ((w[k, _B, j] - w[k, _E, j]) * before + (1.0 - w[k, _B, j]) * vane)
+                    slow = w[k, _E, j] * w[k, _POT, j] + (
+                        (w[k, _B, j] - w[k, _E, j]) * before + (1.0 - w[k, _B, j]) * vane
+                    )
                     w[k, _POT, j] = w[k, _POT, j] if m == 0 else slow
                     w[k, _BEFORE, j] = vane
                 for j in range(last):
@@ -578,7 +696,11 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
             q = order[j0 + j]
             s[X, q] = b[_STROKE, j]
             for k in range(3):
-                s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q] = w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j]
+                s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q] = (
+                    w[k, _RING, j],
+                    w[k, _BRISTLE, j],
+                    w[k, _DRIVEN, j],
+                )
                 s[POT + k, q] = w[k, _POT, j]
 
 

@@ -4,8 +4,9 @@ Equation, with u the spool position as a fraction of its rated travel::
 
     u'' + 2 zeta w u' + w^2 u = w^2 i / i_rated,   -1 <= u <= 1
 
-Symbols: w = 2 pi bandwidth (rad/s), zeta damping (-), i current (A). The current is constant over a step, so the step below is exact (the
-matrix exponential in closed form), whatever its length, as long as the spool stays off its stops; at a stop the spool rests.
+Symbols: w = 2 pi bandwidth (rad/s), zeta damping (-), i current (A). The current is constant over a step, so the step
+below is exact (the matrix exponential in closed form), whatever its length, as long as the spool stays off its stops;
+at a stop the spool rests.
 
 Source: Merritt, Hydraulic Control Systems (1967), ch. 7: second-order fit to a two-stage valve's frequency response.
 """

@@ -30,7 +30,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Write down what was skipped, and why, into the file VANELOOP_NOT_TESTED: the last lines of `make test` say it (tests/vcan/run.py)."""
+    """Write down what was skipped, and why, into the file VANELOOP_NOT_TESTED: the last lines of `make test` say it
+    (tests/vcan/run.py).
+    """
     if not (file := os.environ.get("VANELOOP_NOT_TESTED")) or hasattr(config, "workerinput"):
         return  # or a worker of xdist: its reports are the main process's too
     told: Counter[str] = Counter()

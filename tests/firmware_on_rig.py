@@ -33,7 +33,8 @@ def firmware(calibration: Calibration | None = None) -> Compiled:
     cal = calibration or load_calibration()
     inputs = new_inputs()
     out = Compiled(
-        tick=tick, inputs=inputs, state=new_state(), calibration=cal, n_dem=IN_N_DEM, n_r=IN_N_R, x_lvdt=IN_X_LVDT, fresh=IN_FRESH,
+        tick=tick, inputs=inputs, state=new_state(), calibration=cal, n_dem=IN_N_DEM, n_r=IN_N_R, x_lvdt=IN_X_LVDT,
+        fresh=IN_FRESH,
         i_cmd=I_CMD, x_dem=X_DEM, mode=MODE, mode_request=IN_MODE_REQUEST,
     )  # fmt: skip
 

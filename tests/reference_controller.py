@@ -1,7 +1,9 @@
-"""The controller once more, written from docs/controller.md and docs/strategies.md: plain Python, time counted in whole ticks.
+"""The controller once more, written from docs/controller.md and docs/strategies.md: plain Python, time counted in whole
+ticks.
 
-It shares nothing with `controller.firmware`: the numbers come from ``calibration.toml`` by their names, faults are objects, modes are
-words, the three stages are numpy arrays. It is slow and has no guard against insane inputs; `tests/test_firmware_spec.py` compares.
+It shares nothing with `controller.firmware`: the numbers come from ``calibration.toml`` by their names, faults are
+objects, modes are words, the three stages are numpy arrays. It is slow and has no guard against insane inputs;
+`tests/test_firmware_spec.py` compares.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ def clip(v: float, low: float, high: float) -> float:
 
 
 class Fault:
-    """Set at the ``after``-th bad tick, healed at the ``heal``-th good one in a row; ``adding_up``: a good one takes back a tenth."""
+    """Set at the ``after``-th bad tick, healed at the ``heal``-th good one in a row; ``adding_up``: a good one takes
+    back a tenth.
+    """
 
     def __init__(self, after: float, heal: float, adding_up: bool = False):
         self.after, self.heal, self.adding_up = max(1, round(after * 1000)), round(heal * 1000), adding_up
@@ -90,13 +94,25 @@ class Reference:
         # direction
         self.filtered, self.rate, self.turn, self.last, self.due, self.d, self.blend = 0.0, 0.0, 0.0, 0.0, 0, 1, 1.0
         # stroke and servo
-        self.target, self.demand, self.before, self.reference, self.integral, self.limited = 0.0, 0.0, 0.0, 0.0, 0.0, False
+        self.target, self.demand, self.before, self.reference, self.integral, self.limited = (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            False,
+        )
         self.recovering, self.degraded = 0, 0
         # play and learning
         self.slow_x, self.speed, self.speed_rate, self.drift, self.noise = 0.0, 0.0, 0.0, 0.0, 0.0
         self.side, self.crossing, self.still, self.used = 0, 0.0, 0.0, np.zeros(2)  # still: s at rest
         self.far, self.on_side = np.zeros(3), np.zeros(3)
-        self.pot, self.pot_seen, self.doubt, self.trusted = np.zeros(3), np.zeros(3, bool), np.zeros(3), np.zeros(3, bool)
+        self.pot, self.pot_seen, self.doubt, self.trusted = (
+            np.zeros(3),
+            np.zeros(3, bool),
+            np.zeros(3),
+            np.zeros(3, bool),
+        )
         self.low, self.high = np.zeros(3), np.zeros(3)
         self.known, self.proved = np.zeros((3, 2)), np.zeros((3, 2))  # offset, width
         self.learned = np.zeros((3, 2))  # s on the sides +1 and -1
@@ -194,7 +210,9 @@ class Reference:
             self.due += 1
             if self.due >= round(k["trend_hold"] / STEP):
                 self.d, self.due = -d, 0
-                self.turn = d * max(d * n, d * self.last)  # along the new direction: the lesser of the two, two steps in a row
+                self.turn = d * max(
+                    d * n, d * self.last
+                )  # along the new direction: the lesser of the two, two steps in a row
         else:
             self.due = 0
         self.last = n
@@ -269,7 +287,9 @@ class Reference:
         if self.age >= round(k["demand_timeout"] * 1000):
             self.speed_rate = 0.0
         else:
-            engine = clip((self.n_dem - self.speed) / k["engine_lag"], -k["engine_deceleration"], k["engine_acceleration"])
+            engine = clip(
+                (self.n_dem - self.speed) / k["engine_lag"], -k["engine_deceleration"], k["engine_acceleration"]
+            )
             self.speed_rate = engine + self.drift
             self.speed += self.speed_rate * STEP
             if self.age < 10:

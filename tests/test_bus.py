@@ -123,7 +123,10 @@ class BusTests:
 
     def test_port_carries_frames_as_words(self, join: Join) -> None:
         a, b = Port(join()), Port(join())
-        rows = np.array([[frames.word0(0xA0), -1], [3 << 32 | 0x7FF, 0x030201], [frames.EXTENDED | 1 << 32 | 0x12345, 0x7F]], np.int64)
+        rows = np.array(
+            [[frames.word0(0xA0), -1], [3 << 32 | 0x7FF, 0x030201], [frames.EXTENDED | 1 << 32 | 0x12345, 0x7F]],
+            np.int64,
+        )
         assert a.write(rows) == 3
         got = np.zeros((10, 2), np.int64)
         n, deadline = 0, time.monotonic() + PATIENCE
@@ -141,7 +144,9 @@ class BusTests:
         vgv, ecu = Node(seed=1), Ecu(seed=1)
         rows = np.zeros((64, 2), np.int64)
         by_ecu = 0
-        for _ in range(700):  # the nodes have no clock: each tick waits for what the other has sent, however long the bus takes
+        for _ in range(
+            700
+        ):  # the nodes have no clock: each tick waits for what the other has sent, however long the bus takes
             by_vgv = vgv_port.write(vgv.tick(rows, self.arrived(vgv_port, rows, by_ecu)))
             by_ecu = ecu_port.write(ecu.tick(rows, self.arrived(ecu_port, rows, by_vgv)))
         assert vgv.mode == "RUN" and vgv.counts["good"] >= 60 and ecu.stale() == []
@@ -221,7 +226,9 @@ class TestLocal(BusTests):
         for bus in opened:
             bus.shutdown()
 
-    def test_a_slow_reader_is_told_in_place_how_much_it_lost(self, join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    def test_a_slow_reader_is_told_in_place_how_much_it_lost(
+        self, join: Join, caplog: pytest.LogCaptureFixture
+    ) -> None:
         fast, slow, quick = join(), join(), join()
         n = broker.BACKLOG + 6000
         for k in range(n):
@@ -317,7 +324,8 @@ class TestLocal(BusTests):
 
     def test_two_that_start_at_once_are_on_one_bus(self, name: str) -> None:
         code = (
-            f"from hil.bus.port import open_bus; import can, time; b = open_bus('local:{name}'); end = time.monotonic() + 120; heard = None\n"
+            f"from hil.bus.port import open_bus; import can, time; b = open_bus('local:{name}'); end = "
+            f"time.monotonic() + 120; heard = None\n"
             "while heard is None and time.monotonic() < end:\n"
             "    b.send(can.Message(arbitration_id=5, is_extended_id=False)); heard = b.recv(0.05)\n"
             "b.send(can.Message(arbitration_id=5, is_extended_id=False)); print(heard is not None)"
@@ -342,7 +350,7 @@ def broker_of(name: str) -> int:
     raise AssertionError(f"no broker of {name}")
 
 
-# ---- choice ---------------------------------------------------------------------------------------------------------------------------
+# ---- choice ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["", "lo", "eth0", "can", "vcan0:x", "serial", "loc al"])

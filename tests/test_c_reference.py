@@ -14,7 +14,9 @@ SECONDS = 130.0
 
 
 def sensor_noise(ticks: int, spiked: bool) -> np.ndarray:
-    """Standard normal numbers; ``spiked``: with an LVDT that jumps, leaves its range, gives no number, and stands still."""
+    """Standard normal numbers; ``spiked``: with an LVDT that jumps, leaves its range, gives no number, and stands
+    still.
+    """
     noise = np.random.Generator(np.random.PCG64(7)).standard_normal((ticks, 5))
     if spiked:
         at = 1000 * np.array([5, 12, 26, 40, 60])
@@ -26,7 +28,9 @@ def sensor_noise(ticks: int, spiked: bool) -> np.ndarray:
     return noise
 
 
-def both(setup: Setup, gcc: str, noise: np.ndarray | None = None, flags: tuple[str, ...] = BITWISE) -> tuple[np.ndarray, np.ndarray]:
+def both(
+    setup: Setup, gcc: str, noise: np.ndarray | None = None, flags: tuple[str, ...] = BITWISE
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the product and of C."""
     rows = [np.zeros((-(-setup.ticks // setup.every), len(COLUMNS))) for _ in range(2)]
     loops = OurLoop(setup), CLoop(setup, flags, gcc)

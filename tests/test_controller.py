@@ -1,7 +1,8 @@
-"""The firmware against inputs that a machine, a bus or a bad day can give it: direction, tables, sensor, loop, modes, faults, purity.
+"""The firmware against inputs that a machine, a bus or a bad day can give it: direction, tables, sensor, loop, modes,
+faults, purity.
 
-Times in the names of faults and modes are held to the calibration tick by tick: sample ``n`` of a fault time of ``n`` ticks is the one that
-sets it.
+Times in the names of faults and modes are held to the calibration tick by tick: sample ``n`` of a fault time of ``n``
+ticks is the one that sets it.
 """
 
 # ruff: noqa: D103 - a test's name is its claim
@@ -20,7 +21,19 @@ from numba import njit
 
 from controller import firmware as fw
 from controller import load_calibration, new_state, tick
-from controller.firmware import DEGRADED, FAIL_SAFE, INIT, MODES, N_INPUTS, N_STATE, RUN, STANDBY, look_up, servo_step, trend_step
+from controller.firmware import (
+    DEGRADED,
+    FAIL_SAFE,
+    INIT,
+    MODES,
+    N_INPUTS,
+    N_STATE,
+    RUN,
+    STANDBY,
+    look_up,
+    servo_step,
+    trend_step,
+)
 
 CAL = load_calibration()
 SINGLE = load_calibration(strategy="single")
@@ -135,7 +148,7 @@ def fault(states, bit):
     return (states[:, fw.FAULT_BITS].astype(int) >> bit & 1).astype(bool)
 
 
-# ---- direction of the demand --------------------------------------------------------------------------------------------------------
+# ---- direction of the demand -----------------------------------------------------------------------------------------
 
 
 @njit(error_model="numpy")
@@ -185,7 +198,11 @@ def test_a_ramp_turns_the_direction_once_and_in_time(rate):
 def test_a_ramp_out_of_a_dwell_turns_once_with_noise(rate, start):
     n = int(8.0 / rate * 100)
     demand = np.concatenate(
-        [np.full(2000, 70.0), 70.0 - start * rate * 0.01 * np.arange(n), np.full(3000, 70.0 - start * rate * 0.01 * (n - 1))]
+        [
+            np.full(2000, 70.0),
+            70.0 - start * rate * 0.01 * np.arange(n),
+            np.full(3000, 70.0 - start * rate * 0.01 * (n - 1)),
+        ]
     )
     at = turns(directions(demand + noise(len(demand), int(rate * 10)), start), start)
     assert len(at) == 1 and at[0] >= 2000
@@ -247,7 +264,7 @@ def test_insane_demand_never_reaches_the_filter():
     assert fault(rig.log[-1:], fw.F_DEMAND_RANGE).all()
 
 
-# ---- tables to stroke demand --------------------------------------------------------------------------------------------------------
+# ---- tables to stroke demand -----------------------------------------------------------------------------------------
 
 
 @settings(max_examples=200)
@@ -268,7 +285,9 @@ def test_look_up_is_exact_at_its_breakpoints_and_its_ends():
 
 
 @settings(max_examples=100)
-@given(st.lists(st.floats(0, 120), min_size=2, max_size=30, unique=True), st.floats(-10, 130), st.integers(0, 2**32 - 1))
+@given(
+    st.lists(st.floats(0, 120), min_size=2, max_size=30, unique=True), st.floats(-10, 130), st.integers(0, 2**32 - 1)
+)
 def test_look_up_agrees_with_numpy_on_any_table(axis, v, seed):
     axis = np.unique(np.round(axis, 3))
     if axis.size < 2:
@@ -307,7 +326,9 @@ def test_a_reversal_in_the_middle_of_a_change_of_table_turns_it_back_without_a_j
 
 def test_the_single_curve_knows_no_direction():
     rig = Rig(SINGLE).running(80.0)
-    states = rig.play(frames(4000, np.interp(np.arange(4000), [0, 2000, 4000], [80.0, 84.0, 76.0]), 80.0, phase=rig.now))
+    states = rig.play(
+        frames(4000, np.interp(np.arange(4000), [0, 2000, 4000], [80.0, 84.0, 76.0]), 80.0, phase=rig.now)
+    )
     assert turns(states[:, fw.DIRECTION]).size == 1
     assert np.ptp(states[:, fw.X_DEM]) == 0.0
 
@@ -316,7 +337,9 @@ def test_the_single_curve_knows_no_direction():
 def test_stroke_demand_stays_within_limits_and_slew_under_any_speed(table_input):
     rng = np.random.default_rng(2)
     cal = changed(table_input=table_input)
-    cal = cal._replace(table=cal.table * np.array([[1.0], [1.3], [1.0], [1.2]]) - np.array([[0.0], [0.003], [0.003], [0.003]]))
+    cal = cal._replace(
+        table=cal.table * np.array([[1.0], [1.3], [1.0], [1.2]]) - np.array([[0.0], [0.003], [0.003], [0.003]])
+    )
     rig = Rig(cal).running(70.0)
     steps = np.repeat(rng.uniform(0.0, 120.0, (60, 2)), 1000, axis=0)
     states = rig.play(frames(len(steps), steps[:, 0], steps[:, 1], phase=rig.now))
@@ -328,7 +351,7 @@ def test_stroke_demand_stays_within_limits_and_slew_under_any_speed(table_input)
     assert np.abs(np.diff(states[:, fw.X_SERVO])).max() <= k("stroke_rate") * fw.TICK + 1e-15
 
 
-# ---- LVDT ---------------------------------------------------------------------------------------------------------------------------
+# ---- LVDT ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e308, -0.0011, 0.0491, 0.001, 0.047, "above", "below"])
@@ -413,7 +436,9 @@ def test_a_lost_lvdt_is_a_fault_at_lvdt_debounce_and_heals_at_lvdt_heal(wrong):
     good = rig.now
     rig.healthy(4000)
     healed = good + rig.tail(good).first(lambda s: s[:, fw.FAULT_BITS] == 0.0)
-    assert healed <= good + ticks("lvdt_heal") + 5  # the first good sample is where the piston is by now, not where it was
+    assert (
+        healed <= good + ticks("lvdt_heal") + 5
+    )  # the first good sample is where the piston is by now, not where it was
     running = rig.first_mode(RUN, since=good)
     assert running == healed + ticks("recover_time") - 1
     assert np.abs(rig.log[-1, fw.X_DEM] - rig.log[-1, fw.X_MEAS]) < 1e-6
@@ -517,7 +542,9 @@ def test_resting_against_an_end_stop_is_not_stuck():
 
 @pytest.mark.parametrize("far", [0.003, 0.045])
 def test_the_servo_takes_over_without_a_bump_when_the_lvdt_returns(far):
-    """The piston is anywhere by then; it goes to the fail-safe stroke no faster than fail_safe_rate, with a little for the loop."""
+    """The piston is anywhere by then; it goes to the fail-safe stroke no faster than fail_safe_rate, with a little for
+    the loop.
+    """
     cal = changed(fail_safe_current=0.0)
     rig = Rig(cal).running()
     rig.play(lvdt_is(frames(500, phase=rig.now), np.nan))
@@ -550,7 +577,7 @@ def test_bad_samples_at_power_on_delay_the_start_and_nothing_else(bad, stroke):
     assert np.abs(np.diff(reference)).max() <= k("stroke_rate") * fw.TICK + 1e-15
 
 
-# ---- servo --------------------------------------------------------------------------------------------------------------------------
+# ---- servo -----------------------------------------------------------------------------------------------------------
 
 
 def servo(x_ref, stroke, seconds, bias=0.0, strength=1.0):
@@ -586,7 +613,9 @@ def test_a_constant_bias_leaves_no_steady_error(bias):
 
 
 @settings(max_examples=300)
-@given(st.floats(-0.05, 0.1), st.floats(-0.001, 0.05), st.floats(-0.1, 0.1), st.floats(-0.04, 0.04), st.integers(1, 200))
+@given(
+    st.floats(-0.05, 0.1), st.floats(-0.001, 0.05), st.floats(-0.1, 0.1), st.floats(-0.04, 0.04), st.integers(1, 200)
+)
 def test_current_and_integral_stay_within_the_limit(x_ref, x, dx, integral, n):
     z = new_state()
     z[fw.X_MEAS], z[fw.INTEGRAL] = x, integral
@@ -605,7 +634,7 @@ def test_the_integral_does_not_grow_into_a_saturated_current_and_leaves_it_at_on
     assert z[fw.I_CMD] < 0.0 and z[fw.SATURATED] == 0.0
 
 
-# ---- demand faults and modes, times to the tick -------------------------------------------------------------------------------------
+# ---- demand faults and modes, times to the tick ----------------------------------------------------------------------
 
 
 def silent(n, phase):
@@ -617,7 +646,9 @@ def silent(n, phase):
 def test_start_takes_init_time_then_standby_then_run():
     rig = Rig()
     rig.healthy(100)
-    assert (rig.log[: ticks("init_time") - 1, fw.MODE] == INIT).all() and (rig.log[: ticks("init_time"), fw.I_CMD] == 0.0).all()
+    assert (rig.log[: ticks("init_time") - 1, fw.MODE] == INIT).all() and (
+        rig.log[: ticks("init_time"), fw.I_CMD] == 0.0
+    ).all()
     assert rig.first_mode(STANDBY) == ticks("init_time") - 1
     assert rig.first_mode(RUN) == ticks("init_time")
 
@@ -643,7 +674,10 @@ def test_a_stale_demand_degrades_then_fails_safe_then_recovers_at_the_calibrated
     back = rig.now
     rig.healthy(3000, 90.0)
     healed = back + ticks("recover_time") - 1
-    assert not fault(rig.log[healed : healed + 1], fw.F_STALE).any() and fault(rig.log[healed - 1 : healed], fw.F_STALE).all()
+    assert (
+        not fault(rig.log[healed : healed + 1], fw.F_STALE).any()
+        and fault(rig.log[healed - 1 : healed], fw.F_STALE).all()
+    )
     running = healed + ticks("recover_time") - 1
     assert rig.first_mode(RUN, since=back) == running
     assert np.abs(np.diff(rig.log[back:, fw.X_SERVO])).max() <= k("stroke_rate") * fw.TICK + 1e-12
@@ -705,7 +739,9 @@ def test_a_burst_of_refused_frames_never_fails_safe_once_good_ones_return(refuse
     rig.play(rows)
     rig.healthy(2000, 95.0)
     assert set(rig.log[start:, fw.MODE]) == {RUN, DEGRADED}
-    assert rig.first_fault(fw.F_REJECTED) == start + 5 * fw.SLOW  # 0.1 is forgiven between two frames: the sixth overflows
+    assert (
+        rig.first_fault(fw.F_REJECTED) == start + 5 * fw.SLOW
+    )  # 0.1 is forgiven between two frames: the sixth overflows
     assert rig.first_mode(RUN, since=rig.now - 2000) == rig.now - 2000 + ticks("recover_time") - 1
 
 
@@ -787,7 +823,7 @@ def test_time_of_recovery_starts_anew_after_every_loss_of_the_lvdt():
     assert rig.z[fw.RECOVER_TIMER] == 0.0
 
 
-# ---- insane inputs ------------------------------------------------------------------------------------------------------------------
+# ---- insane inputs ---------------------------------------------------------------------------------------------------
 
 ALLOWED = {
     (INIT, STANDBY),
@@ -802,7 +838,9 @@ ALLOWED = {
     (FAIL_SAFE, STANDBY),
     (FAIL_SAFE, RUN),
 }
-INSANE = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, -0.0, 0.0, 0.5, 1.0, -1.0, 3.0, 120.0, 120.0001, 1e-3, 0.0485, 1e6])
+INSANE = np.array(
+    [np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, -0.0, 0.0, 0.5, 1.0, -1.0, 3.0, 120.0, 120.0001, 1e-3, 0.0485, 1e6]
+)
 OK, BAD_CURRENT, BAD_STROKE, BAD_MODE, NOT_FINITE, BAD_SLEW, NO_RECOVERY = range(7)
 RECOVERY = 2000  # ticks from the return of good inputs to RUN, whatever came before
 
@@ -821,8 +859,8 @@ def pick(kind, sane):
 def campaign(seed, n, cal, seen, trials, worst):
     """Segments of sane and insane inputs; returns (0, -1) or what was violated, and at which tick.
 
-    Now and then, from the state reached, good inputs return on a copy: ``worst[0]`` is the longest way in ticks to RUN without a fault that
-    then lasts.
+    Now and then, from the state reached, good inputs return on a copy: ``worst[0]`` is the longest way in ticks to RUN
+    without a fault that then lasts.
     """
     np.random.seed(seed)
     scalars = cal.k
@@ -936,14 +974,24 @@ def test_any_calibration_of_the_compensation_keeps_the_invariants_under_insane_i
         for name, field in model.model_fields.items():
             bound = next((m for m in field.metadata if isinstance(m, Bound)), None)
             if name in fw.SCALARS and bound is not None and name not in ("pot_low", "pot_high"):
-                value = rng.choice([bound.low, bound.high, rng.uniform(bound.low, bound.high), bound.low + 0.01 * (bound.high - bound.low)])
+                value = rng.choice(
+                    [
+                        bound.low,
+                        bound.high,
+                        rng.uniform(bound.low, bound.high),
+                        bound.low + 0.01 * (bound.high - bound.low),
+                    ]
+                )
                 scalars[fw.SCALARS.index(name)] = np.deg2rad(value) if bound.unit.startswith("deg") else value
     seen, worst = np.zeros((5, 5), dtype=np.int64), np.zeros(1, dtype=np.int64)
     assert campaign(100 + seed, 200_000, ADAPTIVE._replace(k=scalars), seen, 20, worst) == (OK, -1)
 
 
 @settings(max_examples=100)
-@given(st.lists(st.tuples(*[st.floats(width=64)] * N_INPUTS), min_size=1, max_size=40), st.sampled_from([CAL, SINGLE, INVERSE, ADAPTIVE]))
+@given(
+    st.lists(st.tuples(*[st.floats(width=64)] * N_INPUTS), min_size=1, max_size=40),
+    st.sampled_from([CAL, SINGLE, INVERSE, ADAPTIVE]),
+)
 def test_any_floats_at_all_keep_state_finite_and_outputs_within_limits(rows, cal):
     z = new_state()
     for row in rows:
@@ -952,7 +1000,7 @@ def test_any_floats_at_all_keep_state_finite_and_outputs_within_limits(rows, cal
         assert k("stroke_min") <= z[fw.X_DEM] <= k("stroke_max") and z[fw.MODE] in range(5)
 
 
-# ---- purity -------------------------------------------------------------------------------------------------------------------------
+# ---- purity ----------------------------------------------------------------------------------------------------------
 
 
 def mixed_inputs(n=6000, seed=11):
@@ -1003,7 +1051,9 @@ def test_compiled_and_interpreted_firmware_agree_bit_for_bit():
     runs = [Rig(cal).play(mixed_inputs()) for cal in (CAL, ADAPTIVE)]
     assert all(len(set(states[:, fw.MODE])) == 5 for states in runs)  # the run goes through every mode
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}
-    run = subprocess.run([sys.executable, "-c", SCRIPT], check=False, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(
+        [sys.executable, "-c", SCRIPT], check=False, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300
+    )
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == [hashlib.sha256(states.tobytes()).hexdigest() for states in runs]
 
@@ -1021,6 +1071,15 @@ def test_names_and_indices_of_inputs_scalars_states_and_faults_belong_together()
         else:
             assert getattr(fw, "FAULT_BITS" if name == "faults" else name.upper()) == i
     assert [fw.STATE[fw.T_STALE + bit] for bit in range(fw.N_FAULTS)] == [  # timers in the order of the bits
-        *("t_stale", "t_rejected", "t_lvdt_range", "t_lvdt_rate", "t_lvdt_stuck", "t_tracking", "t_saturated", "t_demand_range"),
+        *(
+            "t_stale",
+            "t_rejected",
+            "t_lvdt_range",
+            "t_lvdt_rate",
+            "t_lvdt_stuck",
+            "t_tracking",
+            "t_saturated",
+            "t_demand_range",
+        ),
         "t_paused",
     ]

@@ -1,4 +1,6 @@
-"""Curves of real parts: a passage in series bends gradually, an LVDT's windings err with the cube. Both are in the library."""
+"""Curves of real parts: a passage in series bends gradually, an LVDT's windings err with the cube. Both are in the
+library.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,18 @@ def test_a_passage_in_series_is_flow_saturation_whether_its_corner_is_round_or_s
 
 
 def test_a_sharp_limit_is_found_wherever_it_lies_below_the_speeds_of_the_log() -> None:
-    """Too high a start has no slope to follow, too low a one costs more than none: one of the starts must be near enough."""
+    """Too high a start has no slope to follow, too low a one costs more than none: one of the starts must be near
+    enough.
+    """
     run = rig.simulate(rig.manoeuvre(53, 120.0), firmware(), (), seed=53)
-    stage = build_chain(Log("clean", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}, [])).stage("actuator")
+    stage = build_chain(Log("clean", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}, [])).stage(
+        "actuator"
+    )
     assert stage.floor is not None
     noise = stage.floor[:, None] * np.random.default_rng(53).standard_normal(stage.measured.shape)
-    fast = float(np.quantile(np.abs(np.gradient(run.log["x_lvdt"], run.log["t"])), 0.998))  # mm/s, for some tenths of a second
+    fast = float(
+        np.quantile(np.abs(np.gradient(run.log["x_lvdt"], run.log["t"])), 0.998)
+    )  # mm/s, for some tenths of a second
     for limit in (0.35 * fast, 0.52 * fast, 0.68 * fast, 0.85 * fast):
         theta = stage.neutral()
         theta[stage.index()["valve_flow_saturation"]] = limit, 0.0

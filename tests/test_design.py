@@ -27,7 +27,9 @@ def result() -> d.DesignResult:
 
 
 def dense_margins(gains: d.Gains, plant: d.ServoPlant) -> tuple[float, float, float, float]:
-    """Crossover (Hz), gain margin (dB), phase margin (deg), disk margin of the continuous loop with its exact delay, on a dense grid."""
+    """Crossover (Hz), gain margin (dB), phase margin (deg), disk margin of the continuous loop with its exact delay, on
+    a dense grid.
+    """
     w = np.geomspace(0.5, 1500.0, 400_000)
     loop = d.continuous_response(gains, plant, w)
     cross = int(np.argmax(np.abs(loop) < 1.0))
@@ -46,7 +48,8 @@ def dense_margins(gains: d.Gains, plant: d.ServoPlant) -> tuple[float, float, fl
 def test_margins_of_the_sampled_loop_are_those_of_the_closed_form(gains: d.Gains, delay: int) -> None:
     plant = replace(PLANT, delay=delay)
     m = d.margins(gains, plant)
-    # the firmware's integral counts this tick's error already: T z/(z - 1) is the trapezoid's 1/s and half a tick's proportional part
+    # the firmware's integral counts this tick's error already: T z/(z - 1) is the trapezoid's 1/s and half a tick's
+    # proportional part
     equal = replace(gains, kp=gains.kp + 0.5 * gains.ki * plant.tick)
     crossover, gain, phase, disk = dense_margins(equal, plant)
     assert m.stable
@@ -72,7 +75,9 @@ def test_sampled_response_is_numpys_own(result: d.DesignResult) -> None:
 
 
 def test_disk_margin_of_the_published_example() -> None:
-    """Seiler, Packard, Gahinet, An Introduction to Disk Margins (2020), first example: L = 25/(s^3 + 10 s^2 + 10 s + 10), alpha = 0.46."""
+    """Seiler, Packard, Gahinet, An Introduction to Disk Margins (2020), first example: L = 25/(s^3 + 10 s^2 + 10 s +
+    10), alpha = 0.46.
+    """
     import control as ct
 
     alpha, gain, _ = ct.disk_margins(ct.tf([25], [1, 10, 10, 10]), np.geomspace(0.01, 100, 4000))
@@ -145,7 +150,9 @@ def test_simulation_is_the_products_plant() -> None:
 
 
 def test_the_gap_is_total_not_half() -> None:
-    """Fourier integral of the play operator against the describing function; a gap taken for half a gap fails by 10 % and more."""
+    """Fourier integral of the play operator against the describing function; a gap taken for half a gap fails by 10 %
+    and more.
+    """
     gap, amplitude, n = 1.0, 0.8, 20_000
     turn = 2 * math.pi * np.arange(2 * n) / n
     x, y, out = amplitude * np.sin(turn), 0.0, np.empty(2 * n)
@@ -158,11 +165,12 @@ def test_the_gap_is_total_not_half() -> None:
 
 
 def test_textbook_servo_with_backlash() -> None:
-    """A motor 4/(s (s + 1)) with play of +-0.2 in its feedback oscillates with A = 0.33 at 1.24 rad/s (read off the Nyquist plot).
+    """A motor 4/(s (s + 1)) with play of +-0.2 in its feedback oscillates with A = 0.33 at 1.24 rad/s (read off the
+    Nyquist plot).
 
-    Example of the backlash lecture of KTH's and Lund's course "Nonlinear Control" (EL2620, FRTN05): P-control with K = 4, D = 0.2, whose
-    simulation shows A = 0.33 and a period of about 5.0 s. Both are readings of plots, quoted without the notes at hand; so the servo is
-    simulated here once more.
+    Example of the backlash lecture of KTH's and Lund's course "Nonlinear Control" (EL2620, FRTN05): P-control with K =
+    4, D = 0.2, whose simulation shows A = 0.33 and a period of about 5.0 s. Both are readings of plots, quoted without
+    the notes at hand; so the servo is simulated here once more.
     """
     x, v, y, h = 1.0, 0.0, 0.8, 1e-3
     t, out = h * np.arange(80_000), np.empty(80_000)
@@ -178,7 +186,10 @@ def test_textbook_servo_with_backlash() -> None:
     (cycle,) = d.limit_cycles(lambda w: 4.0 / (1j * w * (1j * w + 1.0)), 0.4, 0.1, 20.0)
     assert cycle.amplitude == pytest.approx(0.33, abs=0.01)
     assert cycle.omega == pytest.approx(1.24, rel=0.02)
-    assert (cycle.amplitude, cycle.omega) == (pytest.approx(seen.amplitude, rel=0.03), pytest.approx(seen.omega, rel=0.01))
+    assert (cycle.amplitude, cycle.omega) == (
+        pytest.approx(seen.amplitude, rel=0.03),
+        pytest.approx(seen.omega, rel=0.01),
+    )
     assert d.limit_cycles(lambda w: 0.25 / (1j * w * (1j * w + 1.0)), 0.4, 0.01, 20.0) == []  # K = 1/4: none
 
 
@@ -188,7 +199,10 @@ def test_controls_own_search_finds_the_same_crossing() -> None:
     gains = d.Gains(10.0, 400.0, 0.0)
     (cycle,) = d.limit_cycles(lambda w: d.continuous_response(gains, PLANT, w), 1.0, 1.0, 500.0)
     found = ct.describing_function_response(
-        d.continuous_loop(gains, PLANT), ct.friction_backlash_nonlinearity(1.0), np.linspace(0.8, 2.0, 60), np.geomspace(10.0, 200.0, 400)
+        d.continuous_loop(gains, PLANT),
+        ct.friction_backlash_nonlinearity(1.0),
+        np.linspace(0.8, 2.0, 60),
+        np.geomspace(10.0, 200.0, 400),
     ).intersections
     assert len(found) == 1
     assert found[0] == pytest.approx((cycle.amplitude, cycle.omega), rel=2e-3)
@@ -197,7 +211,9 @@ def test_controls_own_search_finds_the_same_crossing() -> None:
 def oscillate(gains: d.Gains, gap: float, seconds: float = 12.0, site: str = "lvdt") -> d.LimitCycle | None:
     n = round(seconds / PLANT.tick)
     start = d.MIDDLE + gap if site == "lvdt" else d.MIDDLE
-    run = d.simulate(gains, PLANT, np.full(n, d.MIDDLE), play=d.Play(site, gap), start=start, integral=0.0 if site == "lvdt" else gap)
+    run = d.simulate(
+        gains, PLANT, np.full(n, d.MIDDLE), play=d.Play(site, gap), start=start, integral=0.0 if site == "lvdt" else gap
+    )
     return d.steady_cycle(run.t, run.play_in, 0.02 * gap)
 
 
@@ -280,7 +296,9 @@ def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
     assert (result.play[0].predicted_amplitude is None) == (gap_mm == 0.0)
 
 
-@pytest.mark.parametrize("bad", [{"kp": -1.0}, {"kp": math.nan}, {"ki": math.inf}, {"kff": -0.1}, {"backlash_inside": math.nan}])
+@pytest.mark.parametrize(
+    "bad", [{"kp": -1.0}, {"kp": math.nan}, {"ki": math.inf}, {"kff": -0.1}, {"backlash_inside": math.nan}]
+)
 def test_a_gain_out_of_range_is_named(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
         d.evaluate(**bad)
@@ -305,7 +323,13 @@ def test_kalman_gain_of_filterpy_is_riccatis_and_the_closed_form(acceleration: f
 
 def test_the_firmwares_filter_estimates_what_filterpy_estimates() -> None:
     t = np.arange(0.0, 60.0, 0.01)
-    y = 60 + np.clip(8 * (t - 5), 0, 30) - np.clip(10 * (t - 20), 0, 20) - np.clip(0.1 * (t - 30), 0, 2) + bus_noise(t.size)
+    y = (
+        60
+        + np.clip(8 * (t - 5), 0, 30)
+        - np.clip(10 * (t - 20), 0, 20)
+        - np.clip(0.1 * (t - 30), 0, 2)
+        + bus_noise(t.size)
+    )
     n, rate = tf.filterpy_estimates(tf.TrendModel(), y)
     n_fw, rate_fw, _ = tf.firmware_estimates(y, TREND)
     np.testing.assert_allclose(n_fw, n, rtol=0, atol=1e-11)
@@ -319,7 +343,11 @@ def test_the_calibration_holds_the_recommended_values() -> None:
     k = read("calibration.toml", CalibrationTable).trend
     assert k.trend_alpha.value == pytest.approx(TREND.alpha, rel=2e-3)
     assert k.trend_beta.value == pytest.approx(TREND.beta, rel=2e-3)
-    assert (k.trend_rate_on.value, k.trend_change.value, k.trend_hold.value) == (TREND.rate_on, TREND.change, TREND.hold)
+    assert (k.trend_rate_on.value, k.trend_change.value, k.trend_hold.value) == (
+        TREND.rate_on,
+        TREND.change,
+        TREND.hold,
+    )
 
 
 def test_rate_noise_and_false_turns_are_what_a_long_run_shows() -> None:
@@ -331,7 +359,9 @@ def test_rate_noise_and_false_turns_are_what_a_long_run_shows() -> None:
     for u in (2.0, 2.5):
         level = u * TREND.rate_noise
         up = np.sum((rate[:-1] < level) & (rate[1:] >= level)) + np.sum((rate[:-1] > -level) & (rate[1:] <= -level))
-        assert up / (rate.size * 0.01 / 3600.0) == pytest.approx(tf.false_turns_per_hour(TREND.alpha, TREND.beta, level, model), rel=0.12)
+        assert up / (rate.size * 0.01 / 3600.0) == pytest.approx(
+            tf.false_turns_per_hour(TREND.alpha, TREND.beta, level, model), rel=0.12
+        )
     assert TREND.false_turns < 1e-4
 
 

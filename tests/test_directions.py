@@ -18,27 +18,42 @@ PHASES = (-180, -159, -90, -20, 45, 120)
 
 
 def ring_stage(phase: float, size: float = 0.6) -> Stage:
-    """An angle (deg) that swings over +-40 deg, hidden in it ``size`` sin(angle + phase), beside a bias, and rivals of other shape."""
+    """An angle (deg) that swings over +-40 deg, hidden in it ``size`` sin(angle + phase), beside a bias, and rivals of
+    other shape.
+    """
     t = np.arange(1500) * 0.02
     angle = 40.0 * np.sin(2 * np.pi * t / 7.3) * np.sin(2 * np.pi * t / 31.0)
     rad = np.deg2rad(angle)
 
     def run(theta: np.ndarray) -> np.ndarray:
         bias, amplitude, turn, cube, late = (theta[:, i, None] for i in range(5))
-        y = angle + bias + amplitude * np.sin(rad + np.deg2rad(turn)) + cube * (angle / 40.0) ** 3 + late * np.gradient(angle, t)
+        y = (
+            angle
+            + bias
+            + amplitude * np.sin(rad + np.deg2rad(turn))
+            + cube * (angle / 40.0) ** 3
+            + late * np.gradient(angle, t)
+        )
         return y[:, None, :]
 
-    measured = angle + 0.05 + size * np.sin(rad + np.deg2rad(phase)) + NOISE * np.random.default_rng(0).standard_normal(len(t))
+    measured = (
+        angle + 0.05 + size * np.sin(rad + np.deg2rad(phase)) + NOISE * np.random.default_rng(0).standard_normal(len(t))
+    )
     effects = (
         Effect(
             "eccentric",
-            (Parameter("amplitude", 0.0, "deg", 0.0, 5.0), Parameter("phase", 0.0, "deg", -180.0, 180.0, shape=True, period=360.0)),
+            (
+                Parameter("amplitude", 0.0, "deg", 0.0, 5.0),
+                Parameter("phase", 0.0, "deg", -180.0, 180.0, shape=True, period=360.0),
+            ),
             tuple((a, p) for a in (0.01, 0.1, 1.0) for p in (0.0, 90.0, 180.0, 270.0)),
         ),
         Effect("cubic", (Parameter("cube", 0.0, "deg", -5.0, 5.0),), ((0.1,), (-0.1,), (1.0,), (-1.0,))),
         Effect("late", (Parameter("lag", 0.0, "s", -1.0, 1.0),), ((0.1,), (-0.1,))),
     )
-    return Stage("ring", ("angle",), ("deg",), (Parameter("bias", 0.0, "deg", tolerance=0.1),), effects, run, t, measured[None])
+    return Stage(
+        "ring", ("angle",), ("deg",), (Parameter("bias", 0.0, "deg", tolerance=0.1),), effects, run, t, measured[None]
+    )
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -92,9 +107,13 @@ def rig_chain(hidden: list[Hidden], seconds: float):
 
 def test_an_eccentric_ring_towards_the_cut_is_named_alone():
     """At -159 deg the phase once stopped at -180, and two other effects were named with certainty."""
-    stage = rig_chain([Hidden("ring_eccentricity", {"amplitude": 12e-3, "phase": np.deg2rad(-159.0), "stage": 0.0})], 80.0).stage("linkage")
+    stage = rig_chain(
+        [Hidden("ring_eccentricity", {"amplitude": 12e-3, "phase": np.deg2rad(-159.0), "stage": 0.0})], 80.0
+    ).stage("linkage")
     assert stage.floor is not None
     d = diagnose_stage(stage, stage.floor)
     assert [f.effect for f in d.effects] == ["ring_eccentricity"]
     assert d.excess < 1.05
-    assert d.effects[0].parameters["phase"]["value"] == pytest.approx(-159.0, abs=12.0)  # links within tolerance turn it
+    assert d.effects[0].parameters["phase"]["value"] == pytest.approx(
+        -159.0, abs=12.0
+    )  # links within tolerance turn it

@@ -1,4 +1,6 @@
-"""The search for missing physics on small stages made of numpy, which know nothing of vanes: it names what is missing, and nothing else."""
+"""The search for missing physics on small stages made of numpy, which know nothing of vanes: it names what is missing,
+and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +37,16 @@ def wave(seed: int, amplitude: float, slowest: float, fastest: float) -> np.ndar
 CURRENT = wave(1, 9.0, 0.05, 1.0)  # mA
 LOAD = 0.8 + 0.12 * np.sin(2 * np.pi * T / 37.0) + 0.08 * np.sin(2 * np.pi * T / 11.0)  # a slow condition
 
-NULL_BIAS = Effect("null_bias", (Parameter("bias", 0.0, "mA", -5.0, 5.0),), ((-1.0,), (-0.1,), (0.1,), (1.0,)), "any motion")
-DEAD_BAND = Effect("dead_band", (Parameter("half_width", 0.0, "mA", 0.0, 5.0),), ((0.1,), (0.5,), (2.0,)), "small currents")
+NULL_BIAS = Effect(
+    "null_bias", (Parameter("bias", 0.0, "mA", -5.0, 5.0),), ((-1.0,), (-0.1,), (0.1,), (1.0,)), "any motion"
+)
+DEAD_BAND = Effect(
+    "dead_band", (Parameter("half_width", 0.0, "mA", 0.0, 5.0),), ((0.1,), (0.5,), (2.0,)), "small currents"
+)
 ASYMMETRY = Effect("gain_asymmetry", (Parameter("share", 0.0, "1", -0.5, 0.5),), ((-0.1,), (0.1,)), "motion both ways")
-SATURATION = Effect("saturation", (Parameter("limit", 40.0, "mA", 2.0, 40.0),), ((30.0,), (20.0,), (12.0,), (6.0,)), "large currents")
+SATURATION = Effect(
+    "saturation", (Parameter("limit", 40.0, "mA", 2.0, 40.0),), ((30.0,), (20.0,), (12.0,), (6.0,)), "large currents"
+)
 LIBRARY = (NULL_BIAS, DEAD_BAND, ASYMMETRY, SATURATION)
 TRUTH = {"null_bias": (0.4,), "dead_band": (0.6,), "gain_asymmetry": (0.06,), "saturation": (14.0,)}
 
@@ -52,12 +60,15 @@ def speed(current: np.ndarray, bias: np.ndarray, half: np.ndarray, share: np.nda
 
 
 def simulator(effects: tuple[Effect, ...]) -> Callable[[np.ndarray], np.ndarray]:
-    """``run`` of a stage that has these effects of the library: stroke (mm) from zero, the integral of gain times the characteristic."""
+    """``run`` of a stage that has these effects of the library: stroke (mm) from zero, the integral of gain times the
+    characteristic.
+    """
     column = {e.name: k + 1 for k, e in enumerate(effects)}
 
     def run(thetas: np.ndarray) -> np.ndarray:
         values = [
-            thetas[:, column[e.name], None] if e.name in column else np.full((len(thetas), 1), e.parameters[0].value) for e in LIBRARY
+            thetas[:, column[e.name], None] if e.name in column else np.full((len(thetas), 1), e.parameters[0].value)
+            for e in LIBRARY
         ]
         return (np.cumsum(thetas[:, :1] * speed(CURRENT, *values), axis=1) * DT)[:, None, :]
 
@@ -65,14 +76,19 @@ def simulator(effects: tuple[Effect, ...]) -> Callable[[np.ndarray], np.ndarray]
 
 
 def integrator(
-    seed: int = 0, effects: tuple[Effect, ...] = LIBRARY, gain: float = GAIN, added: np.ndarray | float = 0.0, **hidden: float
+    seed: int = 0,
+    effects: tuple[Effect, ...] = LIBRARY,
+    gain: float = GAIN,
+    added: np.ndarray | float = 0.0,
+    **hidden: float,
 ) -> Stage:
     """An integrating stage with hidden effects (name=value), and ``added`` to the measured stroke."""
     truth = np.array([[gain, *(hidden.get(e.name, e.parameters[0].value) for e in LIBRARY)]])
     measured = simulator(LIBRARY)(truth)[0] + added + NOISE * np.random.default_rng([5, seed]).standard_normal((1, N))
     direction = np.sign(np.where(np.abs(CURRENT) > 0.2, CURRENT, 0.0))
     return Stage(
-        name="slide", outputs=("x",), units=("mm",), parameters=(Parameter("gain", GAIN, "mm/s/mA", 2.0, 4.0, 0.15),), effects=effects,
+        name="slide", outputs=("x",), units=("mm",), parameters=(Parameter("gain", GAIN, "mm/s/mA", 2.0, 4.0, 0.15),),
+        effects=effects,
         run=simulator(effects), t=T, measured=measured, window=1.0,
         regimes={"time": T, "current": CURRENT, "direction": direction, "load": LOAD},
         regime_units={"time": "s", "current": "mA", "load": "kN"}, floor=FLOOR,
@@ -100,7 +116,8 @@ def gauges(terms: list[tuple[Effect, np.ndarray]], sizes: list[float], seed: int
     measured = simulate(np.array([[bias, 0.0, 0.0, *sizes]]))[0] + GAUGE_FLOOR[:, None] * rng.standard_normal((3, N))
     return Stage(
         name="gauges", outputs=("a", "b", "c"), units=("deg",) * 3,
-        parameters=tuple(Parameter(f"{k}_bias", 0.0, "deg", -1.0, 1.0, 0.1, k) for k in "abc"), effects=tuple(e for e, _ in terms),
+        parameters=tuple(Parameter(f"{k}_bias", 0.0, "deg", -1.0, 1.0, 0.1, k) for k in "abc"),
+        effects=tuple(e for e, _ in terms),
         run=simulate, t=T, measured=measured, regimes={"time": T, "u": U, "v": V}, floor=GAUGE_FLOOR,
     )  # fmt: skip
 
@@ -119,7 +136,7 @@ def search(stage: Stage) -> StageDiagnosis:
     return diagnose_stage(stage, stage.floor)
 
 
-# ---- nothing missing ---------------------------------------------------------------------------------------------------------------------
+# ---- nothing missing -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -161,7 +178,7 @@ def test_only_the_output_whose_bias_moved_is_recalibrated() -> None:
     assert all(abs(float(v)) < 2e-3 for v in moved.values())  # type: ignore[arg-type]
 
 
-# ---- effects -----------------------------------------------------------------------------------------------------------------------------
+# ---- effects ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", TRUTH)
@@ -189,7 +206,9 @@ def test_ninety_per_cent_intervals_hold_the_truth_about_nine_times_in_ten() -> N
     assert np.all(fit.high - fit.low > 0)
 
 
-@pytest.mark.parametrize("pair", [("null_bias", "dead_band"), ("dead_band", "gain_asymmetry"), ("gain_asymmetry", "saturation")])
+@pytest.mark.parametrize(
+    "pair", [("null_bias", "dead_band"), ("dead_band", "gain_asymmetry"), ("gain_asymmetry", "saturation")]
+)
 def test_two_effects_together_are_both_found(pair: tuple[str, str]) -> None:
     d = search(integrator(4, **{p: TRUTH[p][0] for p in pair}))
     assert d.verdict == "missing" and names(d) == set(pair)
@@ -266,7 +285,7 @@ def test_a_parameter_beyond_its_tolerance_is_not_nothing() -> None:
     assert search(integrator(gain=3.8)).verdict != "none"
 
 
-# ---- unknown -----------------------------------------------------------------------------------------------------------------------------
+# ---- unknown ---------------------------------------------------------------------------------------------------------
 
 
 def unknown(stage: Stage) -> str:
@@ -305,7 +324,7 @@ def test_a_static_error_is_described_by_the_error_itself() -> None:
     assert "error of b grows with the square of v" in first.text
 
 
-# ---- where and since when ----------------------------------------------------------------------------------------------------------------
+# ---- where and since when --------------------------------------------------------------------------------------------
 
 
 def test_the_onset_is_found_within_seconds() -> None:
@@ -345,7 +364,7 @@ def test_clean_data_fail_nowhere() -> None:
         assert not any(r.significant.any() for r in found)
 
 
-# ---- samples that are not there ----------------------------------------------------------------------------------------------------------
+# ---- samples that are not there --------------------------------------------------------------------------------------
 
 
 def test_missing_samples_do_not_count() -> None:
@@ -373,7 +392,7 @@ def test_an_output_that_was_never_measured_changes_nothing() -> None:
     assert d.error_after[2] == 0.0
 
 
-# ---- noise -------------------------------------------------------------------------------------------------------------------------------
+# ---- noise -----------------------------------------------------------------------------------------------------------
 
 
 def white(t: np.ndarray, error: np.ndarray) -> float:
@@ -399,7 +418,7 @@ def test_a_floor_that_motion_had_raised_is_measured_again_on_the_best_model() ->
     assert names(d) == {"gain_asymmetry"} and d.floor[0] == pytest.approx(NOISE, rel=0.05)
 
 
-# ---- all stages together -----------------------------------------------------------------------------------------------------------------
+# ---- all stages together ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -488,21 +507,31 @@ def test_a_floor_is_raised_to_what_an_effect_hides_between_two_rows_and_only_the
     assert reach_of(stage, FLOOR, with_it)[0] == NOISE
     with_it[stage.index()["dead_band"]] = 0.6
     assert reach_of(stage, FLOOR, with_it)[0] == pytest.approx(np.hypot(NOISE, 0.03))
-    assert diagnose_stage(stage, FLOOR).floor[0] == extend_stage(replace(stage, floor=FLOOR), ("dead_band",)).floor[0] > 0.03
+    assert (
+        diagnose_stage(stage, FLOOR).floor[0]
+        == extend_stage(replace(stage, floor=FLOOR), ("dead_band",)).floor[0]
+        > 0.03
+    )
 
 
-# ---- what is refused ---------------------------------------------------------------------------------------------------------------------
+# ---- what is refused -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: replace(integrator(), measured=np.zeros((2, N))), r"stage 'slide': measured has shape \(2, 10000\); \(1, 10000\) is"),
+        (
+            lambda: replace(integrator(), measured=np.zeros((2, N))),
+            r"stage 'slide': measured has shape \(2, 10000\); \(1, 10000\) is",
+        ),
         (lambda: integrator(effects=(NULL_BIAS, NULL_BIAS)), "two parameters or effects share a name"),
         (lambda: integrator(effects=(replace(NULL_BIAS, starts=((1.0, 2.0),)),)), "a start has 2 values; 1 are needed"),
         (lambda: compare_stages([replace(integrator(), floor=None)]), "stage 'slide': no noise floor"),
         (lambda: compare_stages([replace(integrator(), floor=np.array([np.nan]))]), "stage 'slide': no noise floor"),
-        (lambda: extend_stage(integrator(), ("sticky",)), "stage 'slide' has no effect 'sticky'; it has null_bias, dead_band"),
+        (
+            lambda: extend_stage(integrator(), ("sticky",)),
+            "stage 'slide' has no effect 'sticky'; it has null_bias, dead_band",
+        ),
     ],
 )
 def test_a_stage_that_cannot_be_used_says_why(make: Callable[[], object], says: str) -> None:
@@ -510,7 +539,7 @@ def test_a_stage_that_cannot_be_used_says_why(make: Callable[[], object], says: 
         make()
 
 
-# ---- long logs --------------------------------------------------------------------------------------------------------------------------
+# ---- long logs -------------------------------------------------------------------------------------------------------
 
 
 def in_pieces(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> tuple[Stage, list[int]]:
@@ -522,7 +551,13 @@ def in_pieces(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> tuple[Stage, lis
 
     def excerpt(at: np.ndarray) -> Stage:
         seen.append(len(at))
-        return replace(stage, run=lambda thetas: stage.run(thetas)[..., at], t=stage.t[at], measured=stage.measured[:, at], excerpt=None)
+        return replace(
+            stage,
+            run=lambda thetas: stage.run(thetas)[..., at],
+            t=stage.t[at],
+            measured=stage.measured[:, at],
+            excerpt=None,
+        )
 
     return replace(stage, excerpt=excerpt), seen
 
@@ -546,7 +581,9 @@ def test_an_effect_that_acts_in_one_stretch_of_a_long_log_is_found(monkeypatch: 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_clean_long_log_lacks_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage, _ = in_pieces(gauges([linear("slope", (1, 1, 1), V), linear("tilt", (1, 0, -1), W)], [0.0, 0.0], seed), monkeypatch)
+    stage, _ = in_pieces(
+        gauges([linear("slope", (1, 1, 1), V), linear("tilt", (1, 0, -1), W)], [0.0, 0.0], seed), monkeypatch
+    )
     assert search(stage).verdict == "none"
 
 
@@ -555,7 +592,7 @@ def test_an_integrating_stage_is_cut_at_its_windows(monkeypatch: pytest.MonkeyPa
     assert names(search(stage)) == {"dead_band"} and all(n % 100 == 0 for n in seen)
 
 
-# ---- fits side by side ------------------------------------------------------------------------------------------------------------------
+# ---- fits side by side -----------------------------------------------------------------------------------------------
 
 
 def test_fits_made_together_are_those_made_one_by_one() -> None:
@@ -590,14 +627,24 @@ def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_simulating_ther
 
 
 def test_stages_settle_two_places_of_rivals_in_one_stage() -> None:
-    """Twins that one stage cannot tell apart; the other stage, where they differ, lacks neither twin that came first."""
+    """Twins that one stage cannot tell apart; the other stage, where they differ, lacks neither twin that came
+    first.
+    """
     first, second = wave(31, 1.0, 0.05, 1.0), wave(32, 1.0, 0.05, 1.0)
     row = (1.0, 1.0, 1.0)
-    twins = [linear("a", row, first), linear("a_twin", row, first), linear("b", row, second), linear("b_twin", row, second)]
+    twins = [
+        linear("a", row, first),
+        linear("a_twin", row, first),
+        linear("b", row, second),
+        linear("b_twin", row, second),
+    ]
     here = gauges(twins, [0.0, 0.4, 0.0, 0.3])
     there = replace(gauges([twins[0], twins[2]], [0.0, 0.0], seed=1), name="others")
     alone = diagnose([here], workers=1).stages[0]
-    assert {frozenset((f.effect, *f.rivals)) for f in alone.effects} == {frozenset(("a", "a_twin")), frozenset(("b", "b_twin"))}
+    assert {frozenset((f.effect, *f.rivals)) for f in alone.effects} == {
+        frozenset(("a", "a_twin")),
+        frozenset(("b", "b_twin")),
+    }
     d = diagnose([here, there], workers=1).stages[0]
     assert {f.effect: f.rivals for f in d.effects} == {"a_twin": [], "b_twin": []}
     assert set(d.final.effects) == {"a_twin", "b_twin"}

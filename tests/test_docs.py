@@ -1,7 +1,8 @@
 """Every command and every Python snippet of README.md and docs/*.md runs as it is written.
 
-A page's steps run in their order, in a folder of its own. What cannot run here as written stands in one of the tables, with the reason:
-`REPLACED` (smaller, or a placeholder filled in), `NOT_RUN` (only parsed), `LONG` (run by `make test-all`). An entry that no page has fails.
+A page's steps run in their order, in a folder of its own. What cannot run here as written stands in one of the tables,
+with the reason: `REPLACED` (smaller, or a placeholder filled in), `NOT_RUN` (only parsed), `LONG` (run by `make
+test-all`). An entry that no page has fails.
 """
 
 from __future__ import annotations
@@ -46,8 +47,13 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
 }
 
 DATA = "needs published data that are not ours to ship; tests/test_real_data.py runs it where they are"
-VCAN = "runs until Ctrl-C, on a kernel with vcan0; tests/test_socketcan.py, tests/test_realtime.py, tests/test_record.py"
-LIVE = "runs in real time until Ctrl-C, or beside such a run; tests/test_realtime.py, tests/test_record.py, tests/test_inject.py"
+VCAN = (
+    "runs until Ctrl-C, on a kernel with vcan0; tests/test_socketcan.py, tests/test_realtime.py, tests/test_record.py"
+)
+LIVE = (
+    "runs in real time until Ctrl-C, or beside such a run; tests/test_realtime.py, tests/test_record.py, "
+    "tests/test_inject.py"
+)
 # the beginning of a command or snippet that is parsed, not run -> why
 NOT_RUN: dict[str, str] = {
     "make demo": "sets up an environment; its steps are the commands of this page",
@@ -115,6 +121,7 @@ class Step:
 
     def listed(self, table: dict[str, str]) -> str | None:
         """The entry of ``table`` that this is, if any."""
+
         def begins(words: str) -> bool:
             return self.text.startswith(words if self.kind == "python" else f"{words} ")
 
@@ -187,7 +194,9 @@ def test_every_replacement_is_used(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", REAL)
-def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(
+    page: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     for s in ALL[page]:
         if s.kind == "command" and s.text.startswith("vaneloop ") and s.listed(NOT_RUN):
             name, *words = shlex.split(s.text)[1:]
@@ -198,7 +207,7 @@ def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(page: str, 
                 assert option in parser.format_help(), f"{page}:{s.line}: {s.text}: {option}"
 
 
-# ---- running -----------------------------------------------------------------------------------------------------------------------------
+# ---- running ---------------------------------------------------------------------------------------------------------
 
 
 def log_of(folder: Path, columns: dict[str, str], name: str = "run.csv", **factors: float) -> None:
@@ -206,7 +215,9 @@ def log_of(folder: Path, columns: dict[str, str], name: str = "run.csv", **facto
     log = read_log(ROOT / EXAMPLE, require=())
     n = 3_000
     values = {"t": log.channels["n_dem"].t[:n], **{k: c.values[:n] for k, c in log.channels.items()}}
-    rows = np.column_stack([values[signal] * factors.get(signal, 1.0) + factors.get(f"{signal}_0", 0.0) for signal in columns.values()])
+    rows = np.column_stack(
+        [values[signal] * factors.get(signal, 1.0) + factors.get(f"{signal}_0", 0.0) for signal in columns.values()]
+    )
     np.savetxt(folder / name, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6f")
 
 
@@ -214,7 +225,9 @@ OWN = {k: k for k in ("t", "n_dem", "n_r", "x_lvdt", "vigv", "p_s", "t_oil")}
 
 
 def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
-    """Put the files of a page's story where the step looks for them; return the names that a snippet takes for granted."""
+    """Put the files of a page's story where the step looks for them; return the names that a snippet takes for
+    granted.
+    """
     text = step.text
     if page == "docs/logs.md":
         if "N1_DEM" in text and step.kind == "python":
@@ -240,7 +253,14 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
         return {"t": t, "pump": pump, "level": level, "other": other}
     if page == "docs/bus.md":
         none = np.zeros((0, 2), np.int64)
-        return {"received": none, "frames": none, "rows": none, "at": np.zeros(0, np.int64), "ticks": 20, "n_dem": np.full(100, 80.0)}
+        return {
+            "received": none,
+            "frames": none,
+            "rows": none,
+            "at": np.zeros(0, np.int64),
+            "ticks": 20,
+            "n_dem": np.full(100, 80.0),
+        }
     if page == "docs/injection.md":
         toml = re.search(r"```toml\n(title.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S)
         assert toml is not None
@@ -252,7 +272,10 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
         shutil.copy(ROOT / "tables" / "geometry.toml", folder / "engine7.toml")
         shutil.copy(ROOT / "tables" / "schedules.toml", folder / "targets.toml")
         c = read_log(ROOT / EXAMPLE, require=()).channels
-        write_log(folder / "loop.csv", {k: Channel(c[k].t[::10], c[k].values[::10]) for k in ("n_dem", "x_lvdt", "vigv", "vgv1", "vgv2")})
+        write_log(
+            folder / "loop.csv",
+            {k: Channel(c[k].t[::10], c[k].values[::10]) for k in ("n_dem", "x_lvdt", "vigv", "vgv1", "vgv2")},
+        )
     return {}
 
 
@@ -306,6 +329,8 @@ def test_a_page_s_commands_and_snippets_run(page: str, tmp_path: Path, request: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in REAL if any(Step(0, s.kind, replaced(p, s.text)).listed(LONG) for s in ALL[p])])
+@pytest.mark.parametrize(
+    "page", [p for p in REAL if any(Step(0, s.kind, replaced(p, s.text)).listed(LONG) for s in ALL[p])]
+)
 def test_a_page_s_long_steps_run_too(page: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     run_page(page, tmp_path, request, long=True)

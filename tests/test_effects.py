@@ -77,7 +77,14 @@ NAMES = tuple(EFFECTS)
 PROMISED = {
     *("can_delay", "frame_hold", "schedule_error", "trend_threshold_error", "controller_gain_error"),
     *("rotor_lag_error", "acceleration_limit_error"),
-    *("valve_null_bias", "valve_dead_band", "valve_hysteresis", "valve_flow_saturation", "valve_lag", "valve_gain_asymmetry"),
+    *(
+        "valve_null_bias",
+        "valve_dead_band",
+        "valve_hysteresis",
+        "valve_flow_saturation",
+        "valve_lag",
+        "valve_gain_asymmetry",
+    ),
     *("supply_pressure_droop", "oil_viscosity"),
     *("piston_friction", "piston_stiction", "internal_leakage", "oil_compressibility", "aero_load", "end_stop_shift"),
     *("lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag", "lvdt_thermal_drift"),
@@ -155,7 +162,7 @@ def speed(machine, current, **conditions):
     return (out[-1] - out[-101]) / 0.1
 
 
-# ---- the registry -------------------------------------------------------------------------------------------------------------------
+# ---- the registry ----------------------------------------------------------------------------------------------------
 
 
 def test_library_holds_the_promised_names() -> None:
@@ -176,10 +183,12 @@ def test_docstring_has_its_sections(name: str) -> None:
 
 
 def test_page_on_effects_is_current() -> None:
-    assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page(), "run: python -m plant.effects_page > docs/effects.md"
+    assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page(), (
+        "run: python -m plant.effects_page > docs/effects.md"
+    )
 
 
-# ---- neutral is an identity ---------------------------------------------------------------------------------------------------------
+# ---- neutral is an identity ------------------------------------------------------------------------------------------
 
 # effect -> (result of its step at neutral, what it must be), for any numbers a, b and any positive c
 IDENTITIES = {
@@ -235,7 +244,12 @@ def test_neutral_effect_is_an_exact_identity(name: str, a: float, b: float, c: f
 
 
 @settings(max_examples=30)
-@given(st.lists(st.floats(-0.045, 0.045), min_size=5, max_size=40), st.floats(0.0, 0.048), st.floats(5e6, 25e6), st.floats(-40.0, 120.0))
+@given(
+    st.lists(st.floats(-0.045, 0.045), min_size=5, max_size=40),
+    st.floats(0.0, 0.048),
+    st.floats(5e6, 25e6),
+    st.floats(-40.0, 120.0),
+)
 def test_neutral_chain_with_every_effect_in_it_is_the_nominal_chain_bit_by_bit(currents, stroke, p_s, t_oil) -> None:
     machine = build_plant()
     assert not machine.p[[DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS], 0].any()
@@ -257,7 +271,7 @@ def test_neutral_chain_with_every_effect_in_it_is_the_nominal_chain_bit_by_bit(c
     assert np.allclose(runs[0], runs[2], rtol=1e-12, atol=1e-15)
 
 
-# ---- where an effect shows: stages driven by the same log ---------------------------------------------------------------------------
+# ---- where an effect shows: stages driven by the same log ------------------------------------------------------------
 
 T = np.arange(0.0, 40.0, 0.01)
 SAMPLES = len(T)
@@ -266,7 +280,9 @@ SAMPLES = len(T)
 @lru_cache(maxsize=1)
 def log() -> dict[str, np.ndarray]:
     """Inputs that excite every effect: both stops, slams, slow motion, reversals, dwells, warming oil."""
-    n_dem = np.interp(T, [0, 3, 10, 12, 18, 20, 22, 22.6, 25, 32, 36, 40], [60, 60, 95, 95, 70, 70, 74, 73.4, 98, 98, 62, 62])
+    n_dem = np.interp(
+        T, [0, 3, 10, 12, 18, 20, 22, 22.6, 25, 32, 36, 40], [60, 60, 95, 95, 70, 70, 74, 73.4, 98, 98, 62, 62]
+    )
     n_r = lockstep(Stimulus.of(n_dem)).columns["n_engine"]
     x = 24.0 + 20.0 * np.sin(0.5 * T) + 4.5 * np.sin(2.3 * T)
     i = 4.0 * np.sin(2.0 * np.pi * T / 7.0) + 2.0 * np.sin(9.0 * T) + np.where((T > 20) & (T < 20.6), 40.0, 0.0)
@@ -341,10 +357,16 @@ def servo_of(machine):
 
 @pytest.fixture(scope="module")
 def stage_outputs():
-    """{effect: {stage: output}} of every effect alone, None for the machine without it. A load is on the piston in all of them."""
+    """{effect: {stage: output}} of every effect alone, None for the machine without it. A load is on the piston in all
+    of them.
+    """
     base = machine_with(aero_load={"force": 2000.0})
     sets = [{}, *({name: SIZES[name]} for name in NAMES)]
-    wide = {"actuator": actuator_lanes(sets, base)[0], "linkage": linkage_lanes(sets, base)[0], "engine": engine_lanes(sets, base)}
+    wide = {
+        "actuator": actuator_lanes(sets, base)[0],
+        "linkage": linkage_lanes(sets, base)[0],
+        "engine": engine_lanes(sets, base),
+    }
     out = {}
     for j, effects in enumerate(sets):
         machine = machine_with(base, **effects)
@@ -370,7 +392,12 @@ def test_any_parameters_within_their_bounds_keep_every_stage_finite() -> None:
     sets += [everything_low, everything_high]
     x, s = actuator_lanes(sets, base)
     vanes, _ = linkage_lanes(sets, base)
-    assert np.isfinite(x).all() and np.isfinite(s).all() and np.isfinite(vanes).all() and np.isfinite(engine_lanes(sets, base)).all()
+    assert (
+        np.isfinite(x).all()
+        and np.isfinite(s).all()
+        and np.isfinite(vanes).all()
+        and np.isfinite(engine_lanes(sets, base)).all()
+    )
     assert np.all((s[chain.X] >= 0.0) & (s[chain.X] <= 0.048))
 
 
@@ -398,7 +425,12 @@ def everything_on():
 @pytest.mark.parametrize("lanes", [2, W, W + 2, SOME + 3, 40])
 def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
     base = everything_on()
-    singles = [{}, {"valve_null_bias": {"bias": -0.5}}, {"piston_friction": {"force": 900.0}}, {"linkage_backlash": {"vigv": 0.4}}]
+    singles = [
+        {},
+        {"valve_null_bias": {"bias": -0.5}},
+        {"piston_friction": {"force": 900.0}},
+        {"linkage_backlash": {"vigv": 0.4}},
+    ]
     sets = [singles[j % 4] for j in range(lanes)]
     x, s = actuator_lanes(sets, base, 600)
     vanes, _ = linkage_lanes(sets, base, 600)
@@ -417,7 +449,11 @@ KINDS = {
         {"oil_viscosity": {"coefficient": 3e-3}},
     ),
     "hysteresis": ({"valve_hysteresis": {"width": 1.0, "spread": 0.6}}, {"lvdt_gain": {"factor": 1.02}}),
-    "load": ({"aero_load": {"force": 3000.0}}, {"piston_friction": {"force": 900.0}}, {"oil_compressibility": {"compliance": 0.1}}),
+    "load": (
+        {"aero_load": {"force": 3000.0}},
+        {"piston_friction": {"force": 900.0}},
+        {"oil_compressibility": {"compliance": 0.1}},
+    ),
     "losses": ({"supply_pressure_droop": {"droop": 20.0}}, {"internal_leakage": {"coefficient": 2.0}}),
     "stiction": ({"piston_stiction": {"excess": 1500.0, "speed": 5.0}}, {"piston_friction": {"force": 900.0}}),
 }
@@ -476,7 +512,9 @@ def test_stages_alone_reproduce_the_closed_loop_that_made_the_log() -> None:
     machine.place_rings(s, tuple(np.deg2rad(c[k][0]) for k in ("vigv", "vgv1", "vgv2")))
     linkage_run(x, n_r, t_oil, T, 1e-2, machine.p, s, vanes)
     for k, stage in enumerate(("vigv", "vgv1", "vgv2")):
-        assert np.sqrt(np.mean((np.rad2deg(vanes[300:, k, 0]) - c[stage][300:]) ** 2)) < 0.006  # a fifth of the potentiometer's noise
+        assert (
+            np.sqrt(np.mean((np.rad2deg(vanes[300:, k, 0]) - c[stage][300:]) ** 2)) < 0.006
+        )  # a fifth of the potentiometer's noise
     s, speeds = machine.start(x[0], c["n_engine"][0]), np.empty((n, 1))
     engine_run(c["n_dem"], 1e-2, machine.p, s, speeds)
     assert np.max(np.abs(speeds[:, 0] - c["n_engine"])) < 0.01
@@ -496,12 +534,14 @@ def test_every_effect_on_gives_the_same_bits_without_compiling() -> None:
     assert found[0] == found[1] and len(found[0].strip()) == 64
 
 
-# ---- physics: demand and engine -----------------------------------------------------------------------------------------------------
+# ---- physics: demand and engine --------------------------------------------------------------------------------------
 
 
 def test_can_delay_shifts_the_demand_by_itself() -> None:
     n = np.interp(T, [0, 3, 10, 12, 18, 40], [60, 60, 95, 95, 70, 70])
-    late, prompt = (lockstep(Stimulus.of(n, n), plant=machine_with(**e)).columns for e in ({"can_delay": {"delay": 0.15}}, {}))
+    late, prompt = (
+        lockstep(Stimulus.of(n, n), plant=machine_with(**e)).columns for e in ({"can_delay": {"delay": 0.15}}, {})
+    )
     assert np.allclose(late["x_dem"][15:], prompt["x_dem"][:-15], atol=1e-9)
     assert np.array_equal(late["n_dem"], prompt["n_dem"])  # the log holds what the ECU sent
     assert np.array_equal(late["n_engine"], prompt["n_engine"])
@@ -557,7 +597,7 @@ def test_acceleration_limit_error_moves_the_slope_of_a_slam_up_only() -> None:
         assert s[chain.N_R, 0] - 70.0 == pytest.approx(slope, rel=1e-9)
 
 
-# ---- physics: valve and supply ------------------------------------------------------------------------------------------------------
+# ---- physics: valve and supply ---------------------------------------------------------------------------------------
 
 
 def test_one_milliampere_of_null_bias_creeps_by_a_fortieth_of_rated_speed() -> None:
@@ -576,9 +616,13 @@ def test_valve_hysteresis_is_as_wide_as_it_says_and_keeps_less_of_small_turns() 
     width = 2e-3
 
     def height_at_zero(amplitude, spread=1.0):
-        """Current (A) that counts at zero command, coming down from ``amplitude`` (A), after two rounds between +-amplitude."""
+        """Current (A) that counts at zero command, coming down from ``amplitude`` (A), after two rounds between
+        +-amplitude.
+        """
         plays = (0.0, 0.0, 0.0, 0.0)
-        for i in amplitude * np.concatenate([np.sin(np.linspace(0.0, 4.0 * np.pi, 4001)), np.sin(np.linspace(0.0, np.pi, 1001))]):
+        for i in amplitude * np.concatenate(
+            [np.sin(np.linspace(0.0, 4.0 * np.pi, 4001)), np.sin(np.linspace(0.0, np.pi, 1001))]
+        ):
             plays = valve_hysteresis.step(*plays, i, width, spread)
         return valve_hysteresis.mean(*plays)
 
@@ -586,7 +630,9 @@ def test_valve_hysteresis_is_as_wide_as_it_says_and_keeps_less_of_small_turns() 
     # Rayleigh: the remanence of a small loop grows with the square of its amplitude
     assert height_at_zero(0.1e-3) == pytest.approx(0.0, abs=1e-9) and height_at_zero(0.5e-3) < 0.12 * width
     # one play: nothing below half its width, then all but that half
-    assert height_at_zero(0.02, 0.0) == pytest.approx(0.5 * width) and height_at_zero(0.99e-3, 0.0) == pytest.approx(0.0, abs=1e-12)
+    assert height_at_zero(0.02, 0.0) == pytest.approx(0.5 * width) and height_at_zero(0.99e-3, 0.0) == pytest.approx(
+        0.0, abs=1e-12
+    )
     assert height_at_zero(1.5e-3, 0.0) == pytest.approx(0.5e-3)
 
 
@@ -597,12 +643,15 @@ def test_flow_saturation_limits_the_speed_and_leaves_slower_motion_alone() -> No
 
 
 def test_a_round_flow_saturation_adds_the_pressure_drops_of_two_orifices_in_series() -> None:
-    # dp = (v / a)^2 + (v / b)^2: the speed of both is 1 / sqrt(1 / a^2 + 1 / b^2), of the spool alone a, of the passage alone b
+    # dp = (v / a)^2 + (v / b)^2: the speed of both is 1 / sqrt(1 / a^2 + 1 / b^2), of the spool alone a, of the passage
+    # alone b
     for current in (0.005, 0.020, 0.040):
         a, b = speed(build_plant(), current, stroke=0.002), 0.100
         both = speed(machine_with(valve_flow_saturation={"limit": 100.0, "roundness": 1.0}), current, stroke=0.002)
         assert both == pytest.approx((a**-2 + b**-2) ** -0.5, rel=1e-9)
-        assert speed(machine_with(valve_flow_saturation={"limit": 100.0, "roundness": 0.5}), current, stroke=0.002) > both
+        assert (
+            speed(machine_with(valve_flow_saturation={"limit": 100.0, "roundness": 0.5}), current, stroke=0.002) > both
+        )
 
 
 def test_valve_lag_reaches_63_per_cent_after_its_time_constant() -> None:
@@ -630,7 +679,7 @@ def test_oil_viscosity_changes_the_speed_in_proportion_to_the_temperature() -> N
     assert speed(machine, 0.004, t_oil=70.0) / speed(machine, 0.004, t_oil=40.0) == pytest.approx(1.0 - 0.09, rel=1e-9)
 
 
-# ---- physics: actuator --------------------------------------------------------------------------------------------------------------
+# ---- physics: actuator -----------------------------------------------------------------------------------------------
 
 
 @given(st.lists(st.floats(-1e-4, 1e-4), min_size=1, max_size=60), st.floats(10.0, 1e4), st.floats(1e7, 1e9))
@@ -662,7 +711,9 @@ def test_friction_costs_speed_both_ways_and_motion_at_reversals() -> None:
 
 @pytest.mark.parametrize("x0", [0.004, 0.024, 0.044])
 def test_motion_lost_at_a_reversal_is_that_of_two_chambers_of_oil(x0: float) -> None:
-    """The chain against both chambers' pressures integrated: the piston stands until their difference has turned round."""
+    """The chain against both chambers' pressures integrated: the piston stands until their difference has
+    turned round.
+    """
     force, area, bulk, dead, p_s, h = 3000.0, 1.2e-3, 1.6e9, 0.0024, 21e6, 1e-6
     p1, p2, x, pushed, lost = 0.5 * (p_s - force / area), 0.5 * (p_s + force / area), x0, [0.0], [0.0]
     opening = 0.015 / np.sqrt(0.5 * p_s)
@@ -670,7 +721,9 @@ def test_motion_lost_at_a_reversal_is_that_of_two_chambers_of_oil(x0: float) -> 
         v1, v2 = area * (x + dead), area * (0.048 - x + dead)
         q1, q2 = area * opening * np.sqrt(p_s - p1), area * opening * np.sqrt(p2)
         v = (q1 * v2 + q2 * v1) / (area * (v1 + v2)) if area * (p1 - p2) >= force else 0.0
-        pushed.append(pushed[-1] + h * opening * np.sqrt(0.5 * (p_s - p1 + p2)))  # by a valve whose chambers are in balance
+        pushed.append(
+            pushed[-1] + h * opening * np.sqrt(0.5 * (p_s - p1 + p2))
+        )  # by a valve whose chambers are in balance
         p1, p2, x = p1 + h * bulk / v1 * (q1 - area * v), p2 + h * bulk / v2 * (area * v - q2), x + h * v
         lost.append(pushed[-1] - (x - x0))
     machine = machine_with(piston_friction={"force": force})
@@ -704,7 +757,11 @@ def test_leakage_lets_a_loaded_piston_creep() -> None:
 
 
 def test_nominal_oil_is_as_stiff_as_the_textbook_says() -> None:
-    bulk, area, stroke = 1.6e9, 1.2e-3, 0.048  # Merritt: least stiffness 4 B A^2 / V, V both chambers with 5 % dead volume each
+    bulk, area, stroke = (
+        1.6e9,
+        1.2e-3,
+        0.048,
+    )  # Merritt: least stiffness 4 B A^2 / V, V both chambers with 5 % dead volume each
     assert pytest.approx(4.0 * bulk * area**2 / (area * stroke * 1.1), rel=1e-12) == 1.0 / oil_compressibility.NOMINAL
 
 
@@ -732,7 +789,7 @@ def test_shifted_stops_hold_the_piston() -> None:
         assert drive(machine, 0.020, 500)[-1, chain.X] == pytest.approx(ends[1], abs=1e-15)
 
 
-# ---- physics: LVDT ------------------------------------------------------------------------------------------------------------------
+# ---- physics: LVDT ---------------------------------------------------------------------------------------------------
 
 
 @given(*(st.floats(a, b) for a, b in ((0.0, 0.048), (-5, 5), (0.8, 1.25), (-3, 3), (-0.2, 0.2), (0.0, 100.0), (-1, 1))))
@@ -746,7 +803,9 @@ def test_true_stroke_undoes_every_effect_of_the_lvdt(x, bias, factor, amplitude,
 
 
 def test_lvdt_effects_add_up_as_on_a_data_sheet() -> None:
-    machine = machine_with(lvdt_bias={"bias": 0.2}, lvdt_gain={"factor": 1.01}, lvdt_thermal_drift={"coefficient": 0.002})
+    machine = machine_with(
+        lvdt_bias={"bias": 0.2}, lvdt_gain={"factor": 1.01}, lvdt_thermal_drift={"coefficient": 0.002}
+    )
     assert chain.measured_stroke(0.020, machine.p, 0, 60.0) == pytest.approx(0.0202 + 0.0002 + 0.00004, abs=1e-15)
 
 
@@ -756,21 +815,28 @@ def test_lvdt_nonlinearity_is_nil_at_the_ends_and_in_the_middle() -> None:
 
 
 def test_the_windings_cubic_bends_without_a_gain() -> None:
-    """Odd about the middle, its size at both ends, and no straight part: a line through it by least squares is level."""
+    """Odd about the middle, its size at both ends, and no straight part: a line through it by least squares is
+    level.
+    """
     q = np.linspace(0.0, 1.0, 20001)
     error = np.array([lvdt_nonlinearity.step(x * 0.048, 0.048, 0.0, 1e-4) - x * 0.048 for x in q])
     assert error[[0, 10000, -1]] == pytest.approx([-1e-4, 0.0, 1e-4], abs=1e-15)
     assert abs(np.polyfit(q, error, 1)[0]) < 1e-7
     step = 1e-7
     for x in (0.0005, 0.011, 0.0475, -0.001, 0.049):
-        rise = lvdt_nonlinearity.step(x + step, 0.048, 2e-3, -5e-4) - lvdt_nonlinearity.step(x - step, 0.048, 2e-3, -5e-4)
+        rise = lvdt_nonlinearity.step(x + step, 0.048, 2e-3, -5e-4) - lvdt_nonlinearity.step(
+            x - step, 0.048, 2e-3, -5e-4
+        )
         assert lvdt_nonlinearity.slope(x, 0.048, 2e-3, -5e-4) == pytest.approx(rise / (2.0 * step), rel=1e-6)
 
 
 def test_lvdt_lag_trails_a_moving_piston_by_its_time_constant() -> None:
     machine = machine_with(lvdt_lag={"time_constant": 0.02})
     out = drive(machine, 0.004, 300, stroke=0.002)
-    behind_first, behind_both = out[-1, chain.X_LVDT] - out[-1, chain.READING], out[-1, chain.X] - out[-1, chain.READING]
+    behind_first, behind_both = (
+        out[-1, chain.X_LVDT] - out[-1, chain.READING],
+        out[-1, chain.X] - out[-1, chain.READING],
+    )
     assert behind_first == pytest.approx(0.015 * 0.02, rel=5e-3)
     assert behind_both == pytest.approx(0.015 * 0.021, rel=5e-3)
 
@@ -787,7 +853,7 @@ def test_slow_raster_keeps_the_delay_of_the_lvdt() -> None:
         assert s[chain.X, 0] - out[-1, 0] == pytest.approx(0.015 * delay, rel=1e-3)
 
 
-# ---- physics: linkage ---------------------------------------------------------------------------------------------------------------
+# ---- physics: linkage ------------------------------------------------------------------------------------------------
 
 
 def loop_of(machine, k, *, t=0.0, turns=(1e-3, 47e-3)):
@@ -864,7 +930,9 @@ def test_thermal_growth_turns_the_vane_by_its_coefficient() -> None:
     assert angles[1] - angles[0] == pytest.approx(0.02 * 25.0, rel=0.05)
 
 
-@pytest.mark.parametrize(("name", "row", "size"), [("crank_length_error", G_LB, 1.5), ("link_length_error", G_LC, -0.8)])
+@pytest.mark.parametrize(
+    ("name", "row", "size"), [("crank_length_error", G_LB, 1.5), ("link_length_error", G_LC, -0.8)]
+)
 def test_length_errors_are_those_of_the_linkages_equations(name, row, size) -> None:
     machine = machine_with(**{name: {"vgv1": size}})
     g = build_plant().p[GEOMETRY:, 0].copy()
@@ -903,7 +971,7 @@ def test_potentiometer_lag_trails_moving_vanes() -> None:
     assert np.interp(T[300] - 0.04, T[:400], prompt) == pytest.approx(late[300], abs=2e-5)
 
 
-# ---- model files --------------------------------------------------------------------------------------------------------------------
+# ---- model files -----------------------------------------------------------------------------------------------------
 
 
 def test_model_file_comes_back_as_it_was_written(tmp_path) -> None:
@@ -918,7 +986,9 @@ def test_model_file_comes_back_as_it_was_written(tmp_path) -> None:
 
 def test_model_fills_the_plants_rows_in_si() -> None:
     plain = build_plant()
-    model = Model(parameters={"linkage.vigv_play": 1.7, "actuator.flow_gain": 0.147}, effects={"lvdt_bias": {"bias": 0.3}})
+    model = Model(
+        parameters={"linkage.vigv_play": 1.7, "actuator.flow_gain": 0.147}, effects={"lvdt_bias": {"bias": 0.3}}
+    )
     machine = build_plant(model=model)
     assert machine.p[ROW["lvdt_bias"], 0] == pytest.approx(3e-4)
     assert machine.p[chain.PLAY, 0] / plain.p[chain.PLAY, 0] == pytest.approx(1.7 / 1.6)

@@ -1,7 +1,7 @@
 """Each effect against its docstring's equation, written down here once more in numpy; loads and droop against physics.
 
-Nothing here calls what it checks: lanes and chain share their kernel, so that one against the other proves nothing about it. The numbers
-that stand in docs/effects.md (temperature of reference, stiffness of the oil) are written out.
+Nothing here calls what it checks: lanes and chain share their kernel, so that one against the other proves nothing
+about it. The numbers that stand in docs/effects.md (temperature of reference, stiffness of the oil) are written out.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ def dahl(y: float, travel: float, distance: float) -> float:
 
 V = (-0.15, -0.01, 0.0, 0.003, 0.15)
 EQUATIONS: dict[str, tuple[Callable[..., Any], list[tuple[float, ...]]]] = {
-    "acceleration_limit_error": (lambda n, e: n + e if n + e > 0.01 else 0.01, each((8.0,), (-8.5, -7.995, -2.0, 0.0, 3.0))),
+    "acceleration_limit_error": (
+        lambda n, e: n + e if n + e > 0.01 else 0.01,
+        each((8.0,), (-8.5, -7.995, -2.0, 0.0, 3.0)),
+    ),
     "aero_load": (lambda n, f: f * (n / 100.0) ** 2, each((0.0, 50.0, 100.0, 110.0), (-900.0, 0.0, 3500.0))),
     "can_delay": (lambda t, d: t - d, each((0.0, 1.0, 7.25), (0.0, 0.02, 0.31))),
     "controller_gain_error": (lambda g, f: g * f, each((16e3, 100.0), (0.5, 1.0, 1.2))),
@@ -64,18 +67,32 @@ EQUATIONS: dict[str, tuple[Callable[..., Any], list[tuple[float, ...]]]] = {
         each(V, (-3e6, 0.0, 2e6), (1.25e6,), (0.0, 1.5e-9, 2e-8, 1.0)),
     ),
     "link_length_error": (lambda a, e: a + e, each((0.1,), (-0.001, 0.0, 0.002))),
-    "linkage_backlash": (lambda w, e, r: np.clip(w + e * r, 0, None), each((0.02,), (-0.03, -0.01, 0.0, 0.03), (0.6, 1.4))),
-    "linkage_compliance": (lambda th, n, c: th - c * (n / 100.0) ** 2, each((-0.1, 0.2), (0.0, 60.0, 105.0), (-0.01, 0.0, 0.02))),
+    "linkage_backlash": (
+        lambda w, e, r: np.clip(w + e * r, 0, None),
+        each((0.02,), (-0.03, -0.01, 0.0, 0.03), (0.6, 1.4)),
+    ),
+    "linkage_compliance": (
+        lambda th, n, c: th - c * (n / 100.0) ** 2,
+        each((-0.1, 0.2), (0.0, 60.0, 105.0), (-0.01, 0.0, 0.02)),
+    ),
     "linkage_friction": (dahl, each((-1.0, -0.3, 0.0, 0.7, 1.0), (-0.02, -0.001, 0.002, 0.05), (0.004, 0.02))),
-    "linkage_wear": (lambda w, e, r, t: w + e * r * t if t > 0 else w, each((0.02,), (0.0, 1e-6), (0.6, 1.4), (-5.0, 0.0, 3000.0))),
+    "linkage_wear": (
+        lambda w, e, r, t: w + e * r * t if t > 0 else w,
+        each((0.02,), (0.0, 1e-6), (0.6, 1.4), (-5.0, 0.0, 3000.0)),
+    ),
     "lvdt_bias": (lambda x, b: x + b, each((0.0, 0.03), (-1e-3, 0.0, 2e-3))),
     "lvdt_gain": (lambda x, f: x * f, each((0.0, 0.03), (0.9, 1.0, 1.1))),
     "lvdt_lag": (lambda y, x, a: (1 - a) * y + a * x, each((0.01, 0.02), (0.01, 0.03), (0.1, 0.6, 1.0))),
     "lvdt_nonlinearity": (  # Legendre's third polynomial, held beyond the stroke
         lambda x, s, a, c: x - a * np.sin(2 * np.pi * x / s) + c * Legendre.basis(3)(np.clip(2 * x / s - 1, -1, 1)),
-        each((-0.001, 0.0, 0.011, 0.024, 0.04, 0.048, 0.05), (0.048,), (-1e-3, 0.0, 2e-3, 1.0), (-5e-4, 0.0, 1e-3, 1.0)),
+        each(
+            (-0.001, 0.0, 0.011, 0.024, 0.04, 0.048, 0.05), (0.048,), (-1e-3, 0.0, 2e-3, 1.0), (-5e-4, 0.0, 1e-3, 1.0)
+        ),
     ),
-    "lvdt_thermal_drift": (lambda x, t, c: x + c * (t - 40.0), each((0.02,), (-20.0, 40.0, 90.0), (-1e-6, 0.0, 2e-6, 1.0))),
+    "lvdt_thermal_drift": (
+        lambda x, t, c: x + c * (t - 40.0),
+        each((0.02,), (-20.0, 40.0, 90.0), (-1e-6, 0.0, 2e-6, 1.0)),
+    ),
     "oil_compressibility": (
         lambda f, v, c, d: -(SOFT + c) * f - c * d * v,
         each((-2000.0, 0.0, 4000.0), (-0.1, 0.0, 0.05), (0.0, 5e-8), (0.0, 1500.0)),
@@ -92,14 +109,20 @@ EQUATIONS: dict[str, tuple[Callable[..., Any], list[tuple[float, ...]]]] = {
     "pot_bias": (lambda n, b: n + b, each((0.001,), (-0.01, 0.0, 0.01))),
     "pot_gain": (lambda v, f: v * f, each((-0.3, 0.2), (0.9, 1.0, 1.1))),
     "pot_lag": (lambda n, e: n + e, each((0.01,), (-0.005, 0.0, 0.1))),
-    "ring_eccentricity": (lambda th, a, ph: th + a * np.sin(th + ph), each((-0.1, 0.0, 0.15), (0.0, 0.01, 1.0), (-2.0, 0.0, 1.0))),
+    "ring_eccentricity": (
+        lambda th, a, ph: th + a * np.sin(th + ph),
+        each((-0.1, 0.0, 0.15), (0.0, 0.01, 1.0), (-2.0, 0.0, 1.0)),
+    ),
     "rotor_lag_error": (lambda n, e: n + e if n + e > 0.01 else 0.01, each((1.2,), (-1.5, -1.195, -0.3, 0.0, 2.0))),
     "schedule_error": (lambda x, e: x + e, each((0.01, 0.04), (-0.001, 0.0, 0.002))),
     "supply_pressure_droop": (  # v^2 = v0^2 (1 - droop |v| / p), its root of v0's sign
         lambda v0, p, d: float(np.sign(v0) * max(np.roots([1.0, v0 * v0 * d / p, -v0 * v0]).real)),
         each(V, (5e5, 8e6, 21e6), (0.0, 1.0, 2e6, 6e7)),
     ),
-    "thermal_growth": (lambda th, t, c, r: th + c * r * (t - 40.0), each((0.1,), (-20.0, 40.0, 90.0), (-1e-3, 0.0, 2e-3, 1.0), (0.6, 1.4))),
+    "thermal_growth": (
+        lambda th, t, c, r: th + c * r * (t - 40.0),
+        each((0.1,), (-20.0, 40.0, 90.0), (-1e-3, 0.0, 2e-3, 1.0), (0.6, 1.4)),
+    ),
     "trend_threshold_error": (lambda a, f: a * f, each((0.06, 0.5), (0.5, 1.0, 3.0))),
     "valve_dead_band": (
         lambda u, h: float(np.sign(u) * np.clip(abs(u) - h, 0, None)),
@@ -123,7 +146,8 @@ def test_an_effect_is_its_equation(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("x", "amplitude", "cubic"), each((-0.001, 0.0007, 0.011, 0.024, 0.04, 0.05), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3))
+    ("x", "amplitude", "cubic"),
+    each((-0.001, 0.0007, 0.011, 0.024, 0.04, 0.05), (-1e-3, 0.0, 2e-3), (-5e-4, 0.0, 1e-3)),
 )
 def test_the_slope_of_the_reading_is_its_derivative(x: float, amplitude: float, cubic: float) -> None:
     lvdt, h = effect("lvdt_nonlinearity"), 1e-7
@@ -154,7 +178,9 @@ def test_magnetic_hysteresis_is_four_plays_side_by_side() -> None:
 
 @pytest.mark.parametrize("x", [0.0, 0.01, 0.024, 0.048])
 def test_columns_of_oil_are_unequal_off_the_middle(x: float) -> None:
-    assert effect("piston_friction").off_middle(x, 1 / 0.048) == pytest.approx(1 - 2 * (x + 0.0024) / (0.048 + 0.0048), abs=1e-12)
+    assert effect("piston_friction").off_middle(x, 1 / 0.048) == pytest.approx(
+        1 - 2 * (x + 0.0024) / (0.048 + 0.0048), abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(("off", "jump", "ways"), each((-3.0, 0.0, 5.0), (-1.0, 0.0, 2.0), (0.0, 0.4, 1.0, 1.7)))
@@ -170,10 +196,12 @@ def test_friction_in_the_joints_holds_the_vane_back_by_half_its_width() -> None:
 
 def test_droop_without_pressure_to_spare_stops_no_clock() -> None:
     """No pressure left: no speed to lose, no division by nothing."""
-    assert effect("supply_pressure_droop").step(0.01, 0.0, 1e6) == pytest.approx(0.01 * (math.sqrt(1 + 1e8) - 1e4), rel=1e-9)
+    assert effect("supply_pressure_droop").step(0.01, 0.0, 1e6) == pytest.approx(
+        0.01 * (math.sqrt(1 + 1e8) - 1e4), rel=1e-9
+    )
 
 
-# ---- loads in the chain: the speed at which pressures balance --------------------------------------------------------------------------
+# ---- loads in the chain: the speed at which pressures balance --------------------------------------------------------
 
 AREA, SUPPLY, RATED, FASTEST = 1.2e-3, 21e6, 0.040, 0.150
 
@@ -183,7 +211,8 @@ def balance(i: float, load: float, droop: float = 0.0, leakage: float = 0.0, dra
 
     What the valve lets in is what the piston and the leak take.
 
-    The line loses droop |q|, the load takes its share of what is left, the orifice the rest; q is the valve's flow per area.
+    The line loses droop |q|, the load takes its share of what is left, the orifice the rest; q is the valve's flow per
+    area.
     """
     way = math.copysign(1.0, i)
 
@@ -200,7 +229,9 @@ def balance(i: float, load: float, droop: float = 0.0, leakage: float = 0.0, dra
 @pytest.mark.parametrize(("droop", "leakage"), [(0.0, 0.0), (60e6, 0.0), (0.0, 1.5e-9), (60e6, 1.5e-9)])
 def test_speed_under_load_is_where_the_pressures_balance(i: float, load: float, droop: float, leakage: float) -> None:
     machine = machine_with(
-        aero_load={"force": load}, supply_pressure_droop={"droop": droop * 1e-6}, internal_leakage={"coefficient": leakage * 1e9}
+        aero_load={"force": load},
+        supply_pressure_droop={"droop": droop * 1e-6},
+        internal_leakage={"coefficient": leakage * 1e9},
     )
     assert speed(machine, i, n_r=100.0) == pytest.approx(balance(i, load, droop, leakage), rel=1e-6)
 
@@ -247,13 +278,15 @@ def test_friction_takes_the_energy_of_coulombs_law(way: float) -> None:
     assert work == pytest.approx(spring, rel=2e-3)
 
 
-# ---- all of them together -----------------------------------------------------------------------------------------------------------
+# ---- all of them together --------------------------------------------------------------------------------------------
 
 
 class Drive:
-    """Valve, piston and LVDT of docs/effects.md, one column of oil on either side, in plain Python: 0.1 ms at a time, SI.
+    """Valve, piston and LVDT of docs/effects.md, one column of oil on either side, in plain Python: 0.1 ms at a time,
+    SI.
 
-    Effects act, each by its equation above, in the order of the signal flow. ``sizes`` are those of `machine_with`, in the library's units.
+    Effects act, each by its equation above, in the order of the signal flow. ``sizes`` are those of `machine_with`, in
+    the library's units.
     """
 
     def __init__(self, machine: Any, sizes: dict[str, dict[str, float]], stroke: float) -> None:
@@ -289,7 +322,10 @@ class Drive:
         left = p_s - (pressure if opening > 0 else -pressure)
         v = opening * gain * math.sqrt(max(left, 0) / SUPPLY)
         v = law("supply_pressure_droop", v, left, size("supply_pressure_droop", "droop") * 1e6) if v else 0.0
-        limit, roundness = size("valve_flow_saturation", "limit", 1e3) * 1e-3, size("valve_flow_saturation", "roundness")
+        limit, roundness = (
+            size("valve_flow_saturation", "limit", 1e3) * 1e-3,
+            size("valve_flow_saturation", "roundness"),
+        )
         v = law("valve_flow_saturation", v, limit, roundness)
         drag, compliance = size("oil_compressibility", "drag", 1500.0), size("oil_compressibility", "compliance") * 1e-6
         v = law("internal_leakage", v, pressure, drag / AREA, size("internal_leakage", "coefficient") * 1e-9)
@@ -333,10 +369,17 @@ DRAWN: dict[str, Callable[[np.random.Generator], dict[str, float]]] = {
 @pytest.mark.parametrize("seed", range(24))
 def test_the_drive_with_several_effects_is_their_equations_in_the_order_of_the_flow(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    names = list(DRAWN) if seed % 4 == 0 else [str(n) for n in rng.choice(list(DRAWN), rng.integers(1, 6), replace=False)]
+    names = (
+        list(DRAWN) if seed % 4 == 0 else [str(n) for n in rng.choice(list(DRAWN), rng.integers(1, 6), replace=False)]
+    )
     sizes = {name: {k: float(v) for k, v in DRAWN[name](rng).items()} for name in names}
     machine = machine_with(**sizes)
-    stroke, n_r, p_s, t_oil = float(rng.uniform(0.002, 0.046)), float(rng.uniform(40, 105)), float(rng.uniform(12e6, 24e6)), 65.0
+    stroke, n_r, p_s, t_oil = (
+        float(rng.uniform(0.002, 0.046)),
+        float(rng.uniform(40, 105)),
+        float(rng.uniform(12e6, 24e6)),
+        65.0,
+    )
     s, by_hand = machine.start(stroke=stroke, n_r=n_r, t_oil=t_oil), Drive(machine, sizes, stroke)
     by_hand.lagged, by_hand.give = float(s[chain.LAGGED, 0]), float(s[chain.GIVE, 0])
     current = 0.0

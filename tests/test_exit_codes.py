@@ -46,7 +46,9 @@ def test_an_internal_error_of_any_command_leaves_with_70(
     monkeypatch.setattr(importlib.import_module(COMMANDS[name][0]), "add_options", broken)
     assert main([name]) == terminal.DEFECT == 70
     line = complaint(capsys.readouterr().err)
-    assert "KeyError: 'level.square_root' (test_exit_codes.py:" in line and "defect of VaneLoop, not of your input" in line
+    assert (
+        "KeyError: 'level.square_root' (test_exit_codes.py:" in line and "defect of VaneLoop, not of your input" in line
+    )
     (file,) = kept.glob("vaneloop-*.traceback")
     assert str(file) in line and "in broken" in file.read_text(encoding="utf-8")
 
@@ -60,7 +62,9 @@ def test_an_error_deep_inside_leaves_with_70(
     assert "internal error" in complaint(capsys.readouterr().err)
 
 
-def test_the_traceback_is_printed_where_asked_for(kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_traceback_is_printed_where_asked_for(
+    kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("VANELOOP_DEBUG", "1")
     assert terminal.run(lambda: broken() or 0) == 70
     err = capsys.readouterr().err
@@ -116,6 +120,8 @@ def test_a_module_run_by_itself_leaves_with_70(module: str, tmp_path: Path) -> N
         f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)\n"
     )
     env = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
-    p = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
+    p = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False
+    )
     assert p.returncode == 70, p.stderr
     assert "internal error" in complaint(p.stderr) and list(tmp_path.glob("vaneloop-*.traceback"))

@@ -1,6 +1,8 @@
-"""The firmware does what its pages say: tick by tick as a second controller written from them, and at each documented number to both sides.
+"""The firmware does what its pages say: tick by tick as a second controller written from them, and at each documented
+number to both sides.
 
-`tests/reference_controller.py` is that second controller. Numbers that stand in docs/controller.md are written out here once more.
+`tests/reference_controller.py` is that second controller. Numbers that stand in docs/controller.md are written out here
+once more.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ def rows(n: int, n_dem=80.0, n_r=None, **more) -> np.ndarray:
 
 
 class Machine:
-    """Firmware on a piston that integrates its current; ``beside`` a reference that gets the same inputs, if there is one."""
+    """Firmware on a piston that integrates its current; ``beside`` a reference that gets the same inputs, if there is
+    one.
+    """
 
     def __init__(self, strategy="dual", stroke=0.020, beside: bool = False, table_input="n_r", **changed):
         scalars = CALS[strategy].k.copy()
@@ -70,9 +74,33 @@ class Machine:
         assert MODES[int(z[fw.MODE])] == b.mode, f"mode at tick {i}"
         bits = sum(b.faults[name].on << bit for bit, name in enumerate(FAULTS))
         assert int(z[fw.FAULT_BITS]) == bits, f"faults at tick {i}"
-        ours = z[[fw.X_MEAS, fw.X_DEM, fw.X_SERVO, fw.I_CMD, fw.INTEGRAL, fw.N_R, fw.DIRECTION, fw.BLEND, fw.X_TARGET, fw.TREND_RATE]]
+        ours = z[
+            [
+                fw.X_MEAS,
+                fw.X_DEM,
+                fw.X_SERVO,
+                fw.I_CMD,
+                fw.INTEGRAL,
+                fw.N_R,
+                fw.DIRECTION,
+                fw.BLEND,
+                fw.X_TARGET,
+                fw.TREND_RATE,
+            ]
+        ]
         theirs = [b.x, b.demand, b.reference, b.i, b.integral, b.n, b.d, b.blend, b.target, b.rate]
-        names = ("x_meas", "x_dem", "x_servo", "i_cmd", "integral", "n_r", "direction", "blend", "x_target", "trend_rate")
+        names = (
+            "x_meas",
+            "x_dem",
+            "x_servo",
+            "i_cmd",
+            "integral",
+            "n_r",
+            "direction",
+            "blend",
+            "x_target",
+            "trend_rate",
+        )
         for name, v, w in zip(names, ours, theirs, strict=True):
             assert abs(v - w) <= 1e-10, f"{name} at tick {i}: {v!r}, by the page {w!r}"
 
@@ -96,7 +124,7 @@ def first(states: np.ndarray, fault: str) -> int | None:
     return int(hits[0]) + 1 if hits.size else None
 
 
-# ---- the whole controller, tick by tick -----------------------------------------------------------------------------------------------
+# ---- the whole controller, tick by tick ------------------------------------------------------------------------------
 
 
 def manoeuvres(seed: int, n: int = 3000) -> np.ndarray:
@@ -105,7 +133,9 @@ def manoeuvres(seed: int, n: int = 3000) -> np.ndarray:
     at = np.cumsum(rng.integers(100, 500, n // 200))
     to = 80.0 + rng.choice([0.2, 0.4, 2.0, 18.0], len(at)) * rng.normal(0.0, 1.0, len(at))
     speed = np.interp(np.arange(n), at, np.clip(to, 0.0, 120.0))
-    return rows(n, speed, np.convolve(np.pad(speed, (99, 0), "edge"), np.ones(100) / 100.0, "valid") + rng.normal(0.0, 0.02, n))
+    return rows(
+        n, speed, np.convolve(np.pad(speed, (99, 0), "edge"), np.ones(100) / 100.0, "valid") + rng.normal(0.0, 0.02, n)
+    )
 
 
 @pytest.mark.parametrize(("strategy", "table_input"), [("dual", "n_r"), ("dual", "n_dem"), ("single", "n_r")])
@@ -117,7 +147,9 @@ def test_ordinary_runs_are_those_of_the_page(strategy, table_input):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_bad_days_are_those_of_the_page(seed):
-    """Silence, refused and insane frames, standby, an LVDT that jumps, freezes, drops out, a weak and a blocked piston, in any order."""
+    """Silence, refused and insane frames, standby, an LVDT that jumps, freezes, drops out, a weak and a blocked piston,
+    in any order.
+    """
     rng = np.random.default_rng(seed)
     m = Machine(stroke=rng.uniform(0.0, 0.048), beside=True)
     for _ in range(8):
@@ -147,7 +179,7 @@ def test_bad_days_are_those_of_the_page(seed):
     assert m.mode == "RUN" and not m.faults
 
 
-# ---- each number of docs/controller.md, to both sides --------------------------------------------------------------------------------
+# ---- each number of docs/controller.md, to both sides ----------------------------------------------------------------
 
 
 def held(machine: Machine, n: int, x: float | np.ndarray, current: float) -> np.ndarray:
@@ -167,7 +199,9 @@ def held(machine: Machine, n: int, x: float | np.ndarray, current: float) -> np.
 def test_a_current_at_either_limit_for_a_second_is_a_fault(way):
     """Extend and retract; the last tick but one is not, and a limit left for one tick starts the second anew."""
     m = Machine(tracking_limit=1.0, stroke=0.024).running(80.0)
-    far = m.play(rows(1400, 80.0 + way * 18.0, strength=0.0, x=0.0))  # a blocked piston: the stuck fault is masked below
+    far = m.play(
+        rows(1400, 80.0 + way * 18.0, strength=0.0, x=0.0)
+    )  # a blocked piston: the stuck fault is masked below
     assert first(far, "lvdt_stuck")  # the other guard is quicker there
     m = Machine(tracking_limit=1.0, stuck_time=10.0).running(80.0)
     r = rows(3000, 80.0 + way * 18.0, strength=0.0)
@@ -186,7 +220,9 @@ def test_the_integral_stops_at_the_limit_and_may_always_come_back(way):
     fw.servo_step(z, k, 0.020 + way * 0.005, 0.0)
     assert z[fw.I_CMD] == way * 0.040 and z[fw.INTEGRAL] == way * 0.010 and z[fw.SATURATED] == 1.0
     fw.servo_step(z, k, 0.020 - way * 1e-4, way * 1.0)  # limited by the feed-forward, with the error the other way
-    assert z[fw.I_CMD] == way * 0.040 and z[fw.INTEGRAL] == pytest.approx(way * (0.010 - 100.0 * 1e-4 * 1e-3), abs=1e-12)
+    assert z[fw.I_CMD] == way * 0.040 and z[fw.INTEGRAL] == pytest.approx(
+        way * (0.010 - 100.0 * 1e-4 * 1e-3), abs=1e-12
+    )
     assert z[fw.SATURATED] == 1.0
     fw.servo_step(z, k, 0.020, 0.0)
     assert z[fw.SATURATED] == 0.0 and z[fw.I_CMD] == pytest.approx(z[fw.INTEGRAL])
@@ -306,7 +342,9 @@ def test_what_500_mm_per_second_can_just_do_is_no_jump(way):
 
 
 def test_a_good_sample_takes_back_a_tenth_of_a_bad_one():
-    """One bad in eleven never adds up; one in ten does, slowly: 200 bad ones gain nothing, two bad to eighteen good gain a fifth a turn."""
+    """One bad in eleven never adds up; one in ten does, slowly: 200 bad ones gain nothing, two bad to eighteen good
+    gain a fifth a turn.
+    """
     m = Machine().running(80.0)
     r = rows(3300)
     r[::11, 5] = np.nan
@@ -359,7 +397,9 @@ def test_a_speed_counts_from_0_to_120_per_cent(speed, good, column):
     assert (states[0, (fw.N_DEM, fw.N_R_RAW)[column]] == speed) == good
 
 
-@pytest.mark.parametrize(("asked", "good", "run"), [(0.0, True, False), (1.0, True, True), (-1e-9, False, True), (1.0000001, False, True)])
+@pytest.mark.parametrize(
+    ("asked", "good", "run"), [(0.0, True, False), (1.0, True, True), (-1e-9, False, True), (1.0000001, False, True)]
+)
 def test_a_mode_request_is_0_or_1(asked, good, run):
     m = Machine().running(80.0)
     states = m.play(rows(1, request=asked))
@@ -396,7 +436,7 @@ def test_a_table_is_exact_at_each_of_its_points():
             assert fw.look_up(0, 1, table, v) == pytest.approx(np.interp(v, *table), abs=1e-12)
 
 
-# ---- direction: the times of the page ------------------------------------------------------------------------------------------------
+# ---- direction: the times of the page --------------------------------------------------------------------------------
 
 
 def turn_time(rate: float, side: float) -> tuple[float, int]:
@@ -429,7 +469,9 @@ def test_a_reversal_turns_beyond_a_quarter_per_cent_moving_and_half_a_per_cent_c
     """A quarter at 2 %/s; creeping at 0.04 %/s the whole half."""
     rate = 2.0 if steps == 1 else 0.04
     n = max(int(back / rate * 100), 1)
-    demand = 80.0 + side * np.concatenate([np.zeros(400), -back * np.arange(1, n + 1) / n, np.full(8 if rate == 2.0 else 30, -back)])
+    demand = 80.0 + side * np.concatenate(
+        [np.zeros(400), -back * np.arange(1, n + 1) / n, np.full(8 if rate == 2.0 else 30, -back)]
+    )
     demand = np.append(demand, np.full(3, demand[-1]))
     z = new_state()
     z[fw.TREND_N] = z[fw.TREND_TURN] = z[fw.TREND_LAST] = 80.0
@@ -457,7 +499,9 @@ def test_a_turn_takes_ten_steps_without_a_gap():
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize(("back", "rate", "due"), [(0.25, 1.0, False), (0.26, 0.06, False), (0.26, 0.061, True), (0.5, 0.0, False)])
+@pytest.mark.parametrize(
+    ("back", "rate", "due"), [(0.25, 1.0, False), (0.26, 0.06, False), (0.26, 0.061, True), (0.5, 0.0, False)]
+)
 def test_what_is_just_at_a_limit_of_the_direction_is_not_beyond_it(back, rate, due, side):
     k = CALS["dual"].k.copy()
     k[fw.TREND_BETA] = 0.0  # the rate stays
@@ -469,7 +513,7 @@ def test_what_is_just_at_a_limit_of_the_direction_is_not_beyond_it(back, rate, d
     assert (z[fw.TREND_TIMER] > 0.0) == due
 
 
-# ---- a calibration of one's own ------------------------------------------------------------------------------------------------------
+# ---- a calibration of one's own --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("beside", "whole"), [(0.45, 0), (-0.45, 0), (0.55, 1)])
@@ -523,7 +567,7 @@ def test_a_pause_without_end_leaves_a_state_of_finite_numbers():
     assert np.isfinite(m.z).all() and m.mode == "FAIL_SAFE" and m.faults == {"demand_stale", "paused"}
 
 
-# ---- play and learning: each step from any state -------------------------------------------------------------------------------------
+# ---- play and learning: each step from any state ---------------------------------------------------------------------
 
 
 def any_state(rng: random.Random) -> np.ndarray:
@@ -567,7 +611,9 @@ def any_state(rng: random.Random) -> np.ndarray:
         z[fw.HIGHEST + j] = expected + pick([0.0, 2.0, 5.0, 7.0]) * DEG
     if rng.random() < 0.5:  # the vane near its target, the stroke somewhere in the gap
         strokes, vigv = CALS["inverse"].angles[:2]
-        goal = np.interp(np.interp(z[fw.SPEED], *CALS["inverse"].table[[0, 3]]), strokes, vigv) + rng.gauss(0.0, 0.2) * DEG
+        goal = (
+            np.interp(np.interp(z[fw.SPEED], *CALS["inverse"].table[[0, 3]]), strokes, vigv) + rng.gauss(0.0, 0.2) * DEG
+        )
         width = 1.6 * DEG + z[fw.WIDTH_IN_USE]
         z[fw.FARTHEST] = goal + 0.5 * z[fw.ENGAGED] * width - z[fw.OFFSET_IN_USE]
         stroke = np.interp(z[fw.FARTHEST] - z[fw.ENGAGED] * rng.uniform(-0.1, 1.1) * width, vigv, strokes)
@@ -581,7 +627,9 @@ def any_machine(rng: random.Random) -> np.ndarray:
     z, pick, ms = any_state(rng), rng.choice, 1e-3
     mode = z[fw.MODE] = rng.randrange(5)
     z[fw.TICKS] = pick([0, 40, 48, 49, 50, 60] if mode == fw.INIT else [100, 200, 200, 300, 509, 999])
-    z[fw.DEMAND_SEEN], z[fw.RUN_REQUEST], z[fw.LVDT_GOOD], z[fw.SATURATED] = [rng.random() < chance for chance in (0.8, 0.7, 0.9, 0.2)]
+    z[fw.DEMAND_SEEN], z[fw.RUN_REQUEST], z[fw.LVDT_GOOD], z[fw.SATURATED] = [
+        rng.random() < chance for chance in (0.8, 0.7, 0.9, 0.2)
+    ]
     z[fw.REJECT_BUCKET] = pick([0.0, 0.0, 0.005, 0.4, 3.0, 4.005, 4.02, 5.0])
     z[fw.TREND_N] = z[fw.TREND_LAST] = z[fw.N_DEM] + pick([0.0, 0.1, 0.3, -0.1, -0.3])
     z[fw.TREND_LAST] += pick([0.0, 0.0, 0.02, -0.02, 0.6, -0.6])
@@ -593,7 +641,10 @@ def any_machine(rng: random.Random) -> np.ndarray:
     z[fw.X_REACH] = pick([0.0, 0.0, 1e-3, 1.0])
     z[fw.STUCK_X] = z[fw.X_MEAS] + pick([0.0, 9e-5, 1.1e-4, 1e-3]) * pick([1.0, -1.0])
     z[fw.STUCK_TIMER] = pick([0, 100, 198, 199, 200]) * ms
-    z[fw.INTEGRAL], z[fw.I_CMD] = pick([0.0, 0.01, -0.01, 0.03999, -0.03999]), pick([0.0, 0.0079, -0.0079, 0.0081, -0.0081, 0.04])
+    z[fw.INTEGRAL], z[fw.I_CMD] = (
+        pick([0.0, 0.01, -0.01, 0.03999, -0.03999]),
+        pick([0.0, 0.0079, -0.0079, 0.0081, -0.0081, 0.04]),
+    )
     z[fw.RECOVER_TIMER], z[fw.DEGRADED_TIMER] = (pick([0, 100, 498, 499]) * ms for _ in range(2))
     few = rng.random() < 0.7
     for bit, f in enumerate(taken_from(z).faults.values()):
@@ -614,7 +665,9 @@ def any_inputs(rng: random.Random, z: np.ndarray) -> np.ndarray:
     row[fw.IN_FRESH] = rng.random() < 0.6
     row[fw.IN_REJECTED] = pick([0.0, 0.0, 0.0, 0.5, 1.0, 2.0, 5.0, -1.0, math.nan])
     row[fw.IN_MODE_REQUEST] = pick([0.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.51, -0.01, 1.01, np.nan])
-    row[fw.IN_X_LVDT] = z[fw.X_MEAS] + pick([0.0, 1e-5, 0.9e-4, 1.1e-4, 0.499e-3, 0.501e-3, 1.499e-3, 1.501e-3, 0.01]) * pick([1.0, -1.0])
+    row[fw.IN_X_LVDT] = z[fw.X_MEAS] + pick(
+        [0.0, 1e-5, 0.9e-4, 1.1e-4, 0.499e-3, 0.501e-3, 1.499e-3, 1.501e-3, 0.01]
+    ) * pick([1.0, -1.0])
     if rng.random() < 0.15:
         row[fw.IN_X_LVDT] = pick([-0.000999, -0.001001, 0.048999, 0.049001, np.nan, np.inf])
     for j in range(3):
@@ -628,7 +681,12 @@ def taken_from(z: np.ndarray, table_input: str = "n_r", strategy: str = "adaptiv
     b = Reference(CALS[strategy], strategy, table_input, numbers(**changed))
     b.ticks, b.i, b.reach, b.plausible = int(z[fw.TICKS]), z[fw.I_CMD], z[fw.X_REACH], z[fw.LVDT_GOOD] == 1.0
     b.stuck_from, b.stuck_for, b.bucket = z[fw.STUCK_X], round(z[fw.STUCK_TIMER] * 1000), z[fw.REJECT_BUCKET]
-    b.seen, b.run, b.filtered, b.turn = z[fw.DEMAND_SEEN] == 1.0, z[fw.RUN_REQUEST] == 1.0, z[fw.TREND_N], z[fw.TREND_TURN]
+    b.seen, b.run, b.filtered, b.turn = (
+        z[fw.DEMAND_SEEN] == 1.0,
+        z[fw.RUN_REQUEST] == 1.0,
+        z[fw.TREND_N],
+        z[fw.TREND_TURN],
+    )
     b.last, b.due, b.blend, b.target = z[fw.TREND_LAST], round(z[fw.TREND_TIMER] * 100), z[fw.BLEND], z[fw.X_TARGET]
     b.reference, b.integral, b.limited = z[fw.X_SERVO], z[fw.INTEGRAL], z[fw.SATURATED] == 1.0
     b.recovering, b.degraded = (round(z[at] * 1000) for at in (fw.RECOVER_TIMER, fw.DEGRADED_TIMER))
@@ -651,7 +709,8 @@ def taken_from(z: np.ndarray, table_input: str = "n_r", strategy: str = "adaptiv
 
 
 ROWS = {
-    "far": fw.FARTHEST, "on_side": fw.ENGAGED, "pot": fw.POT, "seen": fw.POT_SEEN, "doubt": fw.SUSPECT, "trusted": fw.TRUSTED,
+    "far": fw.FARTHEST, "on_side": fw.ENGAGED, "pot": fw.POT, "seen": fw.POT_SEEN, "doubt": fw.SUSPECT,
+    "trusted": fw.TRUSTED,
     "low": fw.LOWEST, "high": fw.HIGHEST, "offset": fw.OFFSET, "width": fw.WIDTH, "proved_offset": fw.PROVED_OFFSET,
     "proved_width": fw.PROVED_WIDTH, "up": fw.LEARNED_UP, "down": fw.LEARNED_DOWN,
 }  # fmt: skip
@@ -659,8 +718,10 @@ ROWS = {
 
 def assert_same_state(z: np.ndarray, b: Reference, what: str) -> None:
     theirs = {
-        "far": b.far, "on_side": b.on_side, "pot": b.pot, "seen": b.pot_seen, "doubt": b.doubt, "trusted": b.trusted, "low": b.low,
-        "high": b.high, "offset": b.known[:, 0], "width": b.known[:, 1], "proved_offset": b.proved[:, 0], "proved_width": b.proved[:, 1],
+        "far": b.far, "on_side": b.on_side, "pot": b.pot, "seen": b.pot_seen, "doubt": b.doubt, "trusted": b.trusted,
+        "low": b.low,
+        "high": b.high, "offset": b.known[:, 0], "width": b.known[:, 1], "proved_offset": b.proved[:, 0],
+        "proved_width": b.proved[:, 1],
         "up": b.learned[:, 0], "down": b.learned[:, 1],
     }  # fmt: skip
     ours = np.concatenate([z[at : at + 3] for at in ROWS.values()] + [z[SCALARS]])
@@ -670,7 +731,8 @@ def assert_same_state(z: np.ndarray, b: Reference, what: str) -> None:
 
 
 SCALARS = [
-    fw.SPEED, fw.SPEED_RATE, fw.SPEED_DRIFT, fw.SPEED_NOISE, fw.SIDE, fw.CROSSING, fw.QUIET, fw.OFFSET_IN_USE, fw.WIDTH_IN_USE, fw.X_TARGET,
+    fw.SPEED, fw.SPEED_RATE, fw.SPEED_DRIFT, fw.SPEED_NOISE, fw.SIDE, fw.CROSSING, fw.QUIET, fw.OFFSET_IN_USE,
+    fw.WIDTH_IN_USE, fw.X_TARGET,
 ]  # fmt: skip
 
 
@@ -678,12 +740,17 @@ def assert_same_machine(z: np.ndarray, b: Reference, what: str) -> None:
     """Everything that is not of play and learning."""
     ms = 1e-3
     theirs = {
-        fw.MODE: MODES.index(b.mode), fw.TICKS: b.ticks, fw.FAULT_BITS: sum(f.on << bit for bit, f in enumerate(b.faults.values())),
-        fw.N_DEM: b.n_dem, fw.N_R_RAW: b.raw, fw.N_R: b.n, fw.DEMAND_AGE: b.age * ms, fw.REJECT_BUCKET: b.bucket, fw.DEMAND_SEEN: b.seen,
-        fw.RUN_REQUEST: b.run, fw.TREND_N: b.filtered, fw.TREND_RATE: b.rate, fw.TREND_TURN: b.turn, fw.TREND_TIMER: b.due * 0.01,
-        fw.TREND_LAST: b.last, fw.DIRECTION: b.d, fw.BLEND: b.blend, fw.X_TARGET: b.target, fw.X_DEM: b.demand, fw.X_FROM: b.before,
+        fw.MODE: MODES.index(b.mode), fw.TICKS: b.ticks,
+        fw.FAULT_BITS: sum(f.on << bit for bit, f in enumerate(b.faults.values())),
+        fw.N_DEM: b.n_dem, fw.N_R_RAW: b.raw, fw.N_R: b.n, fw.DEMAND_AGE: b.age * ms, fw.REJECT_BUCKET: b.bucket,
+        fw.DEMAND_SEEN: b.seen,
+        fw.RUN_REQUEST: b.run, fw.TREND_N: b.filtered, fw.TREND_RATE: b.rate, fw.TREND_TURN: b.turn,
+        fw.TREND_TIMER: b.due * 0.01,
+        fw.TREND_LAST: b.last, fw.DIRECTION: b.d, fw.BLEND: b.blend, fw.X_TARGET: b.target, fw.X_DEM: b.demand,
+        fw.X_FROM: b.before,
         fw.X_SERVO: b.reference, fw.X_MEAS: b.x, fw.LVDT_GOOD: b.plausible, fw.STUCK_X: b.stuck_from,
-        fw.STUCK_TIMER: b.stuck_for * ms, fw.INTEGRAL: b.integral, fw.I_CMD: b.i, fw.SATURATED: b.limited, fw.SPEED: b.speed,
+        fw.STUCK_TIMER: b.stuck_for * ms, fw.INTEGRAL: b.integral, fw.I_CMD: b.i, fw.SATURATED: b.limited,
+        fw.SPEED: b.speed,
         fw.RECOVER_TIMER: b.recovering * ms, fw.DEGRADED_TIMER: b.degraded * ms,
         **{fw.T_STALE + bit: (-f.good if f.on else f.bad) * ms for bit, f in enumerate(b.faults.values())},
     }  # fmt: skip
@@ -697,14 +764,19 @@ def assert_same_machine(z: np.ndarray, b: Reference, what: str) -> None:
 def test_a_tick_is_that_of_the_page_from_any_state(seed):
     rng = random.Random(seed)
     for i in range(10 if seed < 4 else 50 if seed < 8 else 200):
-        strategy, by = rng.choice(["dual", "dual", "single", "inverse", "adaptive"]), rng.choice(["n_r", "n_r", "n_dem"])
+        strategy, by = (
+            rng.choice(["dual", "dual", "single", "inverse", "adaptive"]),
+            rng.choice(["n_r", "n_r", "n_dem"]),
+        )
         z = any_machine(rng)
         row = any_inputs(rng, z)
         b = taken_from(z, by, strategy)
         k = CALS[strategy].k.copy()
         k[fw.TABLE_INPUT] = float(by == "n_dem")
         tick(row, z, CALS[strategy]._replace(k=k))
-        refused, pause = (v if v > 0.0 else 0.0 for v in row[[fw.IN_REJECTED, fw.IN_PAUSE]])  # less than none, NaN: none
+        refused, pause = (
+            v if v > 0.0 else 0.0 for v in row[[fw.IN_REJECTED, fw.IN_PAUSE]]
+        )  # less than none, NaN: none
         b.tick(row[0], row[1], row[2] > 0.5, refused, *row[4:9], pause)
         assert_same_machine(z, b, f"state {i}, {strategy}")
         assert_same_state(z, b, f"state {i}, {strategy}")
@@ -739,7 +811,9 @@ def test_learning_is_that_of_the_page_from_any_state():
 
 
 def at_rest(side: float, point: int, play: float, off: float, noise: float = 0.0, **changed: float) -> np.ndarray:
-    """State after one step with the demand at a ``point`` of the schedule and the vane ``off`` (rad) its target there, along ``side``."""
+    """State after one step with the demand at a ``point`` of the schedule and the vane ``off`` (rad) its target there,
+    along ``side``.
+    """
     cal = CALS["inverse"]
     k = cal.k.copy()
     k[fw.TABLE_INPUT], k[fw.PLAY_VIGV] = 1.0, play
@@ -759,7 +833,9 @@ def at_rest(side: float, point: int, play: float, off: float, noise: float = 0.0
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.2])
 def test_the_vane_turns_round_beyond_the_band_and_not_within_it(side, noise):
-    """0.05 deg, and 8 times what is left of the noise behind the observer (alpha 0.05), through the slope of the schedule."""
+    """0.05 deg, and 8 times what is left of the noise behind the observer (alpha 0.05), through the slope of the
+    schedule.
+    """
     cal, point = CALS["inverse"], 7
     n = cal.table[0, point] + np.array([-0.5, 0.5])
     slope = abs(np.diff(np.interp(np.interp(n, *cal.table[[0, 3]]), *cal.angles[:2]))[0])
@@ -804,7 +880,8 @@ def test_without_play_a_stroke_at_rest_keeps_its_side(side):
 
 
 @pytest.mark.parametrize(
-    ("moved", "off", "rests"), [(0.0, 0.0, True), (1.9e-5, 9e-5, True), (2e-5, 0.0, False), (-2e-5, 0.0, False), (0.0, 1e-4, False)]
+    ("moved", "off", "rests"),
+    [(0.0, 0.0, True), (1.9e-5, 9e-5, True), (2e-5, 0.0, False), (-2e-5, 0.0, False), (0.0, 1e-4, False)],
 )
 @pytest.mark.parametrize("mode", [fw.RUN, fw.DEGRADED])
 def test_the_stroke_rests_below_0_02_mm_in_10_ms_and_0_1_mm_off(moved, off, rests, mode):
@@ -830,7 +907,9 @@ def test_readings_are_taken_and_doubted_as_the_page_says():
 
 @pytest.mark.parametrize("strategy", ["inverse", "adaptive"])
 def test_runs_with_play_are_those_of_the_page(strategy):
-    """With readings of a linkage that is worn and has grown, from trust half won; one potentiometer drops out on the way."""
+    """With readings of a linkage that is worn and has grown, from trust half won; one potentiometer drops out on the
+    way.
+    """
     m = Machine(strategy, beside=True)
     r = manoeuvres(5, 1500)
     vigv = np.interp(np.interp(r[:, 0], m.cal.table[0], m.cal.table[3]), m.cal.angles[0], m.cal.angles[1])

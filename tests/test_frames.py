@@ -1,4 +1,6 @@
-"""Frames as the DBC says: compiled codec against cantools and autosar-e2e, receiver against what a bus brings, node against lockstep."""
+"""Frames as the DBC says: compiled codec against cantools and autosar-e2e, receiver against what a bus brings, node
+against lockstep.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def test_codec_equals_cantools_and_the_e2e_library(db: Any, seed: int) -> None:
     for message in db.messages:
         for _ in range(40):
             v = {
-                s.name: float(rng.uniform(s.minimum, s.maximum)) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1))
+                s.name: float(rng.uniform(s.minimum, s.maximum))
+                if s.scale != 1
+                else int(rng.integers(s.minimum, s.maximum + 1))
                 for s in message.signals
                 if s.name not in ("crc", "counter")
             }
@@ -150,7 +154,7 @@ def test_message_and_words_are_the_same_frame(ident: int, extended: bool, kind: 
     assert words[0] & frames.HEAD_MASK == words[0] != frames.PAUSE  # no bus gives the loop's own word
 
 
-# ---- receiver -----------------------------------------------------------------------------------------------------------------------
+# ---- receiver --------------------------------------------------------------------------------------------------------
 
 
 class Sender:
@@ -161,7 +165,9 @@ class Sender:
         self.now, self.counter = 0, 0
 
     def frame(self, n_dem: float = 70.0, counter: int | None = None) -> tuple[int, int]:
-        return int(frames.word0(ECU_DEMAND)), int(frames.encode_demand(n_dem, n_dem, 1, self.counter if counter is None else counter))
+        return int(frames.word0(ECU_DEMAND)), int(
+            frames.encode_demand(n_dem, n_dem, 1, self.counter if counter is None else counter)
+        )
 
     def give(self, head: int, data: int) -> str:
         return frames.VERDICTS[frames.receive(self.r, head, data, self.now)]
@@ -280,7 +286,7 @@ def test_error_frames_and_other_identifiers_are_nobodys_refusals() -> None:
     assert frames.refused(s.r) == 0
 
 
-# ---- nodes --------------------------------------------------------------------------------------------------------------------------
+# ---- nodes -----------------------------------------------------------------------------------------------------------
 
 
 def test_node_does_what_lockstep_does_bit_for_bit() -> None:
@@ -290,10 +296,15 @@ def test_node_does_what_lockstep_does_bit_for_bit() -> None:
     vgv = Node(n_r=60.0, seed=4)
     sent = []
     for k in range(4000):
-        row = np.array([[frames.word0(ECU_DEMAND), frames.encode_demand(n_dem[k // 10], n_r[k // 10], 1, k // 10 % 15)]], np.int64)
+        row = np.array(
+            [[frames.word0(ECU_DEMAND), frames.encode_demand(n_dem[k // 10], n_r[k // 10], 1, k // 10 % 15)]], np.int64
+        )
         sent.append(vgv.tick(row if k % 10 == 0 else NONE).copy())
 
-    decoded = [frames.decode(ECU_DEMAND | 8 << 32, int(frames.encode_demand(a, b, 1, 0))) for a, b in zip(n_dem, n_r, strict=True)]
+    decoded = [
+        frames.decode(ECU_DEMAND | 8 << 32, int(frames.encode_demand(a, b, 1, 0)))
+        for a, b in zip(n_dem, n_r, strict=True)
+    ]
     rows = Stimulus.of([d["n_dem"] for d in decoded], [d["n_r"] for d in decoded]).rows.copy()
     rows[0, 4] = 0.0  # the first frame only shows the counter
     like = new_loop(build_plant(), load_calibration(), n_engine=60.0, n_r=60.0, t_oil=40.0, noisy=True)
@@ -301,7 +312,9 @@ def test_node_does_what_lockstep_does_bit_for_bit() -> None:
     noise = np.random.Generator(np.random.PCG64(4)).standard_normal((4000, 5))
     advance(0, 4000, rows, noise, like, 10, out, np.empty((0, 0)))
     assert np.array_equal(vgv.arrays.z, like.z)
-    assert np.array_equal(np.delete(vgv.arrays.s, 0), np.delete(like.s, 0))  # the node's own rotor starts one frame later
+    assert np.array_equal(
+        np.delete(vgv.arrays.s, 0), np.delete(like.s, 0)
+    )  # the node's own rotor starts one frame later
 
     status = [frames.decode(*f.tolist()) for f in (t[0] for t in sent if len(t))]
     servo = [frames.decode(*f.tolist()) for f in (t[1] for t in sent if len(t))]
@@ -312,7 +325,9 @@ def test_node_does_what_lockstep_does_bit_for_bit() -> None:
 
 
 def together(ticks: int, disturb: Any = None) -> tuple[Node, Ecu, list[np.ndarray], list[np.ndarray]]:
-    """An ECU and a controller that hear each other one tick later; ``disturb(k, frames)`` changes what the controller hears."""
+    """An ECU and a controller that hear each other one tick later; ``disturb(k, frames)`` changes what the controller
+    hears.
+    """
     vgv, ecu = Node(seed=1), Ecu(seed=2)
     to_vgv = to_ecu = NONE
     heard, sent = [], []
@@ -421,7 +436,7 @@ def test_a_speed_out_of_range_under_a_right_crc_degrades_with_the_frame(value: i
     assert vgv.mode == "DEGRADED" and vgv.faults == 1 << 7
 
 
-# ---- limits of the receiver and the codec ---------------------------------------------------------------------------------------------
+# ---- limits of the receiver and the codec ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("last", [4, 0])
@@ -452,11 +467,14 @@ def test_a_frame_that_shows_the_counter_is_good_for_five_periods(later: int, ver
 
 
 @pytest.mark.parametrize(
-    ("steps", "verdict", "lost"), [(0, "repeated", 0), (1, "good", 0), (5, "good", 4), (6, "wrong_sequence", 0), (14, "wrong_sequence", 0)]
+    ("steps", "verdict", "lost"),
+    [(0, "repeated", 0), (1, "good", 0), (5, "good", 4), (6, "wrong_sequence", 0), (14, "wrong_sequence", 0)],
 )
 @pytest.mark.parametrize("silent", [False, True])
 @pytest.mark.parametrize("counter", [0, 9, 14])
-def test_a_counter_may_go_on_by_one_to_five_steps(steps: int, verdict: str, lost: int, silent: bool, counter: int) -> None:
+def test_a_counter_may_go_on_by_one_to_five_steps(
+    steps: int, verdict: str, lost: int, silent: bool, counter: int
+) -> None:
     s = Sender()
     s.give(*s.frame(counter=counter if silent else (counter + 14) % 15))
     if not silent:
@@ -492,17 +510,29 @@ def test_fifteen_is_no_counter_after_any_other_and_none_to_go_on_from(before: in
 
 def test_after_silence_a_jump_of_the_counter_starts_anew_from_there() -> None:
     s = Sender()
-    assert [s.give(*s.frame(counter=c)) for c in (3, 3, 11, 11, 12)] == ["sync", "repeated", "wrong_sequence", "repeated", "good"]
+    assert [s.give(*s.frame(counter=c)) for c in (3, 3, 11, 11, 12)] == [
+        "sync",
+        "repeated",
+        "wrong_sequence",
+        "repeated",
+        "good",
+    ]
 
 
 def test_each_verdict_is_counted_and_five_of_them_are_refusals() -> None:
     s = Sender().started()
     head, data = s.frame()
-    s.give(head | frames.EXTENDED, data), s.give(head + (1 << 32), data), s.give(head, data ^ 1 << 33), s.give(head, data)
+    (
+        s.give(head | frames.EXTENDED, data),
+        s.give(head + (1 << 32), data),
+        s.give(head, data ^ 1 << 33),
+        s.give(head, data),
+    )
     s.give(*s.frame(counter=15)), s.give(*s.frame(counter=(s.counter + 7) % 15))
     counted = dict(zip(frames.COUNTS, s.r.tolist(), strict=False))
     assert counted == {
-        "good": 2, "sync": 1, "wrong_crc": 1, "repeated": 1, "wrong_sequence": 2, "wrong_length": 1, "wrong_kind": 1, "lost": 0, "stale": 0,
+        "good": 2, "sync": 1, "wrong_crc": 1, "repeated": 1, "wrong_sequence": 2, "wrong_length": 1, "wrong_kind": 1,
+        "lost": 0, "stale": 0,
     }  # fmt: skip
     assert frames.refused(s.r) == 6
 
@@ -524,7 +554,14 @@ def test_fields_hold_their_own_bits_only(db: Any) -> None:
             if s.scale == 1 or s.minimum is None:
                 continue
             decoder, names = frames.FRAMES[m.frame_id]
-            for value in (s.minimum, s.maximum, s.minimum - 1.0, s.maximum + 1.0, s.minimum + 0.4 * s.scale, s.minimum + 0.6 * s.scale):
+            for value in (
+                s.minimum,
+                s.maximum,
+                s.minimum - 1.0,
+                s.maximum + 1.0,
+                s.minimum + 0.4 * s.scale,
+                s.minimum + 0.6 * s.scale,
+            ):
                 sent = encode_any(m.frame_id, {**dict.fromkeys(names, 1.0), s.name: value})
                 found = dict(zip(names, decoder(int.from_bytes(sent, "little", signed=True)), strict=True))
                 assert found[s.name] == pytest.approx(min(max(value, s.minimum), s.maximum), abs=0.501 * s.scale)
@@ -563,7 +600,9 @@ def test_of_a_can_fd_frame_the_first_eight_bytes_and_its_length_are_kept() -> No
 
 def test_the_loops_own_word_is_recorded_as_a_frame_that_nobody_takes_and_comes_back_as_the_word() -> None:
     good = [int(frames.word0(ECU_DEMAND)), int(frames.encode_demand(60.0, 60.0, 1, 3))]
-    rows = np.array([good, [frames.PAUSE, 5000], good, [frames.word0(0x7FF), frames.PAUSE & frames.HEAD_MASK]], np.int64)
+    rows = np.array(
+        [good, [frames.PAUSE, 5000], good, [frames.word0(0x7FF), frames.PAUSE & frames.HEAD_MASK]], np.int64
+    )
     recorded = np.array([frames.from_message(frames.to_message(*row)) for row in rows], np.int64)
     assert np.array_equal(recorded[1], [frames.PAUSE & frames.HEAD_MASK, 5000])
     message = frames.to_message(*rows[1])
@@ -582,7 +621,9 @@ def test_a_receiver_that_stood_still_begins_a_silence_and_knows_no_counter(count
     assert s.counter == counter
     frames.stand_still(s.r)
     assert (s.count("stale"), s.count("lost")) == (1, 0)
-    assert frames.grow_old(s.r, s.now) and frames.grow_old(s.r, s.now + 10)  # a silence at once, however short the time seems
+    assert frames.grow_old(s.r, s.now) and frames.grow_old(
+        s.r, s.now + 10
+    )  # a silence at once, however short the time seems
     frames.stand_still(s.r)
     assert s.count("stale") == 1  # it is the same silence
     assert [s.next() for _ in range(3)] == ["sync", "good", "good"]

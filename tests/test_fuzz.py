@@ -26,7 +26,11 @@ def held(campaign: Campaign, frames: int) -> None:
     assert not campaign.transitions[~fuzz.TRANSITIONS].any()
     assert all(count > 0 for count in campaign.verdicts.values()), campaign.verdicts
     assert (campaign.ticks_in > 0).all()
-    by_sensor_only = {(INIT, FAIL_SAFE), (STANDBY, FAIL_SAFE), (RUN, FAIL_SAFE)}  # an LVDT that fails; frames cannot bring these about
+    by_sensor_only = {
+        (INIT, FAIL_SAFE),
+        (STANDBY, FAIL_SAFE),
+        (RUN, FAIL_SAFE),
+    }  # an LVDT that fails; frames cannot bring these about
     assert {(int(a), int(b)) for a, b in np.argwhere(campaign.transitions)} == {
         (int(a), int(b)) for a, b in np.argwhere(fuzz.TRANSITIONS)
     } - by_sensor_only
@@ -67,11 +71,17 @@ def test_attacks_are_what_they_are_said_to_be() -> None:
     assert by_kind["foreign"] == {"other", "sync"}  # a tenth of them is left a frame of the ECU
     assert {"wrong_length", "sync"} == by_kind["length"]
     assert {"sync", "wrong_sequence"} == by_kind["counter"]
-    assert "wrong_crc" in by_kind["mutated"] and by_kind["noise"] >= {"other", "wrong_kind", "wrong_crc", "wrong_length"}
+    assert "wrong_crc" in by_kind["mutated"] and by_kind["noise"] >= {
+        "other",
+        "wrong_kind",
+        "wrong_crc",
+        "wrong_length",
+    }
 
 
 SCRIPT = (
-    "from hil.inject.fuzz import fuzz; c = fuzz({frames}, seed=21); print(c.failure, c.verdicts, c.transitions.tolist(), c.longest_recovery_s)"
+    "from hil.inject.fuzz import fuzz; c = fuzz({frames}, seed=21); print(c.failure, c.verdicts, "
+    "c.transitions.tolist(), c.longest_recovery_s)"
 )
 
 
@@ -85,12 +95,15 @@ def test_no_index_is_out_of_bounds_and_compiled_code_does_what_the_source_says()
             text=True,
             check=True,
         ).stdout
-        for env in ({}, {"NUMBA_DISABLE_JIT": "1"})  # plain Python raises IndexError, and OverflowError where an int64 is not enough
+        for env in (
+            {},
+            {"NUMBA_DISABLE_JIT": "1"},
+        )  # plain Python raises IndexError, and OverflowError where an int64 is not enough
     ]
     assert answers[0] == answers[1] and answers[0].startswith("None")
 
 
-# ---- what it does with a failure ------------------------------------------------------------------------------------------------------
+# ---- what it does with a failure -------------------------------------------------------------------------------------
 
 
 TIGHT = np.array([0.040, 0.0, 0.030])  # A, m, m: the controller is allowed 0.0475 m
@@ -129,10 +142,12 @@ def test_a_log_carries_every_kind_of_frame(tmp_path: Path) -> None:
     assert np.array_equal(back.at[warm : warm + n], attack.at)
     assert np.array_equal(rows[~error & ~remote], attack.rows[~error & ~remote]) and error.any() and remote.any()
     assert (rows[error, 0] & ERROR != 0).all()
-    assert np.array_equal(rows[remote, 0], attack.rows[remote, 0] & ~0xFF00000000)  # python-can does not write a remote frame's length
+    assert np.array_equal(
+        rows[remote, 0], attack.rows[remote, 0] & ~0xFF00000000
+    )  # python-can does not write a remote frame's length
 
 
-# ---- command ----------------------------------------------------------------------------------------------------------------------------
+# ---- command ---------------------------------------------------------------------------------------------------------
 
 
 def test_command_reports_and_exits_0_when_everything_held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -157,12 +172,16 @@ def test_command_exits_1_on_a_failure_and_its_log_replays(tmp_path: Path, capsys
     ("right", "wrong", "claim"),
     [
         ("z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:\n            mode = FAIL_SAFE",
-         "z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:\n            mode = STANDBY", "a mode transition that is not in the table"),
-        ("0.0 if trouble else z[RECOVER_TIMER] + TICK", "0.0 if trouble else z[RECOVER_TIMER]", "RUN did not come back on good frames"),
+         "z[DEGRADED_TIMER] >= k[DEGRADED_HOLD] - HALF_TICK:\n            mode = STANDBY", "a mode transition that is "
+                                                                                           "not in the table"),
+        ("0.0 if trouble else z[RECOVER_TIMER] + TICK", "0.0 if trouble else "
+                                                        "z[RECOVER_TIMER]", "RUN did not come back on good frames"),
     ],
     ids=["leaves DEGRADED for STANDBY", "stays in FAIL_SAFE"],
 )  # fmt: skip
-def test_a_broken_controller_is_caught_and_its_shrunk_log_replays(right: str, wrong: str, claim: str, tmp_path: Path) -> None:
+def test_a_broken_controller_is_caught_and_its_shrunk_log_replays(
+    right: str, wrong: str, claim: str, tmp_path: Path
+) -> None:
     for package in ("app", "controller", "hil", "plant", "tables"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     firmware = tmp_path / "controller" / "firmware.py"
@@ -195,7 +214,9 @@ def test_a_broken_controller_is_caught_and_its_shrunk_log_replays(right: str, wr
         (["--replay", "README.md"], "README.md"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(options: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     os.chdir(ROOT)
     assert main(["fuzz", *options]) == 2
     err = capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""What `vaneloop COMMAND --help` shows can be typed: options that exist, files that are there or are made by an example before."""
+"""What `vaneloop COMMAND --help` shows can be typed: options that exist, files that are there or are made by an example
+before.
+"""
 
 from __future__ import annotations
 

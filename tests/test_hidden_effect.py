@@ -1,4 +1,6 @@
-"""The blind benchmark's draw: the same kinds for the same seed, ordinary machines and loggers, and what counts as named too easily."""
+"""The blind benchmark's draw: the same kinds for the same seed, ordinary machines and loggers, and what counts as named
+too easily.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,10 @@ def test_the_same_seed_draws_the_same_case():
 
 def test_a_row_says_what_was_done_to_the_log():
     seed, index = next(
-        (s, i) for s in range(20) for i in range(10) if (c := draw_case(s, i, 40.0))["kind"] == "clean" and c["gaps"] and c["modes"]
+        (s, i)
+        for s in range(20)
+        for i in range(10)
+        if (c := draw_case(s, i, 40.0))["kind"] == "clean" and c["gaps"] and c["modes"]
     )
     row = judge_case(seed, index, 40.0, 100)
     case = draw_case(seed, index, 40.0)

@@ -1,4 +1,6 @@
-"""Frame and fault injection: the actions do what they say, the verdict is not fooled, the shipped scenarios hold, and a user can use it."""
+"""Frame and fault injection: the actions do what they say, the verdict is not fooled, the shipped scenarios hold, and a
+user can use it.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
 
-# ---- the shipped scenarios ----------------------------------------------------------------------------------------------------------
+# ---- the shipped scenarios -------------------------------------------------------------------------------------------
 
 
 def test_at_least_25_scenarios_ship_and_use_every_action() -> None:
@@ -44,7 +46,9 @@ def test_the_page_names_every_action_with_its_keys() -> None:
     page = (ROOT / "docs" / "injection.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
     for name, action in inject.ACTIONS.items():
-        common = {"action", "start", "duration", "every", "probability", "count"} | ({"frame"} if issubclass(action, OnFrame) else set())
+        common = {"action", "start", "duration", "every", "probability", "count"} | (
+            {"frame"} if issubclass(action, OnFrame) else set()
+        )
         for key in set(action.model_fields) - (common if name != "error_frames" else common - {"probability"}):
             assert f"`{key}`" in rows[name], f"docs/injection.md: {name} takes {key}"
 
@@ -56,7 +60,9 @@ def test_the_controller_reacts_as_the_scenario_says(name: str) -> None:
 
 
 def test_the_same_scenario_gives_the_same_run_bit_for_bit() -> None:
-    first, again, other = (inject.run(load_scenario("random_traffic").model_copy(update={"seed": seed})) for seed in (1, 1, 2))
+    first, again, other = (
+        inject.run(load_scenario("random_traffic").model_copy(update={"seed": seed})) for seed in (1, 1, 2)
+    )
     assert first.state_hash == again.state_hash
     assert first.state_hash != other.state_hash
     assert all(np.array_equal(first.trace.signals[k], again.trace.signals[k]) for k in first.trace.signals)
@@ -71,14 +77,20 @@ def test_a_controller_that_reacts_too_late_is_found_out() -> None:
     assert any(c.expected.startswith("DEGRADED") and "2.091" in c.seen for c in broken), outcome.text()
 
 
-# ---- the verdict --------------------------------------------------------------------------------------------------------------------
+# ---- the verdict -----------------------------------------------------------------------------------------------------
 
 
 def trace(modes: list[str], step: float = 0.1, x_dem: list[float] | None = None) -> Trace:
     """A trace with a mode each ``step`` s."""
     n = len(modes)
     signals = {"x_dem": np.array(x_dem or [20.0] * n), "i_cmd": np.zeros(n)}
-    return Trace(np.arange(n) * step, np.array([MODES.index(m) for m in modes]), np.zeros(n, np.int64), signals, stroke=(0.5, 47.5))
+    return Trace(
+        np.arange(n) * step,
+        np.array([MODES.index(m) for m in modes]),
+        np.zeros(n, np.int64),
+        signals,
+        stroke=(0.5, 47.5),
+    )
 
 
 RUN_THEN_DEGRADED = ["INIT", "STANDBY", "RUN", "RUN", "RUN", "DEGRADED", "DEGRADED", "RUN", "RUN", "RUN"]
@@ -123,7 +135,7 @@ def test_unsafe_outputs_and_undocumented_mode_changes_are_always_broken() -> Non
     assert [c.held for c in judge(made, trace(["RUN"] * 3, x_dem=[20.0, math.nan, 20.0]))] == [False, True, True]
 
 
-# ---- frames on their way ------------------------------------------------------------------------------------------------------------
+# ---- frames on their way ---------------------------------------------------------------------------------------------
 
 
 def demand(k: int, n_dem: float = 80.0) -> tuple[int, int]:
@@ -155,13 +167,32 @@ def test_delayed_frames_come_later_once() -> None:
 
 
 def test_duplicates_follow_their_frame() -> None:
-    assert through(inject.Duplicate(copies=2, start=0.05, duration=0.01))[4:9] == [(40, 4), (50, 5), (50, 5), (50, 5), (60, 6)]
+    assert through(inject.Duplicate(copies=2, start=0.05, duration=0.01))[4:9] == [
+        (40, 4),
+        (50, 5),
+        (50, 5),
+        (50, 5),
+        (60, 6),
+    ]
 
 
 def test_reordered_frames_come_backwards_and_none_is_lost() -> None:
-    assert [i for _, i in through(inject.Reorder(window=3, start=0.03, duration=0.06))] == [0, 1, 2, 5, 4, 3, 8, 7, 6, *range(9, 20)]
+    assert [i for _, i in through(inject.Reorder(window=3, start=0.03, duration=0.06))] == [
+        0,
+        1,
+        2,
+        5,
+        4,
+        3,
+        8,
+        7,
+        6,
+        *range(9, 20),
+    ]
     left = through(inject.Reorder(window=3, start=0.03, duration=0.04))
-    assert [i for _, i in left] == [0, 1, 2, 5, 4, 3, 6, *range(7, 20)], "a group that was not complete goes on when it is over"
+    assert [i for _, i in left] == [0, 1, 2, 5, 4, 3, 6, *range(7, 20)], (
+        "a group that was not complete goes on when it is over"
+    )
 
 
 def verdicts(action: object, ticks: int = 400) -> list[str]:
@@ -174,7 +205,13 @@ def verdicts(action: object, ticks: int = 400) -> list[str]:
 
 
 def test_corrupted_frames_are_refused_for_the_right_reason() -> None:
-    assert verdicts(inject.Corrupt(start=0.1, duration=0.03))[9:14] == ["good", "wrong_crc", "wrong_crc", "wrong_crc", "good"]
+    assert verdicts(inject.Corrupt(start=0.1, duration=0.03))[9:14] == [
+        "good",
+        "wrong_crc",
+        "wrong_crc",
+        "wrong_crc",
+        "good",
+    ]
     assert verdicts(inject.Corrupt(length=3, start=0.1, duration=0.01))[9:12] == ["good", "wrong_length", "good"]
 
 
@@ -201,7 +238,9 @@ def sent_by(action: object, ticks: int) -> list[tuple[int, int, int]]:
     return [(k, *frame) for k in range(ticks) for frame in intruder.tick(k, 0)]
 
 
-@pytest.mark.parametrize(("e2e", "verdict"), [("right", "good"), ("wrong_crc", "wrong_crc"), ("wrong_counter", "repeated")])
+@pytest.mark.parametrize(
+    ("e2e", "verdict"), [("right", "good"), ("wrong_crc", "wrong_crc"), ("wrong_counter", "repeated")]
+)
 def test_a_sent_frame_is_protected_as_asked(e2e: str, verdict: str) -> None:
     sent = sent_by(inject.Send(frame="ECU_DEMAND", signals={"n_dem": 70.0, "n_r": 71.0}, period=0.01, e2e=e2e), 100)
     assert [k for k, _, _ in sent] == list(range(0, 100, 10))
@@ -214,7 +253,12 @@ def test_a_sent_frame_is_protected_as_asked(e2e: str, verdict: str) -> None:
 def test_a_raw_frame_is_sent_once_and_as_it_stands() -> None:
     ((k, head, data),) = sent_by(inject.Send(frame=0x123, data="0102FF", start=0.05), 200)
     message = frames.to_message(head, data)
-    assert (k, message.arbitration_id, bytes(message.data), message.is_extended_id) == (50, 0x123, b"\x01\x02\xff", False)
+    assert (k, message.arbitration_id, bytes(message.data), message.is_extended_id) == (
+        50,
+        0x123,
+        b"\x01\x02\xff",
+        False,
+    )
     ((_, head, data),) = sent_by(inject.Send(frame=0x123, data="00", remote=True, extended=True), 10)
     message = frames.to_message(head, data)
     assert message.is_remote_frame and message.is_extended_id and message.dlc == 1
@@ -222,9 +266,9 @@ def test_a_raw_frame_is_sent_once_and_as_it_stands() -> None:
 
 def test_a_flood_has_the_rate_asked_for() -> None:
     assert len(sent_by(inject.Flood(frame=0x100, rate=2500.0, duration=1.0), 2000)) == 2500
-    assert {h & frames.IDENT_MASK for _, h, _ in sent_by(inject.Flood(frame=0x100, last=0x103, rate=1000.0), 500)} == set(
-        range(0x100, 0x104)
-    )
+    assert {
+        h & frames.IDENT_MASK for _, h, _ in sent_by(inject.Flood(frame=0x100, last=0x103, rate=1000.0), 500)
+    } == set(range(0x100, 0x104))
     assert {h & frames.IDENT_MASK for _, h, _ in sent_by(inject.Babble(), 10)} == {0}
 
 
@@ -246,7 +290,7 @@ def test_old_frames_of_a_log_come_again_with_their_spacing(tmp_path: Path) -> No
     assert outcome.held, outcome.text()
 
 
-# ---- what a user types --------------------------------------------------------------------------------------------------------------
+# ---- what a user types -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -256,7 +300,10 @@ def test_old_frames_of_a_log_come_again_with_their_spacing(tmp_path: Path) -> No
         ('[[inject]]\naction = "drop"\nstrt = 1.0', "key 'inject.0.drop.strt' is unknown, probably 'start' is meant"),
         ('[[inject]]\naction = "delay"', "key 'inject.0.delay.delay' is missing"),
         ("[[inject]]\nstart = 1.0", "inject.0: key 'action' is missing"),
-        ('[[inject]]\naction = "drop"\nprobability = 2.0', "inject.0.drop.probability (=2.0): Input should be less than or equal to 1"),
+        (
+            '[[inject]]\naction = "drop"\nprobability = 2.0',
+            "inject.0.drop.probability (=2.0): Input should be less than or equal to 1",
+        ),
         ('[[inject]]\naction = "drop"\nstart = "1"', "inject.0.drop.start (='1')"),
         ('[[inject]]\naction = "drop"\nframe = "VGV_X"', "frame (='VGV_X') must be one of ECU_DEMAND, VGV_STATUS"),
         ('[[inject]]\naction = "drop"\nframe = 0x123', "frame (=291) is sent by neither node"),
@@ -277,7 +324,10 @@ def test_old_frames_of_a_log_come_again_with_their_spacing(tmp_path: Path) -> No
             '[[inject]]\naction = "machine"\neffect = "lvdt_bias"\nparameters = { bias = 50.0 }',
             "parameters.bias (=50 mm) must be in [-5, 5]",
         ),
-        ('[[expect]]\nmode = "RUNNING"\nby = 1.0', "mode (='RUNNING') must be one of INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE"),
+        (
+            '[[expect]]\nmode = "RUNNING"\nby = 1.0',
+            "mode (='RUNNING') must be one of INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE",
+        ),
         ('[[expect]]\nmode = "RUN"\nby = 1.0\nat = 1.0', "exactly one of at, by, during, never; here: at, by"),
         ('[[expect]]\nmode = "RUN"\nby = 9.0', "expect.0 speaks of 9 s; the scenario ends at 3 s"),
         ('[[expect]]\nsignal = "x_dem"\nby = 2.0', "signal needs low or high"),
@@ -288,7 +338,9 @@ def test_old_frames_of_a_log_come_again_with_their_spacing(tmp_path: Path) -> No
         ("nonsense", "not a TOML table"),
     ],
 )
-def test_a_bad_scenario_is_refused_in_one_line(text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_scenario_is_refused_in_one_line(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "bad.toml"
     file.write_text(f'title = "a bad one"\nduration = 3.0\n{text}\n')
     assert main(["inject", str(file)]) == 2
@@ -311,7 +363,9 @@ def test_a_bad_scenario_is_refused_in_one_line(text: str, said: str, tmp_path: P
         (["nominal", "--seed", "-3"], "--seed -3 must be 0 or more"),
     ],
 )
-def test_a_bad_command_line_is_refused_in_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_command_line_is_refused_in_one_line(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["inject", *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
@@ -341,7 +395,7 @@ def test_the_list_names_every_scenario(capsys: pytest.CaptureFixture[str]) -> No
     assert {s["name"] for s in json.loads(capsys.readouterr().out)["scenarios"]} == set(library())
 
 
-# ---- in a user's own suite ----------------------------------------------------------------------------------------------------------
+# ---- in a user's own suite -------------------------------------------------------------------------------------------
 
 OWN_SUITE = """
 def test_a_short_silence(sil):

@@ -25,11 +25,15 @@ def signal(name: str, *values: float, u: np.ndarray = U) -> np.ndarray:
     return laws.apply(SIGNAL_LAWS[name].code, T, u, row(SIGNAL_LAWS[name], values))
 
 
-def force(name: str, values: tuple[float, ...], x: np.ndarray, v: np.ndarray, gap: float = 0.0, asymmetry: float = 0.0) -> np.ndarray:
+def force(
+    name: str, values: tuple[float, ...], x: np.ndarray, v: np.ndarray, gap: float = 0.0, asymmetry: float = 0.0
+) -> np.ndarray:
     memory = np.zeros(laws.MEMORY)
     law = FORCE_LAWS[name]
     p = row(law, values)
-    return np.array([laws.force_of(law.code, v[k], x[k], k == 0, p, gap, asymmetry, 0.0, memory) for k in range(len(x))])
+    return np.array(
+        [laws.force_of(law.code, v[k], x[k], k == 0, p, gap, asymmetry, 0.0, memory) for k in range(len(x))]
+    )
 
 
 ALL = [(family, law) for family, by in laws.LAWS.items() for law in by.values()]
@@ -51,7 +55,9 @@ def test_declared_parameters_hang_together(family: str, law: Law) -> None:
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 @pytest.mark.parametrize(("family", "law"), ALL, ids=[f"{f}-{x.name}" for f, x in ALL])
 def test_bounds_follow_the_data_whatever_the_unit(family: str, law: Law, factor: float) -> None:
-    scaled = Size(SIZE.low * factor, SIZE.high * factor, 2.0 * factor, 6.0 * factor, 0.01, 10.0, force=3.0, speed=2.0, travel=2.0)
+    scaled = Size(
+        SIZE.low * factor, SIZE.high * factor, 2.0 * factor, 6.0 * factor, 0.01, 10.0, force=3.0, speed=2.0, travel=2.0
+    )
     for p, q in zip(law.make(SIZE)[0], law.make(scaled)[0], strict=True):
         assert q.low <= q.value <= q.high
         if p.unit in ("V", "(V)/s") and p.high:
@@ -178,7 +184,10 @@ def test_springs_and_their_gap() -> None:
 
 
 def test_state_laws() -> None:
-    rate = {n: [laws.state_rate(law.code, x, np.array([2.0, 0.0, 0.0, 0.0])) for x in (-4.0, 4.0)] for n, law in STATE_LAWS.items()}
+    rate = {
+        n: [laws.state_rate(law.code, x, np.array([2.0, 0.0, 0.0, 0.0])) for x in (-4.0, 4.0)]
+        for n, law in STATE_LAWS.items()
+    }
     assert rate["offset"] == [2.0, 2.0]
     assert rate["leak"] == [-8.0, 8.0]
     assert rate["square_root"] == [-4.0, 4.0]

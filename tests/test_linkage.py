@@ -39,7 +39,19 @@ def lengths(k: int) -> dict[str, float]:
 
 def paper(stroke: float, p: dict[str, float]) -> tuple[float, float]:
     return lk.paper_vane(
-        stroke, p["lx0"], p["x1"], p["y1"], p["le"], p["dx"], p["dy"], p["theta6"], p["lb"], p["lc"], p["ld"], p["ld_prime"], p["l"]
+        stroke,
+        p["lx0"],
+        p["x1"],
+        p["y1"],
+        p["le"],
+        p["dx"],
+        p["dy"],
+        p["theta6"],
+        p["lb"],
+        p["lc"],
+        p["ld"],
+        p["ld_prime"],
+        p["l"],
     )
 
 
@@ -60,7 +72,9 @@ def meet(c0: complex, r0: float, c1: complex, r1: float, side: float) -> complex
 
 
 def four_bar(stroke: float, p: dict[str, float]) -> tuple[float, float]:
-    """Ring and vane angle by drawing the linkage with compasses, in the actuator's own frame: no formula of the paper but (16)."""
+    """Ring and vane angle by drawing the linkage with compasses, in the actuator's own frame: no formula of the paper
+    but (16).
+    """
     j2 = complex(p["x1"], p["y1"])
     j5 = j2 + complex(p["dx"], p["dy"])
     j1 = meet(0j, p["lx0"] + stroke, j2, p["le"], -1.0)  # below the pivot
@@ -93,7 +107,7 @@ def error_at_full_speed(initial: bool) -> np.ndarray:
     return (target - vane_angles(stroke, GEOMETRY.arrays(initial))[0]) / DEG
 
 
-# --- three forms, one linkage -----------------------------------------------------------------------------------------------
+# --- three forms, one linkage -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", range(3), ids=STAGES)
@@ -124,7 +138,9 @@ def test_printed_principal_value_of_theta4_lets_a_longer_link_open_the_vane():
     p = lengths(1)
 
     def mirrored(lc: float) -> float:
-        x5, y5 = lk.paper_ring(p["dx"], p["dy"], p["theta6"], *lk.paper_crank(0.024, p["lx0"], p["x1"], p["y1"], p["le"]))
+        x5, y5 = lk.paper_ring(
+            p["dx"], p["dy"], p["theta6"], *lk.paper_crank(0.024, p["lx0"], p["x1"], p["y1"], p["le"])
+        )
         theta4 = 2 * math.pi - lk.paper_theta4(x5, y5, p["lb"], lc, p["ld"])
         return lk.paper_theta3(x5, y5, p["lb"], lc, p["ld"], theta4) + theta4
 
@@ -136,8 +152,12 @@ def test_vgv1_passes_90_degrees_of_theta3_where_the_printed_arcsine_folds():
     p = lengths(1)
     theta3 = []
     for stroke in BEYOND:
-        x5, y5 = lk.paper_ring(p["dx"], p["dy"], p["theta6"], *lk.paper_crank(stroke, p["lx0"], p["x1"], p["y1"], p["le"]))
-        theta3.append(lk.paper_theta3(x5, y5, p["lb"], p["lc"], p["ld"], lk.paper_theta4(x5, y5, p["lb"], p["lc"], p["ld"])) / DEG)
+        x5, y5 = lk.paper_ring(
+            p["dx"], p["dy"], p["theta6"], *lk.paper_crank(stroke, p["lx0"], p["x1"], p["y1"], p["le"])
+        )
+        theta3.append(
+            lk.paper_theta3(x5, y5, p["lb"], p["lc"], p["ld"], lk.paper_theta4(x5, y5, p["lb"], p["lc"], p["ld"])) / DEG
+        )
     assert max(theta3) > 90 > min(theta3)
 
 
@@ -145,7 +165,8 @@ def test_uncompiled_functions_give_the_same_bits():
     if os.environ.get("NUMBA_DISABLE_JIT") == "1":
         pytest.skip("already uncompiled")
     code = (
-        "import hashlib, numpy as np; from plant.geometry import load_geometry, vane_angles; import plant.linkage as lk\n"
+        "import hashlib, numpy as np; from plant.geometry import load_geometry, vane_angles; import plant.linkage as "
+        "lk\n"
         "g = load_geometry().arrays(); x = np.linspace(-2e-3, 50e-3, 521)\n"
         "a = np.concatenate([vane_angles(x, g).ravel(), np.array([lk.ring_angles(s, g) for s in x]).ravel(),\n"
         "                    np.array([lk.vane_slope(s, g, 1) for s in x])])\n"
@@ -154,7 +175,12 @@ def test_uncompiled_functions_give_the_same_bits():
     root = Path(__file__).resolve().parent.parent
     digests = [
         subprocess.run(
-            [sys.executable, "-c", code], cwd=root, env=os.environ | {"NUMBA_DISABLE_JIT": off}, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            cwd=root,
+            env=os.environ | {"NUMBA_DISABLE_JIT": off},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         for off in ("0", "1")
     ]
@@ -165,7 +191,7 @@ def test_uncompiled_functions_give_the_same_bits():
     assert hashlib.sha256(np.concatenate(here).tobytes()).hexdigest() == digests[0].strip()
 
 
-# --- properties -------------------------------------------------------------------------------------------------------------
+# --- properties -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", range(3), ids=STAGES)
@@ -196,7 +222,9 @@ def test_ring_angle_of_vane_inverts_equation_16(thetal, ldp, lever):
 @given(st.floats(-0.06, 0.06))
 def test_clevis_moves_axially_by_equation_17(theta5):
     ldp, lever = 0.2, 0.037
-    assert lk.clevis_axial(theta5, ldp, lever) == pytest.approx(lever - math.sqrt(lever**2 - (ldp * math.tan(theta5)) ** 2), abs=1e-15)
+    assert lk.clevis_axial(theta5, ldp, lever) == pytest.approx(
+        lever - math.sqrt(lever**2 - (ldp * math.tan(theta5)) ** 2), abs=1e-15
+    )
 
 
 def test_stroke_for_vigv_inverts_the_linkage():
@@ -248,7 +276,7 @@ def test_assembly_range_ends_where_the_check_begins_to_refuse(k):
     assert lk._fault(high + 1e-8, g, k)[0] != lk._OK == lk._fault(high, g, k)[0]
 
 
-# --- published numbers ------------------------------------------------------------------------------------------------------
+# --- published numbers ------------------------------------------------------------------------------------------------
 
 
 def test_table_4_is_as_published():
@@ -306,7 +334,7 @@ def test_schedule_leaves_the_hysteresis_room_at_both_stops():
         assert room > half / lk.vane_slope(end, g, 0)
 
 
-# --- refusals ---------------------------------------------------------------------------------------------------------------
+# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 def edited(tmp_path: Path, table: str, old: str, new: str) -> Path:
@@ -322,12 +350,24 @@ def edited(tmp_path: Path, table: str, old: str, new: str) -> Path:
     [
         ("value = 497.1", "value = nan", r"vigv\.lc\.value \(=nan\): Input should be a finite number"),
         ("\nlx0 =", "\nlxo =", r"key 'crank\.lxo' is unknown|key 'crank\.lx0' is missing"),
-        ("value = 497.1, unit = \"mm\"", "value = 0.4971, unit = \"m\"", r"lc\.unit \(='m'\) must be 'mm'"),
+        ('value = 497.1, unit = "mm"', 'value = 0.4971, unit = "m"', r"lc\.unit \(='m'\) must be 'mm'"),
         ("value = 112.3", "value = 1e4", r"le \(=10000 mm\) must be in \[10, 1000\]"),
         ("value = 497.1", "value = 600.0", r"vigv cannot be assembled at stroke -2 mm: .* lc|lever arm l"),
-        ("value = 493.7", "value = 900.0", r"vgv1 cannot be assembled at stroke -2 mm: vertical link lc \(=900\) must be in .* mm to join"),
-        ("value = 330.0", "value = 300.0", r"vigv cannot be assembled at stroke -2 mm: lever arm l \(=37\.9\) must be in \(40\.10"),
-        ("value = 330.0", "value = 500.0", r"vigv cannot be assembled at stroke -2 mm: actuator length lx \(=498\) must be in \(.*, 447"),
+        (
+            "value = 493.7",
+            "value = 900.0",
+            r"vgv1 cannot be assembled at stroke -2 mm: vertical link lc \(=900\) must be in .* mm to join",
+        ),
+        (
+            "value = 330.0",
+            "value = 300.0",
+            r"vigv cannot be assembled at stroke -2 mm: lever arm l \(=37\.9\) must be in \(40\.10",
+        ),
+        (
+            "value = 330.0",
+            "value = 500.0",
+            r"vigv cannot be assembled at stroke -2 mm: actuator length lx \(=498\) must be in \(.*, 447",
+        ),
     ],
 )
 def test_geometry_that_cannot_be_used_is_refused_in_one_line(tmp_path, old, new, says):
@@ -339,7 +379,11 @@ def test_geometry_that_cannot_be_used_is_refused_in_one_line(tmp_path, old, new,
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("99.0, 100.0, 101.0", "99.0, 99.0, 101.0", r"speed\.values\[17\] \(=99\) must be greater than the value before it \(=99\)"),
+        (
+            "99.0, 100.0, 101.0",
+            "99.0, 99.0, 101.0",
+            r"speed\.values\[17\] \(=99\) must be greater than the value before it \(=99\)",
+        ),
         ("18.6, 19.0, 19.3", "18.6, 18.6, 19.3", r"vigv\.values\[17\] \(=18.6\) must be greater"),
         ("18.6, 19.0, 19.3", "18.6, inf, 19.3", r"vigv\.values\.17 \(=inf\)"),
         ("18.6, 19.0, 19.3", "18.6, 19.3", r"vigv\.values has 20 numbers, speed\.values has 21"),
@@ -355,7 +399,10 @@ def test_schedule_that_cannot_be_used_is_refused_in_one_line(tmp_path, old, new,
 def test_refusal_names_stroke_and_quantity_where_assembly_first_fails():
     g = GEOMETRY.arrays()
     g[lk.N_CRANK + lk.G_L] = 18e-3  # too short a lever at both ends of the VIGV's range
-    with pytest.raises(InputError, match=r"vigv cannot be assembled at stroke -2 mm: lever arm l \(=18\) must be in \(19\.\d+, inf\) mm"):
+    with pytest.raises(
+        InputError,
+        match=r"vigv cannot be assembled at stroke -2 mm: lever arm l \(=18\) must be in \(19\.\d+, inf\) mm",
+    ):
         lk.check_assembly(g)
     lk.check_assembly(g, 10e-3, 30e-3)
 

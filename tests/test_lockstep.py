@@ -72,7 +72,8 @@ def test_logging_faster_changes_no_state() -> None:
     assert slow.state_hash == fast.state_hash
     assert np.array_equal(slow.columns["x_lvdt"], fast.columns["x_lvdt"][::10])
     assert np.allclose(
-        slow.columns["i_cmd"][1:], fast.columns["i_cmd"][1:].reshape(-1)[: 10 * (len(slow.t) - 1)].reshape(-1, 10).mean(axis=1)
+        slow.columns["i_cmd"][1:],
+        fast.columns["i_cmd"][1:].reshape(-1)[: 10 * (len(slow.t) - 1)].reshape(-1, 10).mean(axis=1),
     )
 
 

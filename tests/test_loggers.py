@@ -1,4 +1,6 @@
-"""What a logger or a mode does is not physics: rows that are missing, a controller that stood aside, a servo at its limit."""
+"""What a logger or a mode does is not physics: rows that are missing, a controller that stood aside, a servo at its
+limit.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,8 @@ def test_rows_lost_one_by_one_are_bridged():
 
 def test_a_servo_at_its_limit_is_judged_where_it_is_not():
     log = {k: v.copy() for k, v in rows(41).items()}
-    # the current stands at its limit for a second, while the law would ask for more; afterwards the integral is another one
+    # the current stands at its limit for a second, while the law would ask for more; afterwards the integral is another
+    # one
     at = slice(7000, 7100)
     log["i_cmd"][at] = 40.0
     log["i_cmd"][at.stop :] += 0.4
@@ -78,14 +81,20 @@ def test_a_servo_at_its_limit_is_judged_where_it_is_not():
 
 
 def test_where_play_was_left_by_a_controller_that_caught_up_at_full_speed_is_not_known() -> None:
-    """Its piston turns between two rows, and play keeps where: 0.08 deg until the next reversal, which two lags would patch."""
+    """Its piston turns between two rows, and play keeps where: 0.08 deg until the next reversal, which two lags would
+    patch.
+    """
     log = rows(42)
     stood_by = (log["t"] >= 60.0) & (log["t"] < 66.0)
-    plain, spell = (chain({**log, "state": np.where(by, 1.0, log["state"])}).stage("linkage") for by in (False, stood_by))
+    plain, spell = (
+        chain({**log, "state": np.where(by, 1.0, log["state"])}).stage("linkage") for by in (False, stood_by)
+    )
     before, judged = np.isfinite(plain.measured[0]), np.isfinite(spell.measured[0])
     x = np.interp(plain.t, log["t"], log["x_lvdt"])
     settled = int(np.searchsorted(plain.t, 66.0 + SETTLE))
     crossed = settled + int(np.argmax(np.maximum.accumulate(x[settled:]) - np.minimum.accumulate(x[settled:]) > 3.0))
     begin = int(np.searchsorted(plain.t, 60.0))
     assert crossed - settled > 10 and before[begin:crossed].all() and not judged[begin:crossed].any()
-    assert np.array_equal(judged[:begin], before[:begin]) and np.array_equal(judged[crossed + 2 :], before[crossed + 2 :])
+    assert np.array_equal(judged[:begin], before[:begin]) and np.array_equal(
+        judged[crossed + 2 :], before[crossed + 2 :]
+    )

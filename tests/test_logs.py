@@ -1,4 +1,6 @@
-"""Logs: every format reads back what was written, names and units arrive as stated, and what cannot be used is refused in one line."""
+"""Logs: every format reads back what was written, names and units arrive as stated, and what cannot be used is refused
+in one line.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +33,14 @@ RESOLUTION = {
 }  # fmt: skip
 # id, name, period ms, DataID of the frames that DESIGN section 7 fixes
 FRAMES = {
-    0x0A0: ("ECU_DEMAND", 10, ("n_dem", "n_r", "mode_request")), 0x0B0: ("VGV_STATUS", 10, ("x_dem", "x_lvdt", "state")),
-    0x0B1: ("VGV_SERVO", 10, ("i_cmd",)), 0x0B2: ("VGV_ANGLES", 10, ("vigv", "vgv1", "vgv2")), 0x0B3: ("VGV_HEALTH", 100, ("p_s", "t_oil")),
+    0x0A0: ("ECU_DEMAND", 10, ("n_dem", "n_r", "mode_request")),
+    0x0B0: ("VGV_STATUS", 10, ("x_dem", "x_lvdt", "state")),
+    0x0B1: ("VGV_SERVO", 10, ("i_cmd",)), 0x0B2: ("VGV_ANGLES", 10, ("vigv", "vgv1", "vgv2")),
+    0x0B3: ("VGV_HEALTH", 100, ("p_s", "t_oil")),
 }  # fmt: skip
 FAULTS = (
-    "fault_demand_stale", "fault_demand_rejected", "fault_lvdt_range", "fault_lvdt_rate", "fault_lvdt_stuck", "fault_tracking",
+    "fault_demand_stale", "fault_demand_rejected", "fault_lvdt_range", "fault_lvdt_rate", "fault_lvdt_stuck",
+    "fault_tracking",
     "fault_current_saturated", "fault_demand_range", "fault_paused",
 )  # fmt: skip
 
@@ -54,7 +59,10 @@ def run(n: int = 400, seed: int = 1) -> dict[str, Channel]:
     slow = t[::10]
     out = {name: Channel(t, rng.uniform(5, 40, n)) for name in UNITS if name not in ("p_s", "t_oil", "state")}
     out["state"] = Channel(t, rng.integers(0, 5, n).astype(float))
-    return out | {"p_s": Channel(slow, rng.uniform(5, 25, slow.size)), "t_oil": Channel(slow, rng.uniform(-40, 120, slow.size))}
+    return out | {
+        "p_s": Channel(slow, rng.uniform(5, 25, slow.size)),
+        "t_oil": Channel(slow, rng.uniform(-40, 120, slow.size)),
+    }
 
 
 def check(log: Log) -> None:
@@ -81,7 +89,7 @@ def csv(path: Path, text: str) -> Path:
     return file
 
 
-# --- the bus's frames --------------------------------------------------------------------------------------------------------------------
+# --- the bus's frames -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +142,9 @@ def test_dbc_names_modes_and_faults(db: Any) -> None:
     )
     demand = db.get_message_by_name("ECU_DEMAND").get_signal_by_name("mode_request")
     assert sorted(demand.choices) == [0, 1]
-    assert [(s.name, s.start) for s in servo.signals if s.name.startswith("fault_")] == [(f, 32 + i) for i, f in enumerate(FAULTS)]
+    assert [(s.name, s.start) for s in servo.signals if s.name.startswith("fault_")] == [
+        (f, 32 + i) for i, f in enumerate(FAULTS)
+    ]
     assert all(s.length == 1 for s in servo.signals if s.name.startswith("fault_"))
     assert all(s.start + s.length <= 41 for s in servo.signals)  # bits 41 to 47 wait for more faults
 
@@ -144,7 +154,8 @@ def test_dbc_round_trip_loses_at_most_half_a_resolution(db: Any, seed: int) -> N
     rng = np.random.default_rng(seed)
     for m in db.messages:
         sent = {
-            s.name: rng.uniform(s.minimum, s.maximum) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1)) for s in m.signals
+            s.name: rng.uniform(s.minimum, s.maximum) if s.scale != 1 else int(rng.integers(s.minimum, s.maximum + 1))
+            for s in m.signals
         }
         got = m.decode(m.encode(sent), decode_choices=False)
         assert all(abs(got[s.name] - sent[s.name]) <= s.scale * 0.5000001 for s in m.signals)
@@ -164,7 +175,9 @@ def test_frames_are_those_of_cantools_and_the_e2e_library(db: Any, seed: int) ->
         theirs = bytearray(8)
         for k in range(n):
             counter = theirs[1] & 15
-            theirs = bytearray(m.encode({name: v[k] for name, v in values.items()} | {"crc": 0, "counter": counter}, strict=False))
+            theirs = bytearray(
+                m.encode({name: v[k] for name, v in values.items()} | {"crc": 0, "counter": counter}, strict=False)
+            )
             e2e.p01.e2e_p01_protect(theirs, message.e2e)
             assert ours[k].tobytes() == bytes(theirs)
             assert e2e.p01.e2e_p01_check(bytearray(ours[k].tobytes()), message.e2e)
@@ -174,7 +187,7 @@ def test_frames_are_those_of_cantools_and_the_e2e_library(db: Any, seed: int) ->
         assert (canlog.e2e_crc(wrong, message.e2e) != wrong[:, 0]).all()
 
 
-# --- signals cut out of columns ----------------------------------------------------------------------------------------------------------
+# --- signals cut out of columns ---------------------------------------------------------------------------------------
 
 
 @given(st.data())
@@ -192,15 +205,22 @@ def test_column_decode_equals_cantools(draw: st.DataObject) -> None:
         big = bool(rng.random() < 0.5)
         first = int(rng.integers(0, 8 * size - length + 1))
         start = 8 * (first // 8) + 7 - first % 8 if big else first
-        scale, offset = (1, 0) if rng.random() < 0.3 else (float(rng.choice([0.5, 0.001, -2.0, 3.7])), float(rng.choice([0.0, -40.0, 1e3])))
+        scale, offset = (
+            (1, 0)
+            if rng.random() < 0.3
+            else (float(rng.choice([0.5, 0.001, -2.0, 3.7])), float(rng.choice([0.0, -40.0, 1e3])))
+        )
         signals.append(
-            Signal(f"s{k}", start, length, "big_endian" if big else "little_endian", bool(rng.random() < 0.5) and not is_float,
+            Signal(f"s{k}", start, length, "big_endian" if big else "little_endian",
+                bool(rng.random() < 0.5) and not is_float,
                    conversion=BaseConversion.factory(scale, offset, None, is_float)))  # fmt: skip
     n = 20
     block = rng.integers(0, 256, (n, size)).astype(np.uint8)
     block[0], block[1] = 0, 255
     wide = np.pad(block, ((0, 0), (0, (8 if size <= 8 else 64) - size)))
-    frames = Frames(np.arange(n) * 0.1, np.full(n, 0x123, np.uint32), np.zeros(n, np.int32), np.full(n, size, np.uint8), wide)
+    frames = Frames(
+        np.arange(n) * 0.1, np.full(n, 0x123, np.uint32), np.zeros(n, np.int32), np.full(n, size, np.uint8), wide
+    )
     for s in signals:
         layout = CanMessage(0x123, "M", size, [s], strict=False)
         _, ours, _ = canlog.cut_signal(frames, np.arange(n), Message(layout, 0x123, None, False, {}), s)
@@ -219,14 +239,16 @@ BO_ 291 M: 8 A
 
 def test_a_multiplexed_signal_is_read_where_its_selector_says_so(tmp_path: Path) -> None:
     (tmp_path / "m.dbc").write_text(MUX)
-    lines = [f"(1.{k:06d}) can0 123#0{1 + k % 2}{(100 * k).to_bytes(2, 'little').hex().upper()}0000000000" for k in range(10)]
+    lines = [
+        f"(1.{k:06d}) can0 123#0{1 + k % 2}{(100 * k).to_bytes(2, 'little').hex().upper()}0000000000" for k in range(10)
+    ]
     (tmp_path / "a.log").write_text("\n".join(lines))
     log = read_log(tmp_path / "a.log", dbc=tmp_path / "m.dbc")
     assert log.channels["n_dem"].values.tolist() == [0, 2, 4, 6, 8]
     assert log.channels["n_r"].values.tolist() == [1, 3, 5, 7, 9]
 
 
-# --- round trips -------------------------------------------------------------------------------------------------------------------------
+# --- round trips ------------------------------------------------------------------------------------------------------
 
 
 def test_every_format_has_a_test() -> None:
@@ -261,7 +283,10 @@ def test_a_bus_log_gives_back_what_the_frames_carry(tmp_path: Path, suffix: str)
             np.testing.assert_allclose(got.values, c.values[::stride], atol=RESOLUTION[name] * 0.501)
 
 
-@given(st.lists(st.tuples(st.floats(0, 1e4), st.floats(-10, 75)), min_size=2, unique_by=lambda p: p[0]), st.sampled_from(TABLES))
+@given(
+    st.lists(st.tuples(st.floats(0, 1e4), st.floats(-10, 75)), min_size=2, unique_by=lambda p: p[0]),
+    st.sampled_from(TABLES),
+)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 def test_any_samples_survive_a_table(tmp_path: Path, points: list[tuple[float, float]], suffix: str) -> None:
     t, values = np.array(sorted(points)).T
@@ -272,7 +297,8 @@ def test_any_samples_survive_a_table(tmp_path: Path, points: list[tuple[float, f
 
 
 @pytest.mark.parametrize(
-    ("suffix", "writer"), [(".log", "CanutilsLogWriter"), (".asc", "ASCWriter"), (".blf", "BLFWriter"), (".trc", "TRCWriter")]
+    ("suffix", "writer"),
+    [(".log", "CanutilsLogWriter"), (".asc", "ASCWriter"), (".blf", "BLFWriter"), (".trc", "TRCWriter")],
 )
 def test_frames_are_those_that_python_can_reads(tmp_path: Path, suffix: str, writer: str) -> None:
     import can
@@ -282,18 +308,28 @@ def test_frames_are_those_that_python_can_reads(tmp_path: Path, suffix: str, wri
         for _ in range(800):
             t += rng.random() * 0.01
             extended, kind = bool(rng.random() < 0.5), rng.random()
-            who = {"timestamp": round(t, 6), "arbitration_id": int(rng.integers(1 << (29 if extended else 11))), "is_extended_id": extended}
+            who = {
+                "timestamp": round(t, 6),
+                "arbitration_id": int(rng.integers(1 << (29 if extended else 11))),
+                "is_extended_id": extended,
+            }
             if suffix == ".trc" or kind > 0.4:
-                out.on_message_received(can.Message(**who, data=rng.bytes(int(rng.integers(9))), channel=int(rng.integers(3))))
+                out.on_message_received(
+                    can.Message(**who, data=rng.bytes(int(rng.integers(9))), channel=int(rng.integers(3)))
+                )
             elif kind > 0.1:
                 n = int(rng.choice([1, 8, 12, 16, 20, 24, 32, 48, 64]))
-                out.on_message_received(can.Message(**who, is_fd=True, bitrate_switch=kind > 0.2, data=rng.bytes(n), channel=0))
+                out.on_message_received(
+                    can.Message(**who, is_fd=True, bitrate_switch=kind > 0.2, data=rng.bytes(n), channel=0)
+                )
             elif kind > 0.05:
                 out.on_message_received(can.Message(**who, is_remote_frame=True, dlc=4, channel=0))
             else:
                 out.on_message_received(can.Message(**who, is_error_frame=True, channel=0))
     theirs = [m for m in can.LogReader(path) if not m.is_error_frame and not m.is_remote_frame]
-    ours = {".log": canlog.read_candump, ".asc": canlog.read_asc, ".blf": canlog.read_blf, ".trc": canlog.read_trc}[suffix](path)
+    ours = {".log": canlog.read_candump, ".asc": canlog.read_asc, ".blf": canlog.read_blf, ".trc": canlog.read_trc}[
+        suffix
+    ](path)
     assert len(theirs) == ours.t.size
     for k, m in enumerate(theirs):
         assert m.arbitration_id | (canlog.EXTENDED if m.is_extended_id else 0) == ours.ident[k]
@@ -316,7 +352,9 @@ def test_what_we_write_python_can_and_asammdf_read(tmp_path: Path) -> None:
 
 def test_a_silent_channel_is_not_made_up_on_the_bus(tmp_path: Path) -> None:
     t = np.concatenate((np.arange(100) * 0.01, 5 + np.arange(100) * 0.01))
-    write_log(tmp_path / "a.log", {"n_dem": Channel(t, np.full(200, 50.0)), "x_dem": Channel(t[:100], np.full(100, 9.0))})
+    write_log(
+        tmp_path / "a.log", {"n_dem": Channel(t, np.full(200, 50.0)), "x_dem": Channel(t[:100], np.full(100, 9.0))}
+    )
     log = read_log(tmp_path / "a.log")
     gap = np.diff(log.channels["n_dem"].t).max()
     assert 3.9 < gap < 4.1
@@ -332,18 +370,21 @@ def test_current_on_the_bus_is_the_mean_since_the_last_frame(tmp_path: Path) -> 
     assert np.abs(read_log(tmp_path / "a.log", require=()).channels["i_cmd"].values[1:]).max() < 0.01
 
 
-# --- candump ------------------------------------------------------------------------------------------------------------------------------
+# --- candump ----------------------------------------------------------------------------------------------------------
 
 
 def test_candump_variants_are_understood(tmp_path: Path) -> None:
-    frame = canlog.encode(canlog.load_dbc(DBC)[0][0], {"n_dem": np.array([10.0, 20.0, 30.0, 40.0]), "n_r": np.full(4, 9.0)}, 4)
+    frame = canlog.encode(
+        canlog.load_dbc(DBC)[0][0], {"n_dem": np.array([10.0, 20.0, 30.0, 40.0]), "n_r": np.full(4, 9.0)}, 4
+    )
     hexes = [f.tobytes().hex() for f in frame]
     text = [
         f"(1735329625.000000) can0 0A0#{hexes[0].upper()}",
         f"(1735329625.010000) can0 0a0#{hexes[1]} R",
         f"(1735329625.020000)  vcan1  0A0   [8]  {' '.join(re.findall('..', hexes[2].upper()))}",
         f"(1735329625.025000) can0 0A0##1{hexes[3].upper()} T\r",
-        "(1735329625.026000) can0 0A0#R", "(1735329625.026000) can0 0A0#R8", "(1735329625.026000) can0 20000080#0000000000000000",
+        "(1735329625.026000) can0 0A0#R", "(1735329625.026000) can0 0A0#R8", "(1735329625.026000) can0 "
+                                                                             "20000080#0000000000000000",
         "(1735329625.027000) can0 1ABCDEF0#0102", "", "# comment", "(1735329625.03",
     ]  # fmt: skip
     (tmp_path / "a.log").write_text("\n".join(text))
@@ -407,7 +448,7 @@ def test_a_cut_log_is_read_as_far_as_it_goes(tmp_path: Path, suffix: str) -> Non
     assert 1000 < log.channels["n_dem"].t.size < 2000
 
 
-# --- other bus formats --------------------------------------------------------------------------------------------------------------------
+# --- other bus formats ------------------------------------------------------------------------------------------------
 
 
 def test_asc_times_relative_to_the_event_before_add_up(tmp_path: Path) -> None:
@@ -431,7 +472,10 @@ def test_asc_times_relative_to_the_event_before_add_up(tmp_path: Path) -> None:
     ],
 )
 def test_every_version_of_trc_is_read(tmp_path: Path, head: str, line: str) -> None:
-    rows = [line.format(n=k + 1, t=10.0 * k, i=0xA0 + k % 2, d=" ".join(f"{b:02X}" for b in range(k, k + 8))) for k in range(120)]
+    rows = [
+        line.format(n=k + 1, t=10.0 * k, i=0xA0 + k % 2, d=" ".join(f"{b:02X}" for b in range(k, k + 8)))
+        for k in range(120)
+    ]
     (tmp_path / "a.trc").write_text(head + "; comment\n" + "\n".join(rows))
     frames = canlog.read_trc(tmp_path / "a.trc")
     np.testing.assert_allclose(frames.t, np.arange(120) * 0.01, atol=1e-9)
@@ -456,12 +500,20 @@ def test_a_blf_object_of_size_zero_and_a_boasting_container_are_survived(tmp_pat
     for stream, promise in ((empty * 4, 128), (bytes(1 << 20), 0xFFFFFFFF)):
         body = zlib.compress(stream)
         size = (32 + len(body)).to_bytes(4, "little")
-        container = b"LOBJ\x10\0\x01\0" + size + (10).to_bytes(4, "little") + b"\x02" + bytes(7) + promise.to_bytes(4, "little") + bytes(4)
+        container = (
+            b"LOBJ\x10\0\x01\0"
+            + size
+            + (10).to_bytes(4, "little")
+            + b"\x02"
+            + bytes(7)
+            + promise.to_bytes(4, "little")
+            + bytes(4)
+        )
         (tmp_path / "a.blf").write_bytes(head + container + body)
         assert "no CAN frame" in refused(tmp_path / "a.blf")
 
 
-# --- names --------------------------------------------------------------------------------------------------------------------------------
+# --- names ------------------------------------------------------------------------------------------------------------
 
 
 def test_names_are_mapped_in_both_directions(tmp_path: Path) -> None:
@@ -517,22 +569,30 @@ def test_an_mdf_name_may_carry_its_group(tmp_path: Path) -> None:
     assert "not numbers" in refused(tmp_path / "a.mf4", mapping={"text": "n_dem"})
 
 
-# --- units --------------------------------------------------------------------------------------------------------------------------------
+# --- units ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("signal", "unit", "value", "expected"),
     [
         ("n_dem", "rpm", 19000.0, 50.0), ("n_dem", "Hz", 38000 / 60, 100.0), ("n_dem", "1/min", 3800.0, 10.0),
-        ("n_dem", "kHz", 0.038 / 0.06, 100.0), ("n_dem", "rad/s", 38000 / 60 * 2 * np.pi, 100.0), ("n_dem", "deg/s", 38000 * 6, 100.0),
-        ("n_dem", "ratio", 0.5, 50.0), ("n_dem", "%", 7.0, 7.0), ("x_dem", "m", 0.02, 20.0), ("x_dem", "inch", 1.0, 25.4),
-        ("i_cmd", "A", 0.01, 10.0), ("p_s", "bar", 210.0, 21.0), ("p_s", "psi", 3000.0, 20.6842719), ("t_oil", "K", 300.0, 26.85),
-        ("t_oil", "°C", 20.0, 20.0), ("t_oil", "degF", 212.0, 100.0), ("vigv", "rad", 1.0, 57.29577951), ("vigv", "°", 3.0, 3.0),
+        ("n_dem", "kHz", 0.038 / 0.06, 100.0), ("n_dem", "rad/s", 38000 / 60 * 2 * np.pi, 100.0),
+        ("n_dem", "deg/s", 38000 * 6, 100.0),
+        ("n_dem", "ratio", 0.5, 50.0), ("n_dem", "%", 7.0, 7.0), ("x_dem", "m", 0.02, 20.0),
+        ("x_dem", "inch", 1.0, 25.4),
+        ("i_cmd", "A", 0.01, 10.0), ("p_s", "bar", 210.0, 21.0), ("p_s", "psi", 3000.0, 20.6842719),
+        ("t_oil", "K", 300.0, 26.85),
+        ("t_oil", "°C", 20.0, 20.0), ("t_oil", "degF", 212.0, 100.0), ("vigv", "rad", 1.0, 57.29577951),
+        ("vigv", "°", 3.0, 3.0),
     ],
 )  # fmt: skip
 def test_units_are_converted(tmp_path: Path, signal: str, unit: str, value: float, expected: float) -> None:
-    stated = read_log(csv(tmp_path, f"t,{signal}\n0,{value!r}\n1,{value!r}\n"), units={signal: unit}, design_rpm=38000, require=())
-    in_header = read_log(csv(tmp_path, f"t,{signal} [{unit}]\n0,{value!r}\n1,{value!r}\n"), design_rpm=38000, require=())
+    stated = read_log(
+        csv(tmp_path, f"t,{signal}\n0,{value!r}\n1,{value!r}\n"), units={signal: unit}, design_rpm=38000, require=()
+    )
+    in_header = read_log(
+        csv(tmp_path, f"t,{signal} [{unit}]\n0,{value!r}\n1,{value!r}\n"), design_rpm=38000, require=()
+    )
     for log in (stated, in_header):
         np.testing.assert_allclose(log.channels[signal].values, expected, rtol=1e-7)
         assert log.notes == []
@@ -551,7 +611,10 @@ def test_a_unit_that_does_not_convert_is_refused_with_what_is_allowed(tmp_path: 
     assert "x_dem" in line and "degC" in line and "mm" in line
     assert "not known" in refused(csv(tmp_path, "t,n_dem\n0,1\n1,2\n"), units={"n_dem": "parsnip"})
     assert "x_dem" in refused(csv(tmp_path, "t,n_dem,x_dem [V]\n0,1,1\n1,2,2\n"))
-    assert read_log(csv(tmp_path, "t,n_dem,x_dem [V]\n0,1,1\n1,2,2\n"), units={"x_dem": "mm"}).channels["x_dem"].values[1] == 2
+    assert (
+        read_log(csv(tmp_path, "t,n_dem,x_dem [V]\n0,1,1\n1,2,2\n"), units={"x_dem": "mm"}).channels["x_dem"].values[1]
+        == 2
+    )
     assert "close: n_dem" in refused(csv(tmp_path, "t,n_dem\n0,1\n1,2\n"), units={"n_den": "rpm"})
 
 
@@ -561,7 +624,9 @@ def test_a_unit_that_nobody_knows_is_taken_for_the_signals_own_with_a_note(tmp_p
     assert log.notes == ["p_s (p_s [Skt]): unit 'Skt' is not known, MPa assumed"]
 
 
-@pytest.mark.parametrize("unit", ["9**9**9**9", "mm^99999", "(" * 40, "mm mm", "%%", "1e999", "m^-", "_", "+", "°°", "\\", "mm/0"])
+@pytest.mark.parametrize(
+    "unit", ["9**9**9**9", "mm^99999", "(" * 40, "mm mm", "%%", "1e999", "m^-", "_", "+", "°°", "\\", "mm/0"]
+)
 def test_no_unit_text_of_a_file_does_harm(tmp_path: Path, unit: str) -> None:
     with contextlib.suppress(LogError):
         check(read_log(csv(tmp_path, f"t,n_dem,p_s [{unit}]\n0,1,5\n1,2,6\n")))
@@ -581,7 +646,9 @@ def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:
 
     start = datetime.datetime(2024, 1, 1)
     t = [start + datetime.timedelta(milliseconds=10 * k) for k in range(4)]
-    pl.DataFrame({"t": t, "n_dem": [1, 2, None, 4], "state": [True, False, True, None]}).write_parquet(tmp_path / "a.parquet")
+    pl.DataFrame({"t": t, "n_dem": [1, 2, None, 4], "state": [True, False, True, None]}).write_parquet(
+        tmp_path / "a.parquet"
+    )
     log = read_log(tmp_path / "a.parquet")
     np.testing.assert_allclose(log.channels["n_dem"].t, [0, 0.01, 0.03], atol=1e-6)
     assert log.channels["n_dem"].values.tolist() == [1, 2, 4] and log.channels["state"].values.tolist() == [1, 0, 1]
@@ -589,7 +656,7 @@ def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:
     assert "not numbers" in refused(tmp_path / "b.parquet")
 
 
-# --- times and values ---------------------------------------------------------------------------------------------------------------------
+# --- times and values -------------------------------------------------------------------------------------------------
 
 
 def test_tables_whose_time_runs_backwards_are_refused_by_row(tmp_path: Path) -> None:
@@ -644,13 +711,15 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
         assert c.t.tolist() == [0, 0.5] and c.values.tolist() == [1.5, 2.5]
 
 
-# --- databases ----------------------------------------------------------------------------------------------------------------------------
+# --- databases --------------------------------------------------------------------------------------------------------
 
 
 def test_a_dbc_that_does_not_fit_or_parse_is_refused(tmp_path: Path) -> None:
     write_log(tmp_path / "a.log", run(50))
     (tmp_path / "other.dbc").write_text(MUX)
-    assert "other.dbc has it in M (0x123), but the log has no such frame" in refused(tmp_path / "a.log", dbc=tmp_path / "other.dbc")
+    assert "other.dbc has it in M (0x123), but the log has no such frame" in refused(
+        tmp_path / "a.log", dbc=tmp_path / "other.dbc"
+    )
     for text in ("", "not a dbc", "BO_ 1 A: 8 X\n SG_ nonsense", "BO_ \0"):
         (tmp_path / "bad.dbc").write_text(text)
         with pytest.raises(LogError, match=r"bad\.dbc"):
@@ -667,10 +736,15 @@ BA_ "VFrameFormat" BO_ {0x8CF004FE} 3;
 
 def test_j1939_frames_are_matched_by_their_parameter_group(tmp_path: Path) -> None:
     (tmp_path / "j.dbc").write_text(
-        MUX.split("BO_")[0] + f'BO_ {0x8CF004FE} EEC1: 8 A\n SG_ n_dem : 24|16@1+ (0.125,0) [0|8031.875] "rpm" A\n' + J1939
+        MUX.split("BO_")[0]
+        + f'BO_ {0x8CF004FE} EEC1: 8 A\n SG_ n_dem : 24|16@1+ (0.125,0) [0|8031.875] "rpm" A\n'
+        + J1939
     )
     speeds = [800, 801, 0xFFFF, 803]
-    lines = [f"(1.{k:06d}) can0 0CF00400#000000{(8 * n & 0xFFFF).to_bytes(2, 'little').hex().upper()}000000" for k, n in enumerate(speeds)]
+    lines = [
+        f"(1.{k:06d}) can0 0CF00400#000000{(8 * n & 0xFFFF).to_bytes(2, 'little').hex().upper()}000000"
+        for k, n in enumerate(speeds)
+    ]
     lines += ["(1.100000) can0 18F00417#0000000000000000"]
     (tmp_path / "a.log").write_text("\n".join(lines))
     log = read_log(tmp_path / "a.log", dbc=tmp_path / "j.dbc", design_rpm=1000)
@@ -678,7 +752,7 @@ def test_j1939_frames_are_matched_by_their_parameter_group(tmp_path: Path) -> No
     assert any("2 senders or buses; took 0xCF00400 (4 of 5 frames)" in n for n in log.notes)
 
 
-# --- real recordings ----------------------------------------------------------------------------------------------------------------------
+# --- real recordings --------------------------------------------------------------------------------------------------
 
 
 def test_a_car_being_revved_is_read_from_candump() -> None:
@@ -699,7 +773,9 @@ def test_a_car_being_revved_is_read_from_candump() -> None:
 
 def test_an_idling_truck_is_read_from_an_mdf_bus_log() -> None:
     folder = data("can_j1939")
-    log = read_log(folder / "log.mf4", dbc=folder / "j1939_demo.dbc", mapping={"EEC1.EngineSpeed": "n_dem"}, design_rpm=2000)
+    log = read_log(
+        folder / "log.mf4", dbc=folder / "j1939_demo.dbc", mapping={"EEC1.EngineSpeed": "n_dem"}, design_rpm=2000
+    )
     check(log)
     c = log.channels["n_dem"]
     assert c.t.size == 12719 and c.t[-1] == pytest.approx(127.19, abs=0.01)
@@ -723,10 +799,12 @@ def test_real_frames_decode_as_cantools_does() -> None:
     for (ident, name), values in theirs.items():
         m = messages[ident]
         rows, _ = canlog.select(frames, m)
-        np.testing.assert_allclose(canlog.cut_signal(frames, rows, m, m.layout.get_signal_by_name(name))[1], values, rtol=1e-15)
+        np.testing.assert_allclose(
+            canlog.cut_signal(frames, rows, m, m.layout.get_signal_by_name(name))[1], values, rtol=1e-15
+        )
 
 
-# --- writing ------------------------------------------------------------------------------------------------------------------------------
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:

@@ -45,7 +45,17 @@ def mutations(raw: bytes, rng: random.Random) -> bytes:
         elif how < 0.75:
             at &= ~7
             number = rng.choice(
-                [0, 1, 8, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1, 1 << 40, rng.randrange(len(out)) & ~7, rng.randrange(1 << 16)]
+                [
+                    0,
+                    1,
+                    8,
+                    0xFFFFFFFF,
+                    (1 << 63) - 1,
+                    (1 << 64) - 1,
+                    1 << 40,
+                    rng.randrange(len(out)) & ~7,
+                    rng.randrange(1 << 16),
+                ]
             )
             out[at : at + 8] = number.to_bytes(8, "little")
         elif how < 0.85:
@@ -54,7 +64,19 @@ def mutations(raw: bytes, rng: random.Random) -> bytes:
             out[at:at] = out[at : at + rng.randrange(1, 300)]
         else:
             out[at : at + 4] = rng.choice(
-                [b"nan,", b",,,,", b"\n\n\n\n", b"1e99", b"-inf", b'"', b"\0\0\0\0", b"#", b"(", b"\xff\xfe\xfd", "٣".encode()]
+                [
+                    b"nan,",
+                    b",,,,",
+                    b"\n\n\n\n",
+                    b"1e99",
+                    b"-inf",
+                    b'"',
+                    b"\0\0\0\0",
+                    b"#",
+                    b"(",
+                    b"\xff\xfe\xfd",
+                    "٣".encode(),
+                ]
             )
         if not out:
             return b"\0"
@@ -147,7 +169,9 @@ def test_no_damage_takes_the_reader_of_bus_mdf_down(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs._FORMATS))
-def test_long_campaign(tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_campaign(
+    tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
     campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
 

@@ -65,11 +65,20 @@ GROSS: dict[str, dict[str, float]] = {
 }
 LOADED = ("piston_stiction", "internal_leakage", "oil_compressibility")  # show under a load only
 T_OIL = 80.0  # degC, so that what grows with heat shows
-POINTS = [[0.0, 45.0], [0.5, 45.0], [0.6, 60.0], [1.6, 62.0], [1.9, 57.0], [2.5, 59.0], [3.0, 59.0]]  # s, %: a slam, ramps, two reversals
+POINTS = [
+    [0.0, 45.0],
+    [0.5, 45.0],
+    [0.6, 60.0],
+    [1.6, 62.0],
+    [1.9, 57.0],
+    [2.5, 59.0],
+    [3.0, 59.0],
+]  # s, %: a slam, ramps, two reversals
 SECONDS = 3.0
 DEMAND = np.interp(np.arange(0.0, SECONDS, 0.01), *np.array(POINTS).T)
 SHOWN = ("x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2", "n_r")
-# border units, several steps of the frames: what two runs that act alike may differ by, and the least that a gross effect moves
+# border units, several steps of the frames: what two runs that act alike may differ by, and the least that a gross
+# effect moves
 LEAST = {"x_dem": 0.01, "x_lvdt": 0.02, "i_cmd": 0.1, "vigv": 0.01, "vgv1": 0.01, "vgv2": 0.01, "n_r": 0.01}
 
 Curves = dict[str, np.ndarray]
@@ -89,7 +98,10 @@ def on_the_bus(plant: Plant, names: tuple[str, ...]) -> tuple[str, Curves]:
     """Controller and ECU as nodes; what they say in frames."""
     node, ecu = Node(plant, n_r=DEMAND[0], t_oil=T_OIL), Ecu(plant, n_dem=DEMAND[0])
     run = run_lockstep(DEMAND, vgv=node, ecu=ecu)
-    words = {ident: [frames.decode(*row) for row in run.rows.tolist() if row[0] & frames.IDENT_MASK == ident] for ident in frames.NAMES}
+    words = {
+        ident: [frames.decode(*row) for row in run.rows.tolist() if row[0] & frames.IDENT_MASK == ident]
+        for ident in frames.NAMES
+    }
     of = {s: i for i, (_, signals) in frames.FRAMES.items() for s in signals}
     taken = run.rows[:, 0] & frames.IDENT_MASK == ECU_DEMAND
     again = Node(plant, n_r=DEMAND[0], t_oil=T_OIL)
@@ -110,7 +122,9 @@ def replayed(plant: Plant, names: tuple[str, ...]) -> tuple[str, Curves]:
 def injected(plant: Plant, names: tuple[str, ...]) -> tuple[str, Curves]:
     """The nominal machine, which an action of a scenario changes at power-on."""
     actions = [Machine(effect=name, parameters=GROSS[name]) for name in names]
-    outcome = inject.run(Scenario(title="made", duration=SECONDS, demand=POINTS, seed=3, inject=[Machine(t_oil=T_OIL), *actions]))
+    outcome = inject.run(
+        Scenario(title="made", duration=SECONDS, demand=POINTS, seed=3, inject=[Machine(t_oil=T_OIL), *actions])
+    )
     return str(outcome.state_hash), {s: outcome.trace.signals[s] for s in SHOWN}
 
 
@@ -152,7 +166,9 @@ def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name
     advance(0, ticks, stimulus.rows, noise, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
     node = Node(plant, n_r=demand[0], t_oil=T_OIL, seed=4)
     at = np.arange(0, ticks, 10)
-    rows = np.array([[frames.word0(ECU_DEMAND), frames.encode_demand(v, v, 1, k % 15)] for k, v in enumerate(demand)], np.int64)
+    rows = np.array(
+        [[frames.word0(ECU_DEMAND), frames.encode_demand(v, v, 1, k % 15)] for k, v in enumerate(demand)], np.int64
+    )
     repeat(node, at, rows, ticks)
     assert np.array_equal(node.arrays.z, loop.z)
     assert np.array_equal(node.arrays.s, loop.s)
@@ -184,7 +200,9 @@ def test_an_effect_that_ends_leaves_the_calibration_as_it_was() -> None:
         node.tick(np.zeros((0, 2), np.int64))
         seen.append(float(node.arrays.calibration.table[1, 0] - before[1][1, 0]))
     assert seen == [pytest.approx(1e-3)] * 20 + [0.0] * 20
-    assert np.array_equal(node.arrays.calibration.k, before[0]) and np.array_equal(node.arrays.calibration.table, before[1])
+    assert np.array_equal(node.arrays.calibration.k, before[0]) and np.array_equal(
+        node.arrays.calibration.table, before[1]
+    )
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.states])

@@ -29,13 +29,13 @@ def over(x, low):
 def unused(x):
     return x + 1
 '''
-TESTS = '''
+TESTS = """
 import tiny
 
 def test_over():
     assert tiny.over(5.0, False) == -5.0 and tiny.over(5.0, True) == 5.0 and tiny.over(4.5, False) == -4.5
     assert tiny.over(3.9, False) == 3.9 and tiny.over(-9, False) == 2 and tiny.over(2.5, False) == 2.5
-'''
+"""
 
 
 def test_every_operator_number_and_statement_is_changed_once(tmp_path: Path) -> None:
@@ -43,8 +43,10 @@ def test_every_operator_number_and_statement_is_changed_once(tmp_path: Path) -> 
     found = {m.name.split(": ", 1)[1] for m in mutants_of(tmp_path, "tiny.py")}
     assert found >= {
         "`LIMIT = 4.0` -> `LIMIT = 3.2`", "`LIMIT = 4.0` -> `LIMIT = 5.0`", "`N = 2` -> `N = 3`",
-        "`if x > LIMIT and (not low)` -> `if x >= LIMIT and (not low)`", "`if x > LIMIT and (not low)` -> `if x <= LIMIT and (not low)`",
-        "`if x > LIMIT and (not low)` -> `if x > LIMIT or not low`", "`if x > LIMIT and (not low)` -> `if x > LIMIT and low`",
+        "`if x > LIMIT and (not low)` -> `if x >= LIMIT and (not low)`", "`if x > LIMIT and (not low)` -> `if x <= "
+                                                                         "LIMIT and (not low)`",
+        "`if x > LIMIT and (not low)` -> `if x > LIMIT or not low`", "`if x > LIMIT and (not low)` -> `if x > LIMIT "
+                                                                     "and low`",
         "`return -x` -> `return x`", "`while n < N` -> `while n >= N`", "`n += 1` -> `n -= 1`", "`n += 1` -> `n += 2`",
         "`n += 1` -> `pass`",
         "`return max(x, n)` -> `return min(x, n)`", "`return x + 1` -> `return x - 1`",
@@ -68,13 +70,17 @@ for o in c.run_target(t, t.mutants(), 2, lambda o: None):
 def campaign(folder: Path, tests: str) -> subprocess.CompletedProcess[str]:
     (folder / "tiny.py").write_text(TINY)
     (folder / "test_tiny.py").write_text(tests)
-    return subprocess.run([sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False
+    )
 
 
 def test_a_campaign_tells_the_killed_from_the_survivors_and_ends_endless_loops(tmp_path: Path) -> None:
     run = campaign(tmp_path, TESTS)
     assert run.returncode == 0, run.stderr
-    killed = {line.split(": ", 1)[1]: line.startswith("# True") for line in run.stdout.splitlines() if line.startswith("#")}
+    killed = {
+        line.split(": ", 1)[1]: line.startswith("# True") for line in run.stdout.splitlines() if line.startswith("#")
+    }
     assert killed["`n += 1` -> `pass`"] and killed["`n += 1` -> `n -= 1`"]  # these never end
     survivors = {name for name, dead in killed.items() if not dead}
     assert survivors == {
@@ -102,5 +108,7 @@ def test_every_equivalent_mutant_listed_is_one_and_has_a_reason() -> None:
 
 @pytest.mark.parametrize("options", [["nothing"], ["--sample", "many"]])
 def test_a_target_that_is_not_there_is_refused(options: list[str]) -> None:
-    run = subprocess.run([sys.executable, "-m", "tests.mutants", *options], cwd=ROOT, capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        [sys.executable, "-m", "tests.mutants", *options], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert run.returncode == 2 and "Traceback" not in run.stderr

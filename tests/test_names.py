@@ -1,4 +1,6 @@
-"""When a name may be given, and what is said instead: bounds, shares of the error, causes that go together, other stages' objections."""
+"""When a name may be given, and what is said instead: bounds, shares of the error, causes that go together, other
+stages' objections.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import shape
 from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
-SMALL = Effect("null_bias", (replace(NULL_BIAS.parameters[0], low=-0.4, high=0.4),), ((-0.1,), (0.1,), (0.3,)), "any motion")
+SMALL = Effect(
+    "null_bias", (replace(NULL_BIAS.parameters[0], low=-0.4, high=0.4),), ((-0.1,), (0.1,), (0.3,)), "any motion"
+)
 
 
 def test_an_effect_and_its_rivals_hold_nine_tenths_of_the_probability():
@@ -40,7 +44,9 @@ def test_a_size_at_its_bound_is_no_answer(truth, said):
         assert d.nearest == ["null_bias"] and "end of its physical range" in d.refused[0] and not d.effects
 
 
-@pytest.mark.parametrize(("before", "after", "said"), [(1.048, 1.040, "none"), (1.08, 1.062, "unknown"), (1.04, 1.005, "missing")])
+@pytest.mark.parametrize(
+    ("before", "after", "said"), [(1.048, 1.040, "none"), (1.08, 1.062, "unknown"), (1.04, 1.005, "missing")]
+)
 def test_what_explains_less_than_half_of_the_excess_is_not_named(monkeypatch, before, after, said):
     assert verdict(monkeypatch, before, after, ("a",)) == said
 
@@ -51,7 +57,7 @@ def test_half_of_the_excess_is_the_limit(monkeypatch, times, beyond):
     assert verdict(monkeypatch, 1.048, after, ("a",)) == ("missing" if beyond else "none")
 
 
-# ---- causes that go together ---------------------------------------------------------------------------------------------------------
+# ---- causes that go together -----------------------------------------------------------------------------------------
 
 WARM = 40.0 + 20.0 * T / T[-1]  # degC: goes with time
 BUSY = 50.0 + 10.0 * np.sin(2.0 * np.pi * T / 41.0)  # degC: goes its own way
@@ -68,7 +74,8 @@ def ageing(t_oil: np.ndarray, true_cause: np.ndarray) -> Stage:
     drift = Effect("gain_drift", (Parameter("fall", 0.0, "1", -2.0, 2.0),), ((-0.1,), (0.1,), (1.0,)), "time")
     share = (t_oil - t_oil.min()) / np.ptp(t_oil)
     return Stage(
-        "valve", ("x",), ("mm",), (Parameter("gain", 2.0, "1", 1.0, 3.0, 0.05),), (drift,), with_cause(T / T[-1]), T, measured[None],
+        "valve", ("x",), ("mm",), (Parameter("gain", 2.0, "1", 1.0, 3.0, 0.05),), (drift,), with_cause(T / T[-1]), T,
+        measured[None],
         regimes={"time": T, "oil temperature": t_oil}, floor=np.array([0.01]),
         twins={"gain_drift": ("oil temperature", with_cause(share))},
     )  # fmt: skip
@@ -92,7 +99,7 @@ def test_an_effect_that_would_have_to_turn_on_something_else_is_the_nearest_of_a
     assert "gain_drift" in diagnosis_json(d, "x")["unknown"][0]["nearest_effects"]
 
 
-# ---- other stages' objections --------------------------------------------------------------------------------------------------------
+# ---- other stages' objections ----------------------------------------------------------------------------------------
 
 
 def reading(name: str, effects: tuple[str, ...], bias: float) -> Stage:
@@ -126,7 +133,9 @@ def test_a_name_without_a_rival_that_another_stage_refutes_is_none():
 
 
 def test_a_name_that_another_stage_sees_too_stays():
-    d = answers(reading("actuator", ("lvdt_bias", "end_stop"), 1.0), reading("linkage", ("lvdt_bias",), 1.0))["actuator"]
+    d = answers(reading("actuator", ("lvdt_bias", "end_stop"), 1.0), reading("linkage", ("lvdt_bias",), 1.0))[
+        "actuator"
+    ]
     assert [(f.effect, f.rivals) for f in d.effects] == [("lvdt_bias", [])]
 
 
@@ -137,7 +146,7 @@ def test_two_stages_may_differ_by_half_of_a_size(times, beyond):
     assert d["actuator"].verdict == ("unknown" if beyond else "missing")
 
 
-# ---- the tool's own rate -------------------------------------------------------------------------------------------------------------
+# ---- the tool's own rate ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("hertz", "named"), [(None, ""), (1.37, "1.37")])

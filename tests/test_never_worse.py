@@ -21,7 +21,9 @@ N = 1200
 
 
 def rough_stage(seed: int) -> Stage:
-    """A stage with effects whose error has many valleys: sizes act through sines and saturations, some starts lie far off."""
+    """A stage with effects whose error has many valleys: sizes act through sines and saturations, some starts lie far
+    off.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(N) * 0.1
     inputs = np.cumsum(rng.standard_normal((4, N)), axis=1) / 10.0
@@ -35,9 +37,20 @@ def rough_stage(seed: int) -> Stage:
     truth = np.concatenate([[0.05], np.where(rng.random(4) < 0.5, rng.uniform(-1.5, 1.5, 4), 0.0)])
     measured = run(truth[None])[0] + 0.1 * rng.standard_normal((1, N))
     effects = tuple(
-        Effect(f"e{k}", (Parameter("size", 0.0, "-", -2.0, 2.0),), tuple((v,) for v in rng.uniform(-2.0, 2.0, 2))) for k in range(4)
+        Effect(f"e{k}", (Parameter("size", 0.0, "-", -2.0, 2.0),), tuple((v,) for v in rng.uniform(-2.0, 2.0, 2)))
+        for k in range(4)
     )
-    return Stage("rough", ("y",), ("-",), (Parameter("offset", 0.0, "-", tolerance=0.1),), effects, run, t, measured, floor=np.array([0.1]))
+    return Stage(
+        "rough",
+        ("y",),
+        ("-",),
+        (Parameter("offset", 0.0, "-", tolerance=0.1),),
+        effects,
+        run,
+        t,
+        measured,
+        floor=np.array([0.1]),
+    )
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -62,7 +75,11 @@ def test_extend_writes_no_model_that_is_no_better(after, written, monkeypatch, t
     stage = rough_stage(0)
     effect = Effect("internal_leakage", (Parameter("coefficient", 0.0, "mm/s/MPa", 0.0, 50.0),), ((1.0,),))
     stage = replace(stage, name="actuator", effects=(effect,), run=lambda theta: np.zeros((len(theta), 1, N)))
-    ended = replace(extend_stage(stage, ("internal_leakage",)), steps=[("nominal", 151.0), ("+ internal_leakage", after)], excess=after)
+    ended = replace(
+        extend_stage(stage, ("internal_leakage",)),
+        steps=[("nominal", 151.0), ("+ internal_leakage", after)],
+        excess=after,
+    )
     chain = Chain(stage.t, [stage], {}, {}, None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(extend, "chain_of", lambda args, model: chain)
     monkeypatch.setattr(workflow, "extend_stage", lambda stage, effects: ended)

@@ -50,7 +50,7 @@ def named(sent: np.ndarray) -> dict[int, dict[str, float]]:
     return {int(head) & frames.IDENT_MASK: frames.decode(int(head), int(data)) for head, data in sent}
 
 
-# ---- what the controller sends -------------------------------------------------------------------------------------------------------
+# ---- what the controller sends ---------------------------------------------------------------------------------------
 
 
 def test_three_frames_every_ten_ticks_and_health_every_hundred_with_counters_of_their_own() -> None:
@@ -81,7 +81,9 @@ def test_servo_tells_the_mean_current_since_the_last_frame() -> None:
 
 def test_frames_tell_the_sampled_sensors_in_the_units_of_the_dbc() -> None:
     vgv = started(seed=5)
-    at = vgv.arrays.s[chain.POT : chain.POT + 3, 0].copy()  # what the tick samples: the machine as the tick before left it
+    at = vgv.arrays.s[
+        chain.POT : chain.POT + 3, 0
+    ].copy()  # what the tick samples: the machine as the tick before left it
     sent = named(vgv.tick(rows(demand(10))))
     a = vgv.arrays
     vane = np.rad2deg(at + a.sigma[1:4] * vgv._noise[0, 1:4])
@@ -110,10 +112,12 @@ def test_faults_are_told_by_their_bits() -> None:
     for _ in range(61):
         vgv.tick(NONE)
     sent = named(np.concatenate([vgv.tick(NONE).copy() for _ in range(10)]))
-    assert vgv.faults == 1 and sent[VGV_SERVO]["faults"] == 1 and sent[VGV_STATUS]["state"] == 3 and vgv.mode == "DEGRADED"
+    assert (
+        vgv.faults == 1 and sent[VGV_SERVO]["faults"] == 1 and sent[VGV_STATUS]["state"] == 3 and vgv.mode == "DEGRADED"
+    )
 
 
-# ---- what a received frame does ------------------------------------------------------------------------------------------------------
+# ---- what a received frame does --------------------------------------------------------------------------------------
 
 
 def test_the_last_good_frame_of_a_tick_counts_and_refused_ones_are_counted_in_it() -> None:
@@ -139,8 +143,16 @@ def test_frames_of_others_are_counted_by_whose_they_seem_to_be() -> None:
     vgv = started()
     before = vgv.counts
     data = frames.encode_demand(70.0, 70.0, 1, 10)
-    heads = [int(frames.word0(i)) for i in (VGV_STATUS, VGV_ANGLES, VGV_HEALTH)] + [int(frames.word0(i)) for i in (0x0AF, 0x0B4)]
-    vgv.tick(rows(*[(h, int(data)) for h in heads], (int(frames.word0(ECU_DEMAND)) | ERROR, 0), (int(frames.word0(0x0B0)) | ERROR, 0)))
+    heads = [int(frames.word0(i)) for i in (VGV_STATUS, VGV_ANGLES, VGV_HEALTH)] + [
+        int(frames.word0(i)) for i in (0x0AF, 0x0B4)
+    ]
+    vgv.tick(
+        rows(
+            *[(h, int(data)) for h in heads],
+            (int(frames.word0(ECU_DEMAND)) | ERROR, 0),
+            (int(frames.word0(0x0B0)) | ERROR, 0),
+        )
+    )
     after = {name: v - before[name] for name, v in vgv.counts.items()}
     assert {name: v for name, v in after.items() if v} == {"own_identifier": 3, "other": 2, "error_frames": 2}
 
@@ -152,7 +164,10 @@ def test_silence_is_no_loss() -> None:
     assert vgv.counts["stale"] == 1 and vgv.counts["lost"] == 0
     sent = [vgv.tick(NONE).copy() for _ in range(21)]
     health = next(named(s)[VGV_HEALTH] for s in sent if len(s) == 4)
-    assert (health["frames_lost"], health["frames_rejected"]) == (0, 0)  # of a sender that sends nothing nothing is lost
+    assert (health["frames_lost"], health["frames_rejected"]) == (
+        0,
+        0,
+    )  # of a sender that sends nothing nothing is lost
 
 
 def test_the_machine_runs_at_its_own_speed_until_a_demand_has_come_and_then_at_the_demands() -> None:
@@ -223,7 +238,7 @@ def test_a_recorded_run_is_repeated_from_any_tick_on(start: int, ticks: int) -> 
     assert one.fingerprint() == other.fingerprint() and other.k == start + ticks
 
 
-# ---- ECU -----------------------------------------------------------------------------------------------------------------------------
+# ---- ECU -------------------------------------------------------------------------------------------------------------
 
 
 def test_the_ecu_sends_its_demand_every_ten_ticks() -> None:
@@ -263,7 +278,12 @@ def test_the_ecu_keeps_the_last_good_values_of_each_frame() -> None:
         VGV_ANGLES: frames.encode_angles,
         VGV_HEALTH: frames.encode_health,
     }
-    values = {VGV_STATUS: (1.0, 2.0, 3), VGV_SERVO: (4.0, 5), VGV_ANGLES: (6.0, 7.0, 8.0), VGV_HEALTH: (9.0, 10.0, 11, 12)}
+    values = {
+        VGV_STATUS: (1.0, 2.0, 3),
+        VGV_SERVO: (4.0, 5),
+        VGV_ANGLES: (6.0, 7.0, 8.0),
+        VGV_HEALTH: (9.0, 10.0, 11, 12),
+    }
     for counter in range(2):  # the first shows only where the counter is
         ecu.tick(rows(*[(int(frames.word0(i)), int(given[i](*v, counter))) for i, v in values.items()]))
     assert list(ecu.values.values()) == pytest.approx([float(i) for i in range(1, 13)])
@@ -307,7 +327,11 @@ def test_the_controller_gets_of_each_potentiometer_what_is_left_of_it() -> None:
 def test_a_frame_with_counter_0_is_heard_like_any_other() -> None:
     ecu = Ecu()
     for k in range(60):
-        heard = [(int(frames.word0(VGV_STATUS)), int(frames.encode_status(1.0, 1.0, 2, c))) for at, c in ((40, 14), (50, 0)) if k == at]
+        heard = [
+            (int(frames.word0(VGV_STATUS)), int(frames.encode_status(1.0, 1.0, 2, c)))
+            for at, c in ((40, 14), (50, 0))
+            if k == at
+        ]
         ecu.tick(rows(*heard))
     assert ecu.stale() == ["VGV_SERVO", "VGV_ANGLES"]
 
@@ -321,7 +345,9 @@ def test_replay_goes_on_in_silence_after_the_last_recorded_frame() -> None:
     one, other = Node(seed=2), Node(seed=2)
     heard = [(k, demand(k // 10)) for k in range(0, 30, 10)]
     sent = [one.tick(rows(*[f for at, f in heard if at == k])).copy() for k in range(130)]
-    at, again = replay(other, np.array([k for k, _ in heard]), rows(*[f for _, f in heard]).ravel(), 130)  # words one after the other
+    at, again = replay(
+        other, np.array([k for k, _ in heard]), rows(*[f for _, f in heard]).ravel(), 130
+    )  # words one after the other
     assert np.array_equal(again, np.concatenate(sent)) and at.tolist() == [k for k, s in enumerate(sent) for _ in s]
     assert one.fingerprint() == other.fingerprint() and one.counts["stale"] == 1
 

@@ -20,7 +20,21 @@ from hypothesis import strategies as st
 from hil.figures import error_figures
 from vaneloop.base.errors import InputError
 from vaneloop.pages import page as page_module
-from vaneloop.pages.page import THEMES, Line, Page, Panel, bars, decimate, heat, histogram, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.page import (
+    THEMES,
+    Line,
+    Page,
+    Panel,
+    bars,
+    decimate,
+    heat,
+    histogram,
+    loop,
+    number,
+    overlay,
+    ranking,
+    waterfall,
+)
 from vaneloop.pages.replay import PAPER_TABLE_5, engine_test_report, replay_report
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'\u2028"
@@ -76,7 +90,10 @@ def full_page(name="vigv"):
     page.plot(loop([Line(name, t, t)], name, name), name, half=True)
     page.plot(bars([name, "b"], {name: [1.0, None]}, name, marks={name: 0.5}), name)
     page.plot(waterfall([(name, 1.0), ("effect", 0.3), ("end", 0.2)], name, floor=0.1), name)
-    page.plot(ranking([name, "b"], [0.9, 0.1], name, notes=[name, ""], highlight=[name], low=[0.8, 0.0], high=[0.95, 0.2]), name)
+    page.plot(
+        ranking([name, "b"], [0.9, 0.1], name, notes=[name, ""], highlight=[name], low=[0.8, 0.0], high=[0.95, 0.2]),
+        name,
+    )
     page.plot(heat([[1.0, None], [0.2, 0.3]], [name, "c"], [name, "r"], name, name, name), name)
     return page
 
@@ -181,8 +198,10 @@ def test_the_same_page_twice_is_the_same_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "–"), (float("nan"), "–"), (0.0, "0"), (0.55, "0.55"), (2.17, "2.17"), (0.12345, "0.123"), (1234.5, "1,234"), (3000.0, "3,000"),
-     (30000, "30,000"), (1e-7, "1.00e-07"), (-0.5, "-0.5"), (True, "yes"), ("vigv", "vigv"), (np.float64(11.72), "11.7")],
+    [(None, "–"), (float("nan"), "–"), (0.0, "0"), (0.55, "0.55"), (2.17, "2.17"), (0.12345, "0.123"),
+    (1234.5, "1,234"), (3000.0, "3,000"),
+     (30000, "30,000"), (1e-7, "1.00e-07"), (-0.5, "-0.5"), (True, "yes"), ("vigv", "vigv"),
+     (np.float64(11.72), "11.7")],
 )  # fmt: skip
 def test_numbers_read_as_a_person_writes_them(value, text):
     assert number(value) == text
@@ -324,7 +343,9 @@ def play(x, gap):
     return y
 
 
-def result(duration=300.0, rate=50.0, width=1.6, model_width=1.6, dual=True, log="run.csv", channels=("n_r", "x_lvdt", "vigv")):
+def result(
+    duration=300.0, rate=50.0, width=1.6, model_width=1.6, dual=True, log="run.csv", channels=("n_r", "x_lvdt", "vigv")
+):
     """Rotor speed to and fro between 40 and 100 %, vanes with play, sensors with noise."""
     t = np.arange(int(duration * rate)) / rate
     rng = np.random.default_rng(0)

@@ -51,7 +51,12 @@ def test_half_current_reaches_the_stop_and_stays(machine) -> None:
 def test_valve_step_is_the_exact_solution_of_its_equation() -> None:
     w, z, dt = 2 * np.pi * 60.0, 0.8, 1e-4
     sol = solve_ivp(
-        lambda t, y: [y[1], w * w * (0.5 - y[0]) - 2 * z * w * y[1]], (0, 0.03), [0.0, 0.0], rtol=1e-11, atol=1e-13, dense_output=True
+        lambda t, y: [y[1], w * w * (0.5 - y[0]) - 2 * z * w * y[1]],
+        (0, 0.03),
+        [0.0, 0.0],
+        rtol=1e-11,
+        atol=1e-13,
+        dense_output=True,
     )
     a = valve_matrix(60.0, z, dt)
     u, du = 0.0, 0.0

@@ -42,7 +42,8 @@ def a_run(seconds: float = 30.0, step: float = 0.01) -> dict[str, Channel]:
     rows = {
         "n_dem": 60.0 + 35.0 * up, "n_r": 60.0 + 35.0 * up + 0.01 * ripple, "x_dem": 8.0 + 34.0 * up,
         "x_lvdt": 8.0 + 34.0 * up + 0.005 * ripple,
-        "i_cmd": 8.0 * np.gradient(up, t) + 0.05 * ripple, "p_s": 21.0 + 0.05 * ripple, "t_oil": 40.0 + 20.0 * t / seconds,
+        "i_cmd": 8.0 * np.gradient(up, t) + 0.05 * ripple, "p_s": 21.0 + 0.05 * ripple,
+        "t_oil": 40.0 + 20.0 * t / seconds,
         "vigv": -25.0 + 42.0 * up, "vgv1": -19.0 + 28.0 * up, "vgv2": -14.0 + 22.0 * up, "state": 2.0 + 0.0 * t,
     }  # fmt: skip
     return {k: Channel(t, v) for k, v in rows.items()}
@@ -76,7 +77,7 @@ WRONG: list[tuple[str, str, Callable[[np.ndarray], np.ndarray], str]] = [
 ]
 
 
-# ---- units --------------------------------------------------------------------------------------------------------------------------
+# ---- units -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_signal_has_a_range_with_a_reason() -> None:
@@ -107,11 +108,21 @@ def test_a_unit_that_was_forgotten_is_refused_with_the_option_that_mends_it(
 
 def test_all_channels_in_si_are_refused_and_named(tmp_path: Path) -> None:
     good = a_run()
-    si = {"x_dem": 1e-3, "x_lvdt": 1e-3, "i_cmd": 1e-3, "vigv": np.pi / 180, "vgv1": np.pi / 180, "n_dem": 1e-2, "n_r": 1e-2}
+    si = {
+        "x_dem": 1e-3,
+        "x_lvdt": 1e-3,
+        "i_cmd": 1e-3,
+        "vigv": np.pi / 180,
+        "vgv1": np.pi / 180,
+        "n_dem": 1e-2,
+        "n_r": 1e-2,
+    }
     write_log(tmp_path / "si.parquet", as_if(good, **{k: lambda v, f=f: v * f for k, f in si.items()}))  # type: ignore[misc]
     line = refused(tmp_path / "si.parquet")
     assert "n_dem" in line and "the same for" in line and "x_lvdt" in line
-    write_log(tmp_path / "si.parquet", as_if(good, p_s=lambda v: v * 1e6, t_oil=lambda v: v + 273.15, n_dem=lambda v: v * 300))
+    write_log(
+        tmp_path / "si.parquet", as_if(good, p_s=lambda v: v * 1e6, t_oil=lambda v: v + 273.15, n_dem=lambda v: v * 300)
+    )
     assert "n_dem (n_dem): all values are outside" in refused(tmp_path / "si.parquet")
     assert "the same for p_s, t_oil" in refused(tmp_path / "si.parquet")
 
@@ -126,13 +137,22 @@ def test_what_the_user_states_is_taken_but_not_against_the_range(tmp_path: Path)
 def test_a_machine_that_stands_still_may_be_near_zero(tmp_path: Path) -> None:
     """A log of an engine that is off, and one held at a schedule's zero, are logs like any other."""
     t, rng = np.arange(3000) * 0.01, np.random.default_rng(1)
-    noise = {k: Channel(t, rng.normal(0.0, s, t.size)) for k, s in {"x_lvdt": 0.005, "i_cmd": 0.02, "vigv": 0.03, "n_r": 0.02}.items()}
+    noise = {
+        k: Channel(t, rng.normal(0.0, s, t.size))
+        for k, s in {"x_lvdt": 0.005, "i_cmd": 0.02, "vigv": 0.03, "n_r": 0.02}.items()
+    }
     write_log(tmp_path / "off.parquet", noise | {"n_dem": Channel(t, 0.0 * t)})
     assert set(read_log(tmp_path / "off.parquet").channels) == {*noise, "n_dem"}
-    slow = as_if(a_run(), i_cmd=lambda v: v * 0.0 + 0.02, vigv=lambda v: 0.0 * v)  # a current sensor and a potentiometer that are dead
+    slow = as_if(
+        a_run(), i_cmd=lambda v: v * 0.0 + 0.02, vigv=lambda v: 0.0 * v
+    )  # a current sensor and a potentiometer that are dead
     write_log(tmp_path / "dead.parquet", slow)
     assert set(read_log(tmp_path / "dead.parquet").channels) == set(UNITS)
-    held = as_if(a_run(), **{k: lambda v: v[:1] + 0.01 * (v - v[0]) for k in ("n_dem", "n_r", "x_dem", "x_lvdt")}, vigv=lambda v: 0.01 * v)
+    held = as_if(
+        a_run(),
+        **{k: lambda v: v[:1] + 0.01 * (v - v[0]) for k in ("n_dem", "n_r", "x_dem", "x_lvdt")},
+        vigv=lambda v: 0.01 * v,
+    )
     write_log(tmp_path / "held.parquet", held)
     assert set(read_log(tmp_path / "held.parquet").channels) == set(UNITS)
 
@@ -180,7 +200,7 @@ def test_a_signal_of_a_users_own_model_may_have_any_size(tmp_path: Path) -> None
     assert "p_s" in refused(tmp_path / "a.csv", require=("p_s",))
 
 
-# ---- every command ------------------------------------------------------------------------------------------------------------------
+# ---- every command ---------------------------------------------------------------------------------------------------
 
 COMMANDS = [
     *([c, "{log}"] for c in ("replay", "compare", "locate", "diagnose", "experiment")),
@@ -238,14 +258,16 @@ def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
     assert log_of(worker.parsed("schedule", words)).channels["n_dem"].values.max() < 100.0
 
 
-# ---- time ---------------------------------------------------------------------------------------------------------------------------
+# ---- time ------------------------------------------------------------------------------------------------------------
 
 FORMATS = [".csv", ".parquet", ".mf4", ".log", ".asc", ".blf", ".trc", "bus.mf4"]
 _T0 = 1_735_000_000.0
 
 
 def write_stamped(file: Path, t: np.ndarray) -> None:
-    """A log of n_dem (60 to 70 %) whose rows or frames carry the stamps ``t`` (s), in this order, in the format of its suffix."""
+    """A log of n_dem (60 to 70 %) whose rows or frames carry the stamps ``t`` (s), in this order, in the format of its
+    suffix.
+    """
     n_dem = 60.0 + np.linspace(0.0, 10.0, t.size)
     suffix = file.suffix
     if suffix == ".csv":
@@ -261,7 +283,9 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
         return
     message = next(m for m in canlog.load_dbc(tables.path("vgv.dbc"))[0] if m.layout.name == "ECU_DEMAND")
     data = canlog.encode(message, {"n_dem": n_dem, "n_r": n_dem}, t.size)
-    frames = Frames(t, np.full(t.size, message.ident, np.uint32), np.zeros(t.size, np.int32), np.full(t.size, 8, np.uint8), data)
+    frames = Frames(
+        t, np.full(t.size, message.ident, np.uint32), np.zeros(t.size, np.int32), np.full(t.size, 8, np.uint8), data
+    )
     if suffix == ".mf4":
         hil.logs.mdf.write_bus(file, frames)
     else:
@@ -277,7 +301,9 @@ def raw_writer(file: Path, frames: Frames) -> None:
         head = "date Fri Jan 1 10:00:00.000 am 2021\nbase hex  timestamps absolute\n"
         file.write_text(head + "".join(f"{t:.6f} 1  {i:X}  Rx  d 8 {d.tobytes().hex(' ')}\n" for t, i, d in rows))
     elif file.suffix == ".trc":
-        text = "".join(f"{k + 1:6}) {1e3 * t:.3f} 1  Rx  {i:04X}  8  {d.tobytes().hex(' ')}\n" for k, (t, i, d) in enumerate(rows))
+        text = "".join(
+            f"{k + 1:6}) {1e3 * t:.3f} 1  Rx  {i:04X}  8  {d.tobytes().hex(' ')}\n" for k, (t, i, d) in enumerate(rows)
+        )
         file.write_text(";$FILEVERSION=1.2\n" + text)
     else:
         file.write_bytes(blf([b"".join(blf_frame(round(t * 1e9), i, d.tobytes()) for t, i, d in rows)]))
@@ -299,7 +325,8 @@ def name_of(form: str) -> str:
 def well_read(file: Path, t: np.ndarray, wrong: list[int], beyond: float = 0.0) -> Log:
     """The log without the rows ``wrong``, with a note that says so; its time still runs as ``t``.
 
-    beyond  s, by how much wrong stamps of the first and last rows lie outside as if there were a gap, so that nobody can tell
+    beyond  s, by how much wrong stamps of the first and last rows lie outside as if there were a gap, so that nobody
+            can tell
     """
     log = read_log(file)
     check(log)
@@ -316,7 +343,9 @@ def well_read(file: Path, t: np.ndarray, wrong: list[int], beyond: float = 0.0) 
 
 @pytest.mark.parametrize("wrong", [[1], [198], [1, 198], [2], [2, 3, 195, 196]])
 @pytest.mark.parametrize("form", [".csv", ".log"])
-def test_of_two_stamps_at_an_end_the_one_that_fits_the_others_is_kept(tmp_path: Path, form: str, wrong: list[int]) -> None:
+def test_of_two_stamps_at_an_end_the_one_that_fits_the_others_is_kept(
+    tmp_path: Path, form: str, wrong: list[int]
+) -> None:
     t = 5.0 + np.arange(200) * 0.01
     stamps = t.copy()
     for k in wrong:
@@ -338,9 +367,17 @@ def test_wrong_time_stamps_anywhere_are_left_out(tmp_path: Path, draw: st.DataOb
     for k in wrong:
         stamps[k] = draw.draw(st.sampled_from([0.0, 1e9, 1e6, 9e4, start + 1e5, _T0 + 12.5]))
     write_stamped(tmp_path / f"a{form}", stamps)
-    before = {k: t[0] - stamps[k] for k in wrong if set(range(k)) <= set(wrong) and 0.0 < t[0] - stamps[k] <= plausible.JUMP}
-    after = {k: stamps[k] - t[-1] for k in wrong if set(range(k, n)) <= set(wrong) and 0.0 < stamps[k] - t[-1] <= plausible.JUMP}
-    log = well_read(tmp_path / f"a{form}", t, wrong, max(before.values(), default=0.0) + max(after.values(), default=0.0))
+    before = {
+        k: t[0] - stamps[k] for k in wrong if set(range(k)) <= set(wrong) and 0.0 < t[0] - stamps[k] <= plausible.JUMP
+    }
+    after = {
+        k: stamps[k] - t[-1]
+        for k in wrong
+        if set(range(k, n)) <= set(wrong) and 0.0 < stamps[k] - t[-1] <= plausible.JUMP
+    }
+    log = well_read(
+        tmp_path / f"a{form}", t, wrong, max(before.values(), default=0.0) + max(after.values(), default=0.0)
+    )
     visible = [k for k in wrong if abs(stamps[k] - t[k]) > 0.1 and k not in before | after]
     assert not visible or any(n.startswith("time") for n in log.notes)
 
@@ -364,7 +401,9 @@ def test_one_wrong_time_stamp_is_left_out_of_every_format(tmp_path: Path, form: 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize(("first", "second"), [(0.0, _T0), (_T0, 0.0), (0.0, 4e5), (4e5, 0.0)])
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_of_a_clock_that_jumps_the_longer_part_is_kept(tmp_path: Path, form: str, first: float, second: float, share: float) -> None:
+def test_of_a_clock_that_jumps_the_longer_part_is_kept(
+    tmp_path: Path, form: str, first: float, second: float, share: float
+) -> None:
     n, cut = 1000, int(1000 * share)
     t = np.arange(n) * 0.01
     stamps = np.where(np.arange(n) < cut, first + t, second + t)
@@ -454,7 +493,7 @@ def test_a_profile_of_any_length_is_refused(tmp_path: Path) -> None:
         load_profile(tmp_path / "e.toml")
 
 
-# ---- memory -------------------------------------------------------------------------------------------------------------------------
+# ---- memory ----------------------------------------------------------------------------------------------------------
 
 
 def limited(words: list[str], memory: int) -> subprocess.CompletedProcess[str]:
@@ -463,7 +502,9 @@ def limited(words: list[str], memory: int) -> subprocess.CompletedProcess[str]:
         f"import resource, sys; resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}));"
         f"sys.argv = ['vaneloop', *{words!r}]; from vaneloop.cli.main import run; run()"
     )
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
@@ -492,11 +533,14 @@ def test_no_toml_takes_much_memory_or_time(tmp_path: Path, what: str) -> None:
     file = tmp_path / "m.toml"
     file.write_text(TOMLS[what])
     code = (
-        f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)); from vaneloop.base.errors import InputError\n"
+        f"import resource; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)); from vaneloop.base.errors "
+        f"import InputError\n"
         "from vaneloop.base.tables import load_toml\n"
         f"try: load_toml({str(file)!r}); print('read')\nexcept InputError as e: print(e)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0 and len(done.stdout.splitlines()) == 1, done.stderr[-300:]
     assert (done.stdout == "read\n") == (what == "many keys of many parts") or str(file) in done.stdout
 
@@ -531,11 +575,15 @@ def blf(containers: list[bytes], stated: int | None = None) -> bytes:
     for body in containers:
         packed = zlib.compress(body, 9)
         size = 32 + len(packed)
-        out.write(struct.pack("<4sHHIIH6xI4x", b"LOBJ", 16, 1, size, 10, 2, stated or len(body)) + packed + bytes(size % 4))
+        out.write(
+            struct.pack("<4sHHIIH6xI4x", b"LOBJ", 16, 1, size, 10, 2, stated or len(body)) + packed + bytes(size % 4)
+        )
     return out.getvalue()
 
 
-@pytest.mark.parametrize("what", [pytest.param("zeros", marks=pytest.mark.slow), "frames", pytest.param("a lie", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "what", [pytest.param("zeros", marks=pytest.mark.slow), "frames", pytest.param("a lie", marks=pytest.mark.slow)]
+)
 def test_a_blf_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, what: str) -> None:
     file = tmp_path / "bomb.blf"
     block = bytes(16 << 20) if what != "frames" else blf_frame(0, 0xA0, bytes(8)) * ((16 << 20) // 48)
@@ -558,7 +606,9 @@ def test_a_parquet_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, what: st
 
     file = tmp_path / "bomb.parquet"
     if what == "rows":
-        with pq.ParquetWriter(file, pa.schema([("t", pa.float64()), ("n_dem", pa.float64())]), compression="zstd") as writer:
+        with pq.ParquetWriter(
+            file, pa.schema([("t", pa.float64()), ("n_dem", pa.float64())]), compression="zstd"
+        ) as writer:
             block = pa.table({"t": np.zeros(1 << 20), "n_dem": np.zeros(1 << 20)})
             for _ in range(64):
                 writer.write_table(block)
@@ -576,14 +626,16 @@ def test_an_mdf_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "bomb.mf4"
     n = 20_000_000
     with asammdf.MDF(version="4.10") as mdf:
-        mdf.append([asammdf.Signal(np.zeros(n), np.zeros(n), name=f"n_{k}") for k in ("dem", "r")], common_timebase=True)
+        mdf.append(
+            [asammdf.Signal(np.zeros(n), np.zeros(n), name=f"n_{k}") for k in ("dem", "r")], common_timebase=True
+        )
         mdf.save(file, overwrite=True, compression=2)
     assert file.stat().st_size < 4 << 20
     line = one_line(limited(["replay", str(file)], 4 << 30))
     assert str(file) in line
 
 
-# ---- what was lost in silence -------------------------------------------------------------------------------------------------------
+# ---- what was lost in silence ----------------------------------------------------------------------------------------
 
 
 def test_a_name_mapped_to_two_signals_serves_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -602,16 +654,24 @@ def test_a_name_mapped_to_two_signals_serves_both(tmp_path: Path, capsys: pytest
     assert "n_dem" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("option", "words"), [("--unit", ["n_dem=rpm", "n_dem=Hz"]), ("--tolerance", ["vigv=1", "vigv=2"])])
-def test_an_option_given_two_values_is_refused(tmp_path: Path, option: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("option", "words"), [("--unit", ["n_dem=rpm", "n_dem=Hz"]), ("--tolerance", ["vigv=1", "vigv=2"])]
+)
+def test_an_option_given_two_values_is_refused(
+    tmp_path: Path, option: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     write_stamped(tmp_path / "a.csv", np.arange(100) * 0.01)
     assert main(["replay", str(tmp_path / "a.csv"), option, words[0], option, words[1]]) == 2
     assert f"{option} '{words[1]}'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", [["--map", "A=n_dem"], ["--unit", "n_dem=rpm"], ["--dbc", "x.dbc"], ["--design-rpm", "100"]])
+@pytest.mark.parametrize(
+    "option", [["--map", "A=n_dem"], ["--unit", "n_dem=rpm"], ["--dbc", "x.dbc"], ["--design-rpm", "100"]]
+)
 @pytest.mark.parametrize("command", [["schedule"], ["run", "--bus", "lockstep"], ["ecu", "--profile", "step"]])
-def test_an_option_of_reading_without_a_log_is_refused(command: list[str], option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_option_of_reading_without_a_log_is_refused(
+    command: list[str], option: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([*command, *option]) == 2
     line = capsys.readouterr().err
     assert line.startswith(f"vaneloop: {option[0]} says how to read a log") and line.count("\n") == 1
@@ -628,7 +688,7 @@ def test_frames_that_candump_dropped_are_told(tmp_path: Path) -> None:
     assert log.notes == ["the logger dropped 8 frames of can0 (DROPCOUNT)"]
 
 
-# ---- compiling ----------------------------------------------------------------------------------------------------------------------
+# ---- compiling -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -647,11 +707,21 @@ def test_compiling_is_told_before_it_is_done_whatever_the_format(tmp_path: Path,
     import os
 
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=500, check=False, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+        env=environment,
+    )
     assert done.returncode == 0, done.stderr
     lines = [line.partition("|") for line in done.stdout.splitlines() if line.startswith("compiling")]
     told = {text.split(" for ")[0].strip(): there for text, _, there in lines}
-    assert set(told) == {"compiling the simulator"} | ({"compiling the reader of CAN logs"} if form == ".blf" else set())
+    assert set(told) == {"compiling the simulator"} | (
+        {"compiling the reader of CAN logs"} if form == ".blf" else set()
+    )
     assert "lockstep.advance" not in told["compiling the simulator"]
     if form == ".blf":
         assert "columns.cut" not in told["compiling the reader of CAN logs"]

@@ -1,4 +1,6 @@
-"""Logs as loggers write them: slow, fast, begun anywhere, the current sampled or averaged. What the raster hides is not missing physics."""
+"""Logs as loggers write them: slow, fast, begun anywhere, the current sampled or averaged. What the raster hides is not
+missing physics.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,9 @@ def test_a_mean_of_the_ticks_before_the_row_is_known_as_such_and_nothing_is_miss
 
 @pytest.mark.parametrize("seed", [38, 39])
 def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -> None:
-    """The LVDT's noise is in the current too: a model driven by it must not be correlated with the noise that it has to explain."""
+    """The LVDT's noise is in the current too: a model driven by it must not be correlated with the noise that it has to
+    explain.
+    """
     chain = chain_of(recorded([], seed, 100, 200.0))
     for name, most in (("actuator", 0.02), ("servo", 0.15), ("linkage", 0.03)):
         stage = chain.stage(name)
@@ -74,7 +78,9 @@ def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -
             start = fit.theta.copy()
             start[stage.index()["oil_compressibility"].start] = 1.0
             soft = judge.fit(("oil_compressibility",), start)
-            assert 0.5 * float(fit.held_out.sum() - soft.held_out.sum()) < 30.0  # nats; 350 with the noise in all ten ticks
+            assert (
+                0.5 * float(fit.held_out.sum() - soft.held_out.sum()) < 30.0
+            )  # nats; 350 with the noise in all ten ticks
 
 
 def test_a_dead_band_much_smaller_than_the_noise_in_the_current_is_found() -> None:

@@ -1,4 +1,5 @@
-"""What other people's rigs measured: the laws that are known to be missing are named, at the published sizes, by one set of defaults.
+"""What other people's rigs measured: the laws that are known to be missing are named, at the published sizes, by one
+set of defaults.
 
 Data: shared/data beside the checkout, or VANELOOP_DATA (`data_dir`); skipped where they are absent.
 """

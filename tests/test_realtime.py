@@ -53,7 +53,9 @@ def nothing_stays_behind() -> Iterator[None]:
 
 def start(*args: str, **options: Any) -> subprocess.Popen[str]:
     """Start a command in a process of its own, with both outputs in pipes."""
-    process = subprocess.Popen([*COMMAND, *args], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+    process = subprocess.Popen(
+        [*COMMAND, *args], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+    )
     _started.append(process)
     return process
 
@@ -77,7 +79,7 @@ def follow(process: subprocess.Popen[str], text: str) -> None:
     raise AssertionError(f"ended without saying {text!r}: {process.communicate()}")
 
 
-# ---- clock and figures --------------------------------------------------------------------------------------------------------------
+# ---- clock and figures -----------------------------------------------------------------------------------------------
 
 
 def test_percentiles_are_those_of_all_times_to_a_bin() -> None:
@@ -127,7 +129,9 @@ def test_a_stall_is_caught_up_or_skipped_as_the_policy_says(policy: str, monkeyp
     while ticks < 200:
         ticker.wait()
         ticks += 1
-    elapsed = (ticker.deadline - ticker.start) // TICK_NS  # deadlines passed or set: firmware's ticks and those left out
+    elapsed = (
+        ticker.deadline - ticker.start
+    ) // TICK_NS  # deadlines passed or set: firmware's ticks and those left out
     assert elapsed == ticks + 1 + ticker.skipped
     if policy == "skip":
         assert ticker.skipped == 29 and ticker.missed == 1
@@ -172,7 +176,9 @@ class Silent:
 def test_a_signal_ends_the_run_after_a_whole_tick() -> None:
     node = Node()
     with stop_on_signals() as stop:
-        report = run_realtime(node, Silent(lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 20 else None), stop=stop)
+        report = run_realtime(
+            node, Silent(lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 20 else None), stop=stop
+        )
     assert report.ended == "SIGTERM"
     assert node.k == report.ticks == report.begin.count == 19  # one read before the first tick empties the bus
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
@@ -188,7 +194,9 @@ def test_a_stop_asked_for_later_is_heard() -> None:
 
 
 class Queue:
-    """A bus whose reader is held up once, for ``stall`` s at read ``at``, while frames of ECU_DEMAND go on, one each 10 reads."""
+    """A bus whose reader is held up once, for ``stall`` s at read ``at``, while frames of ECU_DEMAND go on, one each 10
+    reads.
+    """
 
     def __init__(self, at: int, stall: float):
         self.at, self.stall, self.reads, self.counter = at, stall, 0, 0
@@ -197,7 +205,9 @@ class Queue:
 
     def come(self) -> None:
         self.counter = (self.counter + 1) % 15
-        self.waiting.append((int(frames.word0(frames.ECU_DEMAND)), int(frames.encode_demand(70.0, 70.0, 1, self.counter))))
+        self.waiting.append(
+            (int(frames.word0(frames.ECU_DEMAND)), int(frames.encode_demand(70.0, 70.0, 1, self.counter)))
+        )
 
     def read(self, rows: np.ndarray) -> int:
         self.reads += 1
@@ -256,7 +266,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> StandingClock:
 
 @pytest.mark.parametrize("policy", ["catch-up", "skip"])
 @pytest.mark.parametrize(("missed", "paused"), [(1, 0), (49, 0), (50, 50), (51, 51), (5000, 5000)])
-def test_fifty_ticks_missed_in_one_wake_up_are_a_pause_fewer_are_none(clock: StandingClock, missed: int, paused: int, policy: str) -> None:
+def test_fifty_ticks_missed_in_one_wake_up_are_a_pause_fewer_are_none(
+    clock: StandingClock, missed: int, paused: int, policy: str
+) -> None:
     ticker = Ticker(policy=policy)
     ticker.begin()
     for _ in range(3):
@@ -291,7 +303,7 @@ def test_memory_is_unlocked_and_collection_on_again_afterwards() -> None:
     assert locked.split()[1] == "0"
 
 
-# ---- the ECU's demand ---------------------------------------------------------------------------------------------------------------
+# ---- the ECU's demand ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", BUILTIN)
@@ -330,7 +342,14 @@ def test_a_wrong_profile_is_refused_in_one_line(text: str, says: str, tmp_path: 
 
 def test_typed_lines_set_the_demand_and_nonsense_is_refused() -> None:
     typed = Typed()
-    for line, n_dem, request in [("70", 70, 1), ("+5", 75, 1), ("-0.5", 74.5, 1), ("standby", 74.5, 0), ("", 74.5, 0), ("run", 74.5, 1)]:
+    for line, n_dem, request in [
+        ("70", 70, 1),
+        ("+5", 75, 1),
+        ("-0.5", 74.5, 1),
+        ("standby", 74.5, 0),
+        ("", 74.5, 0),
+        ("run", 74.5, 1),
+    ]:
         typed.line(line)
         assert (typed.n_dem, typed.mode_request, typed.complaint) == (n_dem, request, "")
     for line in ("121", "-200", "nan", "1e9", "up"):
@@ -359,10 +378,12 @@ def test_the_demand_begins_with_the_first_good_status_and_silence_ends_it() -> N
     assert met is not None and 300 < met < 330
     assert end == f"timed out: no good VGV_STATUS for 0.10 s at t = {(k - met) / 1000:.2f} s" and 2380 < k < 2402
     assert ecu.ecu.arrays.demand[0] == pytest.approx(60.0 + (k - met) / 1000, abs=0.011)
-    assert EcuStation(demand, wait=0.5).watcher(None)(500) == "no good VGV_STATUS within 0.5 s: is a controller running?"
+    assert (
+        EcuStation(demand, wait=0.5).watcher(None)(500) == "no good VGV_STATUS within 0.5 s: is a controller running?"
+    )
 
 
-# ---- bad input ----------------------------------------------------------------------------------------------------------------------
+# ---- bad input -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -394,7 +415,9 @@ def test_bad_input_is_one_line_and_exit_code_2(args: list[str], says: str, capsy
     assert err.count("\n") == 1 and says in err
 
 
-def test_ctrl_c_while_a_command_is_still_loading_is_one_word(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_while_a_command_is_still_loading_is_one_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def interrupted(name: str) -> None:
         raise KeyboardInterrupt
 
@@ -403,13 +426,14 @@ def test_ctrl_c_while_a_command_is_still_loading_is_one_word(monkeypatch: pytest
     assert capsys.readouterr().err == "stopped\n"
 
 
-# ---- commands -----------------------------------------------------------------------------------------------------------------------
+# ---- commands --------------------------------------------------------------------------------------------------------
 
 
 def priority() -> list[str]:
     """Options that keep a loop on time while other tests want the processors, where this user may use them.
 
-    On a single processor (user-mode Linux) two such loops would keep each other and candump from running; there nobody else wants it.
+    On a single processor (user-mode Linux) two such loops would keep each other and candump from running; there nobody
+    else wants it.
     """
     if os.cpu_count() == 1:
         return ["--spin-us", "0"]
@@ -421,12 +445,14 @@ ON_TIME_US = 20_000.0  # a tick that is later than this may cost a frame its 50 
 
 
 def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> tuple[dict, dict]:
-    """Controller and ECU as two processes for ``seconds``; both end well, the record is complete and repeats bit for bit.
+    """Controller and ECU as two processes for ``seconds``; both end well, the record is complete and repeats bit for
+    bit.
 
     Returns the JSON of both.
 
-    A busy machine may keep either process from running for longer than the 50 ms after which the controller degrades, or than the kernel
-    keeps frames for a socket (some two seconds): faults and losses are only judged where both were on time.
+    A busy machine may keep either process from running for longer than the 50 ms after which the controller degrades,
+    or than the kernel keeps frames for a socket (some two seconds): faults and losses are only judged where both were
+    on time.
     """
     record, told = folder / "run.mf4", folder / "run.json"
     run = start("run", "--bus", bus, "--record", str(record), "--json", str(told), "--seed", "5", *priority())
@@ -443,14 +469,20 @@ def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> tuple[dict, dic
     assert said["ended"] == "SIGINT" and said["frames"]["refused"] == heard["frames"]["refused"] == 0
     late = {name: json_["lateness"]["max_us"] for name, json_ in (("ecu", heard), ("run", said))}
     assert heard["state"] == "RUN" or max(late.values()) > ON_TIME_US, (heard["state"], late)
-    sent, good, lost = heard["frames"]["sent"], said["counts"]["good"], said["frames"]["lost"] + heard["frames"]["lost_by_reader"]
+    sent, good, lost = (
+        heard["frames"]["sent"],
+        said["counts"]["good"],
+        said["frames"]["lost"] + heard["frames"]["lost_by_reader"],
+    )
     assert (lost == 0 and good >= 80 * seconds) or max(late.values()) > 20 * ON_TIME_US, (lost, good, late)
     assert 0 < good <= sent and 0 < said["frames"]["received"] <= sent
     assert said["ticks"] >= 1000 * seconds and sum(b["ticks"] for b in said["lateness"]["histogram"]) == said["ticks"]
     for part in ("p50", "p99", "p99.9", "max", "missed ticks", "worst tick", "state hash"):
         assert part in run_out
     held = read_record(record)
-    assert len(held.ms) == said["record"]["frames"] == said["frames"]["received"] + said["frames"]["sent"] + said["pauses"]
+    assert (
+        len(held.ms) == said["record"]["frames"] == said["frames"]["received"] + said["frames"]["sent"] + said["pauses"]
+    )
     n_dem = read_log(record).channels["n_dem"]
     assert n_dem.values.max() > 84.0  # the sine's, after a second and a half
     same = ("--seed", "5", "--duration", str(said["ticks"] / 1000))
@@ -468,7 +500,9 @@ def test_controller_and_ecu_as_two_processes_on_the_embedded_bus(own_bus: str, t
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Folder with a real-time run in which things happened (a stall of 3 s, the ECU gone before the end), and what was said of it."""
+    """Folder with a real-time run in which things happened (a stall of 3 s, the ECU gone before the end), and what was
+    said of it.
+    """
     folder = tmp_path_factory.mktemp("recorded")
     bus = f"local:recorded{os.getpid()}"
     told = ("--record", str(folder / "run.log"), "--json", str(folder / "run.json"))
@@ -508,7 +542,9 @@ def test_a_recorded_run_repeats_in_lockstep_bit_for_bit(recorded: Path) -> None:
     assert code == 0, (out, err)
     assert f"all {said['frames']['sent']:,} frames sent are the same, bit for bit, in the same ticks" in out
     assert said["state_hash"] in out
-    first, second = ([line.split() for line in (recorded / f).read_text().splitlines()] for f in ("run.log", "again.log"))
+    first, second = (
+        [line.split() for line in (recorded / f).read_text().splitlines()] for f in ("run.log", "again.log")
+    )
     assert [(t, *rest) for t, _, *rest in first] == [(t, *rest) for t, _, *rest in second]
 
 
@@ -522,7 +558,9 @@ def test_a_changed_frame_is_found_when_the_run_is_repeated(recorded: Path, tmp_p
 
 
 def heard(port: Port, what: dict[str, Any], seconds: float, until: Any = None) -> list[tuple[str, float]]:
-    """Listen for ``seconds``, or until ``until()``; return states and fault bits as they came, and keep the last ones in ``what``."""
+    """Listen for ``seconds``, or until ``until()``; return states and fault bits as they came, and keep the last ones
+    in ``what``.
+    """
     rows, out, end = np.zeros((256, 2), np.int64), [], time.monotonic() + seconds
     while time.monotonic() < end and not (until is not None and until()):
         for head, data in rows[: port.read(rows)].tolist():
@@ -537,7 +575,20 @@ def heard(port: Port, what: dict[str, Any], seconds: float, until: Any = None) -
 def test_a_controller_stopped_for_five_seconds_says_so_and_takes_no_old_frame(own_bus: str, tmp_path: Path) -> None:
     record, told = tmp_path / "run.mf4", tmp_path / "run.json"
     run = start("run", "--bus", own_bus, "--record", str(record), "--json", str(told), *priority())
-    ecu = start("ecu", "--bus", own_bus, "--profile", "idle", "--duration", "600", "--wait", "120", "--timeout", "100", *priority())
+    ecu = start(
+        "ecu",
+        "--bus",
+        own_bus,
+        "--profile",
+        "idle",
+        "--duration",
+        "600",
+        "--wait",
+        "120",
+        "--timeout",
+        "100",
+        *priority(),
+    )
     bus, now = open_bus(own_bus), {}
     try:
         port = Port(bus)
@@ -563,7 +614,19 @@ def test_a_controller_stopped_for_five_seconds_says_so_and_takes_no_old_frame(ow
     assert code == 0, err
     said_json = json.loads(told.read_text())
     assert said_json["pauses"] >= 1 and said_json["dropped"] >= 300 and said_json["skipped"] >= 4000
-    again = ended(start("run", "--bus", "lockstep", "--inputs", str(record), "--duration", str(said_json["ticks"] / 1000), "--json", "-"))
+    again = ended(
+        start(
+            "run",
+            "--bus",
+            "lockstep",
+            "--inputs",
+            str(record),
+            "--duration",
+            str(said_json["ticks"] / 1000),
+            "--json",
+            "-",
+        )
+    )
     assert again[0] == 0, again
     repeated = json.loads(again[1])
     assert repeated["same"] and repeated["state_hash"] == said_json["state_hash"]
@@ -628,13 +691,28 @@ def test_a_recorded_run_is_a_log_for_replay(tmp_path: Path) -> None:
     file = tmp_path / "run.parquet"
     assert main(["run", "--bus", "lockstep", "--profile", "step", "--record", str(file), "--quiet"]) == 0
     assert main(["replay", str(file), "--quiet", "--json", str(tmp_path / "r.json"), "--tolerance", "vigv=0.2"]) == 0
-    signals = {s["signal"] for s in json.loads((tmp_path / "r.json").read_text())["signals"] if s["reference"] == "measured"}
+    signals = {
+        s["signal"] for s in json.loads((tmp_path / "r.json").read_text())["signals"] if s["reference"] == "measured"
+    }
     assert {"x_dem", "x_lvdt", "i_cmd", "vigv"} <= signals
 
 
 def test_typed_demand_reaches_the_controller(own_bus: str, tmp_path: Path) -> None:
     run = start("run", "--bus", own_bus, "--json", str(tmp_path / "run.json"), *priority())
-    ecu = start("ecu", "--bus", own_bus, "--wait", "120", "--timeout", "5", "--json", "-", "--live", *priority(), stdin=subprocess.PIPE)
+    ecu = start(
+        "ecu",
+        "--bus",
+        own_bus,
+        "--wait",
+        "120",
+        "--timeout",
+        "5",
+        "--json",
+        "-",
+        "--live",
+        *priority(),
+        stdin=subprocess.PIPE,
+    )
     assert ecu.stdin is not None and ecu.stderr is not None
     follow(run, "Ctrl-C ends")
     ecu.stdin.write("70\nfaster\n+5.5\n")
@@ -672,4 +750,7 @@ def test_priority_that_is_not_allowed_is_one_line(own_bus: str) -> None:
     if done.returncode == 0:
         pytest.skip("this user may use SCHED_FIFO")
     assert done.returncode == 2
-    assert done.stderr == "vaneloop: --realtime-priority 50: Operation not permitted; run as root, or allow it with ulimit -r 50\n"
+    assert (
+        done.stderr
+        == "vaneloop: --realtime-priority 50: Operation not permitted; run as root, or allow it with ulimit -r 50\n"
+    )

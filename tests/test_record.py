@@ -29,17 +29,23 @@ COMMAND = [sys.executable, "-m", "vaneloop.cli.main"]
 
 
 def waited(pid: int) -> float:
-    """Time, s, that a process's threads have waited for a processor so far: what a busy machine adds to everything that they do."""
+    """Time, s, that a process's threads have waited for a processor so far: what a busy machine adds to everything that
+    they do.
+    """
     return sum(int(f.read_text().split()[1]) for f in Path(f"/proc/{pid}/task").glob("*/schedstat")) * 1e-9
 
 
 def some_frames(n: int, first: int = 0) -> np.ndarray:
-    """Frames ``first`` to ``first + n``, a millisecond apart: VGV_STATUS with the number in x_dem, every other one sent."""
+    """Frames ``first`` to ``first + n``, a millisecond apart: VGV_STATUS with the number in x_dem, every other one
+    sent.
+    """
     status = next(m for m in canlog.load_dbc(path("vgv.dbc"))[0] if m.layout.name == "VGV_STATUS")
     k = first + np.arange(n)
     out = np.zeros(n, FRAME)
     out["ns"], out["ident"], out["length"], out["tx"] = START + k * 10**6, 0x0B0, 8, k % 2
-    out["data"][:, :8] = canlog.encode(status, {"x_dem": k % 40000 * 0.001, "x_lvdt": np.zeros(n), "state": np.full(n, 2.0)}, n)
+    out["data"][:, :8] = canlog.encode(
+        status, {"x_dem": k % 40000 * 0.001, "x_lvdt": np.zeros(n), "state": np.full(n, 2.0)}, n
+    )
     return out
 
 
@@ -117,7 +123,9 @@ def test_long_parquet_recordings_keep_every_row_in_order(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_recording_cut_off_at_the_end_still_opens_where_the_format_can(suffix: str, tmp_path: Path) -> None:
-    """A write that a power failure cuts off: whole blocks before it are there (Parquet needs its footer: documented)."""
+    """A write that a power failure cuts off: whole blocks before it are there (Parquet needs its footer:
+    documented).
+    """
     file = tmp_path / f"run{suffix}"
     recorder = Recorder(file)
     for k in range(5):
@@ -146,7 +154,12 @@ def test_an_earlier_recording_of_that_name_is_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "says"),
-    [("run.csv", "suffix '.csv'"), ("run", "suffix ''"), ("no/such/run.log", "its folder does not exist"), ("folder.log", "is a folder")],
+    [
+        ("run.csv", "suffix '.csv'"),
+        ("run", "suffix ''"),
+        ("no/such/run.log", "its folder does not exist"),
+        ("folder.log", "is a folder"),
+    ],
 )
 def test_what_cannot_be_recorded_to_is_refused_in_one_line(name: str, says: str, tmp_path: Path) -> None:
     (tmp_path / "folder.log").mkdir()
@@ -174,7 +187,9 @@ def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: 
         except InputError as e:
             print(recorder.frames, e)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240
+    )
     frames, _, words = done.stdout.partition(" ")
     assert int(frames) > 100 and f"ends after {int(frames):,} frames" in words and "File too large" in words
     assert len(read_record(file).ms) == int(frames)
@@ -190,18 +205,21 @@ def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str
         from pathlib import Path
         from hil.logs import columns
         from hil.logs.recorder import Recorder
-        loaded = lambda: {{*sys.modules, *((f, s) for f in ("cut", "wrong_crc") for s in map(str, getattr(columns, f).signatures))}}
+        compiled = lambda f: map(str, getattr(columns, f).signatures)
+        loaded = lambda: {{*sys.modules, *((f, s) for f in ("cut", "wrong_crc") for s in compiled(f))}}
         recorder = Recorder({str(tmp_path / f"run{suffix}")!r})
         before = loaded()
         recorder.put(Path({str(frames)!r}).read_bytes())
         recorder.flush()
         print(sorted(map(str, loaded() - before)))
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, capture_output=True, text=True, check=True, timeout=240
+    )
     assert done.stdout.strip() == "[]"
 
 
-# ---- kill -9 ------------------------------------------------------------------------------------------------------------------------
+# ---- kill -9 ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -215,7 +233,9 @@ def test_killing_the_recorder_costs_at_most_a_second(suffix: str, tmp_path: Path
         put_at.append(time.monotonic())
         k += 1
         time.sleep(0.002)
-        if time.monotonic() > end:  # frames that must be in the file by now: a second old, more where the recorder had to wait
+        if (
+            time.monotonic() > end
+        ):  # frames that must be in the file by now: a second old, more where the recorder had to wait
             late = waited(recorder._process.pid)
             due = sum(t < time.monotonic() - 1.0 - late for t in put_at)
             assert time.monotonic() < end + 120.0
@@ -244,7 +264,11 @@ def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> N
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=120, check=False)
     assert done.returncode == -signal.SIGKILL
     pid, end = int(done.stdout), time.monotonic() + 120
-    while Path(f"/proc/{pid}").exists() and Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z" and time.monotonic() < end:
+    while (
+        Path(f"/proc/{pid}").exists()
+        and Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+        and time.monotonic() < end
+    ):
         time.sleep(0.05)
     assert len(read_record(file).ms) == 500
 
@@ -253,7 +277,10 @@ def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None
     """Four recorders on one bus, killed while frames come; and one that is asked to end, which has them all."""
     name = f"local:record{os.getpid()}"
     files = [tmp_path / f"killed{s}" for s in FORMATS] + [tmp_path / "whole.blf"]
-    started = [subprocess.Popen([*COMMAND, "record", str(f), "--bus", name], cwd=ROOT, stdout=subprocess.PIPE, text=True) for f in files]
+    started = [
+        subprocess.Popen([*COMMAND, "record", str(f), "--bus", name], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        for f in files
+    ]
     for p in started:
         assert p.stdout is not None
         assert p.stdout.readline().startswith("recording")

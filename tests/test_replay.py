@@ -18,7 +18,9 @@ from tests.conftest import ROOT
 from vaneloop.cli.main import main
 
 
-def vaneloop(*args: str | Path, module: str = "vaneloop.cli.main", cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+def vaneloop(
+    *args: str | Path, module: str = "vaneloop.cli.main", cwd: Path = ROOT
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", module, *map(str, args)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
@@ -66,15 +68,32 @@ def test_model_agrees_with_a_log_that_it_made(own_log, name, tmp_path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads(out.read_text())
     assert result["schema"] == 1 and len(result["state_hash"]) == 64
-    keys = {"signal", "stage", "unit", "reference", "rms", "mean_abs", "max_abs", "mean_abs_99_100", "noise_floor", "samples"}
+    keys = {
+        "signal",
+        "stage",
+        "unit",
+        "reference",
+        "rms",
+        "mean_abs",
+        "max_abs",
+        "mean_abs_99_100",
+        "noise_floor",
+        "samples",
+    }
     assert all(set(s) == keys for s in result["signals"])
-    assert {(s["signal"], s["reference"]) for s in result["signals"]} >= {("vigv", "measured"), ("vigv", "schedule"), ("i_cmd", "measured")}
+    assert {(s["signal"], s["reference"]) for s in result["signals"]} >= {
+        ("vigv", "measured"),
+        ("vigv", "schedule"),
+        ("i_cmd", "measured"),
+    }
 
 
 def test_exceeded_tolerance_exits_1_and_says_which(own_log) -> None:
     done = vaneloop("compare", own_log / "biased.csv", "--tolerance", "vigv=0.4")
     assert done.returncode == 1
-    assert "differs: vigv rms 0.4" in done.stdout  # a little less than the bias: the play starts where the log's vane was
+    assert (
+        "differs: vigv rms 0.4" in done.stdout
+    )  # a little less than the bias: the play starts where the log's vane was
     assert vaneloop("compare", own_log / "biased.csv", "--tolerance", "vigv=0.6", "--quiet").returncode == 0
 
 

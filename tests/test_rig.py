@@ -1,4 +1,6 @@
-"""The rig: an independent machine. Its physics, its agreement with the design's nominal equations, and what can be hidden in it."""
+"""The rig: an independent machine. Its physics, its agreement with the design's nominal equations, and what can be
+hidden in it.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,14 @@ DEG = np.pi / 180.0
 VANES = ("vigv", "vgv1", "vgv2")
 DESIGN_LIBRARY = [  # in the order of the design's table
     "can_delay", "frame_hold", "schedule_error", "trend_threshold_error", "controller_gain_error", "rotor_lag_error",
-    "acceleration_limit_error", "valve_null_bias", "valve_dead_band", "valve_hysteresis", "valve_flow_saturation", "valve_lag",
-    "valve_gain_asymmetry", "supply_pressure_droop", "oil_viscosity", "piston_friction", "piston_stiction", "internal_leakage",
-    "oil_compressibility", "aero_load", "end_stop_shift", "lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag", "lvdt_thermal_drift",
-    "linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "thermal_growth", "crank_length_error",
+    "acceleration_limit_error", "valve_null_bias", "valve_dead_band", "valve_hysteresis", "valve_flow_saturation",
+    "valve_lag",
+    "valve_gain_asymmetry", "supply_pressure_droop", "oil_viscosity", "piston_friction", "piston_stiction",
+    "internal_leakage",
+    "oil_compressibility", "aero_load", "end_stop_shift", "lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag",
+    "lvdt_thermal_drift",
+    "linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "thermal_growth",
+    "crank_length_error",
     "link_length_error", "ring_eccentricity", "pot_bias", "pot_gain", "pot_lag",
 ]  # fmt: skip
 
@@ -55,7 +61,9 @@ def constant(n: float, seconds: float, p_s: float = 21e6, t_oil: float = 40.0) -
     return Manoeuvre("constant", 0, np.full(rows, n), np.full(rows, p_s), np.full(rows, t_oil))
 
 
-def open_loop(currents: np.ndarray, hidden=(), *, x0: float = 24e-3, test: Manoeuvre | None = None, rate: int = 1000, **options):
+def open_loop(
+    currents: np.ndarray, hidden=(), *, x0: float = 24e-3, test: Manoeuvre | None = None, rate: int = 1000, **options
+):
     """Play currents (A, one a tick) into the exactly nominal, noise-free machine, without run-up."""
     test = test or constant(60.0, len(currents) / 1000)
     options = {"randomised": False, "noise": False, "jitter": 0.0} | options
@@ -69,7 +77,7 @@ def closed_loop(hidden: tuple[tuple[str, tuple], ...] = (), seed: int = 1, secon
     return simulate(manoeuvre(seed, seconds), controller(), effects, seed=seed, rate=1000)
 
 
-# ---- independence ----------------------------------------------------------------------------------------------------------------------
+# ---- independence ----------------------------------------------------------------------------------------------------
 
 
 def test_the_rig_imports_nothing_of_the_product():
@@ -87,7 +95,7 @@ def test_the_rig_imports_nothing_of_the_product():
                 assert name in allowed or name in sys.stdlib_module_names, f"{file.name} imports {name}"
 
 
-# ---- kinematics ------------------------------------------------------------------------------------------------------------------------
+# ---- kinematics ------------------------------------------------------------------------------------------------------
 
 
 def test_circle_intersection_closes_every_loop():
@@ -115,10 +123,12 @@ def test_published_sensitivities_come_out():
         slope, offset = line(g, k)
         longer_arm, longer_link = line(g.with_error(k, crank=1e-3), k), line(g.with_error(k, link=1e-3), k)
         assert 1.01 < longer_arm[0] / slope < 1.035
-        assert np.mean(np.polyval(longer_link, x * 1e3) - np.polyval((slope, offset), x * 1e3)) == pytest.approx(-1.6, abs=0.15)
+        assert np.mean(np.polyval(longer_link, x * 1e3) - np.polyval((slope, offset), x * 1e3)) == pytest.approx(
+            -1.6, abs=0.15
+        )
 
 
-# ---- physics ---------------------------------------------------------------------------------------------------------------------------
+# ---- physics ---------------------------------------------------------------------------------------------------------
 
 
 def test_full_spool_moves_at_the_nominal_speed():
@@ -158,7 +168,9 @@ def test_the_stops_hold_the_piston():
 
 
 def test_oil_spring_rings_at_its_textbook_frequency():
-    """omega^2 = 2 beta A^2 / (V m) at mid stroke (Merritt 1967, ch. 6), here with beta made soft by a hidden compliance."""
+    """omega^2 = 2 beta A^2 / (V m) at mid stroke (Merritt 1967, ch. 6), here with beta made soft by a hidden
+    compliance.
+    """
     c = 1e-6
     p = machine()
     p[P.viscous] = 50.0
@@ -188,7 +200,9 @@ def test_friction_only_takes_energy():
 
 def test_the_vane_loses_its_nominal_play_on_reversal():
     """1.6, 1.1 and 0.8 deg lie between the strokes at which the vane passes zero opening and closing."""
-    run = open_loop(np.concatenate([np.full(8000, 0.0012), np.full(8000, -0.0012)]), x0=4e-3)  # 4.5 mm/s to 40 mm and back
+    run = open_loop(
+        np.concatenate([np.full(8000, 0.0012), np.full(8000, -0.0012)]), x0=4e-3
+    )  # 4.5 mm/s to 40 mm and back
     x, g = run.truth["x"], load()
     for k, width in enumerate((1.6, 1.1, 0.8)):
         vane = run.truth[f"vane_{k}"]
@@ -211,7 +225,11 @@ def test_the_engine_keeps_its_acceleration_limits():
 
 @pytest.mark.parametrize(
     ("hidden", "limit"),
-    [((), 1e-6), ((("piston_friction", 2000.0),), 1e-6), ((("aero_load", 4000.0), ("oil_compressibility", 1e-7)), 1e-6)],
+    [
+        ((), 1e-6),
+        ((("piston_friction", 2000.0),), 1e-6),
+        ((("aero_load", 4000.0), ("oil_compressibility", 1e-7)), 1e-6),
+    ],
     ids=["nominal", "friction", "load on soft oil"],
 )
 def test_halving_the_step_changes_nothing_that_matters(hidden, limit):
@@ -229,7 +247,9 @@ def test_halving_the_step_changes_nothing_that_matters(hidden, limit):
 
 
 def test_stick_slip_converges_in_its_statistics():
-    """Each hop is F / k, some 12 um long; when it comes depends on the last digit, so single hops do not converge, but work and size do."""
+    """Each hop is F / k, some 12 um long; when it comes depends on the last digit, so single hops do not converge, but
+    work and size do.
+    """
     t = np.arange(6000) * 1e-3
     currents = 0.006 * np.sin(2 * np.pi * 0.6 * t)
     work, size = [], []
@@ -242,7 +262,7 @@ def test_stick_slip_converges_in_its_statistics():
     assert size[1] == pytest.approx(size[0], rel=0.2)
 
 
-# ---- agreement with the design's nominal equations -------------------------------------------------------------------------------------
+# ---- agreement with the design's nominal equations -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -266,7 +286,7 @@ def test_without_noise_only_model_form_is_left():
     assert np.abs(reference.engine_residual(run)).max() < 0.015  # %; the frame resolves 0.002 %
 
 
-# ---- hidden effects --------------------------------------------------------------------------------------------------------------------
+# ---- hidden effects --------------------------------------------------------------------------------------------------
 
 
 def test_every_effect_of_the_design_can_be_hidden():
@@ -329,12 +349,17 @@ def test_an_onset_leaves_the_time_before_untouched():
 
 def test_two_effects_add_up():
     both = simulate(
-        steady(1, 10.0), controller(), [Hidden("valve_null_bias", {"bias": 5e-4}), Hidden("pot_bias", {"bias": 0.02, "stage": 1})], seed=1
+        steady(1, 10.0),
+        controller(),
+        [Hidden("valve_null_bias", {"bias": 5e-4}), Hidden("pot_bias", {"bias": 0.02, "stage": 1})],
+        seed=1,
     )
     clean = simulate(steady(1, 10.0), controller(), seed=1)
     difference = {name: np.mean(both.log[name][300:] - clean.log[name][300:]) for name in LOG}
     assert difference["i_cmd"] == pytest.approx(-0.5, abs=0.02)
-    assert difference["vgv1"] == pytest.approx(0.02 / DEG, abs=0.05)  # the servo's start with a bias leaves the pins elsewhere
+    assert difference["vgv1"] == pytest.approx(
+        0.02 / DEG, abs=0.05
+    )  # the servo's start with a bias leaves the pins elsewhere
     assert abs(difference["vigv"]) < 0.05
 
 
@@ -359,7 +384,7 @@ def test_drawn_sizes_stay_near_their_rung():
                 assert 0.6 * abs(rung) <= abs(value) <= 1.4 * abs(rung)
 
 
-# ---- runs and logs ---------------------------------------------------------------------------------------------------------------------
+# ---- runs and logs ---------------------------------------------------------------------------------------------------
 
 
 def test_the_same_seed_gives_the_same_log():
@@ -441,7 +466,7 @@ def test_kernel_slots_are_all_different():
     assert len({int(v) for v in P}) == len(P) == kernel.N_P
 
 
-# ---- ordinary machines and loggers -----------------------------------------------------------------------------------------------------
+# ---- ordinary machines and loggers -----------------------------------------------------------------------------------
 
 
 def test_links_are_drawn_within_the_tolerance_that_the_table_states():
@@ -449,7 +474,9 @@ def test_links_are_drawn_within_the_tolerance_that_the_table_states():
     drawn = [load(rng=np.random.default_rng(seed)) for seed in range(40)]
     for part in ("x1", "y1", "Le", "length_0"):
         off = [getattr(g, part) - getattr(nominal, part) for g in drawn]
-        assert 3e-5 < np.abs(off).max() <= 5e-5 + 1e-12, part  # m: up to the tolerance, and not all of them near nominal
+        assert 3e-5 < np.abs(off).max() <= 5e-5 + 1e-12, (
+            part
+        )  # m: up to the tolerance, and not all of them near nominal
     for k in range(3):
         for part in ("Lb", "Lc", "Ld"):
             off = [getattr(g.stages[k], part) - getattr(nominal.stages[k], part) for g in drawn]
@@ -481,7 +508,9 @@ def test_a_gap_takes_rows_out_and_leaves_the_others():
 
 @pytest.mark.parametrize("kind", ["standby", "deaf"])
 def test_a_spell_in_another_mode_is_the_firmwares(kind):
-    """The controller leaves RUN and comes back by itself; the machine moves as it says; the rows before are untouched."""
+    """The controller leaves RUN and comes back by itself; the machine moves as it says; the rows before are
+    untouched.
+    """
     firmware = pytest.importorskip("controller.firmware")
     from tests.firmware_on_rig import firmware as controller_of_the_product
     from tests.rig import Spell

@@ -19,8 +19,8 @@ def said(hidden: list[Hidden], seed: int, stage: str) -> StageDiagnosis:
 @pytest.mark.parametrize(
     ("name", "sizes", "rivals"),
     [
-        # a ring off its centre of the right phase does the same and has more freedom; a crank's length does it too, since the link's
-        # may be off within its tolerance
+        # a ring off its centre of the right phase does the same and has more freedom; a crank's length does it too,
+        # since the link's may be off within its tolerance
         ("pot_gain", {"factor": 1.03, "stage": 1}, {"crank_length_error"}),
         # three wrong cranks do the same; and nothing does what a ring does
         pytest.param("lvdt_gain", {"factor": 0.98}, set(), marks=pytest.mark.slow),

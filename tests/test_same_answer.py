@@ -1,4 +1,6 @@
-"""Every verb says the same of one log: compare, locate, diagnose, extend, page, workbench start from one error and one noise floor."""
+"""Every verb says the same of one log: compare, locate, diagnose, extend, page, workbench start from one error and one
+noise floor.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from vaneloop.discrepancy.models.vanes import Chain, build_chain
 from vaneloop.discrepancy.workflow import compare_stages, extend_stage, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
-SENSOR = {"actuator": 0.00505}  # mm, the rig's LVDT: noise of 5 um, its converter's step, what its valve has beyond the model's
+SENSOR = {
+    "actuator": 0.00505
+}  # mm, the rig's LVDT: noise of 5 um, its converter's step, what its valve has beyond the model's
 
 
 def rig(hidden: list[Hidden], seed: int, rate: int = 100) -> Chain:
@@ -144,7 +148,8 @@ def test_agrees_is_one_number() -> None:
     own = re.compile(r"(ratio|excess|rms\([a-z_]+\)|error_after|\.rms)\b[^\n]{0,40}(<=?|>=?) ?1\.[0-3]\d?\b")
     wrong = [
         f"{p.relative_to(ROOT)}: {m[0]}"
-        for top in ("app", "hil", "discrepancy") for p in (ROOT / top).rglob("*.py") for m in own.finditer(p.read_text(encoding="utf-8"))
+        for top in ("app", "hil",
+            "discrepancy") for p in (ROOT / top).rglob("*.py") for m in own.finditer(p.read_text(encoding="utf-8"))
         if p.name not in ("strategies.py", "engine_test.py")
     ]  # fmt: skip
     assert not [w for w in wrong if "1.05" not in w], wrong
@@ -160,7 +165,9 @@ def test_clean_logs_stand_at_their_floors(seed: int) -> None:
 
 
 def test_a_noise_floor_is_no_more_than_the_noise_of_the_replayed_error() -> None:
-    """The channel moves, and motion passes for noise; the error of a model that moves as the machine does holds less of it."""
+    """The channel moves, and motion passes for noise; the error of a model that moves as the machine does holds less of
+    it.
+    """
     t = np.arange(30_000) * 0.01
     motion = 2.0 * np.sin(2.0 * np.pi * 5.0 * t) * (1.0 + 0.5 * np.sin(2.0 * np.pi * 0.21 * t))
     measured = motion + np.random.default_rng(1).normal(0.0, 0.005, t.size)

@@ -1,4 +1,6 @@
-"""The scheduling method: published figures, measured loops of another machine than the nominal one, tables that the controller loads."""
+"""The scheduling method: published figures, measured loops of another machine than the nominal one, tables that the
+controller loads.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ OTHER = geometry_with(  # another engine: lengths and play beyond what the geome
 )
 
 
-def zigzag(points: list[float], rate: float = 4.0, dt: float = 0.05, dwell: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def zigzag(
+    points: list[float], rate: float = 4.0, dt: float = 0.05, dwell: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Time, s, and stroke, mm, there and back between ``points`` at ``rate`` mm/s."""
     t, x = [0.0], [points[0]]
     for p in points[1:]:
@@ -57,7 +61,9 @@ def branch(geometry: Geometry, k: int, stroke: np.ndarray, side: int) -> np.ndar
     g = geometry.arrays()
     o = N_CRANK + k * N_PER_STAGE
     half = 0.5 * g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
-    return np.degrees([vane_angle(stage_ring_angle(x * 1e-3, g, k) - side * half, g[o + G_LDP], g[o + G_L]) for x in stroke])
+    return np.degrees(
+        [vane_angle(stage_ring_angle(x * 1e-3, g, k) - side * half, g[o + G_LDP], g[o + G_L]) for x in stroke]
+    )
 
 
 def angles(geometry: Geometry, k: int, stroke: np.ndarray) -> np.ndarray:
@@ -102,11 +108,12 @@ def curve_error(m: MeasuredLoop) -> float:
     inside = (m.stroke >= low) & (m.stroke <= high)
     k = STAGES.index(m.stage)
     return max(
-        float(np.max(np.abs(c[inside] - branch(OTHER, k, m.stroke[inside], side)))) for c, side in ((m.extension, 1), (m.retraction, -1))
+        float(np.max(np.abs(c[inside] - branch(OTHER, k, m.stroke[inside], side))))
+        for c, side in ((m.extension, 1), (m.retraction, -1))
     )
 
 
-# --- the paper's figures ----------------------------------------------------------------------------------------------------
+# --- the paper's figures ----------------------------------------------------------------------------------------------
 
 
 def test_the_papers_numbers_give_the_papers_errors():
@@ -132,7 +139,9 @@ def test_no_other_pair_of_lengths_on_the_step_is_better(criterion):
     best = schedule(GEOMETRY, SCHEDULES, options=o).links[1]
 
     def worth(s: LinkChange, state: str) -> float:
-        return {"rms": s.rms[state], "max": s.largest[state], "design": abs(s.at_design[state]) + s.rms[state]}[criterion]
+        return {"rms": s.rms[state], "max": s.largest[state], "design": abs(s.at_design[state]) + s.rms[state]}[
+            criterion
+        ]
 
     for lb in range(-3, 4):
         for lc in range(-2, 3):
@@ -141,7 +150,7 @@ def test_no_other_pair_of_lengths_on_the_step_is_better(criterion):
             assert worth(s, "built") >= worth(best, "adjusted") - 1e-9
 
 
-# --- the measured loop ------------------------------------------------------------------------------------------------------
+# --- the measured loop ------------------------------------------------------------------------------------------------
 
 
 def test_one_noisy_loop_gives_width_lengths_and_both_curves():
@@ -181,11 +190,13 @@ def test_a_drift_is_reported_as_large_as_it_was():
 
 def test_a_mechanism_without_play_has_a_loop_of_no_width():
     t, x = zigzag([1.0, 47.0, 1.0])
-    y = angles(geometry_with(GEOMETRY, {"vigv": {"hysteresis": 0.0}}), 0, x) + 0.03 * np.random.default_rng(2).standard_normal(t.size)
+    y = angles(geometry_with(GEOMETRY, {"vigv": {"hysteresis": 0.0}}), 0, x) + 0.03 * np.random.default_rng(
+        2
+    ).standard_normal(t.size)
     assert measure_loop(Channel(t, x), Channel(t, y), GEOMETRY).width == pytest.approx(0.0, abs=0.03)
 
 
-# --- end to end -------------------------------------------------------------------------------------------------------------
+# --- end to end -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -238,8 +249,12 @@ def test_a_log_of_the_independent_rig_gives_tables_that_serve_the_same_machine(s
     run = simulate(loops, firmware(), hidden, seed=seed, rate=100)
     channels = {k: Channel(run.log["t"], run.log[k]) for k in ("x_lvdt", *STAGES)}
     r = schedule(GEOMETRY, SCHEDULES, Log("rig", channels))
-    assert r.loops["vigv"].lc == pytest.approx(497.7, abs=0.08)  # a bias of the potentiometer is within: 0.1 deg are 0.06 mm
-    assert r.loops["vigv"].width == pytest.approx(1.6 + np.degrees(5e-3), abs=0.08)  # the rig draws the play within 0.05 deg
+    assert r.loops["vigv"].lc == pytest.approx(
+        497.7, abs=0.08
+    )  # a bias of the potentiometer is within: 0.1 deg are 0.06 mm
+    assert r.loops["vigv"].width == pytest.approx(
+        1.6 + np.degrees(5e-3), abs=0.08
+    )  # the rig draws the play within 0.05 deg
     shipped = load_calibration()
     own = shipped._replace(table=np.vstack([r.table[0], r.table[1:] * 1e-3]))
     errors = []
@@ -280,7 +295,7 @@ def test_the_tables_cover_the_schedule_from_where_it_rises():
     assert table_speeds(SCHEDULES).tolist() == list(range(40, 106))
 
 
-# --- bad input --------------------------------------------------------------------------------------------------------------
+# --- bad input --------------------------------------------------------------------------------------------------------
 
 
 def log_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> Log:
@@ -303,7 +318,10 @@ def upwards(t, x):
         (upwards, "retraction is missing: x_lvdt from 1 to"),
         (lambda t, x: (t, x, -angles(GEOMETRY, 0, x)), "vigv changes by -1.0"),
         (lambda t, x: (t, x, 0.0 * x + 3.0), "vigv stays at 3 deg while x_lvdt moves from 1 to"),
-        (lambda t, x: (t, 25.4 * x, angles(GEOMETRY, 0, x)), "x_lvdt (x_lvdt): 461 of 500 values are outside -25 to 75 mm"),
+        (
+            lambda t, x: (t, 25.4 * x, angles(GEOMETRY, 0, x)),
+            "x_lvdt (x_lvdt): 461 of 500 values are outside -25 to 75 mm",
+        ),
         (lambda t, x: (t, 1.5 * x, angles(GEOMETRY, 0, x)), "x_lvdt (="),
         (lambda t, x: (t[:10], x[:10], angles(GEOMETRY, 0, x[:10])), "a loop needs at least 20"),
     ],
@@ -316,7 +334,10 @@ def test_a_log_without_a_loop_is_refused_in_one_line(make, says):
 
 def test_a_dead_potentiometer_of_vgv1_is_named_and_left_out():
     t, x = zigzag([1.0, 47.0, 1.0])
-    log = Log("loop.csv", {"x_lvdt": Channel(t, x), "vigv": Channel(t, angles(GEOMETRY, 0, x)), "vgv1": Channel(t, 0.0 * t + 3.0)})
+    log = Log(
+        "loop.csv",
+        {"x_lvdt": Channel(t, x), "vigv": Channel(t, angles(GEOMETRY, 0, x)), "vgv1": Channel(t, 0.0 * t + 3.0)},
+    )
     r = schedule(GEOMETRY, SCHEDULES, log)
     assert set(r.loops) == {"vigv"}
     assert any("vgv1 is not measured" in n and "vgv1 stays at 3 deg" in n for n in r.notes)
@@ -343,7 +364,9 @@ def test_geometry_that_cannot_be_assembled_names_stage_stroke_and_quantity(tmp_p
 
 def test_a_vigv_schedule_beyond_the_stroke_names_speed_and_angle(tmp_path, capsys):
     file = edited("schedules.toml", tmp_path, "19.0, 19.3, 19.6, 20.1", "19.0, 19.3, 19.6, 40.0")
-    assert "no stroke meets the schedule at 105 % speed: target angle (=40 deg)" in refused(["--schedules", file], capsys)
+    assert "no stroke meets the schedule at 105 % speed: target angle (=40 deg)" in refused(
+        ["--schedules", file], capsys
+    )
 
 
 def test_a_vgv1_schedule_that_no_length_meets_names_speed_stroke_and_error(tmp_path, capsys):
@@ -385,7 +408,18 @@ def test_a_csv_of_other_names_and_units_gives_the_same_loop(engine, tmp_path, ca
         igv = "nan" if i % 50 == 7 else repr(float(np.radians(float(r[at["vigv"]]))))
         lines.append(f"{r[at['t']]},{float(r[at['x_lvdt']]) * 1e-3!r},{igv}")
     (tmp_path / "other.csv").write_text("\n".join(lines) + "\n")
-    names = ["--map", "time=t", "--map", "stroke=x_lvdt", "--map", "igv=vigv", "--unit", "x_lvdt=m", "--unit", "vigv=rad"]
+    names = [
+        "--map",
+        "time=t",
+        "--map",
+        "stroke=x_lvdt",
+        "--map",
+        "igv=vigv",
+        "--unit",
+        "x_lvdt=m",
+        "--unit",
+        "vigv=rad",
+    ]
     assert main(["schedule", "--log", str(tmp_path / "other.csv"), *names, "--quiet", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["loops"]["vigv"]["width"] == pytest.approx(2.3, abs=0.05)
 

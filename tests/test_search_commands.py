@@ -1,4 +1,6 @@
-"""The commands of the search for missing physics, as a user runs them: on the example log whose machine has a dead band and a load."""
+"""The commands of the search for missing physics, as a user runs them: on the example log whose machine has a dead band
+and a load.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ from vaneloop.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 LOG = ROOT / "examples" / "hidden_effect.parquet"
-HIDDEN = {"valve_dead_band": ("half_width", 0.8, "mA"), "aero_load": ("force", 3500.0, "N")}  # what examples/record.py put in
+HIDDEN = {
+    "valve_dead_band": ("half_width", 0.8, "mA"),
+    "aero_load": ("force", 3500.0, "N"),
+}  # what examples/record.py put in
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,9 @@ def diagnosis(tmp_path_factory: pytest.TempPathFactory) -> tuple[Answer, Path]:
 @pytest.fixture(scope="session")
 def extension(tmp_path_factory: pytest.TempPathFactory) -> tuple[Answer, Path]:
     model = tmp_path_factory.mktemp("extension") / "both.toml"
-    return vaneloop("extend", LOG, "--effect", "valve_dead_band", "--effect", "aero_load", "--out", model, "--json", "-"), model
+    return vaneloop(
+        "extend", LOG, "--effect", "valve_dead_band", "--effect", "aero_load", "--out", model, "--json", "-"
+    ), model
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +65,7 @@ def nominal() -> Answer:
     return vaneloop("compare", LOG, "--json", "-")
 
 
-# ---- diagnose ----------------------------------------------------------------------------------------------------------------------------
+# ---- diagnose --------------------------------------------------------------------------------------------------------
 
 
 def test_diagnose_names_both_hidden_effects_and_no_other(diagnosis: tuple[Answer, Path]) -> None:
@@ -102,7 +109,7 @@ def test_diagnose_tells_the_user_on_standard_error_and_writes_a_page(diagnosis: 
     assert 'src="http' not in text  # self-contained
 
 
-# ---- extend, compare, locate -------------------------------------------------------------------------------------------------------------
+# ---- extend, compare, locate -----------------------------------------------------------------------------------------
 
 
 def test_extend_brings_the_held_out_error_to_the_noise_floor(extension: tuple[Answer, Path]) -> None:
@@ -130,7 +137,18 @@ def test_compare_shows_the_whole_loop_and_each_stage(nominal: Answer) -> None:
     assert nominal.code == 0, nominal.err
     j = nominal.json()
     assert {"schema", "log", "simulated_s", "wall_s", "state_hash", "signals", "stages"} <= set(j)
-    keys = {"signal", "stage", "unit", "reference", "rms", "mean_abs", "max_abs", "mean_abs_99_100", "noise_floor", "samples"}
+    keys = {
+        "signal",
+        "stage",
+        "unit",
+        "reference",
+        "rms",
+        "mean_abs",
+        "max_abs",
+        "mean_abs_99_100",
+        "noise_floor",
+        "samples",
+    }
     assert all(keys <= set(s) for s in j["signals"])
     assert {s["stage"] for s in j["stages"]} == {"demand", "servo", "engine", "actuator", "linkage"}
     worst = max(j["stages"], key=lambda s: s["ratio"])
@@ -144,7 +162,9 @@ def test_the_loop_hides_what_the_stage_shows(nominal: Answer) -> None:
     assert stage > 10 * loop
 
 
-def test_the_extended_model_is_nearer_to_the_log_in_the_whole_loop(nominal: Answer, extension: tuple[Answer, Path], tmp_path: Path) -> None:
+def test_the_extended_model_is_nearer_to_the_log_in_the_whole_loop(
+    nominal: Answer, extension: tuple[Answer, Path], tmp_path: Path
+) -> None:
     page = tmp_path / "compare.html"
     answer = vaneloop("compare", LOG, "--model", extension[1], "--json", "-", "--report", page)
     assert answer.code == 0, answer.err
@@ -180,7 +200,7 @@ def test_locate_agrees_with_the_extended_model(extension: tuple[Answer, Path]) -
     assert ratio < 2.0
 
 
-# ---- bad input ---------------------------------------------------------------------------------------------------------------------------
+# ---- bad input -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -200,10 +220,16 @@ def bad(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SEARCH = ("locate", "diagnose")
 BAD: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
-    (("extend", "{log}", "--effect", "valve_dead_bnad", "--out", "m.toml"), ("valve_dead_bnad", "'valve_dead_band' is meant")),
+    (
+        ("extend", "{log}", "--effect", "valve_dead_bnad", "--out", "m.toml"),
+        ("valve_dead_bnad", "'valve_dead_band' is meant"),
+    ),
     (("extend", "{log}", "--out", "m.toml"), ("--effect",)),
     (("extend", "{log}", "--effect", "aero_load"), ("--out",)),
-    (("extend", "{log}", "--effect", "aero_load", "--out", "no_such_folder/m.toml"), ("no_such_folder/m.toml", "cannot be written")),
+    (
+        ("extend", "{log}", "--effect", "aero_load", "--out", "no_such_folder/m.toml"),
+        ("no_such_folder/m.toml", "cannot be written"),
+    ),
     (("extend", "{log}", "--effect", "aero_load", "--out", "a_folder"), ("a_folder", "cannot be written")),
     (("extend", "vanes_only.csv", "--effect", "aero_load", "--out", "m.toml"), ("vanes_only.csv",)),
     *(((c, "no_such.csv"), ("no_such.csv",)) for c in (*SEARCH, "compare")),
@@ -228,7 +254,11 @@ def complaint(code: int, text: str) -> str:
 
 @pytest.mark.parametrize(("words", "says"), BAD, ids=[" ".join(w) for w, _ in BAD])
 def test_bad_input_gets_one_line_and_exit_code_two(
-    words: tuple[str, ...], says: tuple[str, ...], bad: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...],
+    says: tuple[str, ...],
+    bad: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(bad)
     try:  # in this process: twenty of their own would take a minute

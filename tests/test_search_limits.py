@@ -1,7 +1,9 @@
-"""The numbers that decide the search, each a fifth below and a quarter above: what is named, confirmed, called unknown, tried at all.
+"""The numbers that decide the search, each a fifth below and a quarter above: what is named, confirmed, called unknown,
+tried at all.
 
-The documented values stand in one place, `DOCUMENTED`, and must be those of the table in docs/diagnosis.md. The decisions are asked of the
-functions that make them, on errors made up to stand exactly where a number says; nothing is simulated.
+The documented values stand in one place, `DOCUMENTED`, and must be those of the table in docs/diagnosis.md. The
+decisions are asked of the functions that make them, on errors made up to stand exactly where a number says; nothing is
+simulated.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 
 DOCUMENTED = {
-    "NATS": 12.0, "SPREADS": 3.0, "BLOCK_SPREADS": 8.0, "LEAST_SHARE": 0.15, "FLOOR_KNOWN": 0.01, "TOLERATED": 1.05, "LEFT_FLOORS": 3.0,
+    "NATS": 12.0, "SPREADS": 3.0, "BLOCK_SPREADS": 8.0, "LEAST_SHARE": 0.15, "FLOOR_KNOWN": 0.01, "TOLERATED": 1.05,
+    "LEFT_FLOORS": 3.0,
     "RIVAL_NATS": 3.0, "RIVAL_SPREADS": 0.3, "RIVAL_SHARE": 0.25,
 }  # fmt: skip
 BELOW, ABOVE = 0.81, 1.24  # just inside what a number wrong by a fifth or a quarter would let through
@@ -39,12 +42,14 @@ def test_the_page_documents_the_numbers_that_are_in_force():
         assert getattr(diagnose, name) == value, name
 
 
-# ---- made-up errors ------------------------------------------------------------------------------------------------------------------
+# ---- made-up errors --------------------------------------------------------------------------------------------------
 
 
 def judge_of(blocks: int, each: int) -> Any:
     """What a decision asks of a `Judge`: how many samples, and where."""
-    return SimpleNamespace(n=blocks * each, samples=np.full(blocks, each), n_blocks=blocks, expected=lambda: np.ones(blocks))
+    return SimpleNamespace(
+        n=blocks * each, samples=np.full(blocks, each), n_blocks=blocks, expected=lambda: np.ones(blocks)
+    )
 
 
 def fit_of(rms: Any, judge: Any, effects: tuple[str, ...] = ()) -> Fit:
@@ -60,7 +65,7 @@ def rms_after(judge: Any, nats: float) -> float:
     return float(np.sqrt(1.0 + 2.0 * nats / judge.n))
 
 
-# ---- is an effect worth its place? ---------------------------------------------------------------------------------------------------
+# ---- is an effect worth its place? -----------------------------------------------------------------------------------
 
 
 @SIDES
@@ -92,7 +97,7 @@ def test_an_effect_must_explain_a_seventh_of_the_excess(times: float, beyond: bo
     assert diagnose.significant(judge, fit_of(np.sqrt(3.0), judge), after, 1.0) == beyond
 
 
-# ---- is anything missing? ------------------------------------------------------------------------------------------------------------
+# ---- is anything missing? --------------------------------------------------------------------------------------------
 
 
 @SIDES
@@ -123,13 +128,17 @@ def verdict(monkeypatch: pytest.MonkeyPatch, before: float, after: float, effect
 
 
 @SIDES
-def test_nothing_is_missing_up_to_five_per_cent_above_the_floor(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+def test_nothing_is_missing_up_to_five_per_cent_above_the_floor(
+    monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
+) -> None:
     rms = 1.0 + 0.05 * times
     assert verdict(monkeypatch, rms, rms, ()) == ("unknown" if beyond else "none")
 
 
 @SIDES
-def test_a_named_model_may_leave_a_seventh_of_the_excess(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+def test_a_named_model_may_leave_a_seventh_of_the_excess(
+    monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
+) -> None:
     after = float(np.sqrt(1.0 + 0.15 * times * 10.0))
     assert verdict(monkeypatch, np.sqrt(11.0), after, ("a",)) == ("unknown" if beyond else "missing")
 
@@ -143,7 +152,7 @@ def test_a_named_model_may_leave_three_floors_and_two_effects_two(
     assert verdict(monkeypatch, 1000.0, after, effects) == ("unknown" if beyond else "missing")
 
 
-# ---- does one of two beat the other? -------------------------------------------------------------------------------------------------
+# ---- does one of two beat the other? ---------------------------------------------------------------------------------
 
 
 @SIDES
@@ -176,7 +185,7 @@ def test_a_rival_must_be_worse_by_a_quarter_of_what_is_left(times: float, beyond
     assert diagnose._worse(judge, other, best, 1.0, 0.0) == beyond
 
 
-# ---- how much is tried ---------------------------------------------------------------------------------------------------------------
+# ---- how much is tried -----------------------------------------------------------------------------------------------
 
 
 class Endless:
@@ -203,7 +212,9 @@ class Endless:
         return self._fit(effects)
 
 
-def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     effects = tuple(Effect(c, (Parameter("size", 0.0, "1"),), ((1.0,),)) for c in "abcdefgh")
     stage: Any = SimpleNamespace(effects=effects, effect=lambda n: None)
     judge = judge_of(20, 100)
@@ -232,10 +243,14 @@ def test_the_three_leading_sets_are_finished() -> None:
     assert finished == [("a",), ("b",), ("c",)]
 
 
-def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_pieces_of_four(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_pieces_of_four(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert (diagnose.LONG, diagnose.SEARCHED, diagnose.PIECE) == (60_000, 40_000, 4_000)
     seen = []
-    monkeypatch.setattr(diagnose, "_to_the_floor", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown"))
+    monkeypatch.setattr(
+        diagnose, "_to_the_floor", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown")
+    )
     nothing = SimpleNamespace(theta=np.zeros(1))
     monkeypatch.setattr(diagnose, "_confirm", lambda *_: SimpleNamespace(verdict="none", final=nothing))
 
@@ -252,7 +267,7 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
     assert np.diff(np.flatnonzero(np.diff(at, prepend=-9) > 1)).min() >= 4_000
 
 
-# ---- fits ----------------------------------------------------------------------------------------------------------------------------
+# ---- fits ------------------------------------------------------------------------------------------------------------
 
 
 def straight(n: int, dt: float, noise: float = 0.1, tolerance: float = 0.0) -> Stage:
@@ -283,7 +298,9 @@ def test_a_log_is_cut_into_blocks_of_ten_seconds_twelve_at_least_and_sixty_at_mo
 def test_a_log_is_worth_two_hundred_observations_at_most(n: int, worth: float) -> None:
     """Interval of a slope over a sine: 1.645 sqrt(2 / N) noises, N no more than 200."""
     found = Judge(straight(n, 40.0 * np.pi / n), np.array([0.1])).fit(("slope",), np.zeros(2))
-    assert found.high[0] - found.low[0] == pytest.approx(2.0 * 1.645 * 0.1 * np.sqrt(2.0 / worth), rel=0.07 if n > 1000 else 0.12)
+    assert found.high[0] - found.low[0] == pytest.approx(
+        2.0 * 1.645 * 0.1 * np.sqrt(2.0 / worth), rel=0.07 if n > 1000 else 0.12
+    )
 
 
 def test_derivatives_are_taken_over_a_thousandth_of_a_parameters_scale() -> None:
@@ -294,7 +311,7 @@ def test_derivatives_are_taken_over_a_thousandth_of_a_parameters_scale() -> None
     assert np.allclose(np.sort(steps), [0.0, 2.0 * 1e-3], rtol=1e-12)
 
 
-# ---- where it fails ------------------------------------------------------------------------------------------------------------------
+# ---- where it fails --------------------------------------------------------------------------------------------------
 
 
 def test_a_condition_has_eight_bins_of_equal_population() -> None:
@@ -305,12 +322,15 @@ def test_a_condition_has_eight_bins_of_equal_population() -> None:
 
 
 def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
-    """A stage of pure noise, but for one of its eight bins, whose error so many independent samples exceed by that chance."""
+    """A stage of pure noise, but for one of its eight bins, whose error so many independent samples exceed by that
+    chance.
+    """
     n = 500
     squares = np.ones(8 * n)
     squares[:n] = 1.0 + float(norm.isf(chance / 8)) * np.sqrt(2.0 * correlation / n)
     stage = SimpleNamespace(
-        name="s", outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)}, regime_units={}, neutral=lambda: np.zeros(1),
+        name="s", outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)}, regime_units={},
+        neutral=lambda: np.zeros(1),
     )  # fmt: skip
     return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
@@ -328,7 +348,9 @@ def test_one_log_in_a_hundred_has_a_bin_called_significant_by_chance(chance: flo
 
 
 @SIDES
-def test_two_samples_count_as_one_where_bins_are_judged(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+def test_two_samples_count_as_one_where_bins_are_judged(
+    monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
+) -> None:
     monkeypatch.setattr(locate, "onset", lambda *_: None)
     monkeypatch.setattr(locate, "rms_per_output", lambda *_: np.ones(1))
     said = locate.locate(first_of_eight_bins_beyond(0.01, 2.0 * times), AT_NOTHING)
@@ -336,7 +358,9 @@ def test_two_samples_count_as_one_where_bins_are_judged(monkeypatch: pytest.Monk
 
 
 @SIDES
-def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool) -> None:
+def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(
+    monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
+) -> None:
     said = SimpleNamespace(verdict="missing", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
     monkeypatch.setattr(workflow, "_WORK", [SimpleNamespace()])
     monkeypatch.setattr(workflow, "diagnose_stage", lambda *_: said)
@@ -355,5 +379,3 @@ def test_the_limits_of_work_done_at_one_time_change_no_answer(monkeypatch: pytes
         many = judge.together([judge.fitting(("slope",), np.array([0.0, s])) for s in (-1.0, 0.5, 2.0)])
         answers.append([f.theta.tolist() for f in many])
     assert answers[0] == answers[1]
-
-

@@ -1,4 +1,5 @@
-"""On a real vcan0 (this machine's own, or one booted for it, `make test-can`): two processes, and can-utils as foreign clients.
+"""On a real vcan0 (this machine's own, or one booted for it, `make test-can`): two processes, and can-utils as foreign
+clients.
 
 What is judged is what candump wrote, decoded by cantools. Times are only judged where the machine was on time.
 """
@@ -40,7 +41,16 @@ class Vaneloop:
     def __init__(self, folder: Path, *arguments: str, options: list[str] | None = None):
         self.name = arguments[0]
         self.json_file, self.text_file = folder / f"{self.name}.json", folder / f"{self.name}.txt"
-        command = [sys.executable, "-m", "vaneloop.cli.main", *arguments, "--bus", INTERFACE, "--json", str(self.json_file)]
+        command = [
+            sys.executable,
+            "-m",
+            "vaneloop.cli.main",
+            *arguments,
+            "--bus",
+            INTERFACE,
+            "--json",
+            str(self.json_file),
+        ]
         command += priority() if options is None else options
         with self.text_file.open("w") as text:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=text, stderr=text)
@@ -82,7 +92,11 @@ class Heard:
     def signal(self, frame: str, name: str) -> np.ndarray:
         """Values of a signal in every frame of that name whose length is right."""
         message = DBC.get_message_by_name(frame)
-        rows = [bytes.fromhex(d) for i, d in zip(self.ident, self.data, strict=True) if i == message.frame_id and len(d) == 16]
+        rows = [
+            bytes.fromhex(d)
+            for i, d in zip(self.ident, self.data, strict=True)
+            if i == message.frame_id and len(d) == 16
+        ]
         return np.array([message.decode(r, decode_choices=False)[name] for r in rows])
 
     def assert_safe(self) -> None:
@@ -93,7 +107,9 @@ class Heard:
         assert abs(i).max() <= CURRENT + 2e-3
 
     def stood_still(self) -> bool:
-        """The controller says that it stood still for so long that it dropped what came: a busy machine; it is in FAIL_SAFE then."""
+        """The controller says that it stood still for so long that it dropped what came: a busy machine; it is in
+        FAIL_SAFE then.
+        """
         return bool(self.signal("VGV_SERVO", "fault_paused").any())
 
     def degraded(self) -> bool:
@@ -119,7 +135,10 @@ def wait_for_listener(before: int, process: subprocess.Popen) -> None:
 def candump(folder: Path, name: str = "heard.log") -> Iterator[Path]:
     """Let candump write down what it hears."""
     log, before = folder / name, listeners()
-    with log.open("w") as out, subprocess.Popen(["candump", "-L", "-d", "-r", "8000000", INTERFACE], stdout=out) as process:
+    with (
+        log.open("w") as out,
+        subprocess.Popen(["candump", "-L", "-d", "-r", "8000000", INTERFACE], stdout=out) as process,
+    ):
         try:
             wait_for_listener(before, process)
             yield log
@@ -128,7 +147,9 @@ def candump(folder: Path, name: str = "heard.log") -> Iterator[Path]:
 
 
 def wait_for_run(seconds: float = 60.0) -> None:
-    """Wait until the controller has said RUN for half a second. Skips on a machine so busy that it stands still again and again."""
+    """Wait until the controller has said RUN for half a second. Skips on a machine so busy that it stands still again
+    and again.
+    """
     status, servo = (DBC.get_message_by_name(name) for name in ("VGV_STATUS", "VGV_SERVO"))
     filters = [{"can_id": m.frame_id, "can_mask": 0x7FF} for m in (status, servo)]
     since, last, stood_still = None, None, False
@@ -150,8 +171,12 @@ def wait_for_run(seconds: float = 60.0) -> None:
             elif time.monotonic() - since > 0.5:
                 return
     if stood_still:
-        pytest.skip(f"this machine is too busy: the controller stood still for 50 ms or more again and again, for {seconds:g} s")
-    pytest.fail(f"the controller is not in RUN within {seconds:g} s; last heard: {None if last is None else MODES[last]}")
+        pytest.skip(
+            f"this machine is too busy: the controller stood still for 50 ms or more again and again, for {seconds:g} s"
+        )
+    pytest.fail(
+        f"the controller is not in RUN within {seconds:g} s; last heard: {None if last is None else MODES[last]}"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +199,9 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Vaneloop, V
 def test_a_frame_passes_between_python_can_and_can_utils_both_ways() -> None:
     with can.Bus(interface="socketcan", channel=INTERFACE) as bus:
         before = listeners()
-        with subprocess.Popen(["candump", "-L", "-n", "1", f"{INTERFACE},123:7FF"], stdout=subprocess.PIPE, text=True) as foreign:
+        with subprocess.Popen(
+            ["candump", "-L", "-n", "1", f"{INTERFACE},123:7FF"], stdout=subprocess.PIPE, text=True
+        ) as foreign:
             wait_for_listener(before, foreign)
             bus.send(can.Message(arbitration_id=0x123, data=bytes(range(8)), is_extended_id=False))
             seen, _ = foreign.communicate(timeout=PATIENCE)
@@ -187,7 +214,9 @@ def test_a_frame_passes_between_python_can_and_can_utils_both_ways() -> None:
 
 @pytest.mark.any_speed
 def test_every_frame_is_heard_and_every_wrong_one_counted_however_slow_the_machine(tmp_path: Path) -> None:
-    """Judges no time: what candump hears is what controller and ECU say that they sent, and what cansend slips in is counted."""
+    """Judges no time: what candump hears is what controller and ECU say that they sent, and what cansend slips in is
+    counted.
+    """
     wrong = 10
     with candump(tmp_path) as log:
         run = Vaneloop(tmp_path, "run", options=["--spin-us", "0"])
@@ -209,7 +238,10 @@ def test_every_frame_is_heard_and_every_wrong_one_counted_however_slow_the_machi
     counts, lost = said["counts"], said["frames"]["lost"] + said["dropped"]
     assert 0 < counts["good"] < said["frames"]["received"] <= heard_by["frames"]["sent"] + wrong
     assert wrong - lost <= counts["wrong_crc"] <= wrong, counts
-    told = f"{said['ticks']:,} ticks, {said['missed']:,} missed, {said['skipped']:,} skipped, {lost} frames lost or dropped"
+    told = (
+        f"{said['ticks']:,} ticks, {said['missed']:,} missed, {said['skipped']:,} skipped, {lost} frames lost or "
+        f"dropped"
+    )
     print(f"{told}, {len(heard.t):,} in candump and {heard.dropped} dropped there")
 
 
@@ -236,13 +268,17 @@ def test_controller_and_ecu_run_for_60_seconds(minute: tuple[Path, dict, dict]) 
 def test_the_foreign_log_of_a_run_replays(minute: tuple[Path, dict, dict], tmp_path: Path) -> None:
     """candump's log is a log for `vaneloop replay`, which finds the strokes and angles again.
 
-    The replay knows neither the lateness of real ticks nor the bus: hence the tolerance, one frame (10 ms) and the latest tick at the
-    fastest rise seen.
+    The replay knows neither the lateness of real ticks nor the bus: hence the tolerance, one frame (10 ms) and the
+    latest tick at the fastest rise seen.
     """
     log, result, said = minute
     replayed = tmp_path / "replay.json"
-    subprocess.run([sys.executable, "-m", "hil.replay", str(log), "--quiet", "--json", str(replayed)], check=True, timeout=PATIENCE)
-    errors = {s["signal"]: s["rms"] for s in json.loads(replayed.read_text())["signals"] if s["reference"] == "measured"}
+    subprocess.run(
+        [sys.executable, "-m", "hil.replay", str(log), "--quiet", "--json", str(replayed)], check=True, timeout=PATIENCE
+    )
+    errors = {
+        s["signal"]: s["rms"] for s in json.loads(replayed.read_text())["signals"] if s["reference"] == "measured"
+    }
     assert {"x_dem", "x_lvdt", "vigv", "vgv1", "vgv2"} <= set(errors)
     heard = Heard(log)
     states = heard.signal("VGV_STATUS", "state")
@@ -251,7 +287,9 @@ def test_the_foreign_log_of_a_run_replays(minute: tuple[Path, dict, dict], tmp_p
     whole = (states[first : last + 1] == RUN).all()
     assert whole or late > ON_TIME_US, "a fault although nobody was late"
     if not whole:
-        pytest.skip(f"the log replays; its figures are not judged, because a tick was {late * 1e-3:.0f} ms late and cost frames")
+        pytest.skip(
+            f"the log replays; its figures are not judged, because a tick was {late * 1e-3:.0f} ms late and cost frames"
+        )
     fastest = np.abs(np.diff(heard.signal("VGV_STATUS", "x_dem"))).max() * (1.0 + late / 10_000.0)
     assert errors["x_lvdt"] < fastest and errors["x_dem"] < fastest, (errors, fastest)
 
@@ -280,7 +318,8 @@ def test_the_controller_survives_old_frames_by_canplayer(pair, tmp_path: Path) -
         wait_for_run()
     heard = Heard(log)
     heard.assert_safe()
-    # whether it degrades depends on how the frames of both senders mix, and that on the machine: they are refused and counted in any case
+    # whether it degrades depends on how the frames of both senders mix, and that on the machine: they are refused and
+    # counted in any case
     rejected = heard.signal("VGV_HEALTH", "frames_rejected")
     assert rejected[-1] - rejected[0] >= 100 or heard.stood_still(), "old frames of a second sender went unnoticed"
 
@@ -309,7 +348,17 @@ def test_a_scenario_is_played_on_the_live_bus(pair, tmp_path: Path) -> None:
     wait_for_run()
     out = tmp_path / "inject.json"
     with candump(tmp_path) as log:
-        command = [sys.executable, "-m", "hil.inject", "extended_lookalike", "--bus", INTERFACE, "--quiet", "--json", str(out)]
+        command = [
+            sys.executable,
+            "-m",
+            "hil.inject",
+            "extended_lookalike",
+            "--bus",
+            INTERFACE,
+            "--quiet",
+            "--json",
+            str(out),
+        ]
         done = subprocess.run(command, check=False, timeout=PATIENCE, capture_output=True, text=True)
     if done.returncode == 2 and "no controller in RUN" in done.stderr and Heard(log).stood_still():
         pytest.skip("this machine is too busy: the controller stood still just before")
@@ -319,7 +368,9 @@ def test_a_scenario_is_played_on_the_live_bus(pair, tmp_path: Path) -> None:
     assert seen["always 0.5 <= x_dem <= 47.5 mm"] and seen["always -40 <= i_cmd <= 40 mA"]
     # FAIL_SAFE on a machine that stood still for too long at that moment
     assert {"DEGRADED", "FAIL_SAFE"} & {m["mode"] for m in scenario["modes"]}, scenario
-    assert [v for k, v in seen.items() if "wrong_kind" in k] == [None], "the receiver's own counts cannot be seen from outside"
+    assert [v for k, v in seen.items() if "wrong_kind" in k] == [None], (
+        "the receiver's own counts cannot be seen from outside"
+    )
     sent = re.findall(r"000000A0#", log.read_text())
     assert len(sent) == 100
     wait_for_run()

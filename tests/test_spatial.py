@@ -1,4 +1,6 @@
-"""The planar linkage against the mechanism in space, by a multibody library and by Newton's method; hysteresis out of clearances."""
+"""The planar linkage against the mechanism in space, by a multibody library and by Newton's method; hysteresis out of
+clearances.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ from scipy.optimize import minimize
 from plant import load_geometry
 from plant.geometry import vane_angles
 from plant.linkage import STAGES, clevis_axial, stage_ring_angle
-from plant.spatial import Clearances, clearance_for, clearance_loop, clearance_width, contributions, freedoms, plane_joints, spatial_angles
+from plant.spatial import (
+    Clearances,
+    clearance_for,
+    clearance_loop,
+    clearance_width,
+    contributions,
+    freedoms,
+    plane_joints,
+    spatial_angles,
+)
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.cli.main import main
@@ -30,7 +41,7 @@ def planar(stage: str, stroke: np.ndarray = STROKE) -> np.ndarray:
     return np.degrees(vane_angles(stroke * 1e-3, GEOMETRY)[:, STAGES.index(stage)])
 
 
-# --- the mechanism in space -------------------------------------------------------------------------------------------------
+# --- the mechanism in space -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("stage", "limit"), [("vigv", 0.041), ("vgv1", 0.012), ("vgv2", 0.0035)])
@@ -44,13 +55,17 @@ def test_planar_model_is_the_multibody_mechanism_to_hundredths_of_a_degree(stage
 @pytest.mark.parametrize("offset", [0.0, 15.0])
 def test_two_codes_close_the_same_loop_in_space(stage, offset):
     pytest.importorskip("exudyn")
-    assert multibody_angles(GEOMETRY, stage, STROKE, offset) == pytest.approx(spatial_angles(GEOMETRY, stage, STROKE, offset), abs=1e-7)
+    assert multibody_angles(GEOMETRY, stage, STROKE, offset) == pytest.approx(
+        spatial_angles(GEOMETRY, stage, STROKE, offset), abs=1e-7
+    )
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_the_difference_is_the_link_leaning_by_the_clevis_axial_motion(stage):
     k, s, h = STAGES.index(stage), getattr(GEOMETRY, stage), 1e-4
-    axial = np.array([clevis_axial(stage_ring_angle(x * 1e-3, GEOMETRY.arrays(), k), s.ld_prime.value, s.l.value) for x in STROKE])
+    axial = np.array(
+        [clevis_axial(stage_ring_angle(x * 1e-3, GEOMETRY.arrays(), k), s.ld_prime.value, s.l.value) for x in STROKE]
+    )
     shorter = geometry_with(GEOMETRY, {stage: {"lc": s.lc.value - h}})
     per_mm = (np.degrees(vane_angles(STROKE * 1e-3, shorter)[:, k]) - planar(stage)) / h
     expected = per_mm * axial**2 / (2.0 * s.lc.value)
@@ -69,8 +84,12 @@ def test_drawn_joints_have_the_lengths_of_the_table(stage):
     s, c = getattr(GEOMETRY, stage), GEOMETRY.crank
     for stroke in (0.0, 24.0, 48.0):
         j = plane_joints(GEOMETRY, stage, stroke * 1e-3)
-        lengths = [abs(j[b] - j[a]) * 1e3 for a, b in (("J0", "J1"), ("J1", "J2"), ("J2", "J3"), ("J3", "J4"), ("J4", "J5"))]
-        assert lengths == pytest.approx([c.lx0.value + stroke, c.le.value, s.lb.value, s.lc.value, s.ld.value], abs=1e-9)
+        lengths = [
+            abs(j[b] - j[a]) * 1e3 for a, b in (("J0", "J1"), ("J1", "J2"), ("J2", "J3"), ("J3", "J4"), ("J4", "J5"))
+        ]
+        assert lengths == pytest.approx(
+            [c.lx0.value + stroke, c.le.value, s.lb.value, s.lc.value, s.ld.value], abs=1e-9
+        )
 
 
 def test_a_mechanism_that_does_not_close_is_refused_with_its_stroke():
@@ -81,11 +100,13 @@ def test_a_mechanism_that_does_not_close_is_refused_with_its_stroke():
         multibody_angles(GEOMETRY, "vigv", np.array([24.0, 400.0]))
 
 
-# --- clearance --------------------------------------------------------------------------------------------------------------
+# --- clearance --------------------------------------------------------------------------------------------------------
 
 
 def branch_by_optimisation(stage: str, stroke: float, c: Clearances, side: float) -> float:
-    """Least (side 1) or greatest (side -1) ring angle, rad, that the clearances of one planar chain allow: no statics, no sides."""
+    """Least (side 1) or greatest (side -1) ring angle, rad, that the clearances of one planar chain allow: no statics,
+    no sides.
+    """
     s, k = getattr(GEOMETRY, stage), GEOMETRY.crank
     arms = math.radians(s.theta6.value) - math.atan2(s.dx.value, -s.dy.value)
     j2 = complex(k.x1.value, k.y1.value)
@@ -108,7 +129,9 @@ def branch_by_optimisation(stage: str, stroke: float, c: Clearances, side: float
         {"type": "ineq", "fun": lambda q: 0.25 * c.crank_pivot**2 - q[2] ** 2 - q[3] ** 2},
     ]
     start = np.array([0.4, stage_ring_angle(stroke * 1e-3, GEOMETRY.arrays(), STAGES.index(stage)), 0.0, 0.0])
-    found = minimize(lambda q: side * 1e3 * q[1], start, constraints=limits, method="SLSQP", options={"maxiter": 500, "ftol": 1e-14})
+    found = minimize(
+        lambda q: side * 1e3 * q[1], start, constraints=limits, method="SLSQP", options={"maxiter": 500, "ftol": 1e-14}
+    )
     return float(found.x[1])
 
 
@@ -120,21 +143,29 @@ def test_branches_are_the_ends_of_what_the_clearances_allow(stage):
         branches = clearance_loop(GEOMETRY, stage, [stroke], c)
         for branch, side in zip(branches, (1.0, -1.0), strict=True):
             ring = branch_by_optimisation(stage, stroke, c, side)
-            assert branch[0] == pytest.approx(math.degrees(math.asin(s.ld_prime.value * math.tan(ring) / s.l.value)), abs=2e-3)
+            assert branch[0] == pytest.approx(
+                math.degrees(math.asin(s.ld_prime.value * math.tan(ring) / s.l.value)), abs=2e-3
+            )
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_widths_of_single_joints_add_up(stage):
     c = Clearances(0.1, 0.04, 0.05, 0.05, 0.5, 0.03)
-    assert sum(contributions(GEOMETRY, stage, c).values()) == pytest.approx(clearance_width(GEOMETRY, stage, c), rel=2e-3)
+    assert sum(contributions(GEOMETRY, stage, c).values()) == pytest.approx(
+        clearance_width(GEOMETRY, stage, c), rel=2e-3
+    )
 
 
 def test_clearance_of_the_link_is_worth_what_a_longer_link_is():
     longer = geometry_with(GEOMETRY, {"vigv": {"lc": 498.1}})
-    by_length = np.mean(planar("vigv") - np.degrees(vane_angles(STROKE * 1e-3, longer)[:, 0]))  # published: 1.6 deg for 1 mm
+    by_length = np.mean(
+        planar("vigv") - np.degrees(vane_angles(STROKE * 1e-3, longer)[:, 0])
+    )  # published: 1.6 deg for 1 mm
     up, down = clearance_loop(GEOMETRY, "vigv", STROKE, Clearances(crank_link=1.0))
     assert np.mean(down - up) == pytest.approx(by_length, rel=0.01)
-    assert clearance_loop(GEOMETRY, "vigv", STROKE, Clearances())[0] == pytest.approx(spatial_angles(GEOMETRY, "vigv", STROKE), abs=1e-9)
+    assert clearance_loop(GEOMETRY, "vigv", STROKE, Clearances())[0] == pytest.approx(
+        spatial_angles(GEOMETRY, "vigv", STROKE), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(("stage", "ring"), [("vigv", 0.81), ("vgv1", 0.49), ("vgv2", 0.31)])
@@ -173,7 +204,7 @@ def test_two_links_leave_a_free_ring_four_freedoms():
     assert 6 - np.linalg.matrix_rank(np.array(rows)) == 4
 
 
-# --- commands ---------------------------------------------------------------------------------------------------------------
+# --- commands ---------------------------------------------------------------------------------------------------------
 
 
 def test_spatial_command_states_the_difference_and_draws_it(tmp_path, capsys):

@@ -1,4 +1,6 @@
-"""The control strategies: how each treats the play, what adaptive learns, what it does when a potentiometer lies, and the command."""
+"""The control strategies: how each treats the play, what adaptive learns, what it does when a potentiometer lies, and
+the command.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ def ramps(*points: tuple[float, float]) -> np.ndarray:
     return np.interp(np.arange(0.0, t[-1], 1e-2), t, n)
 
 
-# ---- the comparison -----------------------------------------------------------------------------------------------------------------
+# ---- the comparison --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -67,7 +69,9 @@ def failed(failure: str, during: str, stages: tuple[str, ...] = st.STAGES) -> tu
 
 @pytest.mark.parametrize("failure", st.FAILURES)
 def test_potentiometers_that_fail_make_no_step(failure: str) -> None:
-    """At rest; in motion the command's own test has them. Only a drift as slow as a casing's growth leaves more error than dual's."""
+    """At rest; in motion the command's own test has them. Only a drift as slow as a casing's growth leaves more error
+    than dual's.
+    """
     f, out = failed(failure, "at rest")
     assert f.step <= 0.2 and f.departure <= 0.2
     assert f.mean_abs < f.mean_abs_dual or failure == "drift of -0.005 deg/s"
@@ -80,25 +84,31 @@ def test_one_or_two_potentiometers_that_fail_make_no_step(failure: str, stages: 
     f, out = failed(failure, "in motion", stages)
     assert f.step <= 0.2 and f.mean_abs < f.mean_abs_dual
     if "vigv" not in stages:
-        assert np.array_equal(out.stroke_demand, outcome("all together", "adaptive").stroke_demand)  # the stroke is the VIGV's
+        assert np.array_equal(
+            out.stroke_demand, outcome("all together", "adaptive").stroke_demand
+        )  # the stroke is the VIGV's
 
 
 def test_without_potentiometers_adaptive_is_inverse_bit_for_bit() -> None:
     n = ramps((0, 60), (5, 60), (10, 95), (15, 95), (22, 70), (30, 70))
     none = np.tile([1.0, np.nan], (len(n), 3))
     a, b = (
-        lockstep(Stimulus.of(n), calibration=CALIBRATIONS[s], seed=3, hashed=False, pots=none if s == "adaptive" else None)
+        lockstep(
+            Stimulus.of(n), calibration=CALIBRATIONS[s], seed=3, hashed=False, pots=none if s == "adaptive" else None
+        )
         for s in ("adaptive", "inverse")
     )
     for name in ("x_dem", "i_cmd", "vigv"):
         assert np.array_equal(a.columns[name], b.columns[name]), name
 
 
-# ---- the play ----------------------------------------------------------------------------------------------------------------------
+# ---- the play --------------------------------------------------------------------------------------------------------
 
 
 def test_the_play_followed_by_the_firmware_is_the_play_operator() -> None:
-    """Ring angle = clamp(ring, drive - w/2, drive + w/2): Krasnosel'skii and Pokrovskii, on a random walk of the drive."""
+    """Ring angle = clamp(ring, drive - w/2, drive + w/2): Krasnosel'skii and Pokrovskii, on a random walk of
+    the drive.
+    """
     rng = np.random.default_rng(5)
     z, w = np.zeros(fw.N_STATE), 0.028
     z[fw.DIRECTION] = 1.0
@@ -123,7 +133,9 @@ def test_a_dither_about_a_set_point_does_not_cross_the_gap(strategy: str, amplit
 
 @pytest.mark.parametrize(("hertz", "follows"), [(0.1, True), (0.2, True), (0.5, False), (1.0, False)])
 def test_a_wider_dither_is_followed_only_as_far_as_the_engine_follows(hertz: float, follows: bool) -> None:
-    """+-0.15 %: dual changes its curve at every swing, inverse crosses the gap where the vanes' own target goes to and fro."""
+    """+-0.15 %: dual changes its curve at every swing, inverse crosses the gap where the vanes' own target goes to and
+    fro.
+    """
     n = 99.5 + 0.15 * np.sin(2.0 * np.pi * hertz * np.arange(0.0, 60.0, 1e-2))
     mine, dual = (st.run(st.Scenario("dither"), n, CALIBRATIONS[s]) for s in ("inverse", "dual"))
     crossings = np.abs(np.diff(np.sign(mine.side[500:]))).sum() / 2.0
@@ -141,7 +153,7 @@ def test_after_a_partial_reversal_the_vane_is_on_its_target(back: float) -> None
         assert abs(o.errors[at, VIGV]) < 0.12
 
 
-# ---- learning ----------------------------------------------------------------------------------------------------------------------
+# ---- learning --------------------------------------------------------------------------------------------------------
 
 
 def test_what_is_learned_is_what_is_there() -> None:
@@ -149,7 +161,9 @@ def test_what_is_learned_is_what_is_there() -> None:
     truth = 0.5 / st.HEAT * (st.casing(profile()) - 40.0)
     settled = o.t > 400.0
     assert np.abs(o.offset - truth)[settled].mean() < 0.08
-    assert abs(o.width[settled].mean() - 0.8) < 0.2  # the play at the vane is up to 10 % wider at the ends of the stroke
+    assert (
+        abs(o.width[settled].mean() - 0.8) < 0.2
+    )  # the play at the vane is up to 10 % wider at the ends of the stroke
 
 
 def test_a_healthy_machine_teaches_next_to_nothing() -> None:
@@ -165,18 +179,27 @@ def test_compensation_changes_no_faster_than_its_rate() -> None:
 
 
 def test_a_potentiometer_is_believed_only_after_it_followed_the_linkage() -> None:
-    """At rest nothing is learned from power-on, whatever the potentiometer says; after a rise of more than pot_trust it is."""
+    """At rest nothing is learned from power-on, whatever the potentiometer says; after a rise of more than pot_trust it
+    is.
+    """
     n = ramps((0, 60), (40, 60), (50, 90), (80, 90))
     plant = build_plant()
     shifted = np.tile([1.0, np.deg2rad(0.4)], (len(n), 3))
     kept = []
-    lockstep(Stimulus.of(n), calibration=CALIBRATIONS["adaptive"], plant=plant, seed=1, pots=shifted, watch=lambda s: kept.append(s.copy()))
+    lockstep(
+        Stimulus.of(n),
+        calibration=CALIBRATIONS["adaptive"],
+        plant=plant,
+        seed=1,
+        pots=shifted,
+        watch=lambda s: kept.append(s.copy()),
+    )
     learned = np.rad2deg(np.vstack(kept)[:, fw.OFFSET])
     assert np.abs(learned[:40_000]).max() == 0.0
     assert learned[-1] > 0.1
 
 
-# ---- the command -------------------------------------------------------------------------------------------------------------------
+# ---- the command -----------------------------------------------------------------------------------------------------
 
 
 def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
@@ -185,7 +208,9 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     out = capsys.readouterr().out
     assert "all together" in out and "goals held" in out
     j = json.loads(answer.read_text(encoding="utf-8"))
-    assert j["schema"] == 1 and j["best"] == "adaptive" and len(j["rows"]) == 24 and len(j["failures"]) == len(st.FAILURES)
+    assert (
+        j["schema"] == 1 and j["best"] == "adaptive" and len(j["rows"]) == 24 and len(j["failures"]) == len(st.FAILURES)
+    )
     assert {f["during"] for f in j["failures"]} == {"in motion"} and "never rests at 99 % or more for 15 s" in out
     assert all(g["held"] for g in j["goals"])
     row = next(r for r in j["rows"] if r["scenario"] == "all together" and r["strategy"] == "dual")
@@ -214,11 +239,13 @@ def test_bad_input_is_one_line_and_exit_code_2(words: list[str], said: str, caps
     assert said in err and err.count("\n") == 1
 
 
-# ---- on a machine of other equations -----------------------------------------------------------------------------------------------
+# ---- on a machine of other equations ---------------------------------------------------------------------------------
 
 
 def test_on_the_independent_rig_adaptive_is_three_times_better_than_dual_too() -> None:
-    """A specimen within its tolerances, worn by 0.8 deg and growing by 0.01 deg/K, simulated by the rig with equations of its own."""
+    """A specimen within its tolerances, worn by 0.8 deg and growing by 0.01 deg/K, simulated by the rig with equations
+    of its own.
+    """
     from dataclasses import replace
 
     from tests.firmware_on_rig import firmware
@@ -231,7 +258,9 @@ def test_on_the_independent_rig_adaptive_is_three_times_better_than_dual_too() -
     for strategy in ("dual", "adaptive"):
         controller = replace(firmware(CALIBRATIONS[strategy]), vigv=fw.IN_VIGV)
         r = simulate(manoeuvre(1, 300.0), controller, hidden, seed=1)
-        mean[strategy] = np.abs(np.rad2deg(r.truth["vane_0"]) - np.rad2deg(schedules.targets(r.truth["n"])[:, 0])).mean()
+        mean[strategy] = np.abs(
+            np.rad2deg(r.truth["vane_0"]) - np.rad2deg(schedules.targets(r.truth["n"])[:, 0])
+        ).mean()
         travel[strategy] = np.abs(np.diff(r.log["x_dem"])).sum()
     assert mean["adaptive"] <= mean["dual"] / 3.0
     assert travel["adaptive"] <= 1.15 * travel["dual"]

@@ -1,4 +1,6 @@
-"""The layout that docs/architecture.md promises: who imports whom, what each package exports, what is in the repository."""
+"""The layout that docs/architecture.md promises: who imports whom, what each package exports, what is in the
+repository.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,23 @@ MAY_IMPORT: dict[str, set[str]] = {
 DOORS = {
     "hil/replay.py": "vaneloop.cli.replay",  # python -m hil.replay
     "hil/inject/__main__.py": "vaneloop.cli.inject",  # python -m hil.inject
-    "vaneloop/discrepancy/__init__.py": "vaneloop.discrepancy.models.system",  # what a user describes is offered at the room's door
-    "vaneloop/cli/hidden_effect.py": "tests",  # the blind benchmark hides effects with the rig, and says so where there is no checkout
+    # what a user describes is offered at the room's door
+    "vaneloop/discrepancy/__init__.py": "vaneloop.discrepancy.models.system",
+    # the blind benchmark hides effects with the rig, and says so where there is no checkout
+    "vaneloop/cli/hidden_effect.py": "tests",
 }
-CLOCKS_AND_BUSES = {"asyncio", "can", "cantools", "datetime", "sched", "selectors", "signal", "socket", "threading", "time"}
+CLOCKS_AND_BUSES = {
+    "asyncio",
+    "can",
+    "cantools",
+    "datetime",
+    "sched",
+    "selectors",
+    "signal",
+    "socket",
+    "threading",
+    "time",
+}
 
 # What each package exports. To change it on purpose, paste the line that the failing test prints.
 EXPORTS: dict[str, list[str]] = {
@@ -53,18 +68,60 @@ EXPORTS: dict[str, list[str]] = {
     "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
     "hil.bus": ["Port", "open_bus"],
     "hil.inject": [
-        *("ACTIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood", "Freeze"),
+        *(
+            "ACTIONS",
+            "Babble",
+            "BusOff",
+            "Check",
+            "Corrupt",
+            "Delay",
+            "Drop",
+            "Duplicate",
+            "ErrorFrames",
+            "Expect",
+            "Flood",
+            "Freeze",
+        ),
         *("Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "TRANSITIONS", "Trace"),
         *("judge", "library", "load_scenario", "run"),
     ],
     "hil.logs": ["Channel", "Log", "LogError", "offered", "read_log", "write_log"],
-    "plant": ["Geometry", "Model", "Plant", "Schedules", "build_plant", "load_geometry", "load_model", "load_schedules", "write_model"],
-    "plant.effects": ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"],
+    "plant": [
+        "Geometry",
+        "Model",
+        "Plant",
+        "Schedules",
+        "build_plant",
+        "load_geometry",
+        "load_model",
+        "load_schedules",
+        "write_model",
+    ],
+    "plant.effects": [
+        "DERIVED",
+        "EFFECTS",
+        "NEUTRAL",
+        "N_PARAMETERS",
+        "N_STATE",
+        "ROW",
+        "STATE",
+        "STATE_ROW",
+        "rows_at",
+    ],
     "vaneloop": [
         *("Channel", "InputError", "Log", "Parameter", "Record", "Scenario", "System"),
         *("load_system", "open_bus", "read_log", "replay", "unknown", "write_log"),
     ],
-    "vaneloop.discrepancy": ["Effect", "Parameter", "Record", "Stage", "StageError", "System", "load_system", "unknown"],
+    "vaneloop.discrepancy": [
+        "Effect",
+        "Parameter",
+        "Record",
+        "Stage",
+        "StageError",
+        "System",
+        "load_system",
+        "unknown",
+    ],
 }
 
 
@@ -85,8 +142,19 @@ def imported_names(source: str, file: str) -> Iterator[tuple[int, str]]:
             yield node.lineno, base
             for alias in node.names:
                 yield node.lineno, f"{base}.{alias.name}"
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant) and isinstance(node.args[0].value, str):
-            called = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id if isinstance(node.func, ast.Name) else ""
+        elif (
+            isinstance(node, ast.Call)
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+            and isinstance(node.args[0].value, str)
+        ):
+            called = (
+                node.func.attr
+                if isinstance(node.func, ast.Attribute)
+                else node.func.id
+                if isinstance(node.func, ast.Name)
+                else ""
+            )
             if called in ("import_module", "__import__"):
                 yield node.lineno, node.args[0].value
 
@@ -116,7 +184,9 @@ def may_import(file: str, name: str) -> bool:
 
 def complaints(source: str, file: str) -> list[str]:
     """Imports in ``source`` that the architecture forbids to ``file``, as ``file:line imports name``."""
-    return sorted({f"{file}:{line} imports {name}" for line, name in imported_names(source, file) if not may_import(file, name)})
+    return sorted(
+        {f"{file}:{line} imports {name}" for line, name in imported_names(source, file) if not may_import(file, name)}
+    )
 
 
 def python_files(folder: str) -> list[Path]:
@@ -127,7 +197,9 @@ def python_files(folder: str) -> list[Path]:
 def tracked_files() -> list[Path]:
     """Files that git tracks; skips outside a git checkout (a source archive, say)."""
     try:
-        listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, check=True).stdout.decode()
+        listed = subprocess.run(
+            ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, check=True
+        ).stdout.decode()
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("not a git checkout: tracked files are not known")
     return [ROOT / name for name in listed.split("\0") if name and (ROOT / name).is_file()]
@@ -162,9 +234,17 @@ def test_imports_run_the_way_the_architecture_says(home: str) -> None:
         ("hil/replay.py", "from vaneloop.cli import compare", "vaneloop.cli.compare"),
         ("vaneloop/discrepancy/locate.py", "import hil.logs", "hil.logs"),
         ("vaneloop/discrepancy/locate.py", "from vaneloop.base.errors import InputError", None),
-        ("vaneloop/discrepancy/locate.py", "from vaneloop.discrepancy.models import vanes", "vaneloop.discrepancy.models"),
+        (
+            "vaneloop/discrepancy/locate.py",
+            "from vaneloop.discrepancy.models import vanes",
+            "vaneloop.discrepancy.models",
+        ),
         ("vaneloop/discrepancy/laws/x.py", "from ..models.vanes import chain", "vaneloop.discrepancy.models.vanes"),
-        ("vaneloop/discrepancy/models/vanes.py", "import plant, controller, hil\nfrom vaneloop.discrepancy import fit", None),
+        (
+            "vaneloop/discrepancy/models/vanes.py",
+            "import plant, controller, hil\nfrom vaneloop.discrepancy import fit",
+            None,
+        ),
         ("vaneloop/discrepancy/models/vanes.py", "from vaneloop.pages import page", "vaneloop.pages"),
         ("vaneloop/design/x.py", "from vaneloop.pages.page import Page", "vaneloop.pages.page"),
         ("vaneloop/pages/x.py", "from vaneloop.design import servo", None),
@@ -196,13 +276,17 @@ def packages_with_init() -> list[str]:
 @pytest.mark.parametrize("package", packages_with_init())
 def test_every_exported_name_exists_and_is_expected(package: str) -> None:
     module = importlib.import_module(package)
-    assert Path(str(module.__file__)).is_relative_to(ROOT), f"{package} comes from {module.__file__}, not from this checkout"
+    assert Path(str(module.__file__)).is_relative_to(ROOT), (
+        f"{package} comes from {module.__file__}, not from this checkout"
+    )
     exported = getattr(module, "__all__", None)
     assert exported is not None, f"{package}/__init__.py has no __all__"
     missing = [name for name in exported if not hasattr(module, name)]
     assert not missing, f"{package}.__all__ names what {package} does not have: {missing}"
     line = f'    "{package}": [{", ".join(f"{name!r}" for name in sorted(exported))}],'.replace("'", '"')
-    assert sorted(exported) == sorted(EXPORTS.get(package, [])), f"{package} exports something else; if meant, EXPORTS needs\n{line}"
+    assert sorted(exported) == sorted(EXPORTS.get(package, [])), (
+        f"{package} exports something else; if meant, EXPORTS needs\n{line}"
+    )
 
 
 def test_no_file_names_a_place_on_one_machine() -> None:
@@ -219,7 +303,11 @@ def test_no_file_names_a_place_on_one_machine() -> None:
 
 
 def test_no_tracked_file_is_larger_than_a_mebibyte() -> None:
-    large = [f"{f.relative_to(ROOT)}: {f.stat().st_size / 2**20:.2f} MiB" for f in tracked_files() if f.stat().st_size > 2**20]
+    large = [
+        f"{f.relative_to(ROOT)}: {f.stat().st_size / 2**20:.2f} MiB"
+        for f in tracked_files()
+        if f.stat().st_size > 2**20
+    ]
     assert not large, "\n".join(large)
 
 
@@ -238,3 +326,37 @@ def test_every_requirement_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
     assert {name(r) for r in wanted} <= pinned, {name(r) for r in wanted} - pinned
+
+
+def test_the_hooks_of_a_commit_run_the_pinned_ruff() -> None:
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    pinned = re.search(r"^ruff==(.+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    assert pinned is not None
+    assert re.findall(r"rev: v(.+)", hooks) == [pinned[1]]
+
+
+def test_the_workflow_runs_the_make_targets_on_every_python_promised() -> None:
+    workflow = (ROOT / ".github" / "workflows" / "checks.yml").read_text(encoding="utf-8")
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert {"demo", "test"} <= set(re.findall(r"run: make ([a-z-]+)", workflow)) <= set(targets)
+    assert all(f'"{version}"' in workflow for version in ("3.11", "3.12", "3.13"))
+
+
+def test_fragments_of_the_changelog_are_of_a_known_kind() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    kinds = {t["directory"] for t in project["tool"]["towncrier"]["type"]}
+    fragments = [p for p in (ROOT / "changelog.d").iterdir() if p.name != "README.md"]
+    wrong = [p.name for p in fragments if p.suffix != ".md" or p.stem.rpartition(".")[2] not in kinds]
+    assert not wrong, f"{wrong}: the name must be NAME.KIND.md, KIND one of {sorted(kinds)}"
+
+
+def test_prose_stands_in_lines_of_120_columns() -> None:
+    """Rows of tables, code, and lines that hold one link or picture only are as long as they must be."""
+    long = []
+    for file in (f for f in tracked_files() if f.suffix == ".md"):
+        code = False
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+            code ^= line.lstrip().startswith("```")
+            if len(line) > 120 and not code and not re.match(r"\s*[|#`!]", line):
+                long.append(f"{file.relative_to(ROOT)}:{number}: {len(line)} columns")
+    assert not long, "\n".join(long)

@@ -1,4 +1,6 @@
-"""Shipped tables load and say where their numbers come from; a wrong table is refused in one line; strokes follow from the linkage."""
+"""Shipped tables load and say where their numbers come from; a wrong table is refused in one line; strokes follow from
+the linkage.
+"""
 
 # ruff: noqa: D103 - a test's name is its claim
 from __future__ import annotations
@@ -97,7 +99,7 @@ def edited(name: str, at: str, value: Any) -> str:
     return document(data)
 
 
-# ---- what is shipped ----------------------------------------------------------------------------------------------------------------
+# ---- what is shipped -------------------------------------------------------------------------------------------------
 
 
 def test_every_shipped_table_has_its_model():
@@ -148,7 +150,7 @@ def test_the_tests_own_writer_keeps_every_value(name):
     assert tomllib.loads(document(SHIPPED[name])) == SHIPPED[name]
 
 
-# ---- what is refused ----------------------------------------------------------------------------------------------------------------
+# ---- what is refused -------------------------------------------------------------------------------------------------
 
 WRONG = [
     # NaN, infinity, out of bounds
@@ -156,11 +158,31 @@ WRONG = [
     ("calibration.toml", "servo.kp.value", float("inf"), "servo.kp.value (=inf): Input should be a finite number"),
     ("calibration.toml", "servo.kp.value", -1.0, "kp (=-1 mA/mm) must be in [0, 1000]"),
     ("plant.toml", "valve.damping.value", 1.2, "damping (=1.2 -) must be in [0.05, 0.99]"),
-    ("plant.toml", "valve.damping.tolerance", -0.1, "valve.damping.tolerance (=-0.1): Input should be greater than or equal to 0"),
-    ("stroke_tables.toml", "extension.values.3", float("nan"), "extension.values.3 (=nan): Input should be a finite number"),
+    (
+        "plant.toml",
+        "valve.damping.tolerance",
+        -0.1,
+        "valve.damping.tolerance (=-0.1): Input should be greater than or equal to 0",
+    ),
+    (
+        "stroke_tables.toml",
+        "extension.values.3",
+        float("nan"),
+        "extension.values.3 (=nan): Input should be a finite number",
+    ),
     # order and length
-    ("stroke_tables.toml", "speed.values.5", 44, "speed.values[5] (=44) must be greater than the value before it (=44)"),
-    ("stroke_tables.toml", "extension.values.5", 3.0, "extension.values[5] (=3) must not be less than the value before it (=3.1682)"),
+    (
+        "stroke_tables.toml",
+        "speed.values.5",
+        44,
+        "speed.values[5] (=44) must be greater than the value before it (=44)",
+    ),
+    (
+        "stroke_tables.toml",
+        "extension.values.5",
+        3.0,
+        "extension.values[5] (=3) must not be less than the value before it (=3.1682)",
+    ),
     (
         "stroke_tables.toml",
         "single.values.65",
@@ -169,31 +191,81 @@ WRONG = [
     ),
     ("stroke_tables.toml", "single.values.65", ..., "single.values has 65 numbers; speed has 66"),
     ("stroke_tables.toml", "speed.values", [40.0], "speed.values (=[40.0]): List should have at least 2 items"),
-    ("schedules.toml", "vigv.values.10", -30.0, "vigv.values[10] (=-30) must be greater than the value before it (=-12.9)"),
+    (
+        "schedules.toml",
+        "vigv.values.10",
+        -30.0,
+        "vigv.values[10] (=-30) must be greater than the value before it (=-12.9)",
+    ),
     ("engine_test.toml", "dwell.values.0", ..., "dwell.values has 49 numbers; speed has 50"),
     # missing keys
     ("calibration.toml", "servo.kp", ..., "key 'servo.kp' is missing; allowed here: kp, ki, kff, current_limit"),
     ("calibration.toml", "servo", ..., "key 'servo' is missing; allowed here: trend, schedule, servo"),
-    ("calibration.toml", "servo.kp.origin", ..., "key 'servo.kp.origin' is missing; allowed here: value, unit, origin, tolerance"),
+    (
+        "calibration.toml",
+        "servo.kp.origin",
+        ...,
+        "key 'servo.kp.origin' is missing; allowed here: value, unit, origin, tolerance",
+    ),
     # unit, type
     ("calibration.toml", "servo.kp.unit", "A/mm", "kp.unit (='A/mm') must be 'mA/mm'"),
     ("geometry.toml", "crank.le.unit", "m", "le.unit (='m') must be 'mm'"),
     ("calibration.toml", "servo.kp.value", "16", "servo.kp.value (='16'): Input should be a valid number"),
     ("calibration.toml", "servo.kp.value", True, "servo.kp.value (=True): Input should be a valid number"),
     ("calibration.toml", "servo.kp.value", [16.0], "servo.kp.value (=[16.0]): Input should be a valid number"),
-    ("calibration.toml", "servo.kp", 16.0, "servo.kp (=16.0): must be a table with the keys value, unit, origin, tolerance"),
+    (
+        "calibration.toml",
+        "servo.kp",
+        16.0,
+        "servo.kp (=16.0): must be a table with the keys value, unit, origin, tolerance",
+    ),
     ("calibration.toml", "servo", 16.0, "servo (=16.0): must be a table with the keys kp, ki, kff, current_limit"),
     ("calibration.toml", "servo.kp.origin", "", "servo.kp.origin (=''): String should have at least 4 characters"),
-    ("calibration.toml", "schedule.strategy", "tripple", "strategy (='tripple') must be one of single, dual, inverse, adaptive"),
+    (
+        "calibration.toml",
+        "schedule.strategy",
+        "tripple",
+        "strategy (='tripple') must be one of single, dual, inverse, adaptive",
+    ),
     ("calibration.toml", "schedule.table_input", "n_x", "table_input (='n_x') must be n_r or n_dem"),
     # possible one by one, not together
-    ("calibration.toml", "schedule.stroke_min.value", 47.6, "stroke_min (=47.6 mm) must be below stroke_max (=47.5 mm)"),
-    ("calibration.toml", "fail_safe.fail_safe_stroke.value", 48, "fail_safe.fail_safe_stroke (=48 mm) must be in [0.5, 47.5]"),
-    ("calibration.toml", "fail_safe.fail_safe_current.value", -41, "fail_safe.fail_safe_current (=-41 mA) must be in [-40, 40]"),
+    (
+        "calibration.toml",
+        "schedule.stroke_min.value",
+        47.6,
+        "stroke_min (=47.6 mm) must be below stroke_max (=47.5 mm)",
+    ),
+    (
+        "calibration.toml",
+        "fail_safe.fail_safe_stroke.value",
+        48,
+        "fail_safe.fail_safe_stroke (=48 mm) must be in [0.5, 47.5]",
+    ),
+    (
+        "calibration.toml",
+        "fail_safe.fail_safe_current.value",
+        -41,
+        "fail_safe.fail_safe_current (=-41 mA) must be in [-40, 40]",
+    ),
     ("calibration.toml", "demand_monitor.demand_high.value", 0.0, "demand_high (=0 %) must be in [1, 150]"),
-    ("calibration.toml", "lvdt_monitor.lvdt_low.value", 0.5, "lvdt_monitor.lvdt_low (=0.5 mm) must be below stroke_min (=0.5 mm)"),
-    ("calibration.toml", "lvdt_monitor.lvdt_high.value", 40, "lvdt_monitor.lvdt_high (=40 mm) must be above stroke_max (=47.5 mm)"),
-    ("calibration.toml", "lvdt_monitor.stuck_margin.value", 30, "lvdt_monitor.stuck_margin (=30 mm) must be below 23.5"),
+    (
+        "calibration.toml",
+        "lvdt_monitor.lvdt_low.value",
+        0.5,
+        "lvdt_monitor.lvdt_low (=0.5 mm) must be below stroke_min (=0.5 mm)",
+    ),
+    (
+        "calibration.toml",
+        "lvdt_monitor.lvdt_high.value",
+        40,
+        "lvdt_monitor.lvdt_high (=40 mm) must be above stroke_max (=47.5 mm)",
+    ),
+    (
+        "calibration.toml",
+        "lvdt_monitor.stuck_margin.value",
+        30,
+        "lvdt_monitor.stuck_margin (=30 mm) must be below 23.5",
+    ),
     (
         "calibration.toml",
         "lvdt_monitor.stuck_current.value",
@@ -205,7 +277,9 @@ WRONG = [
 
 
 @pytest.mark.parametrize(
-    ("name", "at", "value", "said"), WRONG, ids=[f"{at}={value}" if value is not ... else f"no {at}" for _, at, value, _ in WRONG]
+    ("name", "at", "value", "said"),
+    WRONG,
+    ids=[f"{at}={value}" if value is not ... else f"no {at}" for _, at, value, _ in WRONG],
 )
 def test_a_wrong_value_is_refused_in_one_line_with_key_value_and_what_is_allowed(tmp_path, name, at, value, said):
     assert said in refusal(tmp_path, name, edited(name, at, value))
@@ -214,8 +288,18 @@ def test_a_wrong_value_is_refused_in_one_line_with_key_value_and_what_is_allowed
 @pytest.mark.parametrize(
     ("name", "right", "wrong", "key"),
     [
-        ("calibration.toml", "[servo]", "[sevro]", "'sevro' is unknown, probably 'servo' is meant; allowed here: trend, schedule, servo"),
-        ("calibration.toml", "kff =", "kf =", "'servo.kf' is unknown, probably 'kff' is meant; allowed here: kp, ki, kff, current_limit"),
+        (
+            "calibration.toml",
+            "[servo]",
+            "[sevro]",
+            "'sevro' is unknown, probably 'servo' is meant; allowed here: trend, schedule, servo",
+        ),
+        (
+            "calibration.toml",
+            "kff =",
+            "kf =",
+            "'servo.kf' is unknown, probably 'kff' is meant; allowed here: kp, ki, kff, current_limit",
+        ),
         (
             "calibration.toml",
             "kp = { value",
@@ -230,7 +314,12 @@ def test_a_wrong_value_is_refused_in_one_line_with_key_value_and_what_is_allowed
         ),
         ("geometry.toml", "theta6", "theta_6", "'vigv.theta_6' is unknown, probably 'theta6' is meant"),
         ("stroke_tables.toml", "[retraction]", "[retracton]", "'retracton' is unknown, probably 'retraction' is meant"),
-        ("stroke_tables.toml", "[retraction]", "[zzz]", "'zzz' is unknown; allowed here: speed, extension, retraction, single"),
+        (
+            "stroke_tables.toml",
+            "[retraction]",
+            "[zzz]",
+            "'zzz' is unknown; allowed here: speed, extension, retraction, single",
+        ),
     ],
 )
 def test_a_misspelt_key_is_refused_with_the_key_that_was_probably_meant(tmp_path, name, right, wrong, key):
@@ -339,7 +428,9 @@ def test_any_edit_of_a_table_gives_a_loaded_table_or_one_line(tmp_path, name, da
         if how == "delete":
             del holder[key]
         elif how == "rename" and isinstance(holder, dict):
-            holder[data.draw(st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=8))] = holder.pop(key)
+            holder[data.draw(st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=8))] = (
+                holder.pop(key)
+            )
         elif how == "add" and isinstance(holder, dict):
             holder[f"{key}x"] = copy.deepcopy(data.draw(ODD))
         elif how == "scale" and isinstance(holder[key], int | float):
@@ -366,7 +457,7 @@ def test_a_table_with_bytes_overwritten_gives_a_loaded_table_or_one_line(tmp_pat
         assert len(str(e).splitlines()) == 1 and str(e).startswith(f"{file}: ")
 
 
-# ---- the stroke tables --------------------------------------------------------------------------------------------------------------
+# ---- the stroke tables -----------------------------------------------------------------------------------------------
 
 
 def test_the_shipped_stroke_tables_follow_from_geometry_schedules_and_hysteresis_to_their_last_digit(tmp_path):
@@ -376,7 +467,9 @@ def test_the_shipped_stroke_tables_follow_from_geometry_schedules_and_hysteresis
     for row, axis in zip(derived[1:], (shipped.extension, shipped.retraction, shipped.single), strict=True):
         assert np.array_equal(np.round(row, 4), axis.values)
     write_stroke_tables(derived, tmp_path / "again.toml", shipped.speed.origin)
-    assert (tmp_path / "again.toml").read_text(encoding="utf-8") == path("stroke_tables.toml").read_text(encoding="utf-8")
+    assert (tmp_path / "again.toml").read_text(encoding="utf-8") == path("stroke_tables.toml").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_the_shipped_vane_angles_follow_from_the_geometry_to_their_last_digit(tmp_path):
@@ -416,6 +509,11 @@ def test_strokes_stay_off_the_calibrated_limits_and_on_the_machine():
     machine = build_plant()
     calibration = read("calibration.toml", CalibrationTable)
     strokes = load_calibration().table[1:] * 1e3
-    assert strokes.min() > calibration.schedule.stroke_min.value and strokes.max() < calibration.schedule.stroke_max.value
-    assert calibration.schedule.stroke_min.value > 0.0 and calibration.schedule.stroke_max.value < machine.table.actuator.stroke.value
+    assert (
+        strokes.min() > calibration.schedule.stroke_min.value and strokes.max() < calibration.schedule.stroke_max.value
+    )
+    assert (
+        calibration.schedule.stroke_min.value > 0.0
+        and calibration.schedule.stroke_max.value < machine.table.actuator.stroke.value
+    )
     assert calibration.servo.current_limit.value == machine.table.valve.rated_current.value

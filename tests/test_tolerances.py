@@ -30,13 +30,19 @@ def moved(seed: int) -> Geometry:
     parts = {}
     for name in PARTS:
         part = getattr(g, name)
-        drawn = {k: q.model_copy(update={"value": q.value + rng.uniform(-1, 1) * q.tolerance}) for k, q in part if k != "hysteresis"}
+        drawn = {
+            k: q.model_copy(update={"value": q.value + rng.uniform(-1, 1) * q.tolerance})
+            for k, q in part
+            if k != "hysteresis"
+        }
         parts[name] = part.model_copy(update=drawn)
     return g.model_copy(update=parts)
 
 
 def stand_ins(g: Geometry) -> tuple[np.ndarray, np.ndarray]:
-    """Link and lever arm of each stage (mm off the table) that imitate ``g``'s angles best beside an offset, and what is left (deg)."""
+    """Link and lever arm of each stage (mm off the table) that imitate ``g``'s angles best beside an offset, and what
+    is left (deg).
+    """
     table = load_geometry()
     off = np.rad2deg(vane_angles(STROKE, g) - vane_angles(STROKE, table))
     sizes, left = [], []
@@ -45,7 +51,9 @@ def stand_ins(g: Geometry) -> tuple[np.ndarray, np.ndarray]:
         shapes = []
         for key in STANDS_FOR:
             q = getattr(part, key)
-            longer = table.model_copy(update={stage: part.model_copy(update={key: q.model_copy(update={"value": q.value + 0.1})})})
+            longer = table.model_copy(
+                update={stage: part.model_copy(update={key: q.model_copy(update={"value": q.value + 0.1})})}
+            )
             shapes.append(np.rad2deg(vane_angles(STROKE, longer) - vane_angles(STROKE, table))[:, k] / 0.1)
         a = np.column_stack([*shapes, np.ones(len(STROKE))])
         x = np.linalg.lstsq(a, off[:, k], rcond=None)[0]
@@ -71,7 +79,10 @@ def test_the_two_lengths_stay_within_their_tolerance_on_all_but_few_machines():
 
 def test_a_table_that_calls_its_lengths_exact_frees_none():
     g = load_geometry()
-    parts = {n: getattr(g, n).model_copy(update={k: q.model_copy(update={"tolerance": 0.0}) for k, q in getattr(g, n)}) for n in PARTS}
+    parts = {
+        n: getattr(g, n).model_copy(update={k: q.model_copy(update={"tolerance": 0.0}) for k, q in getattr(g, n)})
+        for n in PARTS
+    }
     assert length_tolerances(g.model_copy(update=parts)) == {}
 
 

@@ -1,4 +1,6 @@
-"""A real vcan0 for the tests: which way is taken, what is said where none leads there, and what a kernel that fails makes of the run."""
+"""A real vcan0 for the tests: which way is taken, what is said where none leads there, and what a kernel that fails
+makes of the run.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,7 @@ def no(name: str) -> Outcome:
     return Outcome(None, f"no {name} here")
 
 
-# ---- which way ----------------------------------------------------------------------------------------------------------------------
+# ---- which way -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,9 @@ def no(name: str) -> Outcome:
         ({"host": no("host"), "uml": Outcome(5)}, ["host", "uml"], 5),  # no test at all was collected
     ],
 )
-def test_the_first_way_that_gets_to_the_tests_decides(ways, outcomes: dict[str, Outcome], tried: list[str], code: int) -> None:
+def test_the_first_way_that_gets_to_the_tests_decides(
+    ways, outcomes: dict[str, Outcome], tried: list[str], code: int
+) -> None:
     took = ways(**outcomes)
     assert run.main([]) == code
     assert took == tried
@@ -95,7 +99,9 @@ def test_a_way_asked_for_is_the_only_one_and_must_lead_there(ways, monkeypatch: 
     assert run.main([]) == 1, "who asks for a way wants to know that it failed"
 
 
-def test_an_unknown_way_is_one_line_and_exit_code_2(ways, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_way_is_one_line_and_exit_code_2(
+    ways, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("VANELOOP_CAN", "vmware")
     tried = ways()
     assert run.main([]) == 2 and tried == []
@@ -104,7 +110,7 @@ def test_an_unknown_way_is_one_line_and_exit_code_2(ways, monkeypatch: pytest.Mo
     assert "VANELOOP_CAN='vmware'" in said.err and "host, uml, qemu" in said.err
 
 
-# ---- what is said at the end --------------------------------------------------------------------------------------------------------
+# ---- what is said at the end -----------------------------------------------------------------------------------------
 
 
 def test_no_vcan0_at_all_is_said_in_the_last_lines_with_every_reason(ways, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,11 +118,15 @@ def test_no_vcan0_at_all_is_said_in_the_last_lines_with_every_reason(ways, capsy
     assert run.main([]) == 0
     said = capsys.readouterr().out.rstrip().splitlines()
     first = next(k for k, line in enumerate(said) if "NOT TESTED ON A REAL vcan0: ANYTHING" in line)
-    assert ["no host here" in said[first + 1], "no uml here" in said[first + 2], "no qemu here" in said[first + 3]] == [True] * 3
+    assert ["no host here" in said[first + 1], "no uml here" in said[first + 2], "no qemu here" in said[first + 3]] == [
+        True
+    ] * 3
     assert said[-1] == "!" * 100 and first + 3 == len(said) - 2, "nothing stands below"
 
 
-def test_where_the_run_is_there_for_these_tests_not_running_them_is_a_failure(ways, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_run_is_there_for_these_tests_not_running_them_is_a_failure(
+    ways, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ways(host=no("host"), uml=no("uml"), qemu=no("qemu"))
     monkeypatch.setenv("VANELOOP_NEED_VCAN", "1")
     assert run.main([]) == 1
@@ -126,7 +136,11 @@ def test_what_only_the_short_list_leaves_out_is_said_with_the_reason(ways, capsy
     ways(host=no("host"), uml=no("uml"), qemu=Outcome(0, untested=("test_socketcan.py::test_a: would judge time",)))
     assert run.main([]) == 0
     said = capsys.readouterr().out.split("!" * 100)[1]
-    assert "NOT TESTED ON A REAL vcan0" in said and "no uml here" in said and "test_socketcan.py::test_a: would judge time" in said
+    assert (
+        "NOT TESTED ON A REAL vcan0" in said
+        and "no uml here" in said
+        and "test_socketcan.py::test_a: would judge time" in said
+    )
 
 
 def test_what_pytest_skipped_before_is_said_in_the_last_lines(
@@ -136,7 +150,9 @@ def test_what_pytest_skipped_before_is_said_in_the_last_lines(
     monkeypatch.setenv("VANELOOP_NOT_TESTED", str(tmp_path / "skipped"))
     ways(host=Outcome(0))
     assert run.main([]) == 0
-    assert "NOT TESTED, TESTS SKIPPED:\n!!   - tests/test_web.py: no Chromium (12 tests)\n!!!" in capsys.readouterr().out
+    assert (
+        "NOT TESTED, TESTS SKIPPED:\n!!   - tests/test_web.py: no Chromium (12 tests)\n!!!" in capsys.readouterr().out
+    )
 
 
 def test_a_whole_run_says_nothing_loud(ways, capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,9 +172,19 @@ def test_skipped_and_left_out_tests_are_written_down_by_pytest(tmp_path: Path) -
         "def test_of_no_bus(): pass\n"
     )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.conftest"]
-    command += ["-c", str(run.ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), "-m", "socketcan and any_speed", str(tests)]
+    command += [
+        "-c",
+        str(run.ROOT / "pyproject.toml"),
+        "--rootdir",
+        str(tmp_path),
+        "-m",
+        "socketcan and any_speed",
+        str(tests),
+    ]
     environment = os.environ | {"VANELOOP_NOT_TESTED": str(told), "VANELOOP_NEED_VCAN": "1"}
-    done = subprocess.run(command, cwd=run.ROOT, env=environment, check=False, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, cwd=run.ROOT, env=environment, check=False, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     first, second = told.read_text().splitlines()
     assert first == "test_it.py: no oil (2 tests)"
@@ -172,11 +198,15 @@ def test_the_last_thing_make_test_does_is_to_say_what_was_not_tested() -> None:
         lines = done.stdout.strip().splitlines()
         assert lines[-1].endswith("-m tests.vcan.run") and "VANELOOP_NOT_TESTED=" in lines[-1]
         written = lines[-1].split("VANELOOP_NOT_TESTED=")[1].split()[0]
-        assert any(f"VANELOOP_NOT_TESTED={written}" in line and "-m pytest" in line for line in lines), "pytest writes what is read there"
-        assert any(line.startswith("rm -f") and line.endswith(written) for line in lines), "nothing of an earlier run is told again"
+        assert any(f"VANELOOP_NOT_TESTED={written}" in line and "-m pytest" in line for line in lines), (
+            "pytest writes what is read there"
+        )
+        assert any(line.startswith("rm -f") and line.endswith(written) for line in lines), (
+            "nothing of an earlier run is told again"
+        )
 
 
-# ---- a kernel that is booted --------------------------------------------------------------------------------------------------------
+# ---- a kernel that is booted -----------------------------------------------------------------------------------------
 
 
 def test_a_failing_test_inside_fails_the_run(boot: Boot, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,16 +272,21 @@ def test_no_kernel_outlives_a_run_that_is_interrupted(tmp_path: Path, number: si
     if number == signal.SIGKILL and run.find("setpriv") is None:
         pytest.skip("setpriv (util-linux) is not installed")
     kernel = tmp_path / "linux.uml"
-    kernel.write_text(f"#!/bin/sh\necho $$ >{tmp_path}/pid.part\nmv {tmp_path}/pid.part {tmp_path}/pid\nexec sleep 600\n")
+    kernel.write_text(
+        f"#!/bin/sh\necho $$ >{tmp_path}/pid.part\nmv {tmp_path}/pid.part {tmp_path}/pid\nexec sleep 600\n"
+    )
     kernel.chmod(0o755)
     code = (
         "import runpy, sys\nfrom tests.vcan import run\n"
         "run.install = lambda wanted: None\nrun.warm_up = lambda *a, **k: None\n"
-        f"run.find = lambda program: {str(kernel)!r} if program == 'linux.uml' else __import__('shutil').which(program)\n"
+        f"run.find = lambda program: {str(kernel)!r} if program == 'linux.uml' else "
+        f"__import__('shutil').which(program)\n"
         "run.handled()\n"
     )
     environment = os.environ | {"VANELOOP_CAN": "uml"}
-    with subprocess.Popen([sys.executable, "-c", code], cwd=run.ROOT, env=environment, stdout=subprocess.DEVNULL) as runner:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], cwd=run.ROOT, env=environment, stdout=subprocess.DEVNULL
+    ) as runner:
         until = time.monotonic() + 120.0
         while not (tmp_path / "pid").exists():
             assert runner.poll() is None and time.monotonic() < until
@@ -262,7 +297,7 @@ def test_no_kernel_outlives_a_run_that_is_interrupted(tmp_path: Path, number: si
     assert ends(int((tmp_path / "pid").read_text()))
 
 
-# ---- what is needed for it ----------------------------------------------------------------------------------------------------------
+# ---- what is needed for it -------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,7 +305,12 @@ def test_what_cannot_be_installed_is_named(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(run, "find", lambda program: None)
     assert run.main([]) == 0
     said = capsys.readouterr().out
-    for words in ("this machine's kernel has no vcan0", "user-mode Linux needs the Debian packages", "user-mode-linux", "qemu-system-x86"):
+    for words in (
+        "this machine's kernel has no vcan0",
+        "user-mode Linux needs the Debian packages",
+        "user-mode-linux",
+        "qemu-system-x86",
+    ):
         assert words in said.split("!" * 100)[1]
 
 
@@ -291,7 +331,9 @@ def test_a_kernel_that_cannot_be_downloaded_is_a_reason_not_an_error(monkeypatch
     assert outcome.code is None and "could not be had: apt-get download failed" in outcome.why
 
 
-def test_modules_of_the_kernel_are_taken_in_order_packed_or_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_modules_of_the_kernel_are_taken_in_order_packed_or_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Debian 13 packs its modules with xz; busybox there reads them unpacked."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:

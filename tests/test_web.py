@@ -1,4 +1,5 @@
-"""The workbench in a real browser: headless Chromium, driven by Playwright. Skips, saying so, where there is no Chromium.
+"""The workbench in a real browser: headless Chromium, driven by Playwright. Skips, saying so, where there is no
+Chromium.
 
 Screenshots are kept in ``out/web`` (or VANELOOP_SHOTS).
 """
@@ -27,16 +28,32 @@ from tests.test_realtime import ON_TIME_US
 
 CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
 SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
-LONG = 1000.0 * float(os.environ.get("VANELOOP_PATIENCE", "240"))  # ms; a slow machine with other work compiles the simulator first
+LONG = 1000.0 * float(
+    os.environ.get("VANELOOP_PATIENCE", "240")
+)  # ms; a slow machine with other work compiles the simulator first
 
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium (make test does, where it may)")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium: apt-get install chromium (make test does, where it may)"
+)
 
 
 class Server:
     """``vaneloop web`` as a user starts it."""
 
     def __init__(self, folder: Path, *options: str, **environment: str):
-        words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--port", "0", "--no-open", "--quiet", "--folder", str(folder), *options]
+        words = [
+            sys.executable,
+            "-m",
+            "vaneloop.cli.main",
+            "web",
+            "--port",
+            "0",
+            "--no-open",
+            "--quiet",
+            "--folder",
+            str(folder),
+            *options,
+        ]
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         self.folder, self.environment = folder, {**os.environ, "PYTHONPATH": path, **environment}
         self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=folder, env=self.environment)
@@ -57,7 +74,9 @@ class Server:
         found, look = [], [self.process.pid]
         while look:
             pid = look.pop()
-            children = [int(c) for task in Path(f"/proc/{pid}/task").glob("*/children") for c in task.read_text().split()]
+            children = [
+                int(c) for task in Path(f"/proc/{pid}/task").glob("*/children") for c in task.read_text().split()
+            ]
             found += children
             look += children
         return found
@@ -131,7 +150,9 @@ def looks(page: Any, name: str) -> None:
             page.get_by_label("light or dark").click()
             page.wait_for_function(f"document.body.classList.contains('body--dark') === {str(dark).lower()}")
         page.wait_for_timeout(700)  # charts and figures follow the width
-        assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), f"{name} at {width}"
+        assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), (
+            f"{name} at {width}"
+        )
         shot(page, f"{name}_{width}_{'dark' if dark else 'light'}")
     page.get_by_label("light or dark").click()
     page.set_viewport_size({"width": 1280, "height": 800})
@@ -148,10 +169,12 @@ def ratio(page: Any) -> float:
 
 
 def wait_ratio(page: Any, condition: str) -> None:
-    page.wait_for_function(f"(() => {{ const e = document.querySelector('.after'); return e && e.dataset.ratio {condition}; }})()")
+    page.wait_for_function(
+        f"(() => {{ const e = document.querySelector('.after'); return e && e.dataset.ratio {condition}; }})()"
+    )
 
 
-# ---- page 1: missing physics ------------------------------------------------------------------------------------------------------------
+# ---- page 1: missing physics -----------------------------------------------------------------------------------------
 
 
 @needs_browser
@@ -192,8 +215,11 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     page.get_by_role("switch", name="aero_load").click()
     wait_ratio(page, "< 1.1")
 
-    # a button stays the same element while work goes on in the background: a click on one that was drawn anew would be lost
-    page.evaluate("window.kept = [...document.querySelectorAll('button')].find((b) => b.innerText.includes('Extended model'))")
+    # a button stays the same element while work goes on in the background: a click on one that was drawn anew would be
+    # lost
+    page.evaluate(
+        "window.kept = [...document.querySelectorAll('button')].find((b) => b.innerText.includes('Extended model'))"
+    )
 
     # and the sliders
     page.get_by_text("Turn the parameters by hand").click()
@@ -255,7 +281,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     shot(page, "mapped_1280_light")
 
 
-# ---- page 2: schedule -------------------------------------------------------------------------------------------------------------------
+# ---- page 2: schedule ------------------------------------------------------------------------------------------------
 
 
 def step(page: Any, name: str) -> None:
@@ -303,7 +329,7 @@ def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page
     looks(page, "schedule")
 
 
-# ---- page 3: run ------------------------------------------------------------------------------------------------------------------------
+# ---- page 3: run -----------------------------------------------------------------------------------------------------
 
 
 # What lamps have shown in this browser, however short: a busy machine may draw a lamp's end with its beginning.
@@ -313,7 +339,9 @@ WATCH_LAMPS = """window.lamps = new Set(); new MutationObserver((changes) => { f
 
 
 def press(page: Any, button: str, until: str) -> None:
-    """Press ``button`` until ``until`` (JavaScript) is so: a page that could not answer for long is loaded anew, and loses a click."""
+    """Press ``button`` until ``until`` (JavaScript) is so: a page that could not answer for long is loaded anew, and
+    loses a click.
+    """
     from playwright.sync_api import TimeoutError as Late
 
     end = time.monotonic() + 2 * LONG / 1000.0
@@ -356,7 +384,9 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
     slider = page.get_by_role("slider", name="speed demand")
     box = slider.bounding_box()
     slider.click(position={"x": 0.8 * box["width"], "y": box["height"] / 2})
-    page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[1].innerText) > 80")  # rotor speed follows
+    page.wait_for_function(
+        "parseFloat(document.querySelectorAll('.tiles .v')[1].innerText) > 80"
+    )  # rotor speed follows
     page.get_by_label("find a scenario").fill("demand_stops")
     press(page, "demand_stops", "window.lamps.has('FAIL_SAFE bad') && window.lamps.has('demand_stale bad')")
     page.get_by_label("filter of the trace").fill("VGV_HEALTH")
@@ -379,7 +409,9 @@ def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None
     page.goto(server.at("run"))
     page.locator(".bus").click()
     page.get_by_role("option", name="real time, embedded bus").click()
-    press(page, "Start", "parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 3")  # s that the listener has heard
+    press(
+        page, "Start", "parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 3"
+    )  # s that the listener has heard
     late = page.get_by_text(re.compile(r"p50 \d+ us"))
     late.wait_for()
     press(page, "Stop", RECORD_IS_THERE)
@@ -417,14 +449,26 @@ def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> Non
     assert [given["bus"] for _, given in asked] == [loop.bus_name] * 3
 
 
-# ---- who may ask ------------------------------------------------------------------------------------------------------------------------
+# ---- who may ask -----------------------------------------------------------------------------------------------------
 
-NAVIGATION = {"Accept": "text/html,*/*;q=0.8", "Sec_Fetch_Site": "none", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
-UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec_WebSocket_Version": "13", "Sec_WebSocket_Key": "A" * 22 + "=="}
+NAVIGATION = {
+    "Accept": "text/html,*/*;q=0.8",
+    "Sec_Fetch_Site": "none",
+    "Sec_Fetch_Mode": "navigate",
+    "Sec_Fetch_Dest": "document",
+}
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Key": "A" * 22 + "==",
+}
 SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
 
-def answer_of(server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, dict[str, str], str]:
+def answer_of(
+    server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str
+) -> tuple[int, dict[str, str], str]:
     """One request with headers of our own; status, headers by small names and content of the answer."""
     from http.client import HTTPConnection
 
@@ -436,7 +480,9 @@ def answer_of(server: Server, path: str = "/", method: str = "GET", body: bytes 
 
 def ask(server: Server, path: str = "/", method: str = "GET", body: bytes = b"", **headers: str) -> tuple[int, str]:
     """A request of one browser that knows the token; status and the first line of the answer."""
-    status, sent, text = answer_of(server, path, method, body, **({"Cookie": server.known + server.session} | NAVIGATION | headers))
+    status, sent, text = answer_of(
+        server, path, method, body, **({"Cookie": server.known + server.session} | NAVIGATION | headers)
+    )
     if sent.get("set-cookie", "").startswith("vaneloop_session_"):
         server.session = "; " + sent["set-cookie"].partition(";")[0]
     return status, text.partition("\n")[0]
@@ -475,11 +521,20 @@ def test_a_page_of_another_port_of_this_machine_cannot_use_the_server(server: Se
 def test_the_token_is_asked_for_on_loopback_too(server: Server) -> None:
     wrong = server.known[:-1] + ("a" if server.known[-1] != "a" else "b")
     for cookie in ("", wrong, f"vaneloop_token={server.token}", f"x={server.known}", server.known + "x"):
-        for path, more in (("/", {}), ("/run", {}), ("/curves/log", {}), (SOCKET, UPGRADE), ("/?token=wrong", {}), ("/?token=", {})):
+        for path, more in (
+            ("/", {}),
+            ("/run", {}),
+            ("/curves/log", {}),
+            (SOCKET, UPGRADE),
+            ("/?token=wrong", {}),
+            ("/?token=", {}),
+        ):
             status, _, text = answer_of(server, path, Cookie=cookie, **NAVIGATION, **more)
             assert status == 403 and server.token not in text
             assert more or "Open the link that `vaneloop web` printed" in text
-    others = '{"odd": [1, 2]}; =; ;;; "=x; ' + server.known + "; other=\x7f"  # cookies of other programs on this machine come along
+    others = (
+        '{"odd": [1, 2]}; =; ;;; "=x; ' + server.known + "; other=\x7f"
+    )  # cookies of other programs on this machine come along
     assert ask(server, "/", Cookie=others + server.session)[0] == 200
 
 
@@ -489,12 +544,24 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(server: Server) -> No
         assert (status, headers["location"], text) == (303, f"/{page}", "")
         kept = headers["set-cookie"].split("; ")
         assert kept[0] == server.known and set(kept[1:]) == {"HttpOnly", "SameSite=Strict", "Path=/"}
-    for path in ("//evil.example/", "/\\evil.example", "/nowhere", "/%0d%0aX:%20y"):  # nothing of the address but a page of ours
+    for path in (
+        "//evil.example/",
+        "/\\evil.example",
+        "/nowhere",
+        "/%0d%0aX:%20y",
+    ):  # nothing of the address but a page of ours
         status, headers, _ = answer_of(server, f"{path}?token={server.token}", **NAVIGATION)
         assert status == 400 or (status, headers["location"]) == (303, "/")
     # a link on another site: a redirect would still be that site's
-    status, headers, text = answer_of(server, f"/run?token={server.token}", **{**NAVIGATION, "Sec_Fetch_Site": "cross-site"})
-    assert status == 200 and headers["set-cookie"].startswith(server.known) and server.token not in text and "url=/run" in text
+    status, headers, text = answer_of(
+        server, f"/run?token={server.token}", **{**NAVIGATION, "Sec_Fetch_Site": "cross-site"}
+    )
+    assert (
+        status == 200
+        and headers["set-cookie"].startswith(server.known)
+        and server.token not in text
+        and "url=/run" in text
+    )
 
 
 @needs_browser
@@ -522,7 +589,8 @@ def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: A
         there = page.context.new_page()
         there.goto(f"http://127.0.0.1:{other.server_port}/")
         ours = f"http://127.0.0.1:{server.port}"
-        opened = there.evaluate(f"new Promise((r) => {{ const w = new WebSocket('{ours.replace('http', 'ws')}{SOCKET}');"
+        opened = there.evaluate(f"new Promise((r) => {{ const w = new "
+                                f"WebSocket('{ours.replace('http', 'ws')}{SOCKET}');"
                                 " w.onopen = () => r('opened'); w.onerror = () => r('refused'); })")  # fmt: skip
         with there.expect_navigation() as navigation:
             there.evaluate(f"location.href = '{ours}/'")
@@ -537,8 +605,10 @@ def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: A
 def test_only_a_page_that_a_browser_goes_to_makes_a_session_and_a_seventh_ends_none(tmp_path: Path) -> None:
     s = Server(tmp_path, TMPDIR=str(tmp_path))
     try:
-        for more in ({}, {"Accept": "*/*"}, {"Accept": "image/*", **{k: v for k, v in NAVIGATION.items() if k != "Accept"}},
-                     NAVIGATION | {"Sec_Fetch_Mode": "no-cors"}, NAVIGATION | {"Sec_Fetch_Dest": "iframe"}):  # fmt: skip
+        for more in ({}, {"Accept": "*/*"},
+            {"Accept": "image/*", **{k: v for k, v in NAVIGATION.items() if k != "Accept"}},
+                     NAVIGATION | {"Sec_Fetch_Mode": "no-cors"},
+                     NAVIGATION | {"Sec_Fetch_Dest": "iframe"}):  # fmt: skip
             assert answer_of(s, "/", Cookie=s.known, **more)[0] == 406
         for path in ("/curves/log", "/saved/model", "/nowhere", "/_nicegui/nothing"):
             assert ask(s, path)[0] == 404
@@ -593,19 +663,39 @@ def test_a_session_with_an_open_tab_never_gives_way() -> None:
 
 TEXTS = st.one_of(
     st.text(st.characters(max_codepoint=255), max_size=40),
-    st.sampled_from(["", "[", "[::1", "]", "::", "[::1]", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999999", "localhost", "local host"]),
+    st.sampled_from(
+        [
+            "",
+            "[",
+            "[::1",
+            "]",
+            "::",
+            "[::1]",
+            "127.0.0.1",
+            "127.0.0.1:x",
+            "127.0.0.1:99999999",
+            "localhost",
+            "local host",
+        ]
+    ),
     st.sampled_from(["a@127.0.0.1", "http://[", "http://127.0.0.1", "null", "http://127.0.0.1:1@x"]),
     st.sampled_from(["\xb2", "9" * 5000, "-1", "1e9", "%", "%zz", "a" * 70_000]),
 )
 
 
-def through_the_guard(kind: str, method: str, path: str, query: bytes, headers: list[tuple[bytes, bytes]], guard: Any = None) -> list[Any]:
+def through_the_guard(
+    kind: str, method: str, path: str, query: bytes, headers: list[tuple[bytes, bytes]], guard: Any = None
+) -> list[Any]:
     """What a guard in front of an application answers."""
     from vaneloop.web.guard import Guard
 
     async def behind(scope: Any, receive: Any, send: Any) -> None:
         await receive()
-        await send({"type": "http.response.start", "status": 200, "headers": []} if kind == "http" else {"type": "websocket.accept"})
+        await send(
+            {"type": "http.response.start", "status": 200, "headers": []}
+            if kind == "http"
+            else {"type": "websocket.accept"}
+        )
         if kind == "http":
             await send({"type": "http.response.body", "body": b"secret"})
 
@@ -619,7 +709,14 @@ def through_the_guard(kind: str, method: str, path: str, query: bytes, headers: 
     if guard is None:
         guard = Guard(behind, "the-token-of-the-test", 8765, 100, loopback=True, pages=("/", "/run"))
         guard.ticket()
-    scope = {"type": kind, "method": method, "path": path, "raw_path": path.encode(), "query_string": query, "headers": headers}
+    scope = {
+        "type": kind,
+        "method": method,
+        "path": path,
+        "raw_path": path.encode(),
+        "query_string": query,
+        "headers": headers,
+    }
     with pytest.raises(StopIteration):  # nothing in it waits
         guard(scope, receive, send).send(None)  # type: ignore[attr-defined]
     return sent
@@ -641,8 +738,12 @@ GUARDED = st.sampled_from(["host", "origin", "cookie", "content-length", "sec-fe
 def test_nothing_that_is_asked_breaks_the_guard(
     kind: str, method: str, path: str, query: bytes, extra: list[tuple[str, str]], good: bool, known: bool
 ) -> None:
-    """Any header, path and query: one answer, never one that says that the server failed; and without the token nothing passes."""
-    headers = [("host", "127.0.0.1:8765")] * good + [("cookie", "vaneloop_token_8765=the-token-of-the-test")] * known + extra
+    """Any header, path and query: one answer, never one that says that the server failed; and without the token nothing
+    passes.
+    """
+    headers = (
+        [("host", "127.0.0.1:8765")] * good + [("cookie", "vaneloop_token_8765=the-token-of-the-test")] * known + extra
+    )
     raw = [(k.encode(), v.encode("latin-1")) for k, v in headers]
     sent = through_the_guard(kind, method, path, query, raw)
     if kind == "http":
@@ -696,9 +797,11 @@ ODD_REQUESTS = [
     "GET / HTTP/1.1\r\n{h}Cookie: vaneloop_session_{p}=\xff\xfe; {k}\r\n\r\n",
     "GET / HTTP/1.1\r\n{h}{c}Upgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
     "GET /_nicegui_ws/socket.io/?EIO=%ff&transport=%00 HTTP/1.1\r\n{h}{c}\r\n",
-    "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket&client_id=%ff HTTP/1.1\r\n{h}{c}Upgrade: websocket\r\nConnection: Upgrade\r\n"
+    "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket&client_id=%ff HTTP/1.1\r\n{h}{c}Upgrade: "
+    "websocket\r\nConnection: Upgrade\r\n"
     "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: !\r\n\r\n",
-    "POST /_nicegui_ws/socket.io/?EIO=4&transport=polling&sid=x HTTP/1.1\r\n{h}{c}Content-Length: 3\r\n\r\n\xff\xff\xff",
+    "POST /_nicegui_ws/socket.io/?EIO=4&transport=polling&sid=x HTTP/1.1\r\n{h}{c}Content-Length: "
+    "3\r\n\r\n\xff\xff\xff",
     "POST /_nicegui/client/x/upload/y HTTP/1.1\r\n{h}{c}Content-Length: 0\r\n\r\n",
     "\x00\x01\x02\r\n\r\n",
     "GET / HTTP/9.9\r\n\r\n",
@@ -706,12 +809,16 @@ ODD_REQUESTS = [
 
 
 def test_no_odd_request_gets_a_server_error(server: Server) -> None:
-    """The kind of `Host: [`: hosts, origins, lengths, paths, cookies and upgrades that are none, sent as bytes to the real server."""
+    """The kind of `Host: [`: hosts, origins, lengths, paths, cookies and upgrades that are none, sent as bytes to the
+    real server.
+    """
     _, headers, _ = answer_of(server, "/", Cookie=server.known, **NAVIGATION)
     session = headers["set-cookie"].partition(";")[0]
     words = {
-        "h": f"Host: 127.0.0.1:{server.port}\r\n", "c": f"Cookie: {server.known}\r\nAccept: text/html\r\n", "long": "a" * 200_000,
-        "s": f"Cookie: {server.known}; {session}\r\n", "k": server.known, "p": server.port, "nines": "9" * 5000, "mid": "a" * 5000,
+        "h": f"Host: 127.0.0.1:{server.port}\r\n", "c": f"Cookie: {server.known}\r\nAccept: "
+                                                        f"text/html\r\n", "long": "a" * 200_000,
+        "s": f"Cookie: {server.known}; {session}\r\n", "k": server.known, "p": server.port, "nines": "9" * 5000,
+        "mid": "a" * 5000,
     }  # fmt: skip
     statuses = {odd: raw_status(server, odd.format(**words).encode("latin-1")) for odd in ODD_REQUESTS}
     assert not {odd: status for odd, status in statuses.items() if status >= 500}
@@ -720,12 +827,16 @@ def test_no_odd_request_gets_a_server_error(server: Server) -> None:
 
 @given(
     st.sampled_from(["GET", "POST", "HEAD"]), st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=30),
-    st.lists(st.tuples(st.sampled_from(["Host", "Origin", "Content-Length", "Transfer-Encoding", "Accept", "Range", "Cookie"]),
-                       st.text(st.characters(min_codepoint=32, max_codepoint=255, exclude_characters="\x7f"), max_size=20)), max_size=4),
+    st.lists(st.tuples(st.sampled_from(["Host", "Origin", "Content-Length", "Transfer-Encoding", "Accept", "Range",
+    "Cookie"]),
+                       st.text(st.characters(min_codepoint=32, max_codepoint=255, exclude_characters="\x7f"),
+                       max_size=20)), max_size=4),
     st.sampled_from(["/", "/curves/", "/saved/", "/_nicegui/", "/_nicegui/3.0/static/", "/_nicegui_ws/socket.io/?"]),
 )  # fmt: skip
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_random_requests_get_no_server_error(server: Server, method: str, tail: str, more: list[tuple[str, str]], path: str) -> None:
+def test_random_requests_get_no_server_error(
+    server: Server, method: str, tail: str, more: list[tuple[str, str]], path: str
+) -> None:
     lines = [f"{method} {path}{tail} HTTP/1.1", f"Host: 127.0.0.1:{server.port}", f"Cookie: {server.known}"]
     lines += [f"{k}: {v}" for k, v in more]
     assert raw_status(server, ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")) < 500
@@ -741,7 +852,8 @@ def test_elsewhere_than_on_loopback_the_token_is_the_users_own(tmp_path: Path) -
     for host in ("0.0.0.0", "127.0.0.1"):
         words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--host", host, "--port", "0", "--no-open"]
         short = subprocess.run(
-            words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "VANELOOP_WEB_TOKEN": "short"}, capture_output=True, text=True,
+            words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "VANELOOP_WEB_TOKEN": "short"},
+            capture_output=True, text=True,
             check=False,
         )  # fmt: skip
         assert short.returncode == 2 and "VANELOOP_WEB_TOKEN" in short.stderr and "Traceback" not in short.stderr
@@ -789,10 +901,12 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
         assert [through_the_guard("http", "GET", "/", q, host, guard)[0]["status"] for _ in range(2)] == statuses
 
 
-# ---- temporary folders ------------------------------------------------------------------------------------------------------------------
+# ---- temporary folders -----------------------------------------------------------------------------------------------
 
 
-def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import stat
     import tempfile
 
@@ -817,7 +931,9 @@ def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_sta
         assert list(tmp_path.glob("vaneloop-web-*")) == [running]
 
 
-def test_only_folders_of_this_user_whose_process_is_gone_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_folders_of_this_user_whose_process_is_gone_are_swept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import tempfile
 
     from vaneloop.web.private import private_folder, sweep
@@ -842,14 +958,20 @@ def test_only_folders_of_this_user_whose_process_is_gone_are_swept(tmp_path: Pat
         monkeypatch.undo()
         assert sweep(tmp_path) == [free] and held.is_dir()
     assert not held.exists()
-    assert {p.name for p in tmp_path.iterdir()} == {"elsewhere", "vaneloop-web-link", "vaneloop-web-a-file", starting.name}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "elsewhere",
+        "vaneloop-web-link",
+        "vaneloop-web-a-file",
+        starting.name,
+    }
     assert (elsewhere / "lock").exists()
 
 
 @pytest.mark.parametrize(
     ("name", "kept"),
     [("run.csv", "run.csv"), ("../../etc/passwd", "passwd"), ("C:\\x\\log.mf4", "log.mf4"), (".bashrc", "bashrc"),
-     ("a;rm -rf $HOME.csv", "a_rm -rf _HOME.csv"), ("\u202ecsv.exe", "_csv.exe"), ("", "file"), ("x" * 300 + ".csv", "x" * 80 + ".csv")],
+     ("a;rm -rf $HOME.csv", "a_rm -rf _HOME.csv"), ("\u202ecsv.exe", "_csv.exe"), ("", "file"),
+     ("x" * 300 + ".csv", "x" * 80 + ".csv")],
 )  # fmt: skip
 def test_a_name_of_an_upload_is_a_name_and_no_path(name: str, kept: str) -> None:
     from vaneloop.web.session import safe_name
@@ -857,7 +979,7 @@ def test_a_name_of_an_upload_is_a_name_and_no_path(name: str, kept: str) -> None
     assert safe_name(name) == kept
 
 
-# ---- curves -----------------------------------------------------------------------------------------------------------------------------
+# ---- curves ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_thinned_view_keeps_every_spike_and_hole() -> None:

@@ -23,7 +23,9 @@ JUNK = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
 def run(*command: str, cwd: Path, **env: str) -> str:
     """Run a command that must succeed and return what it printed."""
     plain = {k: v for k, v in os.environ.items() if not k.startswith(("PYTEST", "PYTHON"))}
-    done = subprocess.run(command, cwd=cwd, env={**plain, **env}, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=cwd, env={**plain, **env}, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, f"{' '.join(command)}: exit {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -44,7 +46,18 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if (ROOT / name).is_file():
             shutil.copy(ROOT / name, source)
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    run(*pip, "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index", "-w", str(folder), str(source), cwd=folder)
+    run(
+        *pip,
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "-w",
+        str(folder),
+        str(source),
+        cwd=folder,
+    )
     (built,) = folder.glob("vaneloop-*.whl")
     return built
 
@@ -69,7 +82,12 @@ def run_installed(installed: Path, folder: Path, *arguments: str) -> str:
 
 def test_the_wheel_holds_every_source_and_table(wheel: Path) -> None:
     inside = set(zipfile.ZipFile(wheel).namelist())
-    kept = [p for name in (*PACKAGES, "tables") for p in (ROOT / name).rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    kept = [
+        p
+        for name in (*PACKAGES, "tables")
+        for p in (ROOT / name).rglob("*")
+        if p.is_file() and "__pycache__" not in p.parts
+    ]
     here = [p.relative_to(ROOT).as_posix() for p in kept if p.suffix not in (".nbi", ".nbc")]
     wanted = {f"vaneloop/{name}" if name.startswith("tables/") else name for name in here}
     assert wanted <= inside, f"not in the wheel: {sorted(wanted - inside)}"

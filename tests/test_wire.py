@@ -75,11 +75,12 @@ def test_a_frame_of_eight_bytes_takes_111_to_135_bits(ident: int, data: bytes) -
 
 
 def test_worst_case_of_stuffing_is_reached() -> None:
-    # a start of frame, four zeros, then blocks of four: a stuff bit every four bits from the fifth on, as far as the CRC lets it
+    # a start of frame, four zeros, then blocks of four: a stuff bit every four bits from the fifth on, as far as the
+    # CRC lets it
     assert len(bits_of(frame(0x078, b"\x3c\x3c\x3c\x3c\x3c\x3c\x3c\x3c", extended=False))) > 98 + 15
 
 
-# ---- arbitration and time ---------------------------------------------------------------------------------------------------------------
+# ---- arbitration and time --------------------------------------------------------------------------------------------
 
 
 def three(**options: Any) -> tuple[Channel, LockstepBus, LockstepBus, LockstepBus]:
@@ -112,7 +113,11 @@ def test_the_lowest_identifier_wins() -> None:
     _, a, b, c = three()
     a.send(frame(0x0B0)), b.send(frame(0x0A0)), b.send(frame(0x001))
     heard = [c.recv(1) for _ in range(3)]
-    assert [m.arbitration_id for m in heard if m] == [0x0A0, 0x001, 0x0B0]  # a queue is first in, first out: 0x001 waits behind 0x0A0
+    assert [m.arbitration_id for m in heard if m] == [
+        0x0A0,
+        0x001,
+        0x0B0,
+    ]  # a queue is first in, first out: 0x001 waits behind 0x0A0
 
 
 def test_standard_beats_extended_and_data_beats_remote() -> None:
@@ -138,7 +143,7 @@ def test_a_babbling_node_at_identifier_0_keeps_all_others_off() -> None:
     assert len(heard) > 300 and 0x0A0 not in heard[1:] and channel.load > 0.99
 
 
-# ---- queues -----------------------------------------------------------------------------------------------------------------------------
+# ---- queues ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_full_queue_refuses_and_counts() -> None:
@@ -161,11 +166,16 @@ def test_a_full_receive_buffer_is_told_in_place() -> None:
     assert [m.arbitration_id for m in heard] == list(range(16)) and b.lost == 24
     a.send(frame(99))
     told, late = b.recv(1), b.recv(1)
-    assert told is not None and told.is_error_frame and told.data[1] == 1 and int.from_bytes(told.data[4:8], "little") == 24
+    assert (
+        told is not None
+        and told.is_error_frame
+        and told.data[1] == 1
+        and int.from_bytes(told.data[4:8], "little") == 24
+    )
     assert late is not None and late.arbitration_id == 99
 
 
-# ---- errors -----------------------------------------------------------------------------------------------------------------------------
+# ---- errors ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_destroyed_frame_is_sent_again_and_counted() -> None:
@@ -230,7 +240,9 @@ def test_a_busy_wire_delays_the_way_back_from_bus_off() -> None:
             channel.advance(1e-4)
         times.append(channel.now - started)
     assert times[0] == pytest.approx(128 * 11 * BIT, abs=2e-4)
-    assert times[1] == pytest.approx(128 * (len(bits_by_the_book(frame(0x200))) + 13) * BIT, rel=0.05)  # one occurrence a frame
+    assert times[1] == pytest.approx(
+        128 * (len(bits_by_the_book(frame(0x200))) + 13) * BIT, rel=0.05
+    )  # one occurrence a frame
 
 
 def test_a_node_that_nobody_acknowledges_stays_error_passive() -> None:
@@ -284,7 +296,7 @@ def test_waiting_for_ever_for_nothing_is_an_error() -> None:
         a.recv()
 
 
-# ---- the whole loop ---------------------------------------------------------------------------------------------------------------------
+# ---- the whole loop --------------------------------------------------------------------------------------------------
 
 
 def demand(seconds: float) -> np.ndarray:
@@ -303,7 +315,13 @@ def test_every_frame_on_the_wire_is_one_that_cantools_and_e2e_accept() -> None:
         assert ident not in counters or v["counter"] == (counters[ident] + 1) % 15
         counters[ident] = v["counter"]
     idents, counts = np.unique(run.rows[:, 0] & frames.IDENT_MASK, return_counts=True)
-    assert dict(zip(idents.tolist(), counts.tolist(), strict=True)) == {0xA0: 500, 0xB0: 500, 0xB1: 500, 0xB2: 500, 0xB3: 50}
+    assert dict(zip(idents.tolist(), counts.tolist(), strict=True)) == {
+        0xA0: 500,
+        0xB0: 500,
+        0xB1: 500,
+        0xB2: 500,
+        0xB3: 50,
+    }
     assert np.all(np.diff(run.t) > 0) and run.frames == 2050 and run.error_frames == 0 and 0.08 < run.load < 0.12
     assert run.vgv.mode == "RUN" and run.vgv.faults == 0 and run.ecu.stale() == []
 
@@ -343,7 +361,8 @@ print(r.state_hash, r.vgv.fingerprint(), hash(r.rows.tobytes()), r.error_frames)
 def test_compiled_and_interpreted_loops_give_the_same_bits() -> None:
     answers = {
         subprocess.run(
-            [sys.executable, "-c", SCRIPT], cwd=ROOT, env={**os.environ, "NUMBA_DISABLE_JIT": off, "PYTHONHASHSEED": "0"},
+            [sys.executable, "-c", SCRIPT], cwd=ROOT,
+            env={**os.environ, "NUMBA_DISABLE_JIT": off, "PYTHONHASHSEED": "0"},
             capture_output=True, text=True, check=True,
         ).stdout
         for off in ("0", "1")
@@ -351,7 +370,7 @@ def test_compiled_and_interpreted_loops_give_the_same_bits() -> None:
     assert len(answers) == 1
 
 
-# ---- limits -----------------------------------------------------------------------------------------------------------------------------
+# ---- limits ----------------------------------------------------------------------------------------------------------
 
 
 def test_an_error_passive_node_waits_eight_bits_more_after_its_own_frames() -> None:
@@ -377,7 +396,9 @@ def test_a_good_frame_takes_back_one_point_of_a_receiver_or_ends_its_passive_sta
     assert b.recv(1) is not None and b.rec == after and b.state is can.BusState.ACTIVE
 
 
-@pytest.mark.parametrize(("before", "after", "state"), [(126, 127, "ACTIVE"), (127, 128, "PASSIVE"), (255, 255, "PASSIVE")])
+@pytest.mark.parametrize(
+    ("before", "after", "state"), [(126, 127, "ACTIVE"), (127, 128, "PASSIVE"), (255, 255, "PASSIVE")]
+)
 def test_a_destroyed_frame_costs_a_receiver_one_point_up_to_255(before: int, after: int, state: str) -> None:
     channel, a, b, _ = three()
     channel.wire.node[b.place, wire.REC] = before
@@ -398,7 +419,8 @@ def test_an_error_frame_ends_fourteen_bits_after_the_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("node", "ident", "hit"), [(0, None, True), (1, None, False), (None, 0x100, True), (None, 0x101, False), (None, 0, False)]
+    ("node", "ident", "hit"),
+    [(0, None, True), (1, None, False), (None, 0x100, True), (None, 0x101, False), (None, 0, False)],
 )
 def test_only_the_frames_asked_for_are_destroyed(node: int | None, ident: int | None, hit: bool) -> None:
     channel, a, b, _ = three()
@@ -411,7 +433,13 @@ def test_only_the_frames_asked_for_are_destroyed(node: int | None, ident: int | 
 
 @pytest.mark.parametrize(
     ("head", "taken"),
-    [(0x100, True), (0x100 | 8 << 32, True), (0x100 | 9 << 32, False), (0x100 | frames.FD | 8 << 32, False), (0x100 | frames.ERROR, False)],
+    [
+        (0x100, True),
+        (0x100 | 8 << 32, True),
+        (0x100 | 9 << 32, False),
+        (0x100 | frames.FD | 8 << 32, False),
+        (0x100 | frames.ERROR, False),
+    ],
 )
 def test_only_classic_frames_of_up_to_eight_bytes_are_queued(head: int, taken: bool) -> None:
     channel, a, _, _ = three()
@@ -449,7 +477,7 @@ def test_frames_sent_and_received_are_counted_once() -> None:
     assert node[a.place, wire.SENT] == 3 == node[b.place, wire.RECEIVED] == channel.wire.clock[wire.FRAMES]
 
 
-# ---- the wire by itself: no bus, no messages --------------------------------------------------------------------------------------------
+# ---- the wire by itself: no bus, no messages -------------------------------------------------------------------------
 
 
 def joined(nodes: int, **options: Any) -> wire.Wire:
@@ -514,7 +542,9 @@ def test_a_frame_ends_ten_bits_behind_its_crc() -> None:
     w, sent = joined(2), frame(0x100)
     put(w, 0, sent)
     wire.run_wire(w, 1, -1)
-    assert w.clock[wire.FREE] == len(bits_by_the_book(sent)) + 10 + 3 and w.rx[1, 0, 2] == len(bits_by_the_book(sent)) + 10
+    assert (
+        w.clock[wire.FREE] == len(bits_by_the_book(sent)) + 10 + 3 and w.rx[1, 0, 2] == len(bits_by_the_book(sent)) + 10
+    )
 
 
 def test_a_length_beyond_eight_counts_as_eight() -> None:
@@ -576,7 +606,9 @@ def test_who_queues_at_the_bit_at_which_a_frame_could_begin_takes_part() -> None
         (frame(0x155 << 18 | 77, b"\x12", extended=True), frame(0x155 << 18 | 77, b"\x13", extended=True)),
     ],
 )
-def test_two_frames_that_differ_behind_the_identifier_end_at_the_first_bit_that_differs(one: can.Message, other: can.Message) -> None:
+def test_two_frames_that_differ_behind_the_identifier_end_at_the_first_bit_that_differs(
+    one: can.Message, other: can.Message
+) -> None:
     a, b = bits_by_the_book(one), bits_by_the_book(other)
     differs = next(i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y) + 1
     for first, second in ((one, other), (other, one)):
@@ -636,7 +668,9 @@ def test_own_frames_are_given_to_those_that_want_them_and_marked() -> None:
     a.send(frame(0x100, b"\x05")), b.send(frame(0x101, b"\x06"))
     for bus, expected in ((a, [(0x100, b"\x05", False), (0x101, b"\x06", True)]), (b, [(0x100, b"\x05", True)])):
         got = list(iter(lambda bus=bus: bus.recv(1e-3), None))
-        assert [(m.arbitration_id, bytes(m.data), m.is_rx) for m in got] == expected and not any(m.is_extended_id for m in got)
+        assert [(m.arbitration_id, bytes(m.data), m.is_rx) for m in got] == expected and not any(
+            m.is_extended_id for m in got
+        )
 
 
 def test_rows_are_taken_in_order_as_many_as_there_is_room_for() -> None:
@@ -676,7 +710,7 @@ def test_a_full_receive_buffer_takes_nothing_before_it_has_room_to_tell_what_is_
     assert idents(heard_by(w, 1)) == [0x106, 0x107, 0x108] and w.node[1, wire.OVERRUN] == 2  # told once
 
 
-# ---- error frames as SocketCAN's linux/can/error.h lays them out, counters, bus-off -----------------------------------------------------
+# ---- error frames as SocketCAN's linux/can/error.h lays them out, counters, bus-off ----------------------------------
 
 NOTHING = bytes(8)
 DESTROYED, OFF, BACK = (0x088, NOTHING), (0x040, NOTHING), (0x100, NOTHING)  # PROT | BUSERROR, BUSOFF, RESTARTED
@@ -708,7 +742,9 @@ def test_a_sender_is_told_of_each_error_once_of_the_passive_state_and_of_bus_off
         (127, 127, [RX_PASSIVE]),
     ],
 )
-def test_beyond_127_points_a_node_is_told_which_counter_made_it_passive(tec: int, rec: int, told: list[tuple[int, bytes]]) -> None:
+def test_beyond_127_points_a_node_is_told_which_counter_made_it_passive(
+    tec: int, rec: int, told: list[tuple[int, bytes]]
+) -> None:
     w, j = joined(2), 0 if rec == 0 else 1
     w.node[j, wire.TEC], w.node[j, wire.REC] = tec, rec
     w.clock[wire.DESTROY] = 1
@@ -825,7 +861,7 @@ def test_the_wire_is_busy_from_the_start_of_a_frame_to_the_end_of_the_intermissi
     assert w.clock[wire.BUSY] == 2 * (length(sent) + 3) and w.clock[wire.FREE] == 1400 + length(sent) + 3
 
 
-# ---- chance -----------------------------------------------------------------------------------------------------------------------------
+# ---- chance ----------------------------------------------------------------------------------------------------------
 
 
 def test_random_numbers_are_drawn_only_where_a_rate_is_not_0() -> None:

@@ -1,4 +1,6 @@
-"""A user's own model: what its page teaches works as written, laws are found where they are, and mistakes are told in one line."""
+"""A user's own model: what its page teaches works as written, laws are found where they are, and mistakes are told in
+one line.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,10 @@ T = np.arange(0.0, 40.0, 0.02)
 def wave(seed: int, t: np.ndarray = T) -> np.ndarray:
     """A smooth random signal between about -2 and 2."""
     rng = np.random.default_rng([5, seed])
-    return np.sum([rng.uniform(0.3, 0.7) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (0.05, 0.12, 0.31, 0.55, 0.83)], axis=0)
+    return np.sum(
+        [rng.uniform(0.3, 0.7) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (0.05, 0.12, 0.31, 0.55, 0.83)],
+        axis=0,
+    )
 
 
 def noise(n: int = len(T)) -> np.ndarray:
@@ -35,7 +40,12 @@ def line(u: Any, p: Any) -> Any:
 
 
 STRAIGHT = System(
-    "map", "static", line, outputs={"y": "V"}, inputs={"u": "V"}, parameters=[unknown("gain", 1.0, "-"), unknown("offset", 0.0, "V")]
+    "map",
+    "static",
+    line,
+    outputs={"y": "V"},
+    inputs={"u": "V"},
+    parameters=[unknown("gain", 1.0, "-"), unknown("offset", 0.0, "V")],
 )
 
 
@@ -141,7 +151,8 @@ def test_springs_may_start_with_the_measured_force() -> None:
 
     def left(start: str) -> float:
         system = System(
-            "damper", "force", lambda u, p: p.c * u.velocity, outputs={"force": "kN"}, position="x", cutoff=20.0, start_force=start,
+            "damper", "force", lambda u, p: p.c * u.velocity, outputs={"force": "kN"}, position="x", cutoff=20.0,
+            start_force=start,
             parameters=[unknown("c", 0.1, "kN s/mm", low=0.0)], units={"position": "mm"},
         )  # fmt: skip
         answer = own_model.extend(system, [log], ["force.elastic_plastic"])
@@ -166,14 +177,15 @@ def test_a_log_without_excitation_names_nothing() -> None:
     assert named(own_model.diagnose(STRAIGHT, [log])) == []
 
 
-BASE = '''from discrepancy import Parameter, System, unknown
+BASE = """from discrepancy import Parameter, System, unknown
 
 def derivative(x, u, p):
     return {body}
 
-system = System(name="tank", kind="simulate", model=derivative, inputs={{"pump": "V"}}, states={{"level": "cm"}}, outputs={{"level": "cm"}},
+system = System(name="tank", kind="simulate", model=derivative, inputs={{"pump": "V"}},
+                states={{"level": "cm"}}, outputs={{"level": "cm"}},
     parameters=[{parameters}])
-'''
+"""
 GOOD = 'unknown("inflow", 0.1, "cm/(V s)", low=0.0), unknown("outflow", 0.01, "1/s", low=0.0)'
 RIGHT = "p.inflow * u.pump - p.outflow * x.level"
 

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hil.bus.port import Port, open_bus
 
-_HOME = {
-    "Port": "hil.bus.port",
-    "open_bus": "hil.bus.port",
-}
+_HOME = {"Port": "hil.bus.port", "open_bus": "hil.bus.port"}
 
 __all__ = ["Port", "open_bus"]
 

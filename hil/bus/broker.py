@@ -1,14 +1,15 @@
 """The embedded bus between processes: a small process that gives every frame to every participant, in one order.
 
-The first participant starts it (`hil.bus.local_bus`); it ends a second after the last one has left, however that one ended. Its address is an
-abstract Unix socket, ``@vaneloop-UID-NAME``, which the kernel frees with the process: there is no stale socket to clean up. Only processes
-of the same user (or root) are let in.
+The first participant starts it (`hil.bus.local_bus`); it ends a second after the last one has left, however that one
+ended. Its address is an abstract Unix socket, ``@vaneloop-UID-NAME``, which the kernel frees with the process: there is
+no stale socket to clean up. Only processes of the same user (or root) are let in.
 
-Packets (SOCK_SEQPACKET keeps their borders): a participant greets with `HELLO` and a byte (bit 0 `OWN`, above it its real-time priority),
-is greeted back, and sends frames of 16 or 72 bytes (``struct can_frame``, ``struct canfd_frame``). It receives `PACKET`: number, time (ns
-since 1970), frame. A participant that does not read keeps up to `BACKLOG` frames; what is beyond is replaced, in its place in the order,
-by one error frame that says how many frames are gone. Nobody else waits for it. The broker runs with the highest real-time priority of
-its participants: who must not be late must not wait for it either.
+Packets (SOCK_SEQPACKET keeps their borders): a participant greets with `HELLO` and a byte (bit 0 `OWN`, above it its
+real-time priority), is greeted back, and sends frames of 16 or 72 bytes (``struct can_frame``, ``struct canfd_frame``).
+It receives `PACKET`: number, time (ns since 1970), frame. A participant that does not read keeps up to `BACKLOG`
+frames; what is beyond is replaced, in its place in the order, by one error frame that says how many frames are gone.
+Nobody else waits for it. The broker runs with the highest real-time priority of its participants: who must not be late
+must not wait for it either.
 
 Only the standard library is imported, and the file is run by its path, so that it starts in some tens of milliseconds.
 """
@@ -36,7 +37,8 @@ TURN = 64  # frames taken from one participant before the next one's turn
 LINGER = 1.0  # s without participants
 SEND_BUFFER = 1 << 20  # bytes
 
-# struct can_frame of an error frame: id CAN_ERR_FLAG | CAN_ERR_CRTL, 8 bytes, data[1] = CAN_ERR_CRTL_RX_OVERFLOW, data[4:8] = frames lost
+# struct can_frame of an error frame: id CAN_ERR_FLAG | CAN_ERR_CRTL, 8 bytes, data[1] = CAN_ERR_CRTL_RX_OVERFLOW,
+# data[4:8] = frames lost
 _LOST = struct.Struct("<IBBBxBBBBI")
 _CRED = struct.Struct("3i")
 
@@ -65,7 +67,9 @@ class _Member:
         self.greeted = False
         self.own = False
         self.priority = 0
-        self.waiting: deque[bytes | list[int]] = deque()  # packets, and [frames lost, number, time] where frames are gone
+        self.waiting: deque[bytes | list[int]] = (
+            deque()
+        )  # packets, and [frames lost, number, time] where frames are gone
 
     def give(self, packet: bytes) -> None:
         """Hand over a packet, keep it, or count it as lost; raises OSError where the participant is gone."""
@@ -148,7 +152,9 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
                 if not other.greeted or (other is member and not other.own):
                     continue
                 try:
-                    other.give(packet if other is not member else packet[:MARK_AT] + bytes([MINE]) + packet[MARK_AT + 1 :])
+                    other.give(
+                        packet if other is not member else packet[:MARK_AT] + bytes([MINE]) + packet[MARK_AT + 1 :]
+                    )
                     if other.waiting:
                         selector.modify(other.connection, selectors.EVENT_READ | selectors.EVENT_WRITE)
                 except OSError:

@@ -1,15 +1,18 @@
-"""The bus's frames in compiled form: `tables/vgv.dbc` as code, E2E protection, and the receiver's judgement of each frame.
+"""The bus's frames in compiled form: `tables/vgv.dbc` as code, E2E protection, and the receiver's judgement of each
+frame.
 
-A frame is two int64, 16 bytes laid out as SocketCAN's ``struct can_frame`` (little endian), so that a socket's bytes are frames already::
+A frame is two int64, 16 bytes laid out as SocketCAN's ``struct can_frame`` (little endian), so that a socket's bytes
+are frames already::
 
     word 0   bits 0..28 identifier, 29 error frame, 30 remote, 31 extended; bits 32..39 length; bit 42 CAN FD
     word 1   the eight bytes of data, the first in the lowest bits
 
-Protection is AUTOSAR E2E profile 1: byte 0 is CRC-8 SAE J1850 over both bytes of the DataID and bytes 1 to 7, the low nibble of byte 1 a
-counter 0 to 14. The layout is tested against cantools and the autosar-e2e library over random values; the DBC is the reference.
+Protection is AUTOSAR E2E profile 1: byte 0 is CRC-8 SAE J1850 over both bytes of the DataID and bytes 1 to 7, the low
+nibble of byte 1 a counter 0 to 14. The layout is tested against cantools and the autosar-e2e library over random
+values; the DBC is the reference.
 
-Physical values are in the DBC's units. Encoding takes the nearest step, holds values at the DBC's limits, and sends a NaN as the signal's
-"not available". Everything here works in place and allocates nothing.
+Physical values are in the DBC's units. Encoding takes the nearest step, holds values at the DBC's limits, and sends a
+NaN as the signal's "not available". Everything here works in place and allocates nothing.
 """
 
 from __future__ import annotations
@@ -25,9 +28,11 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES", "VGV_HEALTH", "VGV_SERVO",
+    "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES", "VGV_HEALTH",
+    "VGV_SERVO",
     "VGV_STATUS",
-    "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes", "to_message", "word0",
+    "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes",
+    "to_message", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -46,11 +51,12 @@ DATA_ID = 0x5600  # plus the identifier
 _CRC = crc_table().astype(np.int64)
 _CRC.setflags(write=False)
 
-# "this node stood still before this tick": word 1 is for how many ticks. In a record it is a frame under an identifier that no node takes.
+# "this node stood still before this tick": word 1 is for how many ticks. In a record it is a frame under an identifier
+# that no node takes.
 PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 
 
-# ---- bits ---------------------------------------------------------------------------------------------------------------------------
+# ---- bits ------------------------------------------------------------------------------------------------------------
 
 
 @in_place
@@ -61,7 +67,9 @@ def word0(ident):
 
 @in_place
 def crc(ident, data):
-    """Return the E2E CRC of ``data`` (word 1) sent under ``ident``; byte 0 is the CRC's own place and does not count."""
+    """Return the E2E CRC of ``data`` (word 1) sent under ``ident``; byte 0 is the CRC's own place and does not
+    count.
+    """
     data_id = DATA_ID + ident
     c = _CRC[_CRC[data_id & 0xFF] ^ (data_id >> 8)]
     for k in range(1, 8):
@@ -105,7 +113,7 @@ def _at(raw, at):
     return raw << at
 
 
-# ---- frames -------------------------------------------------------------------------------------------------------------------------
+# ---- frames ----------------------------------------------------------------------------------------------------------
 
 
 @in_place
@@ -178,7 +186,7 @@ def decode_health(data):
     return u16(data, 16) * 0.001, s16(data, 32) * 0.01, (data >> 48) & 0xFF, (data >> 56) & 0xFF
 
 
-# ---- receiver -----------------------------------------------------------------------------------------------------------------------
+# ---- receiver --------------------------------------------------------------------------------------------------------
 
 MAX_DELTA = 5  # steps of the counter that are taken for loss; more within the time limit is a wrong sequence
 MISSED = 5  # periods without a good frame: stale. The firmware's demand_timeout of 50 ms is the same for ECU_DEMAND.
@@ -222,9 +230,10 @@ def new_receiver(ident: int) -> np.ndarray:
 def receive(r, head, data, now):
     """Judge a frame that came at tick ``now`` (ms); return the verdict. Only after GOOD may its values be used.
 
-    A counter that has gone on by 1..MAX_DELTA since the last good frame is good; what lies between is lost. After MISSED periods without
-    a good frame a sender may have started anew: a right frame then becomes the candidate, and the next that goes on from it is good.
-    So strays and replayed frames between good ones are refused, and a frame that only repeats is never good, however long.
+    A counter that has gone on by 1..MAX_DELTA since the last good frame is good; what lies between is lost. After
+    MISSED periods without a good frame a sender may have started anew: a right frame then becomes the candidate, and
+    the next that goes on from it is good. So strays and replayed frames between good ones are refused, and a frame that
+    only repeats is never good, however long.
     """
     if head & ERROR or head & IDENT_MASK != r[R_IDENT]:
         return OTHER
@@ -266,7 +275,9 @@ def receive(r, head, data, now):
 
 @in_place
 def grow_old(r, now):
-    """State a silence of MISSED periods at tick ``now``, after the frames of the tick; return True while it lasts. It loses nothing."""
+    """State a silence of MISSED periods at tick ``now``, after the frames of the tick; return True while it lasts. It
+    loses nothing.
+    """
     if r[R_LAST] < 0:
         return False
     missed = (now - r[R_LAST_TICK]) // r[R_PERIOD]
@@ -280,7 +291,9 @@ def grow_old(r, now):
 
 @in_place
 def stand_still(r):
-    """Forget where the sender's counter was: its receiver stood still, and what came meanwhile is gone. Begins a silence."""
+    """Forget where the sender's counter was: its receiver stood still, and what came meanwhile is gone. Begins a
+    silence.
+    """
     if r[R_LAST] >= 0 and r[R_SILENT] == 0:
         r[R_STALE] += 1
         r[R_SILENT] = MISSED
@@ -300,7 +313,7 @@ def noted(rows: np.ndarray) -> np.ndarray:
     return out
 
 
-# ---- the same for people ------------------------------------------------------------------------------------------------------------
+# ---- the same for people ---------------------------------------------------------------------------------------------
 
 # identifier -> (decoder, signal names)
 FRAMES: dict[int, tuple[Any, tuple[str, ...]]] = {
@@ -341,7 +354,9 @@ def from_message(message: can.Message) -> tuple[int, int]:
     return head, int.from_bytes(bytes(message.data[:8]).ljust(8, b"\0"), "little", signed=True)
 
 
-def to_message(head: int, data: int, timestamp: float = 0.0, channel: str | None = None, is_rx: bool = True) -> can.Message:
+def to_message(
+    head: int, data: int, timestamp: float = 0.0, channel: str | None = None, is_rx: bool = True
+) -> can.Message:
     """Return a frame as a python-can message."""
     import can
 

@@ -1,10 +1,12 @@
-"""The embedded bus as a python-can interface, ``vaneloop``: ``python -m can.logger -i vaneloop -c NAME`` joins it like any other bus.
+"""The embedded bus as a python-can interface, ``vaneloop``: ``python -m can.logger -i vaneloop -c NAME`` joins it like
+any other bus.
 
-Every participant of the same user on this machine that opens the same NAME hears the others' frames, all in the same order; there is no
-bit rate and no arbitration (`hil.bus.lockstep_bus` has those). Nothing is lost silently: a reader that falls `hil.bus.broker.BACKLOG` frames behind
-gets an error frame (CAN_ERR_CRTL, data[1] = 1 receive overflow, data[4:8] = how many frames are gone) in the place of the frames, its
-`LocalBus.lost` counts them and the log says so. If the broker is killed, the next call starts another one; the reader gets an error frame
-CAN_ERR_RESTARTED, because frames may be gone that nobody can count.
+Every participant of the same user on this machine that opens the same NAME hears the others' frames, all in the same
+order; there is no bit rate and no arbitration (`hil.bus.lockstep_bus` has those). Nothing is lost silently: a reader
+that falls `hil.bus.broker.BACKLOG` frames behind gets an error frame (CAN_ERR_CRTL, data[1] = 1 receive overflow,
+data[4:8] = how many frames are gone) in the place of the frames, its `LocalBus.lost` counts them and the log says so.
+If the broker is killed, the next call starts another one; the reader gets an error frame CAN_ERR_RESTARTED, because
+frames may be gone that nobody can count.
 """
 
 from __future__ import annotations
@@ -103,7 +105,9 @@ class LocalBus(can.BusABC):
         )  # fmt: skip
         if done.returncode not in (0, 3):  # 3: somebody else was quicker
             said = done.stderr.decode(errors="replace").strip().splitlines()
-            raise can.CanInitializationError(f"bus {self.channel}: its broker does not start ({said[-1] if said else done.returncode})")
+            raise can.CanInitializationError(
+                f"bus {self.channel}: its broker does not start ({said[-1] if said else done.returncode})"
+            )
 
     def _rejoin(self) -> None:
         """After the broker's end: join again under the same file descriptor."""
@@ -116,7 +120,9 @@ class LocalBus(can.BusABC):
         LOG.warning("bus %s: its broker ended and was started again; frames may be lost", self.channel)
 
     def receive_packet(self) -> bytes | None:
-        """Return the next packet (`hil.bus.broker.PACKET`) or None if there is none now. Counts and logs what was lost."""
+        """Return the next packet (`hil.bus.broker.PACKET`) or None if there is none now. Counts and logs what
+        was lost.
+        """
         try:
             packet = self._socket.recv(256)
         except BlockingIOError:
@@ -168,11 +174,17 @@ class LocalBus(can.BusABC):
         return message, False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame; waits up to ``timeout`` s (None: as long as it takes) for room, then raises CanOperationError."""
+        """Send a frame; waits up to ``timeout`` s (None: as long as it takes) for room, then raises
+        CanOperationError.
+        """
         ident = msg.arbitration_id | (_EXTENDED if msg.is_extended_id else 0) | (_REMOTE if msg.is_remote_frame else 0)
         if msg.is_error_frame:
             ident = msg.arbitration_id | _ERROR
-        flags = (_FDF if msg.is_fd else 0) | (_BRS if msg.bitrate_switch else 0) | (_ESI if msg.error_state_indicator else 0)
+        flags = (
+            (_FDF if msg.is_fd else 0)
+            | (_BRS if msg.bitrate_switch else 0)
+            | (_ESI if msg.error_state_indicator else 0)
+        )
         length = msg.dlc if msg.is_remote_frame else len(msg.data)
         raw = _FRAME.pack(ident, length, flags, 0, 0, bytes(msg.data))
         self.send_raw(raw if msg.is_fd else raw[:16], timeout)

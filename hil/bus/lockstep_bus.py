@@ -1,8 +1,9 @@
-"""A CAN bus in simulated time as a python-can interface, and the whole loop over it: controller, plant and ECU, frame by frame, bit by bit.
+"""A CAN bus in simulated time as a python-can interface, and the whole loop over it: controller, plant and ECU, frame
+by frame, bit by bit.
 
-`LockstepBus` joins a `Channel` of this process. Simulated time stands still until somebody moves it: `Channel.advance`, or `recv` with a
-timeout, which lets it run until a frame comes or the (simulated) time is over. Nothing depends on the machine's clock, so the same calls
-give the same frames at the same bit, always. `hil.bus.wire` says what is simulated.
+`LockstepBus` joins a `Channel` of this process. Simulated time stands still until somebody moves it: `Channel.advance`,
+or `recv` with a timeout, which lets it run until a frame comes or the (simulated) time is over. Nothing depends on the
+machine's clock, so the same calls give the same frames at the same bit, always. `hil.bus.wire` says what is simulated.
 
 `run_lockstep` is the fast way: both nodes and the wire in one compiled loop.
 """
@@ -43,7 +44,14 @@ class Channel:
     """
 
     def __init__(
-        self, *, queue: int = 64, buffer: int = 4096, error_rate: float = 0.0, loss: float = 0.0, seed: int = 0, restart: bool = True
+        self,
+        *,
+        queue: int = 64,
+        buffer: int = 4096,
+        error_rate: float = 0.0,
+        loss: float = 0.0,
+        seed: int = 0,
+        restart: bool = True,
     ):
         for name, value in (("error_rate", error_rate), ("loss", loss)):
             if not 0.0 <= value <= 1.0:
@@ -52,7 +60,9 @@ class Channel:
         self.tasks: list[_Task] = []
 
     def join(self, *, own: bool = False, errors: bool = True, silent: bool = False) -> int:
-        """Take a free place on the wire; return its number. A silent participant only listens: it does not even acknowledge."""
+        """Take a free place on the wire; return its number. A silent participant only listens: it does not even
+        acknowledge.
+        """
         for j in range(NODES):
             node = self.wire.node[j]
             if not node[w.JOINED]:
@@ -76,7 +86,9 @@ class Channel:
         return float(self.wire.clock[w.BUSY] / max(self.wire.clock[w.NOW], self.wire.clock[w.FREE], 1))
 
     def advance(self, seconds: float, watch: int = -1) -> None:
-        """Let simulated time run on by ``seconds``; with ``watch`` >= 0 no farther than until that participant has something to take."""
+        """Let simulated time run on by ``seconds``; with ``watch`` >= 0 no farther than until that participant has
+        something to take.
+        """
         self.advance_to(int(self.wire.clock[w.NOW]) + round(seconds * BIT_RATE), watch)
 
     def advance_to(self, bit: int, watch: int = -1) -> None:
@@ -94,12 +106,20 @@ class Channel:
         node = self.wire.node
         there = node[:, w.JOINED] == 1
         return (
-            not any(t.active for t in self.tasks) and not (node[there, w.TX_N] > 0).any() and not (node[there, w.MODE] == w.BUS_OFF).any()
+            not any(t.active for t in self.tasks)
+            and not (node[there, w.TX_N] > 0).any()
+            and not (node[there, w.MODE] == w.BUS_OFF).any()
         )
 
     def destroy(self, frames: int, *, node: int = -1, ident: int = -1) -> None:
-        """Destroy the next ``frames`` frames, of participant ``node`` and with identifier ``ident`` only where these are given."""
-        self.wire.clock[w.DESTROY], self.wire.clock[w.DESTROY_NODE], self.wire.clock[w.DESTROY_IDENT] = frames, node, ident
+        """Destroy the next ``frames`` frames, of participant ``node`` and with identifier ``ident`` only where these
+        are given.
+        """
+        self.wire.clock[w.DESTROY], self.wire.clock[w.DESTROY_NODE], self.wire.clock[w.DESTROY_IDENT] = (
+            frames,
+            node,
+            ident,
+        )
 
 
 _channels: dict[str, Channel] = {}
@@ -115,13 +135,13 @@ class LockstepBus(can.BusABC):
 
     channel  a name (one wire per name and process) or a `Channel` made with options of its own
     receive_own_messages, can_filters  as everywhere in python-can
-    receive_errors  error frames (SocketCAN's classes: 0x088 destroyed frame, 0x004 error passive or receive overflow, 0x040 bus-off,
-                    0x100 back again)
+    receive_errors  error frames (SocketCAN's classes: 0x088 destroyed frame, 0x004 error passive or receive overflow,
+                    0x040 bus-off, 0x100 back again)
     silent  listen only
 
-    Timestamps and timeouts are simulated seconds. `send` queues a frame; where the queue is full it lets time run up to ``timeout``
-    (None: as long as it takes), then raises CanOperationError. ``lost`` counts frames for which the receive buffer had no room; in their
-    place stands an error frame with their number (CAN_ERR_CRTL, data[1] = 1, data[4:8]).
+    Timestamps and timeouts are simulated seconds. `send` queues a frame; where the queue is full it lets time run up to
+    ``timeout`` (None: as long as it takes), then raises CanOperationError. ``lost`` counts frames for which the receive
+    buffer had no room; in their place stands an error frame with their number (CAN_ERR_CRTL, data[1] = 1, data[4:8]).
     """
 
     def __init__(
@@ -201,7 +221,9 @@ class LockstepBus(can.BusABC):
         while True:
             while take(channel.wire, self.place, self._row):
                 head, data, at = self._row[0].tolist()
-                message = to_message(head & ~w.OWN, data, at / BIT_RATE, self.name or "lockstep", is_rx=not head & w.OWN)
+                message = to_message(
+                    head & ~w.OWN, data, at / BIT_RATE, self.name or "lockstep", is_rx=not head & w.OWN
+                )
                 if self._matches_filters(message):
                     return message
             now = int(channel.wire.clock[w.NOW])
@@ -224,7 +246,12 @@ class LockstepBus(can.BusABC):
         return sum(put(self.channel.wire, self.place, head, data) for head, data in rows.tolist())
 
     def _send_periodic_internal(
-        self, msgs: Any, period: float, duration: float | None = None, autostart: bool = True, modifier_callback: Any = None
+        self,
+        msgs: Any,
+        period: float,
+        duration: float | None = None,
+        autostart: bool = True,
+        modifier_callback: Any = None,
     ) -> CyclicSendTaskABC:
         task = _Task(self, msgs, period, duration, modifier_callback)
         self.channel.tasks.append(task)
@@ -250,7 +277,12 @@ class _Task(ModifiableCyclicTaskABC, RestartableCyclicTaskABC):
     """Messages sent every ``period`` of simulated time."""
 
     def __init__(
-        self, bus: LockstepBus, messages: Any, period: float, duration: float | None, modify: Callable[[can.Message], None] | None
+        self,
+        bus: LockstepBus,
+        messages: Any,
+        period: float,
+        duration: float | None,
+        modify: Callable[[can.Message], None] | None,
     ):
         if not period > 0:
             raise ValueError(f"period (={period}) must be greater than 0")
@@ -283,14 +315,32 @@ class _Task(ModifiableCyclicTaskABC, RestartableCyclicTaskABC):
         self.due += self.step
 
 
-# ---- the whole loop -----------------------------------------------------------------------------------------------------------------
+# ---- the whole loop --------------------------------------------------------------------------------------------------
 
 
 @in_place
-def run_loop(k0, ticks, profile, vgv, vgv_noise, vgv_row, ecu, ecu_noise, wire, at_vgv, at_ecu, received, sent, log, logged, states):
+def run_loop(
+    k0,
+    ticks,
+    profile,
+    vgv,
+    vgv_noise,
+    vgv_row,
+    ecu,
+    ecu_noise,
+    wire,
+    at_vgv,
+    at_ecu,
+    received,
+    sent,
+    log,
+    logged,
+    states,
+):
     """Run VGV node, ECU and wire for ``ticks`` ticks from tick ``k0``; return the number of rows written to ``log``.
 
-    profile    float64[n, 3] what the ECU demands: n_dem, n_r (NaN = its engine), mode_request; a row every 10 ms, the last one held
+    profile    float64[n, 3] what the ECU demands: n_dem, n_r (NaN = its engine), mode_request; a row every 10 ms, the
+               last one held
     received   int64[m, 2], sent int64[4, 2] scratch
     log        int64[rows, 3] what participant ``logged`` hears (-1: nobody)
     states     float64[ticks or 0, n] the firmware's and the plant's state after each tick
@@ -365,7 +415,9 @@ def run_lockstep(
     progress    called with the fraction done
     """
     n_dem = np.atleast_1d(np.asarray(n_dem, np.float64))
-    profile = np.stack([n_dem, np.broadcast_to(np.nan if n_r is None else n_r, n_dem.shape), np.ones(len(n_dem))], axis=1)
+    profile = np.stack(
+        [n_dem, np.broadcast_to(np.nan if n_r is None else n_r, n_dem.shape), np.ones(len(n_dem))], axis=1
+    )
     vgv = vgv or Node(n_r=float(n_dem[0]), seed=seed)
     ecu = ecu or Ecu(n_dem=float(n_dem[0]), seed=None if seed is None else seed + 1)
     channel = channel or Channel()
@@ -386,7 +438,22 @@ def run_lockstep(
         some = np.empty((16 * n if keep else 0, 3), np.int64)
         states = np.empty((n if hashed else 0, len(vgv.arrays.z) + len(vgv.arrays.s)))
         m = run_loop(
-            vgv.k, n, profile, vgv.arrays, noise, row, ecu.arrays, ecu.noise(n), wire, at_vgv, at_ecu, received, sent, some, ears, states
+            vgv.k,
+            n,
+            profile,
+            vgv.arrays,
+            noise,
+            row,
+            ecu.arrays,
+            ecu.noise(n),
+            wire,
+            at_vgv,
+            at_ecu,
+            received,
+            sent,
+            some,
+            ears,
+            states,
         )
         log.append(some[:m])
         if hashed:

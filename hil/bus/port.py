@@ -26,9 +26,11 @@ _NET = Path("/sys/class/net")
 
 
 def open_bus(name: str, **options: Any) -> can.BusABC:
-    """Open the bus that ``name`` says: ``vcan0``, ``can0`` ... (SocketCAN), ``local[:NAME]`` (embedded), ``lockstep[:NAME]``.
+    """Open the bus that ``name`` says: ``vcan0``, ``can0`` ... (SocketCAN), ``local[:NAME]`` (embedded),
+    ``lockstep[:NAME]``.
 
-    options go to the python-can interface (``receive_own_messages``, ``can_filters``, ...). InputError where there is no such bus.
+    options go to the python-can interface (``receive_own_messages``, ``can_filters``, ...). InputError where there is
+    no such bus.
     """
     import can
 
@@ -48,8 +50,12 @@ def open_bus(name: str, **options: Any) -> can.BusABC:
 
             return SocketcanBus(kind, **{"fd": True, **options})
     except (OSError, can.CanError) as e:
-        raise InputError(f"--bus {name}: {getattr(e, 'strerror', None) or e}; --bus local joins the embedded bus instead") from None
-    raise InputError(f"--bus {name!r} is not known; allowed: vcan0, can0 or another CAN interface, local, local:NAME, lockstep")
+        raise InputError(
+            f"--bus {name}: {getattr(e, 'strerror', None) or e}; --bus local joins the embedded bus instead"
+        ) from None
+    raise InputError(
+        f"--bus {name!r} is not known; allowed: vcan0, can0 or another CAN interface, local, local:NAME, lockstep"
+    )
 
 
 def _is_can(name: str) -> bool:
@@ -77,7 +83,8 @@ def _check_socketcan(name: str) -> None:
 
 
 class Port:
-    """Frames (rows of two int64, `hil.bus.frames`) in and out of an open bus without waiting, as a control tick wants them.
+    """Frames (rows of two int64, `hil.bus.frames`) in and out of an open bus without waiting, as a control tick wants
+    them.
 
     lost     frames that this reader was too slow for
     refused  frames that the bus did not take (queue full, interface down, bus-off)
@@ -95,7 +102,9 @@ class Port:
             try:
                 self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
             except OSError:
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # the kernel takes what it allows
+                self._socket.setsockopt(
+                    socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER
+                )  # the kernel takes what it allows
             self._buffer = bytearray(72)
             self._words = np.frombuffer(self._buffer, "<i8")
 
@@ -105,7 +114,9 @@ class Port:
         return self.bus.lost if self._rows else self._dropped
 
     def read(self, rows: np.ndarray) -> int:
-        """Take what has come into the first rows of ``rows`` (int64[n, 2]); return how many. What does not fit stays for the next call."""
+        """Take what has come into the first rows of ``rows`` (int64[n, 2]); return how many. What does not fit stays
+        for the next call.
+        """
         if self._rows:
             return self.bus.read_rows(rows)
         n = 0

@@ -1,16 +1,19 @@
 """Classic CAN on the wire, in simulated time: who may send, how long each frame takes to the bit, what errors do.
 
-Time is an integer number of bits (2 us at 500 kbit/s). A frame starts when the wire has been free for the three bits of the intermission.
-Of all nodes whose first queued frame is ready then, the one with the lowest arbitration field sends; two frames that only differ behind it
-destroy each other. A frame's bits are the real ones: identifier, control, data, CRC-15, and a stuff bit after five equal bits.
+Time is an integer number of bits (2 us at 500 kbit/s). A frame starts when the wire has been free for the three bits of
+the intermission. Of all nodes whose first queued frame is ready then, the one with the lowest arbitration field sends;
+two frames that only differ behind it destroy each other. A frame's bits are the real ones: identifier, control, data,
+CRC-15, and a stuff bit after five equal bits.
 
-Faults and counters as ISO 11898-1 has them: a destroyed frame costs its sender 8 points (TEC) and each receiver 1 (REC), is answered by an
-error frame and sent again; a frame that went well takes a point back. Beyond 127 a node is error passive (8 bits of pause after its own
-frames), beyond 255 it is bus-off: it neither sends nor hears until 128 times 11 recessive bits have passed. A node that nobody
-acknowledges stays error passive. Simplified: all nodes see an error at the same bit (error flag of 6, delimiter of 8 bits), receivers
-never see one alone, and a node's counters change when its frame begins, up to a frame before they would.
+Faults and counters as ISO 11898-1 has them: a destroyed frame costs its sender 8 points (TEC) and each receiver 1
+(REC), is answered by an error frame and sent again; a frame that went well takes a point back. Beyond 127 a node is
+error passive (8 bits of pause after its own frames), beyond 255 it is bus-off: it neither sends nor hears until 128
+times 11 recessive bits have passed. A node that nobody acknowledges stays error passive. Simplified: all nodes see an
+error at the same bit (error flag of 6, delimiter of 8 bits), receivers never see one alone, and a node's counters
+change when its frame begins, up to a frame before they would.
 
-Everything works in place on one `Wire` and allocates nothing. Random numbers are drawn only where ``error_rate`` or ``loss`` is not 0.
+Everything works in place on one `Wire` and allocates nothing. Random numbers are drawn only where ``error_rate`` or
+``loss`` is not 0.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, REMOTE
 from plant.compiled import in_place
 
 __all__ = [
-    "ACTIVE", "BITS_PER_TICK", "BIT_RATE", "BUS_OFF", "OWN", "PASSIVE", "Wire", "frame_bits", "new_wire", "put", "run_wire", "take",
+    "ACTIVE", "BITS_PER_TICK", "BIT_RATE", "BUS_OFF", "OWN", "PASSIVE", "Wire", "frame_bits", "new_wire", "put",
+    "run_wire", "take",
 ]  # fmt: skip
 
 BIT_RATE = 500_000
@@ -184,7 +188,9 @@ def _random(clock):
 
 @in_place
 def put(wire, j, head, data):
-    """Queue a frame of node ``j``, ready now; return False where it was refused: queue full, bus-off, or not a classic frame."""
+    """Queue a frame of node ``j``, ready now; return False where it was refused: queue full, bus-off, or not a classic
+    frame.
+    """
     node = wire.node[j]
     full = node[TX_N] >= wire.tx.shape[1] or node[MODE] == BUS_OFF or node[SILENT] != 0
     if full or head & (FD | ERROR) or (head >> 32) & 0xFF > 8:
@@ -198,7 +204,9 @@ def put(wire, j, head, data):
 
 @in_place
 def take(wire, j, rows):
-    """Move what node ``j`` has received up to now into the first rows of ``rows`` (int64[n, 2 or 3]); return how many."""
+    """Move what node ``j`` has received up to now into the first rows of ``rows`` (int64[n, 2 or 3]); return
+    how many.
+    """
     node = wire.node[j]
     n = 0
     while n < rows.shape[0] and node[RX_N] > 0 and wire.rx[j, node[RX_AT], 2] <= wire.clock[NOW]:
@@ -226,7 +234,10 @@ def _push(wire, j, head, data, at):
         if told:
             wire.rx[j, place, 0], wire.rx[j, place, 1] = head, data
         else:
-            wire.rx[j, place, 0], wire.rx[j, place, 1] = ERROR | 8 << 32 | 0x004, 1 << 8 | (node[UNTOLD] & 0x7FFFFFFF) << 32
+            wire.rx[j, place, 0], wire.rx[j, place, 1] = (
+                ERROR | 8 << 32 | 0x004,
+                1 << 8 | (node[UNTOLD] & 0x7FFFFFFF) << 32,
+            )
             node[UNTOLD] = 0
         node[RX_N] += 1
         if told:
@@ -269,9 +280,11 @@ def _recess(wire, times):
 
 @in_place
 def run_wire(wire, until, watch):
-    """Simulate up to bit ``until``; with ``watch`` >= 0 stop as soon as that node has something to take. Sets clock[NOW].
+    """Simulate up to bit ``until``; with ``watch`` >= 0 stop as soon as that node has something to take. Sets
+    clock[NOW].
 
-    A frame that has begun before ``until`` is carried through; its receivers get it at its end, so `take` gives it later.
+    A frame that has begun before ``until`` is carried through; its receivers get it at its end, so `take` gives it
+    later.
     """
     clock, node, tx, bits = wire.clock, wire.node, wire.tx, wire.bits
     nodes = node.shape[0]

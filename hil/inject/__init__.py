@@ -69,7 +69,33 @@ _HOME = {
     "run": "hil.inject.injection",
 }
 
-__all__ = ["ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood", "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library", "load_scenario", "run"]
+__all__ = [
+    "ACTIONS",
+    "TRANSITIONS",
+    "Babble",
+    "BusOff",
+    "Check",
+    "Corrupt",
+    "Delay",
+    "Drop",
+    "Duplicate",
+    "ErrorFrames",
+    "Expect",
+    "Flood",
+    "Freeze",
+    "Machine",
+    "Outcome",
+    "Override",
+    "Reorder",
+    "Replay",
+    "Scenario",
+    "Send",
+    "Trace",
+    "judge",
+    "library",
+    "load_scenario",
+    "run",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,18 +1,22 @@
 """Safety campaign: random and mutated frames against controller and plant, by the million, in simulated time.
 
-An episode starts with a controller that has just been switched on, or that runs on good frames; then comes the attack, then good frames for
-`RECOVERY` ticks. Frames come one in 10 ms, one a tick, several a tick, or in bursts with silence between. Kinds of frames, mixed anew for
-each episode::
+An episode starts with a controller that has just been switched on, or that runs on good frames; then comes the attack,
+then good frames for `RECOVERY` ticks. Frames come one in 10 ms, one a tick, several a tick, or in bursts with silence
+between. Kinds of frames, mixed anew for each episode::
 
-    noise      any identifier, kind, length and bytes            wrong kind    a good frame as extended, remote, CAN FD or error frame
+    noise      any identifier, kind, length and bytes            wrong kind    a good frame as extended, remote, CAN FD
+               or error frame
     payload    ECU_DEMAND with random bytes                      replay        a frame of before, once more
-    insane     right CRC and counter, values from anywhere       foreign       the controller's own frames, from somebody else
-    mutated    a good frame with 1 to 8 bits turned              good          demands anywhere in 0..120 %, RUN or standby
+    insane     right CRC and counter, values from anywhere       foreign       the controller's own frames, from
+               somebody else
+    mutated    a good frame with 1 to 8 bits turned              good          demands anywhere in 0..120 %, RUN or
+               standby
     length     a good frame cut or with another length           counter       a right CRC and any counter
 
-What must hold, in every tick: current and stroke demand within their limits, state finite, mode transitions only those of
-docs/controller.md, frames sent that carry a right CRC; and RUN without faults before the good frames end. What does not hold is
-shrunk to the fewest frames that still show it, and written as a candump log that `vaneloop fuzz --replay` runs again.
+What must hold, in every tick: current and stroke demand within their limits, state finite, mode transitions only those
+of docs/controller.md, frames sent that carry a right CRC; and RUN without faults before the good frames end. What does
+not hold is shrunk to the fewest frames that still show it, and written as a candump log that `vaneloop fuzz --replay`
+runs again.
 """
 
 from __future__ import annotations
@@ -40,7 +44,19 @@ from controller.firmware import (
     STROKE_MIN,
     X_DEM,
 )
-from hil.bus.frames import ECU_DEMAND, ERROR, EXTENDED, FD, IDENT_MASK, NAMES, REMOTE, crc, from_message, to_message, word0
+from hil.bus.frames import (
+    ECU_DEMAND,
+    ERROR,
+    EXTENDED,
+    FD,
+    IDENT_MASK,
+    NAMES,
+    REMOTE,
+    crc,
+    from_message,
+    to_message,
+    word0,
+)
 from hil.logs.canlog import e2e_crc
 from hil.loop.node import MOST_SENT, Node, node_tick
 from plant.compiled import in_place
@@ -49,11 +65,13 @@ from vaneloop.base.errors import InputError
 __all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack"]
 
 WARM = 600  # ticks of good frames before an attack on a running controller
-RECOVERY = 2_500  # ticks of good frames after it; docs/controller.md promises RUN within 2 s, silence and a full bucket cost up to 0.2 s
+# ticks of good frames after it; docs/controller.md promises RUN within 2 s, silence and a full bucket cost up to 0.2 s
+RECOVERY = 2_500
 NOISE_ROWS = 1_000
 TRANSITIONS = np.zeros((5, 5), np.bool_)
 for _a, _b in (
-    (INIT, STANDBY), (INIT, FAIL_SAFE), (STANDBY, RUN), (STANDBY, FAIL_SAFE), (RUN, FAIL_SAFE), (DEGRADED, FAIL_SAFE), (RUN, DEGRADED),
+    (INIT, STANDBY), (INIT, FAIL_SAFE), (STANDBY, RUN), (STANDBY, FAIL_SAFE), (RUN, FAIL_SAFE), (DEGRADED, FAIL_SAFE),
+    (RUN, DEGRADED),
     (RUN, STANDBY), (DEGRADED, RUN), (FAIL_SAFE, RUN), (FAIL_SAFE, STANDBY),
 ):  # fmt: skip
     TRANSITIONS[_a, _b] = True
@@ -74,7 +92,8 @@ KINDS = ("noise", "payload", "insane", "mutated", "length", "wrong kind", "repla
 
 @in_place
 def _watched_ticks(k0, k_end, attack_end, at, received, noise, a, sent, limits, seen, ticks_in):
-    """Run ticks ``k0``..``k_end`` on the frames and watch; return what failed, the tick, and how long RUN took after ``attack_end``.
+    """Run ticks ``k0``..``k_end`` on the frames and watch; return what failed, the tick, and how long RUN took after
+    ``attack_end``.
 
     limits    float64[3]: current (A), stroke (m) from, to
     seen      int64[5, 5] counts mode transitions; ticks_in int64[5] ticks in each mode
@@ -116,7 +135,8 @@ def _watched_ticks(k0, k_end, attack_end, at, received, noise, a, sent, limits, 
 
 @dataclass(frozen=True)
 class Attack:
-    """Frames of one episode: ``at`` int64[n] ticks, ``rows`` int64[n, 2]; it ends, and good frames follow, at tick ``end``.
+    """Frames of one episode: ``at`` int64[n] ticks, ``rows`` int64[n, 2]; it ends, and good frames follow, at tick
+    ``end``.
 
     counter  of the first good frame after it
     warm     the controller runs on good frames for `WARM` ticks before
@@ -164,7 +184,7 @@ class Campaign:
     failure: Failure | None = None
 
 
-# ---- attacks ------------------------------------------------------------------------------------------------------------------------
+# ---- attacks ---------------------------------------------------------------------------------------------------------
 
 
 def good_frames(counter: int, n: int, n_dem: Any = 60.0, request: Any = 1) -> np.ndarray:
@@ -217,9 +237,9 @@ def make_attack(rng: np.random.Generator, most: int = 10_000) -> tuple[Attack, n
         value = np.clip(value, 0, 60000)
     request = (rng.random(n) < rng.choice([0.95, 0.5, 0.02], p=[0.8, 0.1, 0.1])).astype(np.int64)
     insane = kind == 2
-    value[insane] = np.where(rng.random((n, 2)) < 0.5, _INSANE[rng.integers(0, len(_INSANE), (n, 2))], rng.integers(0, 65536, (n, 2)))[
-        insane
-    ]
+    value[insane] = np.where(
+        rng.random((n, 2)) < 0.5, _INSANE[rng.integers(0, len(_INSANE), (n, 2))], rng.integers(0, 65536, (n, 2))
+    )[insane]
     request[insane] = rng.integers(0, 4, n)[insane]
     counter = np.where(kind == 9, rng.integers(0, 16, n), counter)
     rows = _demand_frames(counter, value[:, 0], value[:, 1], request)
@@ -273,7 +293,7 @@ def make_attack(rng: np.random.Generator, most: int = 10_000) -> tuple[Attack, n
     return Attack(at, rows, end, int(rng.integers(15)), warm), kind
 
 
-# ---- running ------------------------------------------------------------------------------------------------------------------------
+# ---- running ---------------------------------------------------------------------------------------------------------
 
 
 class Bench:
@@ -300,7 +320,9 @@ class Bench:
 
     def _watch(self, k0: int, k_end: int, attack_end: int, at: np.ndarray, rows: np.ndarray) -> tuple[int, int, int]:
         a = self.node.arrays
-        return _watched_ticks(k0, k_end, attack_end, at, rows, self.noise, a, self._sent, self.limits, self.transitions, self.ticks_in)
+        return _watched_ticks(
+            k0, k_end, attack_end, at, rows, self.noise, a, self._sent, self.limits, self.transitions, self.ticks_in
+        )
 
     def run(self, attack: Attack) -> tuple[int, int, int]:
         """Run one episode; return what failed (`CLAIMS`), the tick, and the ticks that recovery took."""
@@ -312,7 +334,9 @@ class Bench:
         return self._watch(WARM if attack.warm else 0, end, attack.end, at, rows)
 
     def shrink(self, attack: Attack, failed: int, most: int = 3000) -> Attack:
-        """Return the fewest frames found that still fail in the same way: halves, quarters, ... are left out as long as that goes."""
+        """Return the fewest frames found that still fail in the same way: halves, quarters, ... are left out as long as
+        that goes.
+        """
         keep = np.arange(len(attack.at))
         runs = 0
 
@@ -380,7 +404,7 @@ def run_attack(attack: Attack, limits: np.ndarray | None = None, recovery: int =
     return CLAIMS[failed], tick, took * 1e-3
 
 
-# ---- logs ---------------------------------------------------------------------------------------------------------------------------
+# ---- logs ------------------------------------------------------------------------------------------------------------
 
 
 def write_attack(path: str | Path, attack: Attack) -> None:
@@ -389,7 +413,11 @@ def write_attack(path: str | Path, attack: Attack) -> None:
 
     warm = good_frames(0, WARM // 10) if attack.warm else np.empty((0, 2), np.int64)
     after = good_frames(attack.counter, RECOVERY // 10)
-    parts = [(np.arange(len(warm)) * 10, warm), (attack.at, attack.rows), (attack.end + 10 * np.arange(len(after)), after)]
+    parts = [
+        (np.arange(len(warm)) * 10, warm),
+        (attack.at, attack.rows),
+        (attack.end + 10 * np.arange(len(after)), after),
+    ]
     with can.CanutilsLogWriter(path) as log:
         count: dict[int, int] = {}
         for at, rows in parts:
@@ -399,7 +427,9 @@ def write_attack(path: str | Path, attack: Attack) -> None:
 
 
 def read_attack(path: str | Path) -> Attack:
-    """Read a log that `write_attack` wrote, or any candump log, as an attack on a controller that has just been switched on."""
+    """Read a log that `write_attack` wrote, or any candump log, as an attack on a controller that has just been
+    switched on.
+    """
     import can
 
     try:
@@ -416,11 +446,4 @@ def read_attack(path: str | Path) -> Attack:
     return Attack(at[order], rows[order], int(at.max()) + 10, 0, False)
 
 
-# ---- command line -------------------------------------------------------------------------------------------------------------------
-
-
-
-
-
-
-
+# ---- command line ----------------------------------------------------------------------------------------------------

@@ -1,13 +1,16 @@
-"""Bad days on the bus, on purpose: run a scenario of frame and fault injection and say whether the controller reacted as it must.
+"""Bad days on the bus, on purpose: run a scenario of frame and fault injection and say whether the controller reacted
+as it must.
 
-On ``lockstep`` (default) controller, ECU and bus run in simulated time: every action is possible and the same scenario gives the same run,
-bit for bit. On another bus (``local``, ``vcan0``) a controller and an ECU are running already and we are one more station on it, so only
-what an outsider can do is done, and only what the controller's frames show is judged.
+On ``lockstep`` (default) controller, ECU and bus run in simulated time: every action is possible and the same scenario
+gives the same run, bit for bit. On another bus (``local``, ``vcan0``) a controller and an ECU are running already and
+we are one more station on it, so only what an outsider can do is done, and only what the controller's frames show is
+judged.
 
 ::
 
     from hil import inject
-    outcome = inject.run("demand_stops")                       # a shipped scenario, a TOML file, or a Scenario made in Python
+    outcome = inject.run("demand_stops")                       # a shipped scenario, a TOML file, or a Scenario made in
+                                                               Python
     assert outcome.held, outcome.text()
 
 The schema of scenarios is `hil.inject.scenario`; its names are here, too.
@@ -62,24 +65,33 @@ if TYPE_CHECKING:
     from plant import Plant
 
 __all__ = [
-    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood",
-    "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library", "load_scenario",
+    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames",
+    "Expect", "Flood",
+    "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library",
+    "load_scenario",
     "run",
 ]  # fmt: skip
 
 TICK = 1e-3  # s
 SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES", "VGV_HEALTH")}
 
-# ---- lockstep: controller, ECU and bus in simulated time ----------------------------------------------------------------------------
+# ---- lockstep: controller, ECU and bus in simulated time -------------------------------------------------------------
 
 
 class MachineChange:
-    """What a `Machine` action does to the machine, undone at its end: the controller's plant and calibration, the ECU's engine."""
+    """What a `Machine` action does to the machine, undone at its end: the controller's plant and calibration, the ECU's
+    engine.
+    """
 
     def __init__(self, action: Machine, node: Node, ecu: Ecu):
         from plant.effects import EFFECTS, ROW
 
-        self.arrays, self.engine, self.first, self.end = node.arrays, ecu.arrays, tick_of(action.start), tick_of(action.end)
+        self.arrays, self.engine, self.first, self.end = (
+            node.arrays,
+            ecu.arrays,
+            tick_of(action.start),
+            tick_of(action.end),
+        )
         self.new: dict[int, float] = {}
         if action.effect is not None:
             for i, q in enumerate(EFFECTS[action.effect].parameters):
@@ -93,7 +105,10 @@ class MachineChange:
     def tick(self, k: int) -> None:
         """Change the machine at the first tick, and back at the end."""
         if k == self.first:
-            self.old = {r: float(self.arrays.p[r, 0]) for r in self.new}, {i: float(self.arrays.supply[i]) for i in self.supply}
+            self.old = (
+                {r: float(self.arrays.p[r, 0]) for r in self.new},
+                {i: float(self.arrays.supply[i]) for i in self.supply},
+            )
             self._set(self.new, self.supply)
         elif k == self.end:
             self._set(*self.old)
@@ -143,14 +158,33 @@ class Disturber:
 
 def sender_of(action: Action) -> str:
     """Return the node whose frames the action works on."""
-    return next(who for who, names in SENDER.items() if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names)
+    return next(
+        who
+        for who, names in SENDER.items()
+        if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names
+    )
 
 
 def _lockstep(
-    name: str, scenario: Scenario, plant: Plant | None, calibration: Calibration | None, progress: Callable[[float], None] | None
+    name: str,
+    scenario: Scenario,
+    plant: Plant | None,
+    calibration: Calibration | None,
+    progress: Callable[[float], None] | None,
 ) -> Outcome:
     """Run a scenario in simulated time."""
-    from controller.firmware import CURRENT_LIMIT, FAULT_BITS, I_CMD, MODE, N_DEM, N_R_RAW, STROKE_MAX, STROKE_MIN, X_DEM, X_MEAS
+    from controller.firmware import (
+        CURRENT_LIMIT,
+        FAULT_BITS,
+        I_CMD,
+        MODE,
+        N_DEM,
+        N_R_RAW,
+        STROKE_MAX,
+        STROKE_MIN,
+        X_DEM,
+        X_MEAS,
+    )
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
     from hil.loop.node import Ecu, Node
@@ -163,7 +197,10 @@ def _lockstep(
     ticks = round(scenario.duration * 1000.0)
     of = {kind: [a for a in scenario.inject if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
     chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
-    gateways = [Gateway([a for a in of[OnFrame] if sender_of(a) == who], c) for who, c in zip(("ECU", "VGV"), chance, strict=False)]
+    gateways = [
+        Gateway([a for a in of[OnFrame] if sender_of(a) == who], c)
+        for who, c in zip(("ECU", "VGV"), chance, strict=False)
+    ]
     recorded: list[tuple[int, int, int]] = []
     keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
     intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
@@ -191,7 +228,16 @@ def _lockstep(
         from_ecu = ecu.tick(rows, take(wire, places["ECU"], rows)).tolist()
         from_vgv = node.tick(rows, take(wire, places["VGV"], rows)).tolist()
         mode[k], faults[k] = z[MODE], z[FAULT_BITS]
-        values[k] = z[X_DEM], z[X_MEAS], z[I_CMD], z[N_DEM], z[N_R_RAW], s[chain.POT, 0], s[chain.POT + 1, 0], s[chain.POT + 2, 0]
+        values[k] = (
+            z[X_DEM],
+            z[X_MEAS],
+            z[I_CMD],
+            z[N_DEM],
+            z[N_R_RAW],
+            s[chain.POT, 0],
+            s[chain.POT + 1, 0],
+            s[chain.POT + 2, 0],
+        )
         counts[k, :8] = a.receiver[:8]
         counts[k, 8] = frames.refused(a.receiver)
         if k % 10 == 0:
@@ -214,17 +260,32 @@ def _lockstep(
         np.arange(ticks) * TICK,
         mode,
         faults,
-        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2"), (values * to_border).T, strict=True)),
+        dict(
+            zip(
+                ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2"),
+                (values * to_border).T,
+                strict=True,
+            )
+        ),
         dict(zip(COUNTS, counts.T, strict=True)),
         dict(zip(SENDER["VGV"], late.T, strict=True)),
         (float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
         float(cal[CURRENT_LIMIT]) * 1e3,
     )
     wall = time.perf_counter() - started
-    return outcome_of(name, scenario, "lockstep", trace, notes=[], simulated_s=ticks * TICK, wall_s=wall, state_hash=node.fingerprint())
+    return outcome_of(
+        name,
+        scenario,
+        "lockstep",
+        trace,
+        notes=[],
+        simulated_s=ticks * TICK,
+        wall_s=wall,
+        state_hash=node.fingerprint(),
+    )
 
 
-# ---- another bus: one station among others, in real time ----------------------------------------------------------------------------
+# ---- another bus: one station among others, in real time -------------------------------------------------------------
 
 
 class _Witness:
@@ -233,7 +294,10 @@ class _Witness:
     NAMES = ("x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2")
 
     def __init__(self) -> None:
-        self.receivers = {i: frames.new_receiver(i) for i in (frames.VGV_STATUS, frames.VGV_SERVO, frames.VGV_ANGLES, frames.VGV_HEALTH)}
+        self.receivers = {
+            i: frames.new_receiver(i)
+            for i in (frames.VGV_STATUS, frames.VGV_SERVO, frames.VGV_ANGLES, frames.VGV_HEALTH)
+        }
         self.now: dict[str, float] = {}
         self.rows: list[tuple[float, ...]] = []
 
@@ -325,10 +389,12 @@ def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float],
     if not len(trace.t):
         raise InputError(f"{bus}: the controller was not heard again after {begin:.1f} s")
     wall = time.perf_counter() - started
-    return outcome_of(name, scenario, bus, trace, notes=notes, simulated_s=scenario.duration, wall_s=wall, state_hash=None)
+    return outcome_of(
+        name, scenario, bus, trace, notes=notes, simulated_s=scenario.duration, wall_s=wall, state_hash=None
+    )
 
 
-# ---- commands -----------------------------------------------------------------------------------------------------------------------
+# ---- commands --------------------------------------------------------------------------------------------------------
 
 
 def run(

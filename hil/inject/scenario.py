@@ -1,7 +1,8 @@
-"""What a scenario of frame and fault injection is: what is done to the bus and the machine, when, and what must then be seen.
+"""What a scenario of frame and fault injection is: what is done to the bus and the machine, when, and what must then be
+seen.
 
-A scenario is a TOML file or the same as Python objects (`Scenario`, the actions, `Expect`). Times are seconds from power-on of controller
-and ECU. Nothing here runs anything: `hil.inject` does.
+A scenario is a TOML file or the same as Python objects (`Scenario`, the actions, `Expect`). Times are seconds from
+power-on of controller and ECU. Nothing here runs anything: `hil.inject` does.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Table, read
 
 __all__ = [
-    "ACTIONS", "COUNTS", "SIGNALS", "Action", "Babble", "BusOff", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames", "Expect", "Flood",
-    "Freeze", "Machine", "OnBus", "OnFrame", "Outsider", "Override", "Reorder", "Replay", "Scenario", "Send", "identifier", "library",
+    "ACTIONS", "COUNTS", "SIGNALS", "Action", "Babble", "BusOff", "Corrupt", "Delay", "Drop", "Duplicate",
+    "ErrorFrames", "Expect", "Flood",
+    "Freeze", "Machine", "OnBus", "OnFrame", "Outsider", "Override", "Reorder", "Replay", "Scenario", "Send",
+    "identifier", "library",
     "load_scenario", "raw_signal",
 ]  # fmt: skip
 
@@ -30,7 +33,8 @@ Seconds = Annotated[Number, Field(ge=0.0)]
 Positive = Annotated[Number, Field(gt=0.0)]
 Share = Annotated[Number, Field(gt=0.0, le=1.0)]
 IDENTIFIERS = {"ECU_DEMAND": 0x0A0, "VGV_STATUS": 0x0B0, "VGV_SERVO": 0x0B1, "VGV_ANGLES": 0x0B2, "VGV_HEALTH": 0x0B3}
-# what an expectation can be about, besides mode and faults: signals of the controller in border units, and what its receiver counts
+# what an expectation can be about, besides mode and faults: signals of the controller in border units, and what its
+# receiver counts
 SIGNALS = ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2")
 COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "refused")
 
@@ -45,7 +49,9 @@ def layouts() -> dict[str, Any]:
 
 
 def identifier(frame: Frame, extended: bool = False) -> int:
-    """Return the identifier of a frame given by name or number; refuses other names, and numbers beyond 11 (extended: 29) bits."""
+    """Return the identifier of a frame given by name or number; refuses other names, and numbers beyond 11 (extended:
+    29) bits.
+    """
     if isinstance(frame, str) and frame in IDENTIFIERS:
         return IDENTIFIERS[frame]
     try:
@@ -54,32 +60,40 @@ def identifier(frame: Frame, extended: bool = False) -> int:
         ident = -1
     last = 0x1FFFFFFF if extended else 0x7FF
     if not 0 <= ident <= last:
-        raise ValueError(f"frame (={frame!r}) must be one of {', '.join(IDENTIFIERS)}, or an identifier from 0 to 0x{last:X}")
+        raise ValueError(
+            f"frame (={frame!r}) must be one of {', '.join(IDENTIFIERS)}, or an identifier from 0 to 0x{last:X}"
+        )
     return ident
 
 
 def raw_signal(frame: Frame, name: str, value: float) -> tuple[int, int]:
-    """Return the bits of a signal's physical value and their mask, both within the frame's eight bytes (first byte lowest)."""
+    """Return the bits of a signal's physical value and their mask, both within the frame's eight bytes (first byte
+    lowest).
+    """
     message = next((m for m in layouts().values() if m.ident == identifier(frame)), None)
     if message is None:
         raise ValueError(f"frame (={frame!r}) has no signals in vgv.dbc; frames with signals: {', '.join(IDENTIFIERS)}")
     signal = next((s for s in message.layout.signals if s.name == name), None)
     if signal is None:
         raise ValueError(
-            f"signal (={name!r}) is not in {message.layout.name}; allowed: {', '.join(s.name for s in message.layout.signals)}"
+            f"signal (={name!r}) is not in {message.layout.name}; allowed: "
+            f"{', '.join(s.name for s in message.layout.signals)}"
         )
-    low, high = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
+    low, high = (
+        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
+    )
     raw = round((value - float(signal.offset)) / float(signal.scale))
     if not low <= raw <= high:
         a, b = (r * float(signal.scale) + float(signal.offset) for r in (low, high))
         raise ValueError(
-            f"{name} (={value:g}) does not fit its bits in {message.layout.name}; allowed: {a:g} to {b:g} {signal.unit or ''}".rstrip()
+            f"{name} (={value:g}) does not fit its bits in {message.layout.name}; allowed: {a:g} to {b:g} "
+            f"{signal.unit or ''}".rstrip()
         )
     mask = ((1 << signal.length) - 1) << signal.start
     return (raw << signal.start) & mask, mask
 
 
-# ---- actions ------------------------------------------------------------------------------------------------------------------------
+# ---- actions ---------------------------------------------------------------------------------------------------------
 
 
 class Action(Table):
@@ -145,7 +159,9 @@ class Reorder(OnFrame):
 
 
 class Corrupt(OnFrame):
-    """``bits`` random bits of the data are inverted, or those in ``at`` (0..63); or the frame is cut to ``length`` bytes."""
+    """``bits`` random bits of the data are inverted, or those in ``at`` (0..63); or the frame is cut to ``length``
+    bytes.
+    """
 
     action: Literal["corrupt"] = "corrupt"
     bits: Annotated[int, Field(ge=0, le=64)] = 1
@@ -154,7 +170,9 @@ class Corrupt(OnFrame):
 
 
 class Freeze(OnFrame):
-    """A signal keeps the value that it has at ``start``, while CRC and counter stay right (``e2e = "keep"``: the CRC stays as it was)."""
+    """A signal keeps the value that it has at ``start``, while CRC and counter stay right (``e2e = "keep"``: the CRC
+    stays as it was).
+    """
 
     action: Literal["freeze"] = "freeze"
     signal: str
@@ -228,7 +246,9 @@ class Send(Outsider):
 
 
 class Flood(Outsider):
-    """Frames of one identifier, or random ones from ``frame`` to ``last``, random data, ``rate`` a second (default: all the bus takes)."""
+    """Frames of one identifier, or random ones from ``frame`` to ``last``, random data, ``rate`` a second (default: all
+    the bus takes).
+    """
 
     action: Literal["flood"] = "flood"
     frame: Frame = 0x7FF
@@ -269,7 +289,9 @@ class Replay(Outsider):
         if (self.log is None) == (self.begin is None):
             raise ValueError("replay takes either log (a file) or begin (s, of this run), and not both")
         if self.begin is not None and self.begin + self.length > self.start:
-            raise ValueError(f"begin + length (={self.begin + self.length:g} s) must not be after start (={self.start:g} s)")
+            raise ValueError(
+                f"begin + length (={self.begin + self.length:g} s) must not be after start (={self.start:g} s)"
+            )
         if self.frame is not None:
             identifier(self.frame)
         return self
@@ -280,21 +302,27 @@ class OnBus(Action):
 
 
 class ErrorFrames(OnBus):
-    """Frames on the wire are destroyed by error frames, each with ``probability``; the senders try again, as CAN does."""
+    """Frames on the wire are destroyed by error frames, each with ``probability``; the senders try again, as
+    CAN does.
+    """
 
     action: Literal["error_frames"] = "error_frames"
     probability: Share = 1.0
 
 
 class BusOff(OnBus):
-    """A node is in bus-off at ``start``, neither sends nor hears, and recovers when the standard allows it, or after ``duration``."""
+    """A node is in bus-off at ``start``, neither sends nor hears, and recovers when the standard allows it, or after
+    ``duration``.
+    """
 
     action: Literal["bus_off"] = "bus_off"
     node: Literal["ECU", "VGV"] = "ECU"
 
 
 class Machine(Action):
-    """The machine itself: supply pressure ``p_s`` (MPa), oil temperature ``t_oil`` (degC), an ``effect`` and its ``parameters``."""
+    """The machine itself: supply pressure ``p_s`` (MPa), oil temperature ``t_oil`` (degC), an ``effect`` and its
+    ``parameters``.
+    """
 
     action: Literal["machine"] = "machine"
     p_s: Annotated[Number, Field(ge=0.0, le=40.0)] | None = None
@@ -325,15 +353,43 @@ class Machine(Action):
 
 
 AnyAction = Annotated[
-    Drop | Delay | Duplicate | Reorder | Corrupt | Freeze | Override | Send | Flood | Babble | Replay | ErrorFrames | BusOff | Machine,
+    Drop
+    | Delay
+    | Duplicate
+    | Reorder
+    | Corrupt
+    | Freeze
+    | Override
+    | Send
+    | Flood
+    | Babble
+    | Replay
+    | ErrorFrames
+    | BusOff
+    | Machine,
     Field(discriminator="action"),
 ]
 ACTIONS: dict[str, type[Action]] = {
     str(c.model_fields["action"].default): c
-    for c in (Drop, Delay, Duplicate, Reorder, Corrupt, Freeze, Override, Send, Flood, Babble, Replay, ErrorFrames, BusOff, Machine)
+    for c in (
+        Drop,
+        Delay,
+        Duplicate,
+        Reorder,
+        Corrupt,
+        Freeze,
+        Override,
+        Send,
+        Flood,
+        Babble,
+        Replay,
+        ErrorFrames,
+        BusOff,
+        Machine,
+    )
 }
 
-# ---- expectations -------------------------------------------------------------------------------------------------------------------
+# ---- expectations ----------------------------------------------------------------------------------------------------
 
 
 class Expect(Table):
@@ -385,7 +441,9 @@ class Expect(Table):
         }
         given = [k for k in kinds if getattr(self, k) is not None]
         if len(given) != 1:
-            raise ValueError(f"an expectation is about exactly one of {', '.join(kinds)}; here: {', '.join(given) or 'none'}")
+            raise ValueError(
+                f"an expectation is about exactly one of {', '.join(kinds)}; here: {', '.join(given) or 'none'}"
+            )
         kind, value = given[0], getattr(self, given[0])
         if value not in kinds[kind]:
             raise ValueError(f"{kind} (={value!r}) must be one of {', '.join(kinds[kind])}")
@@ -397,7 +455,9 @@ class Expect(Table):
         times = [k for k in ("at", "by") if getattr(self, k) is not None]
         times += ["never"] if self.never else ["during"] if self.during is not None else []
         if len(times) != 1:
-            raise ValueError(f"an expectation has exactly one of at, by, during, never; here: {', '.join(times) or 'none'}")
+            raise ValueError(
+                f"an expectation has exactly one of at, by, during, never; here: {', '.join(times) or 'none'}"
+            )
         if self.during is not None and not self.during[0] < self.during[1]:
             raise ValueError(f"during (={self.during}) must be a time and a later one")
         if self.by is not None and not self.after < self.by:
@@ -431,7 +491,7 @@ class Expect(Table):
         return max(self.at or 0.0, self.by or 0.0, self.during[1] if self.during else 0.0)
 
 
-# ---- scenario -----------------------------------------------------------------------------------------------------------------------
+# ---- scenario --------------------------------------------------------------------------------------------------------
 
 
 class Scenario(Table):
@@ -450,7 +510,9 @@ class Scenario(Table):
     why: str = ""
     duration: Annotated[Number, Field(gt=0.0, le=3600.0)]
     seed: Annotated[int, Field(ge=0)] = 1
-    demand: Annotated[list[Annotated[list[Number], Field(min_length=2, max_length=2)]], Field(min_length=1)] = [[0.0, 80.0]]
+    demand: Annotated[list[Annotated[list[Number], Field(min_length=2, max_length=2)]], Field(min_length=1)] = [
+        [0.0, 80.0]
+    ]
     inject: list[AnyAction] = []
     expect: list[Expect] = []
 
@@ -464,7 +526,9 @@ class Scenario(Table):
                 raise ValueError(f"demand: {n:g} % must be in [0, 125]")
         for i, action in enumerate(self.inject):
             if action.start >= self.duration:
-                raise ValueError(f"inject.{i}.start (={action.start:g} s) must be before the end (duration = {self.duration:g} s)")
+                raise ValueError(
+                    f"inject.{i}.start (={action.start:g} s) must be before the end (duration = {self.duration:g} s)"
+                )
         for i, claim in enumerate(self.expect):
             if claim.latest > self.duration:
                 raise ValueError(f"expect.{i} speaks of {claim.latest:g} s; the scenario ends at {self.duration:g} s")
@@ -494,7 +558,9 @@ def load_scenario(source: str | Path) -> Scenario:
     made = read(Path(source), Scenario)
     folder = Path(source).parent
     beside = [
-        a.model_copy(update={"log": str(folder / a.log)}) if isinstance(a, Replay) and a.log and (folder / a.log).is_file() else a
+        a.model_copy(update={"log": str(folder / a.log)})
+        if isinstance(a, Replay) and a.log and (folder / a.log).is_file()
+        else a
         for a in made.inject
     ]
     return made.model_copy(update={"inject": beside})

@@ -3,7 +3,8 @@
 Installed with VaneLoop; nothing has to be imported or configured::
 
     def test_a_short_silence_is_ridden_through(sil):
-        outcome = sil("demand_gap_200ms")        # a shipped scenario or a TOML file; a broken claim fails the test, with all claims shown
+        outcome = sil("demand_gap_200ms")        # a shipped scenario or a TOML file; a broken claim fails the test,
+                                                 with all claims shown
         assert "demand_rejected" not in outcome.faults_seen()
 
     def test_my_own_bad_day(sil):
@@ -26,7 +27,9 @@ __all__ = ["Sil", "sil"]
 
 
 class Sil:
-    """Software in the loop: controller, plant, ECU and bus in simulated time. The actions of `hil.inject` are attributes (``sil.Drop``)."""
+    """Software in the loop: controller, plant, ECU and bus in simulated time. The actions of `hil.inject` are
+    attributes (``sil.Drop``).
+    """
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -38,11 +41,13 @@ class Sil:
         if name in ("Expect", "Scenario", *(c.__name__ for c in inject.ACTIONS.values())):
             return getattr(inject, name)
         raise AttributeError(
-            f"sil.{name} is not known; allowed: run, Expect, Scenario, {', '.join(c.__name__ for c in inject.ACTIONS.values())}"
+            f"sil.{name} is not known; allowed: run, Expect, Scenario, "
+            f"{', '.join(c.__name__ for c in inject.ACTIONS.values())}"
         )
 
     def __call__(self, scenario: Scenario | str | Path, **changes: Any) -> Outcome:
-        """Run a scenario; the test fails where a claim of it is broken, or what is always demanded (safe limits, documented mode changes).
+        """Run a scenario; the test fails where a claim of it is broken, or what is always demanded (safe limits,
+        documented mode changes).
 
         scenario  the name of a shipped one, a TOML file (also relative to the test's folder), or a `Scenario`
         changes   keys of the scenario to replace, for example ``seed=7``
@@ -64,14 +69,22 @@ class Sil:
         return outcome
 
     def run(self, *actions: AnyAction, duration: float, expect: list[Expect] | None = None, **keys: Any) -> Outcome:
-        """Run actions as a scenario of ``duration`` s; ``keys`` are others of `Scenario` (``demand``, ``seed``). Fails as a call does."""
+        """Run actions as a scenario of ``duration`` s; ``keys`` are others of `Scenario` (``demand``, ``seed``). Fails
+        as a call does.
+        """
         __tracebackhide__ = True
         from hil.inject import injection as inject
 
-        return self(inject.Scenario(title="scenario of a test", inject=list(actions), expect=expect or [], duration=duration, **keys))
+        return self(
+            inject.Scenario(
+                title="scenario of a test", inject=list(actions), expect=expect or [], duration=duration, **keys
+            )
+        )
 
 
 @pytest.fixture
 def sil(request: pytest.FixtureRequest) -> Sil:
-    """Software in the loop: run a scenario of frame and fault injection and fail where the controller did not react as it must."""
+    """Software in the loop: run a scenario of frame and fault injection and fail where the controller did not react as
+    it must.
+    """
     return Sil(request.path.parent)

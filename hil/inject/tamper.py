@@ -1,4 +1,5 @@
-"""What injection does to frames: a gateway between node and bus that drops, delays or changes them, and a third station that sends.
+"""What injection does to frames: a gateway between node and bus that drops, delays or changes them, and a third station
+that sends.
 
 Both work tick by tick (1 ms) on frames as `hil.bus.frames` has them, for any bus.
 """
@@ -34,7 +35,7 @@ from vaneloop.base.errors import InputError
 
 __all__ = ["Gateway", "Intruder", "tick_of"]
 
-# ---- frames on their way from the sender to the bus ---------------------------------------------------------------------------------
+# ---- frames on their way from the sender to the bus ------------------------------------------------------------------
 
 Words = tuple[int, int]  # a frame, see `hil.bus.frames`
 FULL = (1 << 64) - 1
@@ -147,7 +148,7 @@ def _protected(ident: int, data: int, e2e: str) -> int:
     return data if e2e == "keep" else int(frames.protect(ident, _signed(data), (data >> 8) & 15))
 
 
-# ---- what a third station sends -----------------------------------------------------------------------------------------------------
+# ---- what a third station sends --------------------------------------------------------------------------------------
 
 AHEAD = 12  # frames that a flood without a rate keeps waiting: the bus takes at most 11 a millisecond
 
@@ -178,7 +179,9 @@ class Intruder:
                 return [self._frame(action)]
             case Flood() as action:
                 low = identifier(action.frame)
-                return self._burst(low, identifier(action.last) if action.last is not None else low, action.rate, since, waiting)
+                return self._burst(
+                    low, identifier(action.last) if action.last is not None else low, action.rate, since, waiting
+                )
             case Babble():
                 return self._burst(0, 0, None, since, waiting)
             case Replay() as action:
@@ -209,7 +212,9 @@ class Intruder:
             if action.protection != "wrong_counter":
                 self.counter = (self.counter + 1) % 15
         length = length if action.length is None else action.length
-        head = ident | length << 32 | (frames.EXTENDED if action.extended else 0) | (frames.REMOTE if action.remote else 0)
+        head = (
+            ident | length << 32 | (frames.EXTENDED if action.extended else 0) | (frames.REMOTE if action.remote else 0)
+        )
         return head, 0 if action.remote else _signed(data & ((1 << 8 * length) - 1))
 
     def _burst(self, low: int, high: int, rate: float | None, since: int, waiting: int) -> list[Words]:
@@ -237,5 +242,7 @@ def _old_frames(action: Replay) -> tuple[dict[int, list[Words]], int]:
             word = int.from_bytes(data.tobytes().ljust(8, b"\0"), "little", signed=True)
             out.setdefault(t, []).append((ident | length << 32, word))
     if not out:
-        raise InputError(f"{action.log}: holds no frame to replay{'' if action.frame is None else f' of {action.frame}'}")
+        raise InputError(
+            f"{action.log}: holds no frame to replay{'' if action.frame is None else f' of {action.frame}'}"
+        )
     return out, ms[-1] + 10

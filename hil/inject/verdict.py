@@ -1,6 +1,7 @@
 """The verdict on a scenario: what was seen, held against what must be seen.
 
-Every claim of the scenario is judged; besides them, safe limits of stroke demand and current, and the documented mode changes, always.
+Every claim of the scenario is judged; besides them, safe limits of stroke demand and current, and the documented mode
+changes, always.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ __all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "judge", "outcome_of"]
 
 # docs/controller.md, "Modes": these and no others
 TRANSITIONS = frozenset({
-    ("INIT", "STANDBY"), ("INIT", "FAIL_SAFE"), ("STANDBY", "RUN"), ("STANDBY", "FAIL_SAFE"), ("RUN", "STANDBY"), ("RUN", "DEGRADED"),
-    ("RUN", "FAIL_SAFE"), ("DEGRADED", "RUN"), ("DEGRADED", "FAIL_SAFE"), ("FAIL_SAFE", "RUN"), ("FAIL_SAFE", "STANDBY"),
+    ("INIT", "STANDBY"), ("INIT", "FAIL_SAFE"), ("STANDBY", "RUN"), ("STANDBY", "FAIL_SAFE"), ("RUN", "STANDBY"),
+    ("RUN", "DEGRADED"),
+    ("RUN", "FAIL_SAFE"), ("DEGRADED", "RUN"), ("DEGRADED", "FAIL_SAFE"), ("FAIL_SAFE", "RUN"),
+    ("FAIL_SAFE", "STANDBY"),
 })  # fmt: skip
-SLACK = 0.05  # s: what frames every 10 ms, another clock and a busy machine may add to a time on a bus between processes
+SLACK = (
+    0.05  # s: what frames every 10 ms, another clock and a busy machine may add to a time on a bus between processes
+)
 
-# ---- what was seen ------------------------------------------------------------------------------------------------------------------
+# ---- what was seen ---------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -120,7 +125,9 @@ def _check(claim: Expect, trace: Trace, slack: float, lockstep: bool) -> Check:
 
 
 def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Check]:
-    """Hold every claim of a scenario against what was seen; then what is always demanded: safe limits and documented mode changes."""
+    """Hold every claim of a scenario against what was seen; then what is always demanded: safe limits and documented
+    mode changes.
+    """
     slack = 0.0 if lockstep else SLACK
     checks = [_check(claim, trace, slack, lockstep) for claim in scenario.expect]
     low, high = trace.stroke
@@ -133,7 +140,13 @@ def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Ch
     changes = [(MODES[a], MODES[b]) for a, b in zip(trace.mode, trace.mode[1:], strict=False) if a != b]
     if trace.exact:
         wrong = [f"{a} > {b}" for a, b in changes if (a, b) not in TRANSITIONS]
-        checks.append(Check("mode changes as documented", "not: " + ", ".join(wrong) if wrong else f"{len(changes)} changes", not wrong))
+        checks.append(
+            Check(
+                "mode changes as documented",
+                "not: " + ", ".join(wrong) if wrong else f"{len(changes)} changes",
+                not wrong,
+            )
+        )
     return checks
 
 
@@ -189,10 +202,13 @@ class Outcome:
     def json(self) -> dict[str, Any]:
         """Return the outcome as plain data."""
         return {
-            "name": self.name, "title": self.title, "held": self.held, "simulated_s": self.simulated_s, "wall_s": self.wall_s,
+            "name": self.name, "title": self.title, "held": self.held, "simulated_s": self.simulated_s,
+            "wall_s": self.wall_s,
             "state_hash": self.state_hash, "counts": self.counts, "notes": self.notes,
-            "modes": [{"t": t, "mode": m} for t, m in self.modes], "faults": [{"t": t, "fault": f} for t, f in self.faults],
-            "expectations": [{"expected": c.expected, "seen": c.seen, "held": c.held, "because": c.because} for c in self.checks],
+            "modes": [{"t": t, "mode": m} for t, m in self.modes],
+            "faults": [{"t": t, "fault": f} for t, f in self.faults],
+            "expectations": [{"expected": c.expected, "seen": c.seen, "held": c.held,
+            "because": c.because} for c in self.checks],
         }  # fmt: skip
 
 

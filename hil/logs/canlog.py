@@ -5,8 +5,8 @@ of all frames of its message at once. That is what makes an hour of CAN readable
 walk frame by frame at 0.2 to 0.3 million frames/s and serve here as the reference in the tests, as the readers of
 the formats where speed matters less (`.asc`, `.trc`), and as the source of the layout (DBC).
 
-Bit order, as in DBC: a little-endian signal starts at its least significant bit, a big-endian one at its most significant
-bit; bit k of the frame is bit k % 8 (0 = least significant) of byte k // 8.
+Bit order, as in DBC: a little-endian signal starts at its least significant bit, a big-endian one at its most
+significant bit; bit k of the frame is bit k % 8 (0 = least significant) of byte k // 8.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from hil.logs import plausible
 from vaneloop.base.errors import InputError
 
 __all__ = [
-    "DISORDER_S", "EXTENDED", "Frames", "LogError", "Message", "crc_table", "cut_signal", "e2e_crc", "encode", "load_dbc", "read_asc",
+    "DISORDER_S", "EXTENDED", "Frames", "LogError", "Message", "crc_table", "cut_signal", "e2e_crc", "encode",
+    "load_dbc", "read_asc",
     "read_blf", "read_candump", "read_trc", "select", "write_asc", "write_blf", "write_candump", "write_trc",
 ]  # fmt: skip
 
@@ -71,7 +72,9 @@ class Frames:
 
 
 def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | slice]:
-    """Times in s from the first (``t`` in s, or int64 ns) and the order that sorts them; refuse a clock that jumped back."""
+    """Times in s from the first (``t`` in s, or int64 ns) and the order that sorts them; refuse a clock that jumped
+    back.
+    """
     if t.dtype == np.int64:
         t = (t - t[:1]) / 1e9
     if not np.isfinite(t).all():
@@ -83,7 +86,9 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
     if back[worst] > DISORDER_S and (wrong := plausible.out_of_order(t, DISORDER_S)) is not None:
         first = int(np.argmax(wrong))
         what = f"{int(np.count_nonzero(wrong)):,} of {t.size:,} frames"
-        notes.append(f"time: {what} have a wrong time stamp (first frame {first + 1}: {t[first]:.9g} s from the first): left out")
+        notes.append(
+            f"time: {what} have a wrong time stamp (first frame {first + 1}: {t[first]:.9g} s from the first): left out"
+        )
         rows = np.flatnonzero(~wrong)
         return t, rows[in_order(name, t[rows], notes)[1]]
     if back[worst] > DISORDER_S:
@@ -91,12 +96,19 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
         raise LogError(f"{name}: time runs backwards by {back[worst]:.6g} s at frame {worst + 1}; {limit}")
     falls = int(np.count_nonzero(np.diff(t) < 0))
     if falls > 0.3 * t.size and t.size > 10:
-        raise LogError(f"{name}: time runs backwards at {falls} of {t.size} frames; it must count from one start (not from frame to frame)")
-    notes.append(f"{int(np.count_nonzero(back > 0))} frames out of order by up to {back[worst] * 1e3:.3g} ms: sorted by time")
+        raise LogError(
+            f"{name}: time runs backwards at {falls} of {t.size} frames; it must count from one start (not from frame "
+            f"to frame)"
+        )
+    notes.append(
+        f"{int(np.count_nonzero(back > 0))} frames out of order by up to {back[worst] * 1e3:.3g} ms: sorted by time"
+    )
     return t, np.argsort(t, kind="stable")
 
 
-def _frames(name: str, t: np.ndarray, ident: np.ndarray, bus: np.ndarray, length: np.ndarray, data: np.ndarray, notes: list[str]) -> Frames:
+def _frames(
+    name: str, t: np.ndarray, ident: np.ndarray, bus: np.ndarray, length: np.ndarray, data: np.ndarray, notes: list[str]
+) -> Frames:
     """Frames in order of time from the first."""
     t, order = in_order(name, t, notes)
     t = t[order]
@@ -128,12 +140,12 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
 
 
-# --- text formats ------------------------------------------------------------------------------------------------------------------------
+# --- text formats -----------------------------------------------------------------------------------------------------
 
-# Lines of a text log that have equal length nearly always have equal columns. So the first line of a length gives the columns (by a
-# regular expression), all lines that agree with it are parsed as one matrix, and the others take the next round. In the expressions
-# the groups s, f, n are decimal digits (s, n with the blanks that pad them), id, d, flags are hex digits (with the blanks between
-# bytes), tail is free; all else is fixed in a round.
+# Lines of a text log that have equal length nearly always have equal columns. So the first line of a length gives the
+# columns (by a regular expression), all lines that agree with it are parsed as one matrix, and the others take the next
+# round. In the expressions the groups s, f, n are decimal digits (s, n with the blanks that pad them), id, d, flags are
+# hex digits (with the blanks between bytes), tail is free; all else is fixed in a round.
 _DECIMAL, _HEX = ("s", "f", "n"), ("id", "d", "flags")
 _ROUNDS = 24  # per line length; lines left over are sorted into layouts one by one
 _BLOCK = 4096  # lines turned into columns at a time: 200 kB stay in the cache
@@ -150,7 +162,9 @@ _KIND[_NIBBLE < 16] = ord("0")
 
 @dataclass
 class _Lines:
-    """Lines of a text log that one layout fits: their places in the file, their bytes as columns, and the match of one of them."""
+    """Lines of a text log that one layout fits: their places in the file, their bytes as columns, and the match of one
+    of them.
+    """
 
     start: np.ndarray
     columns: np.ndarray
@@ -212,7 +226,9 @@ def _fit(columns: np.ndarray, m: re.Match[bytes]) -> np.ndarray:
 
 
 def _match_lines(raw: bytes, layout: re.Pattern[bytes], lead: bytes) -> Iterator[_Lines | int]:
-    """Lines that ``layout`` matches, by layout; then how many lines that begin with one of ``lead`` it does not match."""
+    """Lines that ``layout`` matches, by layout; then how many lines that begin with one of ``lead`` it does not
+    match.
+    """
     buf = np.frombuffer(raw, np.uint8)
     end = np.flatnonzero(buf == 10)
     start = np.concatenate(([0], end + 1))
@@ -278,10 +294,10 @@ def _join(path: Path, parts: list[_Part], kind: str, example: str, notes: list[s
     return _frames(str(path), ns, ident, bus, length, data[order], notes)
 
 
-# --- candump -----------------------------------------------------------------------------------------------------------------------------
+# --- candump ----------------------------------------------------------------------------------------------------------
 
-# `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f, direction behind;
-# and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
+# `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f,
+# direction behind; and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
 _CANDUMP = re.compile(
     rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<bus>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
     rb"(?P<form>##(?P<flags>[0-9A-Fa-f])|#|\s+\[\s?\d{1,2}\]\s*)(?P<remote>R[0-9A-Fa-f]?|remote request)?"
@@ -310,12 +326,22 @@ def read_candump(path: Path) -> Frames:
         if extended:
             ident |= np.uint32(EXTENDED)
         data = lines.data(8 if m["form"] == b"#" else 64)
-        parts.append((lines.start[right], lines.seconds(10**9)[right], ident[right], buses.setdefault(m["bus"], len(buses)), data[right]))
+        parts.append(
+            (
+                lines.start[right],
+                lines.seconds(10**9)[right],
+                ident[right],
+                buses.setdefault(m["bus"], len(buses)),
+                data[right],
+            )
+        )
     notes = [f"{bad} lines are not candump lines: left out"] if bad else []
     dropped: dict[bytes, int] = {}
     for m in _DROPCOUNT.finditer(raw):
         dropped[m["bus"]] = dropped.get(m["bus"], 0) + int(m["n"])
-    notes += [f"the logger dropped {n:,} frames of {bus.decode('ascii', 'replace')} (DROPCOUNT)" for bus, n in dropped.items()]
+    notes += [
+        f"the logger dropped {n:,} frames of {bus.decode('ascii', 'replace')} (DROPCOUNT)" for bus, n in dropped.items()
+    ]
     if special:
         notes.append(f"{special} remote or error frames: left out")
     return _join(path, parts, "candump", "(1735329625.329586) can0 17C#0000000010000021", notes)
@@ -327,18 +353,22 @@ def write_candump(path: Path, frames: Frames) -> None:
     w = 2 * frames.data.shape[1]
     micros = np.rint(frames.t * 1e6).astype(np.int64).tolist()
     lines = [
-        f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) vcan0 {i & 0x1FFFFFFF:0{8 if i >> 31 else 3}X}#{text[k * w : k * w + 2 * n]}\n"
+        f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) vcan0 "
+        f"{i & 0x1FFFFFFF:0{8 if i >> 31 else 3}X}#{text[k * w : k * w + 2 * n]}\n"
         for k, (us, i, n) in enumerate(zip(micros, frames.ident.tolist(), frames.length.tolist(), strict=True))
     ]
     path.write_text("".join(lines), encoding="ascii")
 
 
-# --- other text formats ------------------------------------------------------------------------------------------------------------------
+# --- other text formats -----------------------------------------------------------------------------------------------
 
-# python-can's readers of these end at the first line they cannot read; a log cut off in mid-line, or with a foreign event, is common.
+# python-can's readers of these end at the first line they cannot read; a log cut off in mid-line, or with a foreign
+# event, is common.
 _ASC = re.compile(
-    rb"(?P<s> *\d{1,10})\.(?P<f>\d{1,9})[ \t]+(?P<fd>CANFD[ \t]+)?(?P<bus>\d{1,4})[ \t]+(?(fd)\w+[ \t]+)(?P<id>[0-9A-Fa-f]{1,8})"
-    rb"(?P<x>x?)[ \t]+(?(fd)(?:\S*[^\s01]\S*[ \t]+)?[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}|\w+[ \t]+d)[ \t]+(?P<len>[0-9A-Fa-f]{1,2})"
+    rb"(?P<s> *\d{1,10})\.(?P<f>\d{1,9})[ \t]+(?P<fd>CANFD[ \t]+)?(?P<bus>\d{1,4})[ \t]+(?(fd)\w+[ "
+    rb"\t]+)(?P<id>[0-9A-Fa-f]{1,8})"
+    rb"(?P<x>x?)[ \t]+(?(fd)(?:\S*[^\s01]\S*[ \t]+)?[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}|\w+[ \t]+d)[ "
+    rb"\t]+(?P<len>[0-9A-Fa-f]{1,2})"
     rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{2}(?![^ \t])){0,64})(?P<tail>(?:[ \t].*)?)\Z"
 )
 _ASC_TIME = re.compile(rb"^[ \t]*(\d+\.\d+)[ \t]", re.M)
@@ -364,10 +394,18 @@ def read_asc(path: Path) -> Frames:
     return _join(path, parts, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07", [])
 
 
-_TRC_COLUMNS = {b"1.0": "OILD", b"1.1": "OdILD", b"1.2": "OBdILD", b"1.3": "OBdIRLD", b"2.0": "OTIdlD", b"2.1": "OTBIdRLD"}
+_TRC_COLUMNS = {
+    b"1.0": "OILD",
+    b"1.1": "OdILD",
+    b"1.2": "OBdILD",
+    b"1.3": "OBdIRLD",
+    b"2.0": "OTIdlD",
+    b"2.1": "OTBIdRLD",
+}
 _TRC_WORD = {
     "O": rb"(?P<s> *\d{1,15})(?:\.(?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
-    "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ \t]+RTR)", "l": rb"(?P<len>\d{1,2})",
+    "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ "
+                                                                              rb"\t]+RTR)", "l": rb"(?P<len>\d{1,2})",
 }  # fmt: skip
 
 
@@ -376,11 +414,18 @@ def read_trc(path: Path) -> Frames:
     raw = read_bytes(path)
     version = re.search(rb"^;\$FILEVERSION=(\d\.\d)", raw[:100_000], re.M)
     if version and version[1] not in _TRC_COLUMNS:
-        raise LogError(f"{path}: TRC version {version[1].decode()} is not known; allowed: {b', '.join(_TRC_COLUMNS).decode()}")
+        raise LogError(
+            f"{path}: TRC version {version[1].decode()} is not known; allowed: {b', '.join(_TRC_COLUMNS).decode()}"
+        )
     stated = re.search(rb"^;\$COLUMNS=N,([A-Za-z,]+)", raw[:100_000], re.M)
     columns = stated[1].decode().replace(",", "") if stated else _TRC_COLUMNS[version[1] if version else b"1.0"]
     given = set(columns)
-    if not given <= {*_TRC_WORD, "D"} or len(given) < len(columns) or not {"O", "I", "D"} <= given or columns[-1] != "D":
+    if (
+        not given <= {*_TRC_WORD, "D"}
+        or len(given) < len(columns)
+        or not {"O", "I", "D"} <= given
+        or columns[-1] != "D"
+    ):
         raise LogError(f"{path}: TRC columns {columns} are not understood; allowed: {', '.join(_TRC_WORD)}, and D last")
     if ("L" in given) == ("l" in given):
         raise LogError(f"{path}: TRC columns {columns} must have one of L and l")
@@ -406,18 +451,22 @@ def _text_part(lines: _Lines, per_unit: int, extended: bool, bus: int, most: int
     return lines.start[right], lines.seconds(per_unit)[right], ident[right], bus, lines.data(most)[right]
 
 
-# --- BLF ---------------------------------------------------------------------------------------------------------------------------------
+# --- BLF --------------------------------------------------------------------------------------------------------------
 
 _OBJECT = struct.Struct("<4sHHII")  # signature, header size, header version, size, type
 _CONTAINER, _CAN, _CAN2, _FD, _FD64 = 10, 1, 86, 100, 101
-_MOST = 32 << 20, 50  # bytes of all containers together, and more for each byte of the file; frames that never change shrink 11-fold
+_MOST = (
+    32 << 20,
+    50,
+)  # bytes of all containers together, and more for each byte of the file; frames that never change shrink 11-fold
 
 
 def read_blf(path: Path) -> Frames:
     """Frames of a Vector binary log.
 
-    python-can's reader does not return from an object of size 0 and believes any container; here the containers are checked and
-    joined, the objects found, and each kind of object decoded as one matrix. A damaged container costs its own frames.
+    python-can's reader does not return from an object of size 0 and believes any container; here the containers are
+    checked and joined, the objects found, and each kind of object decoded as one matrix. A damaged container costs its
+    own frames.
     """
     raw = read_bytes(path)
     if len(raw) < 144 or raw[:4] != b"LOGG":
@@ -451,7 +500,10 @@ def read_blf(path: Path) -> Frames:
             body = raw[at : at + size]
         total += len(body)
         if total > most:
-            raise LogError(f"{path}: {len(raw):,} bytes unpack to more than {most:,}; allowed: {_MOST[1]} times as much, and {_MOST[0]:,}")
+            raise LogError(
+                f"{path}: {len(raw):,} bytes unpack to more than {most:,}; allowed: {_MOST[1]} times as much, and "
+                f"{_MOST[0]:,}"
+            )
         chunks.append(body)
         at += size + size % 4
     stream = b"".join(chunks)
@@ -530,15 +582,19 @@ def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple
         yield tuple(f[keep] for f in fields)
 
 
-# --- writers through python-can ----------------------------------------------------------------------------------------------------------
+# --- writers through python-can ---------------------------------------------------------------------------------------
 
 
 def _write_can(path: Path, frames: Frames, writer: str) -> None:
     import can
 
     with getattr(can, writer)(str(path)) as out:
-        for t, i, n, data in zip(frames.t.tolist(), frames.ident.tolist(), frames.length.tolist(), frames.data, strict=True):
-            message = can.Message(round(t, 6), i & 0x1FFFFFFF, i >> 31 == 1, channel=0, data=data[:n].tobytes(), is_fd=n > 8)
+        for t, i, n, data in zip(
+            frames.t.tolist(), frames.ident.tolist(), frames.length.tolist(), frames.data, strict=True
+        ):
+            message = can.Message(
+                round(t, 6), i & 0x1FFFFFFF, i >> 31 == 1, channel=0, data=data[:n].tobytes(), is_fd=n > 8
+            )
             out.on_message_received(message)
 
 
@@ -557,10 +613,11 @@ def write_trc(path: Path, frames: Frames) -> None:
     _write_can(path, frames, "TRCWriter")
 
 
-# --- database ----------------------------------------------------------------------------------------------------------------------------
+# --- database ---------------------------------------------------------------------------------------------------------
 
 # What a DBC can lose without losing a signal's layout, least needed first.
-_DROP = (("VAL_",), ("CM_",), ("BA_", "BA_DEF_", "BA_DEF_DEF_", "BA_REL_", "BA_DEF_REL_", "BA_DEF_DEF_REL_", "SIG_GROUP_", "EV_",
+_DROP = (("VAL_",), ("CM_",),
+    ("BA_", "BA_DEF_", "BA_DEF_DEF_", "BA_REL_", "BA_DEF_REL_", "BA_DEF_DEF_REL_", "SIG_GROUP_", "EV_",
          "BO_TX_BU_", "VAL_TABLE_"))  # fmt: skip
 
 
@@ -642,14 +699,15 @@ def pgn(ident: np.ndarray | int) -> Any:
     return ((ident >> 8) & 0x3FF00) | np.where(specific, 0, (ident >> 8) & 0xFF)
 
 
-# --- signals -----------------------------------------------------------------------------------------------------------------------------
+# --- signals ----------------------------------------------------------------------------------------------------------
 
 
 def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
     """Rows of ``frames`` that carry ``message``, with notes on what was left out.
 
     The exact identifier counts first, then, for 29-bit identifiers, the J1939 parameter group. Where several senders or
-    buses carry it, the one with most frames is taken: two sources in one channel would be a signal that nobody measured.
+    buses carry it, the one with most frames is taken: two sources in one channel would be a signal that nobody
+    measured.
     """
     name, notes = message.layout.name, []
     rows = np.flatnonzero(frames.ident == np.uint32(message.ident))
@@ -661,11 +719,17 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
     kinds, counts = np.unique(source, return_counts=True)
     if kinds.size > 1:
         best = kinds[np.argmax(counts)]
-        notes.append(f"{name}: {kinds.size} senders or buses; took 0x{(best >> 16) & 0x1FFFFFFF:X} ({counts.max()} of {rows.size} frames)")
+        notes.append(
+            f"{name}: {kinds.size} senders or buses; took 0x{(best >> 16) & 0x1FFFFFFF:X} ({counts.max()} of "
+            f"{rows.size} frames)"
+        )
         rows = rows[source == best]
     short = frames.length[rows] < message.layout.length
     if short.any():
-        notes.append(f"{name}: {int(short.sum())} of {rows.size} frames are shorter than its {message.layout.length} bytes: left out")
+        notes.append(
+            f"{name}: {int(short.sum())} of {rows.size} frames are shorter than its {message.layout.length} bytes: "
+            f"left out"
+        )
         rows = rows[~short]
     if message.e2e is not None and rows.size:
         if message.layout.length == 8 and frames.data.shape[1] == 8:
@@ -703,7 +767,9 @@ def e2e_crc(data: np.ndarray, data_id: int) -> np.ndarray:
 
 
 def _place(signal: Any) -> tuple[list[int], int]:
-    """Bytes of a signal from least to most significant, and how far its lowest bit is above bit 0 of the first of them."""
+    """Bytes of a signal from least to most significant, and how far its lowest bit is above bit 0 of the first
+    of them.
+    """
     if signal.byte_order == "little_endian":
         first, last = signal.start // 8, (signal.start + signal.length - 1) // 8
         return list(range(first, last + 1)), signal.start % 8
@@ -744,10 +810,18 @@ def cut_signal(frames: Frames, rows: np.ndarray, message: Message, signal: Any) 
         selector, wanted = chain[-1].multiplexer_signal, chain[-1].multiplexer_ids
     need = 1 + max(max(_place(s)[0]) for s in chain)
     if any(s.length > 64 or (s.is_float and s.length not in (16, 32, 64)) or min(_place(s)[0]) < 0 for s in chain):
-        raise LogError(f"{message.layout.name}.{signal.name}: {signal.length} bits cannot be read; allowed: 64, or an IEEE number")
+        raise LogError(
+            f"{message.layout.name}.{signal.name}: {signal.length} bits cannot be read; allowed: 64, or an IEEE number"
+        )
     if need > frames.data.shape[1]:
         return rows[:0], np.empty(0), 0
-    if frames.data.shape[1] == 8 and len(chain) == 1 and not signal.is_float and not message.j1939 and signal.length < 64:
+    if (
+        frames.data.shape[1] == 8
+        and len(chain) == 1
+        and not signal.is_float
+        and not message.j1939
+        and signal.length < 64
+    ):
         return _cut_integer(frames, rows, message, signal, need)
     rows = rows[frames.length[rows] >= need]
     for s, chooser in zip(chain, chain[1:], strict=False):
@@ -766,7 +840,9 @@ def cut_signal(frames: Frames, rows: np.ndarray, message: Message, signal: Any) 
     return rows[there], values[there], int(np.count_nonzero(~there))
 
 
-def _cut_integer(frames: Frames, rows: np.ndarray, message: Message, signal: Any, need: int) -> tuple[np.ndarray, np.ndarray, int]:
+def _cut_integer(
+    frames: Frames, rows: np.ndarray, message: Message, signal: Any, need: int
+) -> tuple[np.ndarray, np.ndarray, int]:
     """`cut_signal` for the common case: an integer that is in every frame of eight bytes."""
     from hil.logs.columns import cut
 
@@ -777,7 +853,19 @@ def _cut_integer(frames: Frames, rows: np.ndarray, message: Message, signal: Any
     out_rows, out = np.empty(rows.size, np.int64), np.empty(rows.size)
     scale, offset = float(signal.scale), float(signal.offset)
     n, missing = cut(
-        frames.words, rows, frames.length, need, big, shift, signal.length, bool(signal.is_signed), scale, offset, none, out_rows, out
+        frames.words,
+        rows,
+        frames.length,
+        need,
+        big,
+        shift,
+        signal.length,
+        bool(signal.is_signed),
+        scale,
+        offset,
+        none,
+        out_rows,
+        out,
     )
     return out_rows[:n], out[:n], missing
 
@@ -792,8 +880,15 @@ def encode(message: Message, values: dict[str, np.ndarray], n: int) -> np.ndarra
         if signal.is_float or signal.length > 52:
             if column is None:
                 continue
-            raise LogError(f"{signal.name}: its {signal.length} bits in {message.layout.name} cannot be written; allowed: 52-bit integers")
-        low, high = (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
+            raise LogError(
+                f"{signal.name}: its {signal.length} bits in {message.layout.name} cannot be written; allowed: 52-bit "
+                f"integers"
+            )
+        low, high = (
+            (-(1 << signal.length - 1), (1 << signal.length - 1) - 1)
+            if signal.is_signed
+            else (0, (1 << signal.length) - 1)
+        )
         none = message.missing.get(signal.name, 0)
         if column is None:
             raw = np.full(n, none, np.int64)
@@ -803,10 +898,16 @@ def encode(message: Message, values: dict[str, np.ndarray], n: int) -> np.ndarra
             with np.errstate(invalid="ignore"):
                 bad = (scaled < low) | (scaled > high) | ((scaled == none) & (signal.name in message.missing))
             if bad.any():
-                a, b = sorted((low * float(signal.scale) + float(signal.offset), high * float(signal.scale) + float(signal.offset)))
+                a, b = sorted(
+                    (
+                        low * float(signal.scale) + float(signal.offset),
+                        high * float(signal.scale) + float(signal.offset),
+                    )
+                )
                 raise LogError(
-                    f"{signal.name} (={column[np.argmax(bad)]:g} {signal.unit or ''}): does not fit {message.layout.name}, "
-                    f"which holds {a:g} to {b:g}; a table format (.csv, .parquet) holds any value"
+                    f"{signal.name} (={column[np.argmax(bad)]:g} {signal.unit or ''}): does not fit "
+                    f"{message.layout.name}, which holds {a:g} to {b:g}; a table format (.csv, .parquet) holds any "
+                    "value"
                 )
             raw = np.where(np.isnan(scaled), none, scaled).astype(np.int64)
         bits = raw.astype(np.uint64) & np.uint64((1 << signal.length) - 1)

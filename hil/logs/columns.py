@@ -21,7 +21,8 @@ def warm_up(say: Callable[[str], None]) -> None:
 def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none, out_rows, out):
     """Cut one integer signal out of frames; return how many values there are and how many said "not available".
 
-    words     uint64[n] the frames' bytes, the first lowest; rows int64[m] the frames to look at; length uint8[n] their bytes of data
+    words     uint64[n] the frames' bytes, the first lowest; rows int64[m] the frames to look at; length uint8[n] their
+              bytes of data
     need      bytes that a frame must have to carry the signal
     big       the bytes count from the other end: ``shift`` is then that of the swapped word
     none      raw value that means not available; outside the signal's range where there is none
@@ -36,8 +37,12 @@ def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none
             continue
         w = words[r]
         if big:
-            w = ((w >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)) | ((w & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8))
-            w = ((w >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)) | ((w & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16))
+            w = ((w >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)) | (
+                (w & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8)
+            )
+            w = ((w >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)) | (
+                (w & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16)
+            )
             w = (w >> np.uint64(32)) | (w << np.uint64(32))
         raw = np.int64((w >> np.uint64(shift)) & mask)
         if signed and raw >= half:
@@ -53,7 +58,9 @@ def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none
 
 @in_place
 def wrong_crc(words, rows, table, start, wrong):
-    """Mark in ``wrong`` (bool[m]) the frames whose first byte is not the CRC of the others; ``start`` is the CRC of the DataID."""
+    """Mark in ``wrong`` (bool[m]) the frames whose first byte is not the CRC of the others; ``start`` is the CRC of the
+    DataID.
+    """
     for i in range(rows.shape[0]):
         w = words[rows[i]]
         c = np.int64(start)

@@ -1,10 +1,10 @@
 """Measured runs: read any log into channels in the product's names and units, write channels into any log.
 
 A log is a CAN recording (`.log` of candump, `.asc`, `.blf`, `.trc`, bus-logging `.mf4`) with a DBC, MDF4 channel groups
-(`.mf4`), CSV or Parquet. Whatever it is, it ends as a `Log`: per signal the times, strictly increasing, in seconds from the
-start, and the values, finite, in the unit of docs/architecture.md. Each channel keeps its own raster; nothing is
-interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line; what had to be left out is said in `Log.notes`.
-docs/logs.md is the user's page.
+(`.mf4`), CSV or Parquet. Whatever it is, it ends as a `Log`: per signal the times, strictly increasing, in seconds from
+the start, and the values, finite, in the unit of docs/architecture.md. Each channel keeps its own raster; nothing is
+interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line; what had to be left out is said in
+`Log.notes`. docs/logs.md is the user's page.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Channel:
 class Log:
     """A measured run: where it is from, its channels by name, and what was left out or assumed on reading.
 
-    Raises LogError where a channel of the product's signals cannot be in its unit, or where the time spans more than the rows are worth
-    (`hil.logs.plausible`): no command gets such a log, whoever made it.
+    Raises LogError where a channel of the product's signals cannot be in its unit, or where the time spans more than
+    the rows are worth (`hil.logs.plausible`): no command gets such a log, whoever made it.
     """
 
     path: str
@@ -69,7 +69,9 @@ class Log:
 
 
 def _ours(name: str, signals: Mapping[str, str]) -> bool:
-    """Whether ``name`` is one of the product's signals: a system of a user's own may give its name to something else."""
+    """Whether ``name`` is one of the product's signals: a system of a user's own may give its name to something
+    else.
+    """
     return name in plausible.RANGES and signals.get(name) == UNITS[name]
 
 
@@ -81,7 +83,7 @@ def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]
         raise LogError(f"{path}: {signal} ({key}): {why}; {plausible.proposed(signal, values)}{also}")
 
 
-# --- sources: what a file offers, before names and units ---------------------------------------------------------------------------------
+# --- sources: what a file offers, before names and units --------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,10 @@ class Bus:
                     self.names[key] = (key, s.name)
                     self._of[key] = m, s
                 else:
-                    why = f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no such frame"
+                    why = (
+                        f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no "
+                        f"such frame"
+                    )
                     self._silent[s.name] = self._silent[key] = why
 
     def has(self) -> str:
@@ -210,8 +215,13 @@ def _time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> 
                 if name in (fold(h), fold(h.strip()), fold(_split_unit(h)[0])):
                     return h
     if asked is not None:
-        raise _NoTime(f"{path}: no column {asked!r} to map to t{_close(asked, headers)}{_has('column', headers)}", headers)
-    text = f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names another){_has('column', headers)}"
+        raise _NoTime(
+            f"{path}: no column {asked!r} to map to t{_close(asked, headers)}{_has('column', headers)}", headers
+        )
+    text = (
+        f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names "
+        f"another){_has('column', headers)}"
+    )
     raise _NoTime(text, headers)
 
 
@@ -231,7 +241,7 @@ def _has(kind: str, have: Iterable[str]) -> str:
     return f"; the file has {len(names)} {kind}{'s' * (len(names) != 1)}: {', '.join(names[:12])}{more}"
 
 
-# --- CSV and Parquet ---------------------------------------------------------------------------------------------------------------------
+# --- CSV and Parquet --------------------------------------------------------------------------------------------------
 
 
 def _open_csv(path: Path, options: _Options) -> Source:
@@ -266,14 +276,18 @@ def _open_csv(path: Path, options: _Options) -> Source:
 
     time = _time_column(path, headers, options.mapping)
     known = {*UNITS, *options.mapping, time}
-    table = _Csv(path, rest, headers, [h for h in headers if h in known or _split_unit(h)[0] in known], separator, comma, first)
+    table = _Csv(
+        path, rest, headers, [h for h in headers if h in known or _split_unit(h)[0] in known], separator, comma, first
+    )
     return Table([h for h in headers if h], table.column, first, time)
 
 
 class _Csv:
     """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
 
-    def __init__(self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int):
+    def __init__(
+        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int
+    ):
         self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
         self.separator, self.comma, self.first = separator, comma, first
         self.ready: dict[str, np.ndarray] | None = None
@@ -300,13 +314,17 @@ class _Csv:
         places = [f"c{self.headers.index(h)}" for h in columns]  # names of our own: the file's may be empty
         head = self.separator.join(f"c{i}" for i in range(len(self.headers))).encode() + b"\n"
         frame = pl.read_csv(
-            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0, schema_overrides=dict.fromkeys(places, kind),
-            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String, null_values=["", *_NO_SAMPLE],
+            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0,
+            schema_overrides=dict.fromkeys(places, kind),
+            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String,
+            null_values=["", *_NO_SAMPLE],
         )  # fmt: skip
         return frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
 
     def _numbers(self, header: str) -> np.ndarray:
-        """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is named."""
+        """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
+        named.
+        """
         import polars as pl
 
         try:
@@ -317,7 +335,9 @@ class _Csv:
         number = (text.str.replace(",", ".", literal=True) if self.comma else text).cast(pl.Float64, strict=False)
         bad = (number.is_null() & text.is_not_null()).arg_true()
         if bad.len():
-            raise LogError(f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number")
+            raise LogError(
+                f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number"
+            )
         return _numbers(number)
 
 
@@ -338,7 +358,10 @@ def _is_absent(values: np.ndarray) -> np.ndarray:
     return values.view(np.uint64) == np.uint64(0x7FF8_0000_0000_0A0B)
 
 
-_MOST_ROWS = 4_000_000, 2  # of a Parquet file, and more for each of its bytes; a column that never changes takes next to none
+_MOST_ROWS = (
+    4_000_000,
+    2,
+)  # of a Parquet file, and more for each of its bytes; a column that never changes takes next to none
 
 _MOST_UNPACKED = 40  # bytes a row of a column of numbers
 
@@ -348,7 +371,9 @@ def _chunks(group: Any) -> Iterable[Any]:
 
 
 def _open_parquet(path: Path, options: _Options) -> Source:
-    """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a damaged page."""
+    """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a
+    damaged page.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -363,7 +388,9 @@ def _open_parquet(path: Path, options: _Options) -> Source:
         raise LogError(f"{path}: column {again!r} is there more than once")
     most = _MOST_ROWS[0] + _MOST_ROWS[1] * size
     if file.metadata.num_rows > most:
-        raise LogError(f"{path}: {size:,} bytes say that they hold {file.metadata.num_rows:,} rows; allowed: up to {most:,}")
+        raise LogError(
+            f"{path}: {size:,} bytes say that they hold {file.metadata.num_rows:,} rows; allowed: up to {most:,}"
+        )
 
     def load(key: str) -> np.ndarray:
         kind = schema.field(key).type
@@ -371,10 +398,23 @@ def _open_parquet(path: Path, options: _Options) -> Source:
         scale = 1.0
         if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
-        elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind) or pa.types.is_boolean(kind)):
+        elif not (
+            pa.types.is_integer(kind)
+            or pa.types.is_floating(kind)
+            or pa.types.is_decimal(kind)
+            or pa.types.is_boolean(kind)
+        ):
             raise LogError(f"{path}: column {key!r} holds {kind}, not numbers")
-        chunks = [c for g in range(file.metadata.num_row_groups) for c in _chunks(file.metadata.row_group(g)) if c.path_in_schema == key]
-        unpacked, most = sum(c.total_uncompressed_size for c in chunks), _MOST_UNPACKED * (file.metadata.num_rows + 100_000)
+        chunks = [
+            c
+            for g in range(file.metadata.num_row_groups)
+            for c in _chunks(file.metadata.row_group(g))
+            if c.path_in_schema == key
+        ]
+        unpacked, most = (
+            sum(c.total_uncompressed_size for c in chunks),
+            _MOST_UNPACKED * (file.metadata.num_rows + 100_000),
+        )
         if unpacked > most:
             raise LogError(f"{path}: column {key!r} unpacks to {unpacked:,} bytes; allowed: up to {most:,}")
         try:
@@ -420,7 +460,7 @@ def _write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) -
     _frame(channels).write_parquet(path, compression="zstd")
 
 
-# --- CAN ---------------------------------------------------------------------------------------------------------------------------------
+# --- CAN --------------------------------------------------------------------------------------------------------------
 
 
 def _bus_reader(read: Callable[[Path], canlog.Frames]) -> Callable[[Path, _Options], Source]:
@@ -438,7 +478,9 @@ def _bus(frames: canlog.Frames, options: _Options) -> Bus:
     return Bus(frames, messages, list(notes), dbc)
 
 
-def _bus_writer(write: Callable[[Path, canlog.Frames], None]) -> Callable[[Path, dict[str, Channel], Path | None], None]:
+def _bus_writer(
+    write: Callable[[Path, canlog.Frames], None],
+) -> Callable[[Path, dict[str, Channel], Path | None], None]:
     """Writer of a CAN log format: channels to the frames of the database, then these to the file."""
 
     def write_bus(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
@@ -450,8 +492,9 @@ def _bus_writer(write: Callable[[Path, canlog.Frames], None]) -> Callable[[Path,
 def _encode(channels: dict[str, Channel], dbc: Path, path: Path) -> canlog.Frames:
     """Frames as the nodes would send them: each message at its period, with the value then valid.
 
-    A value is repeated until its channel's next sample, but no longer than `_HOLD` frame periods or steps of the channel: after
-    that the signal says "not available", and a message without any value is not sent. i_cmd is the mean since the last frame.
+    A value is repeated until its channel's next sample, but no longer than `_HOLD` frame periods or steps of the
+    channel: after that the signal says "not available", and a message without any value is not sent. i_cmd is the mean
+    since the last frame.
     """
     messages, _ = canlog.load_dbc(dbc)
     start = min(float(c.t[0]) for c in channels.values())
@@ -495,7 +538,9 @@ def _encode(channels: dict[str, Channel], dbc: Path, path: Path) -> canlog.Frame
 
 
 def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:
-    """The channel's value valid at each ``t``: its latest sample, or the mean since the sample before; NaN where it is silent."""
+    """The channel's value valid at each ``t``: its latest sample, or the mean since the sample before; NaN where it is
+    silent.
+    """
     now = np.searchsorted(c.t, t + 1e-6, side="right")
     age = t - c.t[np.maximum(now - 1, 0)]
     step = float(np.median(np.diff(c.t))) if c.t.size > 1 else 0.0
@@ -509,7 +554,7 @@ def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:
     return np.where(there, values, np.nan)
 
 
-# --- MDF4 --------------------------------------------------------------------------------------------------------------------------------
+# --- MDF4 -------------------------------------------------------------------------------------------------------------
 
 
 class Groups:
@@ -538,13 +583,17 @@ class Groups:
 
 
 def _open_mdf(path: Path, options: _Options) -> Source:
-    """MDF4: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is asked for."""
+    """MDF4: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is
+    asked for.
+    """
     from hil.logs import mdf
 
     wanted = [*UNITS, *options.mapping]
     content, frames = mdf.read_mdf(path, wanted)
     groups = Groups(content)
-    if frames is not None and (options.dbc is not None or not any(_find(groups, n, n in options.mapping) for n in wanted)):
+    if frames is not None and (
+        options.dbc is not None or not any(_find(groups, n, n in options.mapping) for n in wanted)
+    ):
         return _bus(frames, options)
     return groups
 
@@ -562,7 +611,7 @@ def _write_mdf(path: Path, channels: dict[str, Channel], dbc: Path | None) -> No
     mdf.write_groups(path, list(rasters.values()))
 
 
-# --- formats -----------------------------------------------------------------------------------------------------------------------------
+# --- formats ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -597,14 +646,16 @@ def _format(path: Path) -> _Format:
     return found
 
 
-# --- units -------------------------------------------------------------------------------------------------------------------------------
+# --- units ------------------------------------------------------------------------------------------------------------
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
     "%": "percent", "pct": "percent", "per cent": "percent", "1": "", "ratio": "",
     "°": "degree", "deg": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC",
-    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm", "r/min": "rpm",
-    "rev/min": "rpm", "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second", "hz": "turn/second",
+    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm", "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second",
+    "hz": "turn/second",
     "khz": "kiloturn/second", "sec": "second", "s": "second",
     "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
 }  # fmt: skip
@@ -624,7 +675,8 @@ def _registry() -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
-    """(a, b) with value_in_into = a * value_in_unit + b; None where ``unit`` is no unit, its name where it cannot be converted.
+    """(a, b) with value_in_into = a * value_in_unit + b; None where ``unit`` is no unit, its name where it cannot be
+    converted.
 
     Frequencies are turns: 1 Hz of a rotor is 60 rpm (pint alone would take it for 1 rad/s).
     """
@@ -638,7 +690,16 @@ def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
     into = _ALIASES.get(into.casefold(), into)
     try:
         parsed = registry.parse_units(text)
-    except (pint.errors.PintError, ValueError, TypeError, AttributeError, KeyError, SyntaxError, RecursionError, ArithmeticError):
+    except (
+        pint.errors.PintError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        SyntaxError,
+        RecursionError,
+        ArithmeticError,
+    ):
         return None
     except Exception as e:  # the tokenizer of pint's grammar has error types of its own
         if type(e).__module__ in ("tokenize", "builtins"):
@@ -685,13 +746,15 @@ class _Units:
             if isinstance(speed, tuple):
                 if self.design_rpm is None:
                     way = f"--design-rpm R gives the design speed, --unit {signal}=% says that it is % already"
-                    raise LogError(f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}")
+                    raise LogError(
+                        f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}"
+                    )
                 return values * (speed[0] * 100.0 / self.design_rpm)
         what = "unit is not known" if factor is None else "unit does not convert"
         raise LogError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed} (--unit {signal}=...)")
 
 
-# --- reading -----------------------------------------------------------------------------------------------------------------------------
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, str] = UNITS) -> dict[str, str]:
@@ -704,7 +767,9 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, 
         elif a in known:
             name, signal = b, a
         else:
-            raise LogError(f"{path}: map {a}={b}: {b!r} is not a signal{_close(b, known)}; allowed: {', '.join(signals)}, t")
+            raise LogError(
+                f"{path}: map {a}={b}: {b!r} is not a signal{_close(b, known)}; allowed: {', '.join(signals)}, t"
+            )
         if signal in out and out[signal] != name:
             raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
         out[signal] = name
@@ -712,7 +777,9 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, 
 
 
 def _find(source: Source, name: str, mapped: bool) -> list[str]:
-    """What the file offers under ``name``: full name before short; in any case of letters only where the user gave the name."""
+    """What the file offers under ``name``: full name before short; in any case of letters only where the user gave the
+    name.
+    """
     if name in source.names:
         return [name]
     for fold in (str, str.casefold) if mapped else (str,):
@@ -722,7 +789,9 @@ def _find(source: Source, name: str, mapped: bool) -> list[str]:
     return []
 
 
-def _take(path: Path, source: Source, signal: str, name: str, mapped: bool, needed: bool, notes: list[str]) -> tuple[str, Series] | None:
+def _take(
+    path: Path, source: Source, signal: str, name: str, mapped: bool, needed: bool, notes: list[str]
+) -> tuple[str, Series] | None:
     """Key and samples of a signal; None where the file does not offer it. Refuses a name that the user gave in vain."""
     keys = _find(source, name, mapped)
     if not keys:
@@ -746,7 +815,9 @@ def _take(path: Path, source: Source, signal: str, name: str, mapped: bool, need
 
 
 def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list[str]) -> np.ndarray:
-    """The times ``t`` (s) of a series; rows whose stamp is wrong have none. ``known``: what was found before, by the array of the file."""
+    """The times ``t`` (s) of a series; rows whose stamp is wrong have none. ``known``: what was found before, by the
+    array of the file.
+    """
     if id(s.t) not in known:
         rows = np.flatnonzero(np.isfinite(t))
         bad = None
@@ -756,10 +827,14 @@ def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list
         if known[id(s.t)].size:
             first = int(known[id(s.t)][0])
             what = f"{known[id(s.t)].size:,} of {rows.size:,} {s.word}s"
-            notes.append(f"time: {what} have a wrong time stamp (first {s.word} {first + s.first}: {t[first]:.9g} s): left out")
+            notes.append(
+                f"time: {what} have a wrong time stamp (first {s.word} {first + s.first}: {t[first]:.9g} s): left out"
+            )
     bad = known[id(s.t)]
     there = np.isfinite(s.values)
-    if not bad.size or 2 * np.count_nonzero(there[bad]) > np.count_nonzero(there):  # a channel that has a block of rows of its own
+    if not bad.size or 2 * np.count_nonzero(there[bad]) > np.count_nonzero(
+        there
+    ):  # a channel that has a block of rows of its own
         return t
     t = t.copy()
     t[bad] = _ABSENT
@@ -779,11 +854,16 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
         back = np.flatnonzero(np.diff(t) < 0)
         if back.size:
             row, (a, b) = np.flatnonzero(finite)[back[0] + 1] + s.first, t[back[0] : back[0] + 2]
-            raise LogError(f"{path}: {signal} ({key}): time runs backwards at {s.word} {row}, from {a:.9g} s to {b:.9g} s")
+            raise LogError(
+                f"{path}: {signal} ({key}): time runs backwards at {s.word} {row}, from {a:.9g} s to {b:.9g} s"
+            )
     if t.size:
         last = np.append(np.diff(t) > 0, True)
         if not last.all():
-            notes.append(f"{signal} ({key}): {int(np.count_nonzero(~last))} of {t.size} samples have the time of the next: left out")
+            notes.append(
+                f"{signal} ({key}): {int(np.count_nonzero(~last))} of {t.size} samples have the time of the next: "
+                f"left out"
+            )
             t, values = t[last], values[last]
     if not t.size:
         if s.t.size:
@@ -806,7 +886,8 @@ def read_log(
 
     path        the file; its suffix says the format
     dbc         database of a CAN log; default: tables/vgv.dbc
-    mapping     name in the log -> signal, {"N1_DEM": "n_dem"}; a CAN name may be MESSAGE.SIGNAL, an MDF name GROUP.CHANNEL
+    mapping     name in the log -> signal, {"N1_DEM": "n_dem"}; a CAN name may be MESSAGE.SIGNAL, an MDF name
+                GROUP.CHANNEL
     units       signal -> unit that the log uses for it, {"n_r": "rpm"}; goes before a unit in the file
     design_rpm  design speed, rpm; needed where a rotor speed is not in %
     require     signals without which the log is of no use; each needs two samples
@@ -819,11 +900,16 @@ def read_log(
     for what, given in (("unit of", dict(units or {})), ("required", dict.fromkeys(require))):
         for signal in given:
             if signal not in signals and signal != "t":
-                raise LogError(f"{path}: {what} {signal!r}: is not a signal{_close(signal, signals)}; allowed: {', '.join(signals)}, t")
+                raise LogError(
+                    f"{path}: {what} {signal!r}: is not a signal{_close(signal, signals)}; allowed: "
+                    f"{', '.join(signals)}, t"
+                )
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    source = _format(path).read(path, _Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}))
+    source = _format(path).read(
+        path, _Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()})
+    )
     notes: list[str] = []
     unit = _Units(path, units or {}, design_rpm, notes, signals)
     channels: dict[str, Channel] = {}
@@ -845,7 +931,10 @@ def read_log(
             if values is not s.values:
                 values = np.where(_is_absent(s.values), _ABSENT, values)
             if not plausible.latest(t[np.isfinite(t)]):
-                raise LogError(f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if it is in ms")
+                raise LogError(
+                    f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if "
+                    f"it is in ms"
+                )
             if not source.sorted:
                 t = _in_time(s, t, known, notes)
             channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
@@ -865,7 +954,10 @@ def read_log(
     sure, perhaps = plausible.too_small(ours, set(units or {}))
     if sure:
         small, *others = sure
-        raise LogError(f"{path}: {small} ({keys[small]}): {sure[small]}" + (f"; the same for {', '.join(others)}" if others else ""))
+        raise LogError(
+            f"{path}: {small} ({keys[small]}): {sure[small]}"
+            + (f"; the same for {', '.join(others)}" if others else "")
+        )
     notes += [f"{name} ({keys[name]}): {why}" for name, why in perhaps.items()]
     return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals)
 
@@ -873,7 +965,9 @@ def read_log(
 def _inside(
     signal: str, key: str, c: Channel, wrong: list[tuple[str, str, str, np.ndarray]], notes: list[str]
 ) -> Channel | None:
-    """The channel without the few samples that its signal cannot have; where they are not few, it goes on the list of the wrong."""
+    """The channel without the few samples that its signal cannot have; where they are not few, it goes on the list of
+    the wrong.
+    """
     inside, why = plausible.judge(signal, c.values)
     if why:
         wrong.append((signal, key, why, c.values))
@@ -882,12 +976,16 @@ def _inside(
     r, far = plausible.RANGES[signal], c.values[~inside]
     unit = "" if r.unit == "-" else f" {r.unit}"
     furthest = far[np.argmax(np.abs(far))]
-    what = f"{far.size:,} of {inside.size:,} samples are outside {r.low:g} to {r.high:g}{unit} (furthest {furthest:.6g})"
+    what = (
+        f"{far.size:,} of {inside.size:,} samples are outside {r.low:g} to {r.high:g}{unit} (furthest {furthest:.6g})"
+    )
     notes.append(f"{signal} ({key}): {what}: left out")
     return Channel(c.t[inside], c.values[inside])
 
 
-def _one_run(path: Path, channels: dict[str, Channel], require: tuple[str, ...], notes: list[str]) -> dict[str, Channel]:
+def _one_run(
+    path: Path, channels: dict[str, Channel], require: tuple[str, ...], notes: list[str]
+) -> dict[str, Channel]:
     """Channels of the one run that the log holds, where its clock jumped."""
     if not channels:
         return channels
@@ -919,7 +1017,9 @@ def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
 
 
 def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
-    """Count time from the start of the log where the file counts from 1970, from midnight, or from an event far away."""
+    """Count time from the start of the log where the file counts from 1970, from midnight, or from an event far
+    away.
+    """
     if channels and abs(start := min(float(c.t[0]) for c in channels.values())) > plausible.JUMP:
         since = "counts from 1970" if start > _EPOCH else "does not count from the start"
         notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
@@ -927,15 +1027,15 @@ def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
             channels[name] = Channel(c.t - start, c.values)
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------------------------
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path | None = None) -> None:
     """Write channels as a log; the suffix says the format.
 
-    Tables and MDF4 hold every sample as it is. CAN formats hold what the bus would carry: the frames of ``dbc`` (default
-    tables/vgv.dbc) at their periods, in their resolution, with valid counter and CRC, from 0 s on.
-    Raises LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
+    Tables and MDF4 hold every sample as it is. CAN formats hold what the bus would carry: the frames of ``dbc``
+    (default tables/vgv.dbc) at their periods, in their resolution, with valid counter and CRC, from 0 s on. Raises
+    LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
     """
     path = Path(path)
     write = _format(path).write
@@ -947,7 +1047,9 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
             raise LogError(f"{path}: {name!r} is not a signal{_close(name, UNITS)}; allowed: {', '.join(UNITS)}")
         t, values = np.asarray(c.t, np.float64), np.asarray(c.values, np.float64)
         if t.ndim != 1 or t.shape != values.shape or not t.size:
-            raise LogError(f"{path}: {name}: t {t.shape} and values {values.shape} must be lists of one length, not empty")
+            raise LogError(
+                f"{path}: {name}: t {t.shape} and values {values.shape} must be lists of one length, not empty"
+            )
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise LogError(f"{path}: {name}: samples must be finite and their times increasing")
         checked[name] = Channel(t, values)

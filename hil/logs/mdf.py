@@ -1,11 +1,12 @@
 """MDF4 files through asammdf, read in a process of their own.
 
 asammdf follows the links and sizes of a file as they stand: one flipped bit can end in a segmentation fault, an endless
-chain of blocks or an allocation of terabytes (seen in fuzzing, asammdf 8.8). A log from outside must not take its reader down,
-so a child process with limits on time and memory opens the file and hands back arrays. It costs 0.3 s a file.
+chain of blocks or an allocation of terabytes (seen in fuzzing, asammdf 8.8). A log from outside must not take its
+reader down, so a child process with limits on time and memory opens the file and hands back arrays. It costs 0.3 s a
+file.
 
-Request, one line of JSON on the child's stdin: {"path", "wanted": [names]}. Answer on its stdout: one line of JSON, then the
-bytes of the arrays it lists. {"error": text} stands for what the file is to blame for.
+Request, one line of JSON on the child's stdin: {"path", "wanted": [names]}. Answer on its stdout: one line of JSON,
+then the bytes of the arrays it lists. {"error": text} stands for what the file is to blame for.
 """
 
 from __future__ import annotations
@@ -27,19 +28,28 @@ __all__ = ["read_mdf", "write_bus", "write_groups"]
 _MEMORY = 1 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
 _TIME = 20.0, 1e6  # s, and bytes of file per further second
 _BUS = "CAN_DataFrame"
-_FRAMES = "CAN_DataFrame", "CAN_ErrorFrame", "CAN_RemoteFrame", "CAN_OverloadFrame", "LIN_", "FLX_"  # kept by the standard for bus events
+_FRAMES = (
+    "CAN_DataFrame",
+    "CAN_ErrorFrame",
+    "CAN_RemoteFrame",
+    "CAN_OverloadFrame",
+    "LIN_",
+    "FLX_",
+)  # kept by the standard for bus events
 
 
 def read_mdf(path: Path, wanted: list[str]) -> tuple[dict[str, Any], Frames | None]:
     """Channels and CAN frames of a file.
 
-    Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit) of the keys that answer to
-    ``wanted``, "why" (key -> reason it has no numbers), and the frames of its bus logging, if any.
+    Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit) of the keys that
+    answer to ``wanted``, "why" (key -> reason it has no numbers), and the frames of its bus logging, if any.
     """
     head = read_bytes(path, 168)
     if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or head[64:68] != b"##HD":
         old = head[:8] == b"MDF     " and head[8:9] in (b"2", b"3")
-        raise LogError(f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else ""))
+        raise LogError(
+            f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else "")
+        )
     request = json.dumps({"path": str(path.absolute()), "wanted": wanted}) + "\n"
     answer = _child(request.encode(), _TIME[0] + check_file(path) / _TIME[1])
     line, _, body = answer.partition(b"\n")
@@ -77,7 +87,9 @@ def _merge(parts: list[Any]) -> Frames | None:
 
 def _child(request: bytes, seconds: float) -> bytes:
     """Answer of a fresh interpreter that runs `serve`; empty where it was ended by a fault or a limit."""
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from hil.logs.mdf import serve; serve()"
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from hil.logs.mdf import serve; serve()"
+    )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
@@ -89,7 +101,7 @@ def _child(request: bytes, seconds: float) -> bytes:
     return done.stdout if done.returncode == 0 else b""
 
 
-# --- the child ---------------------------------------------------------------------------------------------------------------------------
+# --- the child --------------------------------------------------------------------------------------------------------
 
 
 def serve() -> None:
@@ -117,7 +129,10 @@ def answer(request: bytes, out: BinaryIO) -> None:
         with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
             reply = _read(mdf, asked["wanted"], arrays)
     except MemoryError:
-        reply = {"error": f"unpacks to more memory than its size allows, {_MEMORY[0]:,} bytes and {_MEMORY[1]} for each of its own"}
+        reply = {
+            "error": f"unpacks to more memory than its size allows, {_MEMORY[0]:,} bytes and {_MEMORY[1]} for each of "
+            f"its own"
+        }
         arrays = {}
     except Exception as e:  # the library meets a damaged file with any exception there is
         reply = {"error": f"{type(e).__name__}: {' '.join(str(e).split())}"[:160]}
@@ -189,12 +204,13 @@ def _bus_columns(mdf: Any, g: int, names: list[str]) -> list[np.ndarray]:
         length = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64])[np.clip(dlc, 0, 15)]
     bus = column("BusChannel").samples if f"{_BUS}.BusChannel" in names else np.zeros(n)
     return [
-        ident_signal.timestamps.astype(np.float64), (ident & 0x1FFFFFFF) | np.where(extended, np.uint32(EXTENDED), np.uint32(0)),
+        ident_signal.timestamps.astype(np.float64),
+        (ident & 0x1FFFFFFF) | np.where(extended, np.uint32(EXTENDED), np.uint32(0)),
         np.asarray(bus).astype(np.int32), np.clip(length, 0, wide).astype(np.uint8), data,
     ]  # fmt: skip
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------------------------
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:
@@ -203,7 +219,9 @@ def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.n
 
     with asammdf.MDF(version="4.10") as mdf:
         for t, channels in groups:
-            mdf.append([asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop")
+            mdf.append(
+                [asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop"
+            )
         mdf.save(path, overwrite=True, compression=2)
 
 
@@ -214,8 +232,10 @@ def write_bus(path: Path, frames: Frames) -> None:
     from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS
 
     columns = {
-        "BusChannel": np.ones(frames.t.size, np.uint8), "ID": frames.ident & 0x1FFFFFFF, "IDE": (frames.ident >> 31).astype(np.uint8),
-        "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], frames.length).astype(np.uint8), "DataLength": frames.length,
+        "BusChannel": np.ones(frames.t.size, np.uint8), "ID": frames.ident & 0x1FFFFFFF,
+        "IDE": (frames.ident >> 31).astype(np.uint8),
+        "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], frames.length).astype(np.uint8),
+        "DataLength": frames.length,
         "DataBytes": frames.data, "Dir": np.zeros(frames.t.size, np.uint8), "EDL": (frames.length > 8).astype(np.uint8),
         "BRS": np.zeros(frames.t.size, np.uint8), "ESI": np.zeros(frames.t.size, np.uint8),
     }  # fmt: skip
@@ -225,5 +245,7 @@ def write_bus(path: Path, frames: Frames) -> None:
         samples[f"{_BUS}.{k}"] = c
     source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
     with asammdf.MDF(version="4.10") as mdf:
-        mdf.append(asammdf.Signal(samples, frames.t, name=_BUS, source=source), comment="VaneLoop", common_timebase=True)
+        mdf.append(
+            asammdf.Signal(samples, frames.t, name=_BUS, source=source), comment="VaneLoop", common_timebase=True
+        )
         mdf.save(path, overwrite=True, compression=2)

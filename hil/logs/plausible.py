@@ -1,8 +1,10 @@
-"""What a log of this machine can hold: a range for each signal, and a time that runs. Reading judges by it, for every command alike.
+"""What a log of this machine can hold: a range for each signal, and a time that runs. Reading judges by it, for every
+command alike.
 
-A wrong unit shifts a whole channel, a sensor's spike shifts single samples. So a channel whose samples mostly lie outside its range is
-refused, and a few of them are left out. A channel a hundred or a thousand times too small is inside every range; it is refused where the
-machine moves and the channel moves with it, only so little. docs/logs.md is the user's page.
+A wrong unit shifts a whole channel, a sensor's spike shifts single samples. So a channel whose samples mostly lie
+outside its range is refused, and a few of them are left out. A channel a hundred or a thousand times too small is
+inside every range; it is refused where the machine moves and the channel moves with it, only so little. docs/logs.md is
+the user's page.
 """
 
 from __future__ import annotations
@@ -13,12 +15,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FEW", "JUMP", "RANGES", "Range", "judge", "latest", "longest_part", "out_of_order", "span_complaint", "too_small"]
+__all__ = [
+    "FEW",
+    "JUMP",
+    "RANGES",
+    "Range",
+    "judge",
+    "latest",
+    "longest_part",
+    "out_of_order",
+    "span_complaint",
+    "too_small",
+]
 
-FEW = 0.1  # share of a channel's samples (or a log's rows) that may be wrong one by one; more is a wrong unit, or a wrong clock
+# share of a channel's samples (or a log's rows) that may be wrong one by one; more is a wrong unit, or a wrong clock
+FEW = 0.1
 RUN = 10  # rows: so many wrong time stamps in a row are still single ones
-JUMP = 1e4  # s: a longer silence is a clock that jumped; nearly three hours, longer than any gap that a run is worth keeping for
-SLOWEST = 10.0  # s from row to row, on average, in a log of more than 2 * JUMP; the raster of the simulation must stay in proportion
+# s: a longer silence is a clock that jumped; nearly three hours, longer than any gap that a run is worth keeping for
+JUMP = 1e4
+# s from row to row, on average, in a log of more than 2 * JUMP; the raster of the simulation must stay in proportion
+SLOWEST = 10.0
 LONGEST = 1e5  # s, 28 h: the simulation holds all of it in memory, 30 kB a second
 LATEST = 1e10  # s since 1970, the year 2286
 
@@ -43,17 +59,34 @@ class Range:
     small: tuple[str, float] | None = None
 
 
-_SPEED = Range("%", -10.0, 150.0, "the bus carries up to 131 %; no rotor stands 150 %", 80.0, {"rpm": (0.0, 0.0)}, ("ratio", 100.0))
-_STROKE = Range(
-    "mm", -25.0, 75.0, "0 to 48 mm from stop to stop, half a stroke beyond for a faulty LVDT", 24.0, {"um": (1e-3, 0.0)}, ("m", 1e3)
+_SPEED = Range(
+    "%", -10.0, 150.0, "the bus carries up to 131 %; no rotor stands 150 %", 80.0, {"rpm": (0.0, 0.0)}, ("ratio", 100.0)
 )
-_ANGLE = Range("deg", -90.0, 90.0, "a vane turns less than a quarter turn either way", 15.0, {"mrad": (0.0573, 0.0)}, ("rad", 57.29578))
+_STROKE = Range(
+    "mm",
+    -25.0,
+    75.0,
+    "0 to 48 mm from stop to stop, half a stroke beyond for a faulty LVDT",
+    24.0,
+    {"um": (1e-3, 0.0)},
+    ("m", 1e3),
+)
+_ANGLE = Range(
+    "deg",
+    -90.0,
+    90.0,
+    "a vane turns less than a quarter turn either way",
+    15.0,
+    {"mrad": (0.0573, 0.0)},
+    ("rad", 57.29578),
+)
 RANGES = {
     "n_dem": _SPEED,
     "n_r": _SPEED,
     "x_dem": _STROKE,
     "x_lvdt": _STROKE,
-    "i_cmd": Range("mA", -100.0, 100.0, "rated current 40 mA; drivers give no more than twice that", 5.0, {"uA": (1e-3, 0.0)}, ("A", 1e3)),
+    "i_cmd": Range("mA", -100.0, 100.0, "rated current 40 mA; drivers give no more than twice "
+                                        "that", 5.0, {"uA": (1e-3, 0.0)}, ("A", 1e3)),
     "p_s": Range(
         "MPa", -1.0, 60.0, "nominal 21 MPa; the highest aircraft hydraulics have 56 MPa", 21.0,
         {"Pa": (1e-6, 0.0), "kPa": (1e-3, 0.0), "bar": (0.1, 0.0), "psi": (6.894757e-3, 0.0)},
@@ -69,11 +102,12 @@ RANGES = {
 }  # fmt: skip
 
 
-# ---- values -------------------------------------------------------------------------------------------------------------------------
+# ---- values ----------------------------------------------------------------------------------------------------------
 
 
 def judge(signal: str, values: np.ndarray) -> tuple[np.ndarray, str]:
-    """Which values (own unit) are inside the signal's range, and why they cannot all be the signal's, if so: "" where a few are wild.
+    """Which values (own unit) are inside the signal's range, and why they cannot all be the signal's, if so: "" where a
+    few are wild.
 
     Values near 0 say nothing about the unit: an engine at rest has 0 rpm and 0 %. They do not count in the share.
     """
@@ -110,15 +144,17 @@ _MOVES = {"n_dem": 10.0, "n_r": 10.0, "x_dem": 10.0, "x_lvdt": 10.0, "vigv": 10.
 _PUSHED = 5.0  # mm of stroke in a second: 1.3 mA at the nominal flow gain
 
 
-def too_small(channels: Mapping[str, tuple[np.ndarray, np.ndarray]], stated: set[str]) -> tuple[dict[str, str], dict[str, str]]:
+def too_small(
+    channels: Mapping[str, tuple[np.ndarray, np.ndarray]], stated: set[str]
+) -> tuple[dict[str, str], dict[str, str]]:
     """Signals that are far too small for their unit, each with words: those that certainly are, and those that may be.
 
     channels  signal -> t (s), values (own unit)
     stated    signals whose unit the user named: what they say is taken
 
-    Certainly: it stays within what the larger unit's range would be, moves there smoothly by a tenth of it, and the machine cannot do
-    that. A speed never rises smoothly within 1.5 %, nor a stroke within 0.075 mm; angles count while speed or stroke run over a tenth of
-    their range, a current while the stroke is pushed.
+    Certainly: it stays within what the larger unit's range would be, moves there smoothly by a tenth of it, and the
+    machine cannot do that. A speed never rises smoothly within 1.5 %, nor a stroke within 0.075 mm; angles count while
+    speed or stroke run over a tenth of their range, a current while the stroke is pushed.
     """
     within = {}
     for s, (_, v) in channels.items():
@@ -145,7 +181,10 @@ def too_small(channels: Mapping[str, tuple[np.ndarray, np.ndarray]], stated: set
             certain = True
         words = f"all values are within {v.min():.4g} to {v.max():.4g} {r.unit}"
         if smooth and certain:
-            sure[s] = f"{words}, which is too little for a machine that moves; --unit {s}={unit}, if it is in {unit} ({s}={r.unit}, if not)"
+            sure[s] = (
+                f"{words}, which is too little for a machine that moves; --unit {s}={unit}, if it is in {unit} "
+                f"({s}={r.unit}, if not)"
+            )
         elif smooth or moves or (r is _SPEED and np.median(v) > 0.1):
             perhaps[s] = f"{words}; if they are in {unit}: --unit {s}={unit}"
     return sure, perhaps
@@ -157,7 +196,7 @@ def _in_a_second(t: np.ndarray, v: np.ndarray) -> float:
     return float(np.abs(v[later] - v).max()) if t.size else 0.0
 
 
-# ---- time ---------------------------------------------------------------------------------------------------------------------------
+# ---- time ------------------------------------------------------------------------------------------------------------
 
 
 def latest(t: np.ndarray) -> bool:
@@ -166,10 +205,12 @@ def latest(t: np.ndarray) -> bool:
 
 
 def out_of_order(t: np.ndarray, slack: float = 0.0) -> np.ndarray | None:
-    """Rows whose time stamp is wrong, as the order of the rows shows: bool[n]; None where that does not explain why time runs backwards.
+    """Rows whose time stamp is wrong, as the order of the rows shows: bool[n]; None where that does not explain why
+    time runs backwards.
 
-    The most rows that can be kept with a time that never falls are kept. What is left must be single stamps (no more than `RUN` in a row,
-    `FEW` of all), or one side of a clock that jumped by more than `JUMP`. ``slack`` (s): rows that are so little late are no wrong stamps.
+    The most rows that can be kept with a time that never falls are kept. What is left must be single stamps (no more
+    than `RUN` in a row, `FEW` of all), or one side of a clock that jumped by more than `JUMP`. ``slack`` (s): rows that
+    are so little late are no wrong stamps.
     """
     keep = _rising(t)
     wrong = np.flatnonzero(~keep)
@@ -195,7 +236,9 @@ def out_of_order(t: np.ndarray, slack: float = 0.0) -> np.ndarray | None:
 
 
 def _rising(t: np.ndarray) -> np.ndarray:
-    """A longest part of ``t`` that never falls, as bool[n]; of equally long ones one whose first and last rows lie near the others."""
+    """A longest part of ``t`` that never falls, as bool[n]; of equally long ones one whose first and last rows lie near
+    the others.
+    """
     keep, back = _longest(t), _longest(-t[::-1])[::-1]  # the first chooses well at the end, the second at the start
     alike = np.flatnonzero(keep & back & (np.cumsum(keep) == np.cumsum(back)))
     if alike.size:
@@ -226,9 +269,11 @@ def _longest(t: np.ndarray) -> np.ndarray:
 
 
 def longest_part(times: list[np.ndarray]) -> tuple[float, float, str, str]:
-    """First and last time of what can be kept of channels with these times (s, rising), a note on what was cut, and why nothing can be.
+    """First and last time of what can be kept of channels with these times (s, rising), a note on what was cut, and why
+    nothing can be.
 
-    Where the clock jumped forward (more than `JUMP` without a sample of any channel) only one side belongs to the run: the longer.
+    Where the clock jumped forward (more than `JUMP` without a sample of any channel) only one side belongs to the run:
+    the longer.
     """
     t = np.unique(np.concatenate(times))
     first, last = float(t[0]), float(t[-1])
@@ -249,7 +294,10 @@ def longest_part(times: list[np.ndarray]) -> tuple[float, float, str, str]:
     if lost <= RUN or (at.size > 1 and lost <= FEW * t.size):
         far = t[0] if best else t[-1]
         return a, b, f"time: {lost:,} of {t.size:,} stamps are far from all others ({far:.9g} s): left out", ""
-    words = f"time jumps from {t[at[0]]:.9g} s to {t[at[0] + 1]:.9g} s: only the longer part is kept, {kept:,} of {t.size:,} stamps"
+    words = (
+        f"time jumps from {t[at[0]]:.9g} s to {t[at[0] + 1]:.9g} s: only the longer part is kept, {kept:,} of "
+        f"{t.size:,} stamps"
+    )
     return a, b, words, ""
 
 
@@ -260,4 +308,7 @@ def span_complaint(times: list[np.ndarray], number: Callable[[float], str] = "{:
     most = min(LONGEST, max(2.0 * JUMP, SLOWEST * rows))
     if span <= most:
         return ""
-    return f"spans {number(span)} s with {rows:,} rows; allowed: up to {number(most)} s ({SLOWEST:g} s a row, {number(LONGEST)} s in all)"
+    return (
+        f"spans {number(span)} s with {rows:,} rows; allowed: up to {number(most)} s ({SLOWEST:g} s a row, "
+        f"{number(LONGEST)} s in all)"
+    )

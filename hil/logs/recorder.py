@@ -1,21 +1,26 @@
-"""Frames to a file that opens whenever the recording stops, also by ``kill -9``: candump, BLF, MDF4 or Parquet, by suffix.
+"""Frames to a file that opens whenever the recording stops, also by ``kill -9``: candump, BLF, MDF4 or Parquet, by
+suffix.
 
 Twice a second what has come in is appended, each format in its own way such that the file is whole again afterwards:
 
-========== ============================================================================================================================
+==========
+============================================================================================================================
 candump    lines, written whole, with the direction behind each frame as ``candump -x`` has it
-BLF        a container; the file is closed and opened again with python-can's writer, so that its header counts what is there
-MDF4       a compressed data block behind the file's end, then its address into the list of blocks, then the number of records: two
-           writes of eight bytes, so that a reader meets the state before or after
-Parquet    a row group and a footer with all row groups so far behind the footer before (readers take the last one); row groups are
-           merged ten by ten, so that footers stay small; at the end the file is written anew without what became obsolete
-========== ============================================================================================================================
+BLF        a container; the file is closed and opened again with python-can's writer, so that its header counts what is
+           there
+MDF4       a compressed data block behind the file's end, then its address into the list of blocks, then the number of
+           records: two writes of eight bytes, so that a reader meets the state before or after
+Parquet    a row group and a footer with all row groups so far behind the footer before (readers take the last one); row
+           groups are merged ten by ten, so that footers stay small; at the end the file is written anew without what
+           became obsolete
+==========
+============================================================================================================================
 
-A killed process loses nothing that it has handed to the kernel, so at most half a second is lost; a machine that loses its power may lose
-what the kernel has not yet written to the disk.
+A killed process loses nothing that it has handed to the kernel, so at most half a second is lost; a machine that loses
+its power may lose what the kernel has not yet written to the disk.
 
-`Recorder` writes in the process that calls it. `RecorderProcess` gives frames to a process of its own through a pipe, for a loop that must
-not wait for a disk; it ends the file properly even where the loop's process is killed.
+`Recorder` writes in the process that calls it. `RecorderProcess` gives frames to a process of its own through a pipe,
+for a loop that must not wait for a disk; it ends the file properly even where the loop's process is killed.
 """
 
 from __future__ import annotations
@@ -45,15 +50,25 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message", "read_record",
+    "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message",
+    "read_record",
 ]  # fmt: skip
 
 FLUSH = 0.5  # s between two appends; at most this much is lost
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
 
-# a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused bytes
+# a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused
+# bytes
 FRAME = np.dtype(
-    [("ns", "<i8"), ("ident", "<u4"), ("length", "u1"), ("flags", "u1"), ("tx", "u1"), ("unused", "u1"), ("data", "u1", (64,))]
+    [
+        ("ns", "<i8"),
+        ("ident", "<u4"),
+        ("length", "u1"),
+        ("flags", "u1"),
+        ("tx", "u1"),
+        ("unused", "u1"),
+        ("data", "u1", (64,)),
+    ]
 )
 _FRAME = struct.Struct("<qIBBBx64s")
 _WHOLE = select.PIPE_BUF // FRAME.itemsize * FRAME.itemsize  # bytes that a pipe takes whole or not at all
@@ -70,23 +85,33 @@ class _Format(Protocol):
         """End the file."""
 
 
-# ---- candump ------------------------------------------------------------------------------------------------------------------------
+# ---- candump ---------------------------------------------------------------------------------------------------------
 
 
 class _Candump:
     def __init__(self, path: Path, channel: str):
         self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
-        self.channel = re.sub(r"\W", "-", channel)[:15] or "can0"  # a name of a network interface has 15 characters at most
+        self.channel = (
+            re.sub(r"\W", "-", channel)[:15] or "can0"
+        )  # a name of a network interface has 15 characters at most
 
     def append(self, frames: np.ndarray) -> None:
         text, lines = frames["data"].tobytes().hex().upper(), []
         columns = (frames["ns"] // 1000, frames["ident"], frames["length"], frames["flags"], frames["tx"])
         for k, (us, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            name = f"{ident & 0x1FFFFFFF:08X}" if ident & EXTENDED else f"{ident:08X}" if ident & ERROR else f"{ident & 0x7FF:03X}"
+            name = (
+                f"{ident & 0x1FFFFFFF:08X}"
+                if ident & EXTENDED
+                else f"{ident:08X}"
+                if ident & ERROR
+                else f"{ident & 0x7FF:03X}"
+            )
             data = f"R{n or ''}" if ident & REMOTE else text[128 * k : 128 * k + 2 * n]
             if flags & FD:
                 data = f"#{flags & 3:X}{data}"
-            lines.append(f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) {self.channel} {name}#{data} {'T' if tx else 'R'}\n")
+            lines.append(
+                f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) {self.channel} {name}#{data} {'T' if tx else 'R'}\n"
+            )
         _append(self.fd, "".join(lines).encode("ascii"))
 
     def close(self) -> None:
@@ -105,7 +130,7 @@ def _append(fd: int, data: bytes) -> None:
         raise
 
 
-# ---- BLF ----------------------------------------------------------------------------------------------------------------------------
+# ---- BLF -------------------------------------------------------------------------------------------------------------
 
 
 class _Blf:
@@ -117,7 +142,8 @@ class _Blf:
             pass
 
     def append(self, frames: np.ndarray) -> None:
-        # the writer appends and updates the header in a copy in memory, which then goes to the file at once: first the end, then the header
+        # the writer appends and updates the header in a copy in memory, which then goes to the file at once: first the
+        # end, then the header
         with self.path.open("r+b") as file:
             head, end = file.read(144), file.seek(0, io.SEEK_END)
             part = _Tail(head, end)
@@ -155,7 +181,9 @@ class _Tail(io.RawIOBase):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self.at = offset + (self.start + len(self.tail) if whence == io.SEEK_END else self.at if whence == io.SEEK_CUR else 0)
+        self.at = offset + (
+            self.start + len(self.tail) if whence == io.SEEK_END else self.at if whence == io.SEEK_CUR else 0
+        )
         return self.at
 
     def tell(self) -> int:
@@ -183,21 +211,25 @@ def messages(frames: np.ndarray) -> Any:
     data = frames["data"].tobytes()
     for k, (t, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
         yield can.Message(
-            timestamp=t, arbitration_id=ident & 0x1FFFFFFF, is_extended_id=bool(ident & EXTENDED), is_remote_frame=bool(ident & REMOTE),
-            is_error_frame=bool(ident & ERROR), channel=0, dlc=n, data=None if ident & REMOTE else data[64 * k : 64 * k + n], is_rx=not tx,
+            timestamp=t, arbitration_id=ident & 0x1FFFFFFF, is_extended_id=bool(ident & EXTENDED),
+            is_remote_frame=bool(ident & REMOTE),
+            is_error_frame=bool(ident & ERROR), channel=0, dlc=n,
+            data=None if ident & REMOTE else data[64 * k : 64 * k + n], is_rx=not tx,
             is_fd=bool(flags & FD), bitrate_switch=bool(flags & 1), error_state_indicator=bool(flags & 2),
         )  # fmt: skip
 
 
-# ---- MDF4 ---------------------------------------------------------------------------------------------------------------------------
+# ---- MDF4 ------------------------------------------------------------------------------------------------------------
 
-_COLUMNS = [("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"), ("DataBytes", "u1", (64,)),
+_COLUMNS = [("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"),
+    ("DataBytes", "u1", (64,)),
             ("Dir", "u1"), ("EDL", "u1"), ("BRS", "u1"), ("ESI", "u1")]  # fmt: skip
 _START_TIME = 64 + 24 + 48  # in the file: identification block, head and links of the header block
 
 
 class _Mdf:
-    """Bus logging as ASAM lays it out: a group each of data, error and remote frames. asammdf makes the empty file, blocks are added here.
+    """Bus logging as ASAM lays it out: a group each of data, error and remote frames. asammdf makes the empty file,
+    blocks are added here.
 
     Data group -> header list (HL) -> one list block (DL) an append -> one compressed data block (DZ) each.
     """
@@ -212,12 +244,20 @@ class _Mdf:
         self.kinds = [np.dtype([("t", "<f8"), *((f"{kind}.{c[0]}", *c[1:]) for c in _COLUMNS)]) for kind in self.KINDS]
         with asammdf.MDF(version="4.10") as mdf:
             for kind, dtype in zip(self.KINDS, self.kinds, strict=True):
-                rest = np.empty(0, np.dtype([(n, dtype[n].base, dtype[n].shape) for n in dtype.names or () if n != "t"]))
+                rest = np.empty(
+                    0, np.dtype([(n, dtype[n].base, dtype[n].shape) for n in dtype.names or () if n != "t"])
+                )
                 source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
-                mdf.append(asammdf.Signal(rest, np.empty(0), name=kind, source=source), comment="VaneLoop", common_timebase=True)
+                mdf.append(
+                    asammdf.Signal(rest, np.empty(0), name=kind, source=source),
+                    comment="VaneLoop",
+                    common_timebase=True,
+                )
             mdf.save(path, overwrite=True)
         with asammdf.MDF(path) as mdf:
-            self.groups = [(g.data_group.address + 40, g.channel_group.address + 80) for g in mdf.groups]  # address of the data, records
+            self.groups = [
+                (g.data_group.address + 40, g.channel_group.address + 80) for g in mdf.groups
+            ]  # address of the data, records
             sizes = [g.channel_group.samples_byte_nr for g in mdf.groups]
         if sizes != [k.itemsize for k in self.kinds]:
             raise RuntimeError(f"asammdf lays records out in {sizes} bytes, not {[k.itemsize for k in self.kinds]}")
@@ -263,7 +303,9 @@ class _Mdf:
         block = at + 56
         # list: next, data, flags, one block, its offset in the group's data
         out += struct.pack("<4sIQQQQB3xIQ", b"##DL", 0, 56, 2, 0, block, 0, 1, self.bytes[k])
-        out += struct.pack("<4sIQQ2sBxIQQ", b"##DZ", 0, 48 + len(packed), 0, b"DT", 0, 0, len(raw), len(packed)) + packed
+        out += (
+            struct.pack("<4sIQQ2sBxIQQ", b"##DZ", 0, 48 + len(packed), 0, b"DT", 0, 0, len(raw), len(packed)) + packed
+        )
         out += bytes(-len(packed) % 8)
         _append(self.fd, bytes(out))
         data, count = self.groups[k]
@@ -277,11 +319,13 @@ class _Mdf:
         os.close(self.fd)
 
 
-# ---- Parquet ------------------------------------------------------------------------------------------------------------------------
+# ---- Parquet ---------------------------------------------------------------------------------------------------------
 
 
 class _Group(NamedTuple):
-    """A row group in the file: times merged, its rows (None where it will not be merged again), their number, its part of the footer."""
+    """A row group in the file: times merged, its rows (None where it will not be merged again), their number, its part
+    of the footer.
+    """
 
     level: int
     rows: Any
@@ -290,12 +334,17 @@ class _Group(NamedTuple):
 
 
 class _Parquet:
-    """A row a frame: time, identifier, kind, direction, length, bytes; and the signals of `vgv.dbc` in columns that are null elsewhere.
+    """A row a frame: time, identifier, kind, direction, length, bytes; and the signals of `vgv.dbc` in columns that are
+    null elsewhere.
 
-    So it is a log for every command as it stands, and still holds each frame. ``t`` counts from the first frame, ``time`` from 1970.
+    So it is a log for every command as it stands, and still holds each frame. ``t`` counts from the first frame,
+    ``time`` from 1970.
     """
 
-    MERGE, TOP = 5, 4  # row groups merged into one; times that a row is merged: its group then holds 5**4 appends, about 5 minutes
+    MERGE, TOP = (
+        5,
+        4,
+    )  # row groups merged into one; times that a row is merged: its group then holds 5**4 appends, about 5 minutes
     MOST = 50_000  # rows of a group that is merged further, so that no merge takes longer than an append may
 
     def __init__(self, path: Path, channel: str):
@@ -306,13 +355,17 @@ class _Parquet:
         self.path, self.messages = path, canlog.load_dbc(table_path("vgv.dbc"))[0]
         self.signals = [s.name for m in self.messages for s in m.layout.signals if s.name in UNITS]
         self.schema = pa.schema([
-            ("t", pa.float64()), ("time", pa.timestamp("ns", "UTC")), ("id", pa.uint32()), ("extended", pa.bool_()), ("kind", pa.string()),
-            ("tx", pa.bool_()), ("length", pa.uint8()), ("bytes", pa.binary()), *((s, pa.float64()) for s in self.signals),
+            ("t", pa.float64()), ("time", pa.timestamp("ns", "UTC")), ("id", pa.uint32()), ("extended", pa.bool_()),
+            ("kind", pa.string()),
+            ("tx", pa.bool_()), ("length", pa.uint8()), ("bytes", pa.binary()),
+            *((s, pa.float64()) for s in self.signals),
         ])  # fmt: skip
         self.fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         self.start: int | None = None
         self.groups: list[_Group] = []
-        all_kinds = np.zeros(len(self.messages), FRAME)  # loads, and on a new machine compiles, what an append needs before frames come
+        all_kinds = np.zeros(
+            len(self.messages), FRAME
+        )  # loads, and on a new machine compiles, what an append needs before frames come
         all_kinds["ident"], all_kinds["length"] = [m.ident for m in self.messages], 8
         self._write([], self._rows(np.frombuffer(all_kinds.tobytes(), FRAME)).slice(0, 0), 0)
 
@@ -322,7 +375,11 @@ class _Parquet:
         if self.start is None:
             self.start = int(frames["ns"][0])
         rows, level, keep, others = self._rows(frames), 0, list(self.groups), self.MERGE - 1
-        while level < self.TOP and len(keep) >= others and all(g.level == level and g.rows is not None for g in keep[-others:]):
+        while (
+            level < self.TOP
+            and len(keep) >= others
+            and all(g.level == level and g.rows is not None for g in keep[-others:])
+        ):
             rows = pa.concat_tables([*(g.rows for g in keep[-others:]), rows])
             del keep[-others:]
             level += 1
@@ -334,11 +391,15 @@ class _Parquet:
         ident, n = frames["ident"], len(frames)
         error, remote, fd = ident & ERROR != 0, ident & REMOTE != 0, frames["flags"] & FD != 0
         ours = np.where(error | remote | fd, np.uint32(ERROR), ident)
-        plain = canlog.Frames(np.zeros(n), ours, np.zeros(n, np.int32), frames["length"], np.ascontiguousarray(frames["data"][:, :8]))
+        plain = canlog.Frames(
+            np.zeros(n), ours, np.zeros(n, np.int32), frames["length"], np.ascontiguousarray(frames["data"][:, :8])
+        )
         columns: dict[str, Any] = {
-            "t": (frames["ns"] - (self.start or 0)) * 1e-9, "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
+            "t": (frames["ns"] - (self.start or 0)) * 1e-9,
+            "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
             "id": ident & 0x1FFFFFFF, "extended": ident & EXTENDED != 0,
-            "kind": np.select([error, remote, fd], ["error", "remote", "fd"], "data"), "tx": frames["tx"] != 0, "length": frames["length"],
+            "kind": np.select([error, remote, fd], ["error", "remote", "fd"], "data"), "tx": frames["tx"] != 0,
+            "length": frames["length"],
             "bytes": [d[:k].tobytes() for d, k in zip(frames["data"], frames["length"].tolist(), strict=True)],
         }  # fmt: skip
         for message in self.messages:
@@ -356,7 +417,9 @@ class _Parquet:
         import pyarrow.parquet as pq
 
         end, part = os.lseek(self.fd, 0, os.SEEK_END), io.BytesIO()
-        pq.write_table(rows, part, row_group_size=max(len(rows), 1), compression="zstd", write_statistics=False, store_schema=False)
+        pq.write_table(
+            rows, part, row_group_size=max(len(rows), 1), compression="zstd", write_statistics=False, store_schema=False
+        )
         raw = part.getvalue()
         size = int.from_bytes(raw[-8:-4], "little")
         footer, _ = _thrift_read(raw, len(raw) - 8 - size)
@@ -366,7 +429,10 @@ class _Parquet:
         tail = _thrift_write(footer)
         _append(self.fd, raw[: -8 - size] + tail + len(tail).to_bytes(4, "little") + b"PAR1")
         if len(rows):
-            self.groups = [*keep, _Group(level, rows if level < self.TOP and len(rows) <= self.MOST else None, len(rows), groups[0])]
+            self.groups = [
+                *keep,
+                _Group(level, rows if level < self.TOP and len(rows) <= self.MOST else None, len(rows), groups[0]),
+            ]
 
     def close(self) -> None:
         """Write the file anew without obsolete row groups and footers, and put it in place of the grown one."""
@@ -384,15 +450,18 @@ class _Parquet:
             new.unlink(missing_ok=True)
 
 
-# The footer is a thrift structure in the compact protocol. pyarrow writes a row group only at the beginning of a file; where it is appended
-# to one, the addresses in it move.
+# The footer is a thrift structure in the compact protocol. pyarrow writes a row group only at the beginning of a file;
+# where it is appended to one, the addresses in it move.
 _I64, _LIST, _STRUCT = 6, 9, 12
 _ROWS, _GROUPS = 3, 4  # of the footer: number of rows, row groups
-_ThriftStruct = dict[int, tuple[int, Any]]  # field -> type, value; a list: type and elements, structures that are written already as bytes
+_ThriftStruct = dict[
+    int, tuple[int, Any]
+]  # field -> type, value; a list: type and elements, structures that are written already as bytes
 
 
 def _moved(group: _ThriftStruct, by: int) -> _ThriftStruct:
     """Return a row group whose addresses count from ``by`` bytes earlier."""
+
     def move(struct: _ThriftStruct, *fields: int) -> None:
         for f in fields:
             if f in struct and struct[f][1] > 0:
@@ -499,10 +568,15 @@ def _thrift_write(struct: _ThriftStruct) -> bytes:
     return bytes(out) + b"\0"
 
 
-SUFFIXES: dict[str, Callable[[Path, str], _Format]] = {".log": _Candump, ".blf": _Blf, ".mf4": _Mdf, ".parquet": _Parquet}
+SUFFIXES: dict[str, Callable[[Path, str], _Format]] = {
+    ".log": _Candump,
+    ".blf": _Blf,
+    ".mf4": _Mdf,
+    ".parquet": _Parquet,
+}
 
 
-# ---- a recording --------------------------------------------------------------------------------------------------------------------
+# ---- a recording -----------------------------------------------------------------------------------------------------
 
 
 class Recorder:
@@ -529,7 +603,9 @@ class Recorder:
             self._waiting.append(frames)
 
     def poll(self) -> None:
-        """Append what has come in, if it is time. Raises InputError where the file cannot be written: it then ends before these frames."""
+        """Append what has come in, if it is time. Raises InputError where the file cannot be written: it then ends
+        before these frames.
+        """
         if time.monotonic() >= self._next:
             self.flush()
 
@@ -542,7 +618,9 @@ class Recorder:
             try:
                 self.file.append(frames)
             except OSError as e:
-                raise InputError(f"{self.path}: cannot be written ({e.strerror or e}); it ends after {self.frames:,} frames") from None
+                raise InputError(
+                    f"{self.path}: cannot be written ({e.strerror or e}); it ends after {self.frames:,} frames"
+                ) from None
             self.frames += len(frames)
 
     def close(self) -> None:
@@ -585,7 +663,9 @@ def _keep_old(path: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class Record:
-    """Frames of a recording, in order: ms since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), and whether it sent them."""
+    """Frames of a recording, in order: ms since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), and
+    whether it sent them.
+    """
 
     ms: np.ndarray
     rows: np.ndarray
@@ -632,25 +712,38 @@ def _read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows = [
         (ident | (EXTENDED if extended and kind != "error" else 0) | flags[kind] | length << 32,
          int.from_bytes(data[:8].ljust(8, b"\0"), "little", signed=True))
-        for ident, extended, kind, length, data in zip(t["id"], t["extended"], t["kind"], t["length"], t["bytes"], strict=True)
+        for ident, extended, kind, length,
+            data in zip(t["id"], t["extended"], t["kind"], t["length"], t["bytes"], strict=True)
     ]  # fmt: skip
     return us, np.array(rows, np.int64).reshape(-1, 2), np.array(t["tx"], bool)
 
 
 def packed_message(message: can.Message) -> bytes:
     """Return a python-can message as the recorder takes it (FRAME)."""
-    ident = message.arbitration_id | (EXTENDED if message.is_extended_id else 0) | (REMOTE if message.is_remote_frame else 0)
+    ident = (
+        message.arbitration_id
+        | (EXTENDED if message.is_extended_id else 0)
+        | (REMOTE if message.is_remote_frame else 0)
+    )
     if message.is_error_frame:
         ident = message.arbitration_id | ERROR
-    flags = (FD if message.is_fd else 0) | (1 if message.bitrate_switch else 0) | (2 if message.error_state_indicator else 0)
+    flags = (
+        (FD if message.is_fd else 0)
+        | (1 if message.bitrate_switch else 0)
+        | (2 if message.error_state_indicator else 0)
+    )
     length = message.dlc if message.is_remote_frame else len(message.data)
-    return _FRAME.pack(round(message.timestamp * 1e6) * 1000, ident, length, flags, not message.is_rx, bytes(message.data))
+    return _FRAME.pack(
+        round(message.timestamp * 1e6) * 1000, ident, length, flags, not message.is_rx, bytes(message.data)
+    )
 
 
 class RecorderProcess:
-    """A recording in a process of its own. `put` is one write into a pipe that holds half a minute of frames; it never waits.
+    """A recording in a process of its own. `put` is one write into a pipe that holds half a minute of frames; it never
+    waits.
 
-    Frames that do not fit, because the disk stands still, are counted in ``lost``. Raises InputError for what `Recorder` refuses.
+    Frames that do not fit, because the disk stands still, are counted in ``lost``. Raises InputError for what
+    `Recorder` refuses.
     """
 
     def __init__(self, path: str | Path, channel: str = "vcan0"):
@@ -681,7 +774,9 @@ class RecorderProcess:
                 self.lost += len(part) // FRAME.itemsize
 
     def close(self) -> None:
-        """End the recording and wait until the file is whole. ``frames`` then says how many are in it, ``error`` what went wrong."""
+        """End the recording and wait until the file is whole. ``frames`` then says how many are in it, ``error`` what
+        went wrong.
+        """
         assert self._process.stdin is not None
         self._process.stdin.close()
         word, _, rest = self._answer().partition(" ")
@@ -703,7 +798,11 @@ def serve(path: str, channel: str) -> int:
     """Record what comes through standard input until it ends, and say on standard output how that went."""
     import signal
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the loop's process ends the recording by closing the pipe
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+        signal.SIGHUP,
+    ):  # the loop's process ends the recording by closing the pipe
         signal.signal(number, signal.SIG_IGN)
 
     def say(text: str) -> None:

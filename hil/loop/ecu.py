@@ -1,8 +1,8 @@
 """The external engine control unit: where its demand comes from, and when it gives the controller up.
 
-The node itself is `hil.loop.node.Ecu`: ECU_DEMAND every 10 ms with the speed that its engine model (or the log) has, and a watch on the
-controller's frames. Here it gets a demand for each tick. The demand's time starts with the first good VGV_STATUS: controller and ECU can be
-started in any order; until then its first value is sent.
+The node itself is `hil.loop.node.Ecu`: ECU_DEMAND every 10 ms with the speed that its engine model (or the log) has,
+and a watch on the controller's frames. Here it gets a demand for each tick. The demand's time starts with the first
+good VGV_STATUS: controller and ECU can be started in any order; until then its first value is sent.
 """
 
 from __future__ import annotations
@@ -29,20 +29,34 @@ TICKS_PER_S = 1000
 # name -> (what it is, break points: s, %)
 BUILTIN: dict[str, tuple[str, tuple[tuple[float, float], ...]]] = {
     "idle": ("60 % held for 10 s", ((0, 60), (10, 60))),
-    "step": ("60 %, step to 80 % at 5 s, back at 15 s", ((0, 60), (5, 60), (5.01, 80), (15, 80), (15.01, 60), (25, 60))),
+    "step": (
+        "60 %, step to 80 % at 5 s, back at 15 s",
+        ((0, 60), (5, 60), (5.01, 80), (15, 80), (15.01, 60), (25, 60)),
+    ),
     "ramp": ("60 to 100 % and back at 2 %/s", ((0, 60), (2, 60), (22, 100), (27, 100), (47, 60), (50, 60))),
-    "slam": ("45 to 100 % and back as fast as the engine can", ((0, 45), (3, 45), (3.01, 100), (18, 100), (18.01, 45), (30, 45))),
+    "slam": (
+        "45 to 100 % and back as fast as the engine can",
+        ((0, 45), (3, 45), (3.01, 100), (18, 100), (18.01, 45), (30, 45)),
+    ),
     "staircase": (
         "50 to 100 % in steps of 10 %, 5 s each, and down again",
-        tuple(p for i, n in enumerate([50, 60, 70, 80, 90, 100, 90, 80, 70, 60, 50]) for p in ((5 * i + 0.01, n), (5 * i + 5, n))),
+        tuple(
+            p
+            for i, n in enumerate([50, 60, 70, 80, 90, 100, 90, 80, 70, 60, 50])
+            for p in ((5 * i + 0.01, n), (5 * i + 5, n))
+        ),
     ),
-    "sine": ("80 % +- 10 %, period 10 s, 60 s", tuple((0.1 * i, 80 + 10 * math.sin(2 * math.pi * 0.01 * i)) for i in range(601))),
+    "sine": (
+        "80 % +- 10 %, period 10 s, 60 s",
+        tuple((0.1 * i, 80 + 10 * math.sin(2 * math.pi * 0.01 * i)) for i in range(601)),
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Demand:
-    """Speed demand over time: break points ``t`` (s, from 0, increasing), ``n_dem`` (%), and the measured speed ``n_r`` (%) if it is known.
+    """Speed demand over time: break points ``t`` (s, from 0, increasing), ``n_dem`` (%), and the measured speed ``n_r``
+    (%) if it is known.
 
     held  True: each value is held until the next (a log); False: straight lines in between (a profile)
     """
@@ -75,7 +89,8 @@ def builtin(name: str) -> Demand:
 
 
 def read_profile(path: str | Path, **options: Any) -> Demand:
-    """Read a profile: TOML with the lists ``t`` (s) and ``n_dem`` (%), or any log with n_dem (CSV: a header ``t,n_dem``).
+    """Read a profile: TOML with the lists ``t`` (s) and ``n_dem`` (%), or any log with n_dem (CSV: a header
+    ``t,n_dem``).
 
     ``options`` say how to read a log (`hil.logs.read_log`).
 
@@ -87,13 +102,19 @@ def read_profile(path: str | Path, **options: Any) -> Demand:
         columns: dict[str, np.ndarray] = {}
         for key in ("t", "n_dem"):
             values = table.get(key)
-            if not isinstance(values, list) or not values or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
+            if (
+                not isinstance(values, list)
+                or not values
+                or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values)
+            ):
                 raise InputError(f"{path}: {key} must be a list of numbers, as t = [0, 10] and n_dem = [60, 90]")
             columns[key] = np.array(values, float)
         if unknown := sorted(set(table) - {"t", "n_dem"}):
             raise InputError(f"{path}: {unknown[0]!r} is unknown; allowed: t, n_dem")
         if len(columns["t"]) != len(columns["n_dem"]):
-            raise InputError(f"{path}: t has {len(columns['t'])} numbers, n_dem {len(columns['n_dem'])}; they must be as many")
+            raise InputError(
+                f"{path}: t has {len(columns['t'])} numbers, n_dem {len(columns['n_dem'])}; they must be as many"
+            )
         return _checked(Demand(columns["t"], columns["n_dem"]), path)
     from hil.logs import read_log
 
@@ -102,7 +123,9 @@ def read_profile(path: str | Path, **options: Any) -> Demand:
 
 
 def demand_of_log(log: Any) -> Demand:
-    """Return the demand of a log (`hil.logs.Log`), with its measured speed where it has one; values are held until the next."""
+    """Return the demand of a log (`hil.logs.Log`), with its measured speed where it has one; values are held until the
+    next.
+    """
     c = log.channels["n_dem"]
     t, n_r = c.t, None
     if "n_r" in log.channels:
@@ -129,7 +152,9 @@ def _checked(demand: Demand, source: Any) -> Demand:
 
 
 class Typed:
-    """A demand that somebody types: numbers are %, ``+`` and ``-`` change it, ``run`` and ``standby`` ask for the mode, ``quit`` ends."""
+    """A demand that somebody types: numbers are %, ``+`` and ``-`` change it, ``run`` and ``standby`` ask for the mode,
+    ``quit`` ends.
+    """
 
     HELP = "a number sets n_dem (%), +N or -N changes it; run, standby: mode request; quit ends"
 
@@ -164,7 +189,15 @@ class EcuStation:
     wait     s to wait for the first one
     """
 
-    def __init__(self, demand: Demand | Typed, *, timeout: float = 0.5, wait: float = 10.0, mode_request: int = 1, ecu: Ecu | None = None):
+    def __init__(
+        self,
+        demand: Demand | Typed,
+        *,
+        timeout: float = 0.5,
+        wait: float = 10.0,
+        mode_request: int = 1,
+        ecu: Ecu | None = None,
+    ):
         self.typed = demand if isinstance(demand, Typed) else None
         self.rows = demand.per_frame() if isinstance(demand, Demand) else np.array([[demand.n_dem, np.nan]])
         self.ecu = ecu or Ecu(n_dem=float(self.rows[0, 0]))
@@ -198,15 +231,24 @@ class EcuStation:
         return out
 
     def watcher(self, duration: float | None) -> Callable[[int], str | None]:
-        """Return a function that says after tick k why to end: ``done``, ``quit``, or a complaint about the controller."""
+        """Return a function that says after tick k why to end: ``done``, ``quit``, or a complaint about the
+        controller.
+        """
         last = None if duration is None else round(duration * TICKS_PER_S)
 
         def watch(k: int) -> str | None:
             if self.met is None:
-                return f"no good VGV_STATUS within {self.wait / TICKS_PER_S:g} s: is a controller running?" if k >= self.wait else None
+                return (
+                    f"no good VGV_STATUS within {self.wait / TICKS_PER_S:g} s: is a controller running?"
+                    if k >= self.wait
+                    else None
+                )
             silent = k - int(self._status[R_LAST_TICK])
             if silent >= self.timeout:
-                return f"timed out: no good VGV_STATUS for {silent / TICKS_PER_S:.2f} s at t = {(k - self.met) / TICKS_PER_S:.2f} s"
+                return (
+                    f"timed out: no good VGV_STATUS for {silent / TICKS_PER_S:.2f} s at t = "
+                    f"{(k - self.met) / TICKS_PER_S:.2f} s"
+                )
             if self.typed is not None and self.typed.quit:
                 return "quit"
             return "done" if last is not None and k - self.met >= last else None

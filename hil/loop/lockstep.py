@@ -1,7 +1,7 @@
 """The closed loop in simulated time: controller, plant and sensors, tick by tick, as fast as the machine can.
 
-Time is an integer number of ticks; no clock is read. The same stimulus, tables and seed give the same states, bit for bit, in any process;
-`Run.state_hash` is the proof. One tick k, at t = k ms::
+Time is an integer number of ticks; no clock is read. The same stimulus, tables and seed give the same states, bit for
+bit, in any process; `Run.state_hash` is the proof. One tick k, at t = k ms::
 
     every 10th tick: the ECU's frame (n_dem, n_r) arrives
     the sensors' samples at t go into the controller's tick
@@ -21,17 +21,7 @@ from functools import lru_cache
 import numpy as np
 
 from controller import Calibration, load_calibration
-from controller.firmware import (
-    BLEND,
-    DIRECTION,
-    FAULT_BITS,
-    IN_FRESH,
-    IN_REJECTED,
-    IN_X_LVDT,
-    MODE,
-    SLOW,
-    X_DEM,
-)
+from controller.firmware import BLEND, DIRECTION, FAULT_BITS, IN_FRESH, IN_REJECTED, IN_X_LVDT, MODE, SLOW, X_DEM
 from hil.loop.tick import FRAME, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain
 from plant.compiled import compiled_free
@@ -78,7 +68,9 @@ class Stimulus:
 
 @dataclass(frozen=True)
 class Run:
-    """One simulated run: ``columns`` of border-unit arrays on the raster ``t`` (s), and the digest of every tick's state."""
+    """One simulated run: ``columns`` of border-unit arrays on the raster ``t`` (s), and the digest of every tick's
+    state.
+    """
 
     columns: dict[str, np.ndarray]
     simulated_s: float
@@ -172,9 +164,10 @@ def lockstep(
     angles         rad, measured vane angles at t = 0, to start each stage's play where the machine's was
     stroke_demand  m, logged stroke demand at t = 0: the controller starts on the curve that is nearer to it
     duration       s, default the stimulus's length
-    pots           float64[frames, 6], what the controller gets of each stem potentiometer: share of its reading and offset (rad), stage by
-                   stage; share 0 = stuck, offset NaN = none. The log keeps the reading itself.
-    watch          called with the states of the controller and the plant at each of the next up to 10,000 ticks, side by side
+    pots           float64[frames, 6], what the controller gets of each stem potentiometer: share of its reading and
+                   offset (rad), stage by stage; share 0 = stuck, offset NaN = none. The log keeps the reading itself.
+    watch          called with the states of the controller and the plant at each of the next up to 10,000 ticks, side
+                   by side
     progress       called with the fraction done
     """
     machine = plant or _nominal()
@@ -184,7 +177,15 @@ def lockstep(
     ticks = int(round((duration if duration is not None else len(rows) * FRAME) * 1000))
     n_dem, t_oil = float(rows[0, S_N_DEM]), float(rows[0, S_T_OIL])
     n0 = float(rows[0, S_N_R]) if np.isfinite(rows[0, S_N_R]) else n_dem
-    loop = new_loop(machine, calibration or load_calibration(), n_engine=n_dem, n_r=n0, t_oil=t_oil, noisy=seed is not None, pots=pots)
+    loop = new_loop(
+        machine,
+        calibration or load_calibration(),
+        n_engine=n_dem,
+        n_r=n0,
+        t_oil=t_oil,
+        noisy=seed is not None,
+        pots=pots,
+    )
     z, s = loop.z, loop.s
     z[DIRECTION], z[BLEND] = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
@@ -227,7 +228,9 @@ def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> 
 
 
 def warm_up(say: Callable[[str], None]) -> None:
-    """Compile the loop once, telling the user before a wait of some seconds; silent when its compiled code is there already."""
+    """Compile the loop once, telling the user before a wait of some seconds; silent when its compiled code is there
+    already.
+    """
     from plant.compiled import is_cached
 
     if is_cached("lockstep.advance"):

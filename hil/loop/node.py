@@ -1,8 +1,8 @@
 """The two nodes on the bus, tick by tick: controller with its plant (VGV), and the engine control unit (ECU).
 
-A node takes the frames that came since its last tick and gives the frames to send. It has no clock and no bus, so that the real-time loop,
-the lockstep bus and fault injection run the very same compiled tick; a run whose received frames were kept tick by tick is repeated bit for
-bit by `replay`. Frames are rows of two int64 (`hil.bus.frames`).
+A node takes the frames that came since its last tick and gives the frames to send. It has no clock and no bus, so that
+the real-time loop, the lockstep bus and fault injection run the very same compiled tick; a run whose received frames
+were kept tick by tick is repeated bit for bit by `replay`. Frames are rows of two int64 (`hil.bus.frames`).
 
 One tick k of the VGV node, at t = k ms::
 
@@ -76,9 +76,11 @@ class NodeArrays(NamedTuple):
     """All that the VGV node's tick works on, in place.
 
     inputs .. sent  the loop's (`hil.loop.tick.Loop`)
-    supply      float64[4] supply pressure (Pa), oil temperature (degC); demand and speed (%) of the machine: the last plausible frame's
+    supply      float64[4] supply pressure (Pa), oil temperature (degC); demand and speed (%) of the machine: the last
+                plausible frame's
     receiver    int64, of ECU_DEMAND (`hil.bus.frames`)
-    counter     int64: E2E counters of the four frames sent; frames of other identifiers, under our own identifiers, error frames
+    counter     int64: E2E counters of the four frames sent; frames of other identifiers, under our own identifiers,
+                error frames
     """
 
     inputs: np.ndarray
@@ -100,7 +102,9 @@ class NodeArrays(NamedTuple):
 
 @in_place
 def _take(a, received, n, k):
-    """Judge the ``n`` received frames of tick ``k``, and the loop's word that it stood still; set the firmware's inputs."""
+    """Judge the ``n`` received frames of tick ``k``, and the loop's word that it stood still; set the firmware's
+    inputs.
+    """
     before = refused(a.receiver)
     fresh = pause = 0.0
     n_dem = n_r = 0.0
@@ -150,7 +154,8 @@ def _put(sent, m, ident, data):
 
 @in_place
 def node_tick(k, received, n, noise, row, a, sent):
-    """Run tick ``k`` of the VGV node on the first ``n`` rows of ``received``; write the frames to send and return their number.
+    """Run tick ``k`` of the VGV node on the first ``n`` rows of ``received``; write the frames to send and return their
+    number.
 
     received  int64[>= n, 2] in order of arrival
     noise     float64[:, 5] standard normal numbers, of this tick those in ``row``
@@ -163,7 +168,12 @@ def node_tick(k, received, n, noise, row, a, sent):
     m = 0
     if k % SLOW == 0:
         c = a.counter
-        m = _put(sent, m, VGV_STATUS, encode_status(z[X_DEM] * 1e3, a.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)))
+        m = _put(
+            sent,
+            m,
+            VGV_STATUS,
+            encode_status(z[X_DEM] * 1e3, a.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)),
+        )
         m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(a) * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
         vigv, vgv1, vgv2 = a.angles[0] * DEGREES, a.angles[1] * DEGREES, a.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
@@ -195,9 +205,13 @@ class Node:
         seed: int | None = None,
     ):
         machine, cal = plant or build_plant(), calibration or load_calibration()
-        loop = new_loop(machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=np.array([[1.0, 0.0] * 3]))
+        loop = new_loop(
+            machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=np.array([[1.0, 0.0] * 3])
+        )
         assert NodeArrays._fields[: len(loop)] == Loop._fields
-        self.arrays = NodeArrays(*loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64))
+        self.arrays = NodeArrays(
+            *loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64)
+        )
         self.k = 0
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
         self._generator = np.random.Generator(np.random.PCG64(seed)) if seed is not None else None
@@ -233,7 +247,9 @@ class Node:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What the receiver has counted: `hil.bus.frames.COUNTS`, frames of others, under our own identifiers, and error frames."""
+        """What the receiver has counted: `hil.bus.frames.COUNTS`, frames of others, under our own identifiers, and
+        error frames.
+        """
         out = {name: int(v) for name, v in zip(frames.COUNTS, self.arrays.receiver, strict=False)}
         for name, at in (("other", C_OTHER), ("own_identifier", C_OURS), ("error_frames", C_ERROR_FRAMES)):
             out[name] = int(self.arrays.counter[at])
@@ -252,7 +268,8 @@ class Node:
 def run_ticks(k0, ticks, at, received, first, noise, row, a, out, out_tick, scratch):
     """Run ``ticks`` ticks of the VGV node from tick ``k0`` on recorded frames.
 
-    at, received   int64[n] tick of each frame, in order, and int64[n, 2] the frames; ``first`` is the first row not yet taken
+    at, received   int64[n] tick of each frame, in order, and int64[n, 2] the frames; ``first`` is the first row not yet
+                   taken
     noise, row     float64[:, 5] standard normal numbers, and the row of tick ``k0``
     out, out_tick  int64[m, 2] and int64[m]: the frames sent and their ticks; m >= 4 per 10 ticks begun, rounded up
     scratch        int64[4, 2]
@@ -274,7 +291,8 @@ def run_ticks(k0, ticks, at, received, first, noise, row, a, out, out_tick, scra
 
 
 def replay(node: Node, at: np.ndarray, received: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run ``node`` for ``ticks`` ticks on recorded frames; return the ticks (int64[m]) and the frames (int64[m, 2]) that it sent.
+    """Run ``node`` for ``ticks`` ticks on recorded frames; return the ticks (int64[m]) and the frames (int64[m, 2])
+    that it sent.
 
     at        int64[n], tick in which each frame was taken, not decreasing
     received  int64[n, 2], the frames
@@ -295,7 +313,7 @@ def replay(node: Node, at: np.ndarray, received: np.ndarray, ticks: int) -> tupl
     return np.concatenate(out_at or [np.empty(0, np.int64)]), np.concatenate(out or [np.empty((0, 2), np.int64)])
 
 
-# ---- ECU ----------------------------------------------------------------------------------------------------------------------------
+# ---- ECU -------------------------------------------------------------------------------------------------------------
 
 
 class EcuArrays(NamedTuple):
@@ -318,12 +336,27 @@ class EcuArrays(NamedTuple):
     counter: np.ndarray
 
 
-ECU_VALUES = ("x_dem", "x_lvdt", "state", "i_cmd", "faults", "vigv", "vgv1", "vgv2", "p_s", "t_oil", "frames_lost", "frames_rejected")
+ECU_VALUES = (
+    "x_dem",
+    "x_lvdt",
+    "state",
+    "i_cmd",
+    "faults",
+    "vigv",
+    "vgv1",
+    "vgv2",
+    "p_s",
+    "t_oil",
+    "frames_lost",
+    "frames_rejected",
+)
 
 
 @in_place
 def _listen(a, head, data, k):
-    """Judge one frame of the controller; keep its values if it is good. After a pause of the ECU none is known to be new."""
+    """Judge one frame of the controller; keep its values if it is good. After a pause of the ECU none is known to be
+    new.
+    """
     if head == PAUSE:
         for row in range(4):
             stand_still(a.receiver[row])
@@ -347,7 +380,8 @@ def _listen(a, head, data, k):
 
 @in_place
 def ecu_tick(k, received, n, noise, a, sent):
-    """Run tick ``k`` of the ECU on the first ``n`` rows of ``received``: ECU_DEMAND every 10th tick. Returns the number of frames sent.
+    """Run tick ``k`` of the ECU on the first ``n`` rows of ``received``: ECU_DEMAND every 10th tick. Returns the number
+    of frames sent.
 
     noise  standard normal number for the measured speed
     """
@@ -372,7 +406,9 @@ class Ecu:
     seed     of the measured speed's noise; None = noise-free
     """
 
-    def __init__(self, plant: Plant | None = None, *, n_dem: float = 60.0, mode_request: int = 1, seed: int | None = None):
+    def __init__(
+        self, plant: Plant | None = None, *, n_dem: float = 60.0, mode_request: int = 1, seed: int | None = None
+    ):
         machine = plant or build_plant()
         receivers = np.stack([new_receiver(ident) for ident in (VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH)])
         assert receivers.shape == (4, N_RECEIVER)
@@ -390,18 +426,24 @@ class Ecu:
         self._generator = np.random.Generator(np.random.PCG64(seed)) if seed is not None else None
 
     def set_demand(self, n_dem: float, n_r: float = float("nan"), mode_request: int = 1) -> None:
-        """Demand ``n_dem`` (%) from the next frame on; ``n_r`` (%) is the measured speed to send, NaN = the engine model's."""
+        """Demand ``n_dem`` (%) from the next frame on; ``n_r`` (%) is the measured speed to send, NaN = the engine
+        model's.
+        """
         self.arrays.demand[:] = n_dem, n_r, mode_request
 
     def tick(self, received: np.ndarray, n: int | None = None) -> np.ndarray:
-        """Run the next tick on the first ``n`` rows of ``received``; return the frames to send, a view that the next tick overwrites."""
+        """Run the next tick on the first ``n`` rows of ``received``; return the frames to send, a view that the next
+        tick overwrites.
+        """
         noise = self.noise(1)[self.k // SLOW % SLOW]
         m = ecu_tick(self.k, received, len(received) if n is None else n, noise, self.arrays, self._sent)
         self.k += 1
         return self._sent[:m]
 
     def noise(self, ticks: int) -> np.ndarray:
-        """Return ten standard normal numbers for the speeds measured in the next ``ticks`` (at most 100): of tick k at k // 10 % 10."""
+        """Return ten standard normal numbers for the speeds measured in the next ``ticks`` (at most 100): of tick k at
+        k // 10 % 10.
+        """
         out = np.zeros(SLOW)
         if self._generator is not None:
             for k in range(-(-self.k // SLOW) * SLOW, self.k + ticks, SLOW):

@@ -1,21 +1,24 @@
 """Real time: ticks at absolute deadlines, how late each began, and what is done to be late seldom.
 
-A tick's lateness is the time from its deadline to its begin, deadlines being start + k ms, whatever the ticks before did. The loop sleeps
-until shortly before the deadline (``clock_nanosleep``, absolute) and spins the rest.
+A tick's lateness is the time from its deadline to its begin, deadlines being start + k ms, whatever the ticks before
+did. The loop sleeps until shortly before the deadline (``clock_nanosleep``, absolute) and spins the rest.
 
 Overrun. A tick that begins after the deadline of the next one has *missed* it. What then:
 
-``catch-up``  (default) every tick is run, late ones back to back, until the loop is on time again: the firmware's clock stays with the wall
-              clock, a stall shows as a burst. Beyond 100 ms the rest is skipped, and counted.
-``skip``      deadlines that have passed are left out and counted: no bursts, but the firmware's clock falls behind the wall clock.
+``catch-up``  (default) every tick is run, late ones back to back, until the loop is on time again: the firmware's clock
+              stays with the wall clock, a stall shows as a burst. Beyond 100 ms the rest is skipped, and counted.
+``skip``      deadlines that have passed are left out and counted: no bursts, but the firmware's clock falls behind the
+              wall clock.
 
-Pause. Where 50 ms or more lie between one tick's due begin and its begin, counted from the tick before (a suspended process, a stopped
-machine), the loop *stood still*: all that a receiver could say of frames is as old as a silence. The ticks missed are skipped under either
-policy, what came meanwhile and in the next 50 ms is dropped, and the node is told with its next tick (`hil.bus.frames.PAUSE`), which is
-recorded with the frames: the firmware has no clock of its own. Several shorter stalls in a row are no pause: ticks ran in between.
+Pause. Where 50 ms or more lie between one tick's due begin and its begin, counted from the tick before (a suspended
+process, a stopped machine), the loop *stood still*: all that a receiver could say of frames is as old as a silence. The
+ticks missed are skipped under either policy, what came meanwhile and in the next 50 ms is dropped, and the node is told
+with its next tick (`hil.bus.frames.PAUSE`), which is recorded with the frames: the firmware has no clock of its own.
+Several shorter stalls in a row are no pause: ticks ran in between.
 
-Frames are recorded with the time of the tick in which they were taken or sent: start + k ms, within a tick 1 us apart in their order. The
-start is a whole millisecond, so a record says exactly what to give to which tick, and lockstep repeats the run bit for bit.
+Frames are recorded with the time of the tick in which they were taken or sent: start + k ms, within a tick 1 us apart
+in their order. The start is a whole millisecond, so a record says exactly what to give to which tick, and lockstep
+repeats the run bit for bit.
 
 Only this module reads a clock to decide when to run; `controller`, `plant` and `hil.loop.node` have none.
 """
@@ -42,8 +45,11 @@ __all__ = ["POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "
 TICK_NS = 1_000_000
 POLICIES = ("catch-up", "skip")
 MOST_BEHIND = 100  # ticks to catch up; beyond, the rest is skipped
-PAUSED_NS = 50 * TICK_NS  # that much without a tick is a pause: a demand would be stale (`hil.bus.frames.MISSED` periods)
-DEAF = 50  # ticks after a pause in which frames are dropped: a broker hands over what it kept only once its reader reads again
+PAUSED_NS = (
+    50 * TICK_NS
+)  # that much without a tick is a pause: a demand would be stale (`hil.bus.frames.MISSED` periods)
+# ticks after a pause in which frames are dropped: a broker hands over what it kept only once its reader reads again
+DEAF = 50
 SPIN_US = 50  # a sleep ends up to 50 us late; the spin hides that
 MOST_READ = 64  # frames taken in one tick (a full 500 kbit/s bus carries five); the rest wait for the next
 
@@ -63,7 +69,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 def _steps() -> np.ndarray:
     """Edges of the histogram, ns: 0.1 us up to 1 ms, 10 us up to 100 ms, 1 ms up to 10 s."""
-    return np.concatenate([np.arange(0, 10**6, 100), np.arange(10**6, 10**8, 10**4), np.arange(10**8, 10**10, 10**6), [10**10]])
+    return np.concatenate(
+        [np.arange(0, 10**6, 100), np.arange(10**6, 10**8, 10**4), np.arange(10**8, 10**10, 10**6), [10**10]]
+    )
 
 
 class Lateness:
@@ -134,7 +142,8 @@ class Ticker:
 
     missed   ticks that began after the deadline of the next one
     skipped  deadlines left out (`policy`)
-    paused   whole periods for which the loop stood still before the last tick, 0 if that was less than 50 ms;  pauses  how often it did
+    paused   whole periods for which the loop stood still before the last tick, 0 if that was less than 50 ms;  pauses
+             how often it did
     """
 
     def __init__(self, period_ns: int = TICK_NS, *, spin_us: float = SPIN_US, policy: str = "catch-up"):
@@ -208,7 +217,9 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 def _ask_for_slice(us: int) -> None:
-    """Ask the ordinary scheduler for turns of ``us`` (0: as it likes); who wants short turns gets them soon. Before Linux 6.12: nothing."""
+    """Ask the ordinary scheduler for turns of ``us`` (0: as it likes); who wants short turns gets them soon. Before
+    Linux 6.12: nothing.
+    """
     if _SCHED_SETATTR is not None and os.sched_getscheduler(0) == os.SCHED_OTHER:
         nice = os.getpriority(os.PRIO_PROCESS, 0)
         # struct sched_attr: size, policy, flags, nice, priority, runtime (ns), deadline, period
@@ -217,12 +228,14 @@ def _ask_for_slice(us: int) -> None:
 
 @contextlib.contextmanager
 def undisturbed(priority: int | None = None, cpu: int | None = None) -> Iterator[list[str]]:
-    """Keep this process from being late: memory locked, no garbage collection, exact timers, short turns; SCHED_FIFO or one core if wanted.
+    """Keep this process from being late: memory locked, no garbage collection, exact timers, short turns; SCHED_FIFO or
+    one core if wanted.
 
     priority  of SCHED_FIFO, 1..99; None = the ordinary scheduler
     cpu       number of the processor to stay on
 
-    Gives notes on what the system did not allow. Raises PermissionError or OSError where ``priority`` or ``cpu`` are refused.
+    Gives notes on what the system did not allow. Raises PermissionError or OSError where ``priority`` or ``cpu`` are
+    refused.
     """
     notes: list[str] = []
     affinity, slack, collecting = os.sched_getaffinity(0), _libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0), gc.isenabled()
@@ -252,7 +265,7 @@ def undisturbed(priority: int | None = None, cpu: int | None = None) -> Iterator
         os.sched_setaffinity(0, affinity)
 
 
-# ---- a node in real time ------------------------------------------------------------------------------------------------------------
+# ---- a node in real time ---------------------------------------------------------------------------------------------
 
 
 class Ticking(Protocol):
@@ -305,7 +318,9 @@ _TX = 1 << 48
 
 
 def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
-    """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us apart, in order."""
+    """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us
+    apart, in order.
+    """
     out = [_pack(ns + 1000 * i, head & HEAD_MASK, data) for i, (head, data) in enumerate(received.tolist())]
     ns += 1000 * len(out)
     out += [_pack(ns + 1000 * i, head | _TX, data) for i, (head, data) in enumerate(sent.tolist())]
@@ -381,7 +396,12 @@ def run_realtime(
                 break
             k += 1
             if live is not None and k % 1000 == 0:
-                report.ticks, report.missed, report.skipped, report.pauses = k, ticker.missed, ticker.skipped, ticker.pauses
+                report.ticks, report.missed, report.skipped, report.pauses = (
+                    k,
+                    ticker.missed,
+                    ticker.skipped,
+                    ticker.pauses,
+                )
                 live(report)
     except CanError as e:
         report.failed = f"the bus failed: {e}"

@@ -6,8 +6,8 @@ Tick k, at t = k ms, in two halves; what is logged or sent at t is taken between
     `control`   the calibration as it is flashed, the sensors' samples at t, the firmware's tick, its current
     `move`      the plant moves on to t + 1 ms under the new current
 
-Everything works in place on the arrays of a `Loop` and allocates nothing. An effect whose parameters change in ``p`` while the loop runs
-acts from the next tick on; `plant.parameters.derive` must follow such a change.
+Everything works in place on the arrays of a `Loop` and allocates nothing. An effect whose parameters change in ``p``
+while the loop runs acts from the next tick on; `plant.parameters.derive` must follow such a change.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ __all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "mov
 
 FRAME = 1e-2  # s, period of the ECU's frame
 KEPT = 256  # contents of frames kept: can_delay and frame_hold together reach back 2 s
-CHANGED_BY = (chain.SCHEDULE_ERROR, chain.TREND_THRESHOLD_ERROR, chain.CONTROLLER_GAIN_ERROR)  # rows of p that the flashed calibration has
+CHANGED_BY = (
+    chain.SCHEDULE_ERROR,
+    chain.TREND_THRESHOLD_ERROR,
+    chain.CONTROLLER_GAIN_ERROR,
+)  # rows of p that the flashed calibration has
 
 
 class Loop(NamedTuple):
@@ -54,9 +58,10 @@ class Loop(NamedTuple):
     sigma        float64[5] rms noise of the sensors, SI (LVDT, three potentiometers, speed); zeros = noise-free
     mean         float64[2] sum and number of currents since the last one that was logged or sent
     angles       float64[3] rad, the potentiometers' readings at this tick
-    pots         float64[frames or 0, 6] what the controller gets of each reading: share of it and offset (rad; NaN = not fitted), stage by
-                 stage, a row every 10 ms, the last one held
-    sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%), mode_request
+    pots         float64[frames or 0, 6] what the controller gets of each reading: share of it and offset (rad; NaN =
+                 not fitted), stage by stage, a row every 10 ms, the last one held
+    sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
+                 mode_request
     """
 
     inputs: np.ndarray
@@ -74,9 +79,18 @@ class Loop(NamedTuple):
 
 
 def new_loop(
-    plant: Plant, calibration: Calibration, *, n_engine: float, n_r: float, t_oil: float, noisy: bool, pots: np.ndarray | None = None
+    plant: Plant,
+    calibration: Calibration,
+    *,
+    n_engine: float,
+    n_r: float,
+    t_oil: float,
+    noisy: bool,
+    pots: np.ndarray | None = None,
 ) -> Loop:
-    """Return a loop at rest: its engine at ``n_engine`` (%), its stroke where the mean curve has it at the measured speed ``n_r`` (%)."""
+    """Return a loop at rest: its engine at ``n_engine`` (%), its stroke where the mean curve has it at the measured
+    speed ``n_r`` (%).
+    """
     cal = flashed(calibration, plant)
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
     return Loop(
@@ -105,7 +119,11 @@ def flashed(calibration: Calibration, plant: Plant) -> Calibration:
 @in_place
 def _flash(built, cal, flash, p):
     """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``."""
-    flash[0], flash[1], flash[2] = p[chain.SCHEDULE_ERROR, 0], p[chain.TREND_THRESHOLD_ERROR, 0], p[chain.CONTROLLER_GAIN_ERROR, 0]
+    flash[0], flash[1], flash[2] = (
+        p[chain.SCHEDULE_ERROR, 0],
+        p[chain.TREND_THRESHOLD_ERROR, 0],
+        p[chain.CONTROLLER_GAIN_ERROR, 0],
+    )
     for row in range(1, built.table.shape[0]):
         for i in range(built.table.shape[1]):
             cal.table[row, i] = schedule_error.step(built.table[row, i], flash[0])
@@ -117,7 +135,9 @@ def _flash(built, cal, flash, p):
 
 @in_place
 def _last_by(sent, then, now):
-    """Return the row of the last frame that came in the 10 ms ``then`` or before; of the first one kept if there is none."""
+    """Return the row of the last frame that came in the 10 ms ``then`` or before; of the first one kept if there is
+    none.
+    """
     then = min(then, now)
     for q in range(then, now - KEPT, -1):
         if sent[q % KEPT, 0] == q:
@@ -131,7 +151,9 @@ def _last_by(sent, then, now):
 
 @in_place
 def arrive(k, a, n_dem, n_r, mode_request):
-    """Give the controller what it gets of a good frame of the ECU that comes at tick ``k``: the content of this one or of an older one."""
+    """Give the controller what it gets of a good frame of the ECU that comes at tick ``k``: the content of this one or
+    of an older one.
+    """
     now = k // SLOW
     at = now % KEPT
     a.sent[at, 0], a.sent[at, 1], a.sent[at, 2], a.sent[at, 3] = now, n_dem, n_r, mode_request
@@ -179,7 +201,9 @@ def mean_current(a):
 
 @in_place
 def move(k, a, n_dem, n_r, p_s, t_oil):
-    """Let the machine move on from tick ``k`` to the next under the controller's current, at demand ``n_dem`` and speed ``n_r`` (%)."""
+    """Let the machine move on from tick ``k`` to the next under the controller's current, at demand ``n_dem`` and speed
+    ``n_r`` (%).
+    """
     s, p = a.s, a.p
     chain.rotor_step(s, p, 0, n_dem, chain.TICK)
     chain.drive_step(s, p, 0, a.z[I_CMD], n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)

@@ -1,7 +1,7 @@
 """The library of effects: one file each, found by itself.
 
-An effect's parameters follow the nominal plant's in p, its states the nominal ones in s, in the alphabetical order of the files. A new file
-shifts the rows behind it; nothing else in the plant has numbers of rows in it.
+An effect's parameters follow the nominal plant's in p, its states the nominal ones in s, in the alphabetical order of
+the files. A new file shifts the rows behind it; nothing else in the plant has numbers of rows in it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ def _found() -> dict[str, Effect]:
     for name in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         effect = importlib.import_module(f"{__name__}.{name}").EFFECT
         if effect.name != name:
-            raise ValueError(f"plant/effects/{name}.py declares the effect {effect.name!r}; both must have the same name")
+            raise ValueError(
+                f"plant/effects/{name}.py declares the effect {effect.name!r}; both must have the same name"
+            )
         out[name] = effect
     return out
 

@@ -33,7 +33,9 @@ EFFECT = Effect(
 
 @compiled
 def step(v, p_load, resistance, coefficient):
-    """Return the speed (m/s) left of ``v`` (m/s) at the load pressure ``p_load`` + ``resistance`` v (Pa, against extension)."""
+    """Return the speed (m/s) left of ``v`` (m/s) at the load pressure ``p_load`` + ``resistance`` v (Pa, against
+    extension).
+    """
     if coefficient == 0.0:
         return v
     return (v - coefficient * p_load) / (1.0 + coefficient * resistance)

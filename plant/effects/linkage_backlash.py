@@ -32,5 +32,7 @@ EFFECT = Effect(
 
 @compiled
 def step(play, width, ratio):
-    """Return the total play (rad at the ring) for a ``width`` (rad at the vane) beyond the nominal ``play``; ``ratio`` ring per vane."""
+    """Return the total play (rad at the ring) for a ``width`` (rad at the vane) beyond the nominal ``play``; ``ratio``
+    ring per vane.
+    """
     return max(play + width * ratio, 0.0)

@@ -46,5 +46,7 @@ def step(y, travel, distance):
 
 @compiled
 def loop(theta, y, width, ratio):
-    """Return the ring angle (rad) at the lever: ``theta`` held back by friction; ``width`` at the vane (rad), ``ratio`` ring per vane."""
+    """Return the ring angle (rad) at the lever: ``theta`` held back by friction; ``width`` at the vane (rad), ``ratio``
+    ring per vane.
+    """
     return theta - 0.5 * width * ratio * y

@@ -32,5 +32,7 @@ EFFECT = Effect(
 
 @compiled
 def step(play, rate, ratio, t):
-    """Return the total play (rad at the ring) at time ``t`` (s) with a growth of ``rate`` (rad/s at the vane); ``ratio`` ring per vane."""
+    """Return the total play (rad at the ring) at time ``t`` (s) with a growth of ``rate`` (rad/s at the vane);
+    ``ratio`` ring per vane.
+    """
     return play + rate * ratio * max(t, 0.0)

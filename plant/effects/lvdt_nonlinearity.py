@@ -27,8 +27,12 @@ EFFECT = Effect(
     "lvdt",
     ("actuator", "linkage"),
     (
-        Parameter("amplitude", "mm", 0.0, -3.0, 3.0, "one sine wave of error over the stroke, reading high in its upper half"),
-        Parameter("cubic", "mm", 0.0, -1.0, 1.0, "cubic error at full stroke, reading high there, without its straight part"),
+        Parameter(
+            "amplitude", "mm", 0.0, -3.0, 3.0, "one sine wave of error over the stroke, reading high in its upper half"
+        ),
+        Parameter(
+            "cubic", "mm", 0.0, -1.0, 1.0, "cubic error at full stroke, reading high there, without its straight part"
+        ),
     ),
     (),
     "the stroke reading bends over the stroke",

@@ -7,8 +7,8 @@ Equation::
 Symbols: s way that the oil has pushed (m), F load against extension (N), v speed (m/s), drag of seals and oil
 (N/(m/s)), C0 = (stroke + 2 d) / (4 B A) = 6.9e-9 m/N: two columns of oil, B = 1.6 GPa, A = 1.2e-3 m2, 48 mm, d = 2.4 mm
 of dead volume at either end. Friction acts through the same compliance (piston_friction).
-Limits: quasi-static: the load changes slowly, so that the valve keeps both chambers' mean pressure and the compliance is
-that of mid-stroke anywhere (piston_friction); the resonance with the moving mass (200 Hz for 5 kg at 0.1 mm/kN) lies
+Limits: quasi-static: the load changes slowly, so that the valve keeps both chambers' mean pressure and the compliance
+is that of mid-stroke anywhere (piston_friction); the resonance with the moving mass (200 Hz for 5 kg at 0.1 mm/kN) lies
 above the servo's band.
 In a log: the stroke shifts as the load changes with n_r; reversals with friction lose more motion; while moving it
 trails by compliance * drag * v. Without load, friction or fast motion nothing shows.
@@ -41,5 +41,7 @@ NOMINAL = 0.048 * (1.0 + 2.0 * DEAD) / (4.0 * 1.6e9 * 1.2e-3)  # m/N, see the do
 
 @compiled
 def step(force, v, compliance, drag):
-    """Return by how far (m) the piston stands off the pushed way, under ``force`` (N, against extension) at ``v`` (m/s)."""
+    """Return by how far (m) the piston stands off the pushed way, under ``force`` (N, against extension) at ``v``
+    (m/s).
+    """
     return -((NOMINAL + compliance) * force + compliance * drag * v)

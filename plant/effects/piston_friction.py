@@ -40,7 +40,9 @@ EFFECT = Effect(
 
 @compiled
 def step(z, travel, level, stiffness):
-    """Return the friction force (N) after the oil has pushed by ``travel`` (m) from where it was ``z`` (N); ``stiffness`` 1/C (N/m)."""
+    """Return the friction force (N) after the oil has pushed by ``travel`` (m) from where it was ``z`` (N);
+    ``stiffness`` 1/C (N/m).
+    """
     if level == 0.0:
         return 0.0
     return min(max(z + travel * stiffness, -level), level)
@@ -48,12 +50,16 @@ def step(z, travel, level, stiffness):
 
 @compiled
 def off_middle(x, per_stroke):
-    """Return r, how unequal the columns of oil are at stroke ``x`` (m), 0 in the middle; ``per_stroke`` 1 over the full stroke (1/m)."""
+    """Return r, how unequal the columns of oil are at stroke ``x`` (m), 0 in the middle; ``per_stroke`` 1 over the full
+    stroke (1/m).
+    """
     return 1.0 - (x * per_stroke + DEAD) * (2.0 / (1.0 + 2.0 * DEAD))
 
 
 @compiled
 def recentre(off, jump, ways):
-    """Return (off, back): the mean pressure's offset (N) after a ``jump`` of it and |ds| = ``ways`` of the way, and what of it went (N)."""
+    """Return (off, back): the mean pressure's offset (N) after a ``jump`` of it and |ds| = ``ways`` of the way, and
+    what of it went (N).
+    """
     back = (off + jump) * min(ways, 1.0)
     return off + jump - back, back

@@ -33,15 +33,23 @@ TARGETS = (
         "frames",
         ("hil/bus/frames.py",),
         ("tests/test_frames.py",),
-        "lockstep or recorded_run or one_wrong_frame or ecu_and or silence_is or health_tells or fifth_refused or speed_out",
+        "lockstep or recorded_run or one_wrong_frame or ecu_and or silence_is or health_tells or fifth_refused or "
+        "speed_out",
     ),
-    Target("wire", ("hil/bus/wire.py",), ("tests/test_wire.py",), "compiled or cantools_and_e2e or noticed or fast_loop"),
+    Target(
+        "wire", ("hil/bus/wire.py",), ("tests/test_wire.py",), "compiled or cantools_and_e2e or noticed or fast_loop"
+    ),
     Target("node", ("hil/loop/node.py",), ("tests/test_node.py",)),
     Target("effects", ("plant/effects/*.py",), ("tests/test_effects_reference.py",), constants=False),
     Target("drive", ("plant/chain.py",), ("tests/test_effects_reference.py",), constants=False, only="drive_substep"),
     Target(
         "search",
-        ("vaneloop/discrepancy/diagnose.py", "vaneloop/discrepancy/fit.py", "vaneloop/discrepancy/workflow.py", "vaneloop/discrepancy/locate.py"),
+        (
+            "vaneloop/discrepancy/diagnose.py",
+            "vaneloop/discrepancy/fit.py",
+            "vaneloop/discrepancy/workflow.py",
+            "vaneloop/discrepancy/locate.py",
+        ),
         (
             "tests/test_search_limits.py",
             "tests/test_names.py::test_nine_tenths_are_neither_less_nor_more",
@@ -83,7 +91,9 @@ def main(arguments: list[str] | None = None) -> int:
     targets = [BY_NAME[n] for n in a.targets] or list(TARGETS)
     mutants = {t.name: t.mutants() for t in targets}
     reasons = equivalents(mutants)
-    chosen = {n: [m for m in sample(f, None if a.all else a.sample, a.seed) if a.match in str(m)] for n, f in mutants.items()}
+    chosen = {
+        n: [m for m in sample(f, None if a.all else a.sample, a.seed) if a.match in str(m)] for n, f in mutants.items()
+    }
     if a.list:
         for found in chosen.values():
             print(*found, sep="\n")
@@ -108,8 +118,8 @@ def main(arguments: list[str] | None = None) -> int:
         share = killed / count if count else 1.0
         minutes = (time.monotonic() - begin) / 60.0
         print(
-            f"{t.name}: {killed} of {count} killed ({100.0 * share:.1f} %), {count - killed} survived, {len(equivalent)} equivalent;"
-            f" {len(mutants[t.name])} mutants in all, {minutes:.1f} min",
+            f"{t.name}: {killed} of {count} killed ({100.0 * share:.1f} %), {count - killed} survived, "
+            f"{len(equivalent)} equivalent; {len(mutants[t.name])} mutants in all, {minutes:.1f} min",
             flush=True,
         )
         enough = enough and share >= ENOUGH and not wrong

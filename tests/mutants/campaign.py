@@ -1,8 +1,9 @@
-"""The tests of a module against its mutants: which test runs which line, then each mutant against those tests, fastest first.
+"""The tests of a module against its mutants: which test runs which line, then each mutant against those tests, fastest
+first.
 
-The code runs uncompiled (NUMBA_DISABLE_JIT), where a mutant costs no compiling; that both ways give the same bits is tested elsewhere. Each
-mutant has a process of its own, forked where all tests are collected, in which only the changed function's code is exchanged. A process
-that uses much more processor time than the tests do unchanged hangs: killed.
+The code runs uncompiled (NUMBA_DISABLE_JIT), where a mutant costs no compiling; that both ways give the same bits is
+tested elsewhere. Each mutant has a process of its own, forked where all tests are collected, in which only the changed
+function's code is exchanged. A process that uses much more processor time than the tests do unchanged hangs: killed.
 """
 
 from __future__ import annotations
@@ -82,7 +83,17 @@ def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[O
     """Run the mutants in processes of their own; call ``say`` as each is decided."""
     os.chdir(ROOT)
     campaign = _Campaign(target, chosen, jobs, say)
-    arguments = [*target.tests, "-q", "--no-header", "-p", "no:cacheprovider", "-s", "--disable-warnings", "-m", "not slow"]
+    arguments = [
+        *target.tests,
+        "-q",
+        "--no-header",
+        "-p",
+        "no:cacheprovider",
+        "-s",
+        "--disable-warnings",
+        "-m",
+        "not slow",
+    ]
     if target.without:
         arguments += ["-k", f"not ({target.without})"]
     code = pytest.main(arguments, plugins=[campaign])
@@ -101,7 +112,9 @@ class _Campaign:
         from hypothesis import Phase, settings
 
         phases = (Phase.explicit, Phase.generate)  # shrinking a failure would tell nothing here
-        settings.register_profile("mutants", max_examples=10, deadline=None, derandomize=True, database=None, phases=phases)
+        settings.register_profile(
+            "mutants", max_examples=10, deadline=None, derandomize=True, database=None, phases=phases
+        )
         settings.load_profile("mutants")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -261,7 +274,9 @@ def _function(module: ModuleType, name: str) -> FunctionType:
 
 
 def _rebind(module: ModuleType, code: CodeType) -> None:
-    """Run the changed module aside, and give all that is loaded its new numbers, wherever the old ones are by the same name."""
+    """Run the changed module aside, and give all that is loaded its new numbers, wherever the old ones are by the same
+    name.
+    """
     fresh: dict[str, Any] = {**{k: v for k, v in vars(module).items() if k.startswith("__")}}
     exec(code, fresh)  # noqa: S102
     changed = {}

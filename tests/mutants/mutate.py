@@ -16,7 +16,8 @@ COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,),
 }  # fmt: skip
 OPERATORS: dict[type, type] = {
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult, ast.Pow: ast.Mult,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult,
     ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.BitXor: ast.BitOr,
 }  # fmt: skip
 NAMES = {"min": "max", "max": "min"}
@@ -193,15 +194,24 @@ def _constants(tree: ast.Module) -> Iterator[tuple[ast.stmt, _Edit]]:
                     for factor in (SHRUNK, GROWN):
                         yield s, _Edit(edit.owner, edit.field, edit.index, ast.Constant(old.value * factor))
                     continue
-                if isinstance(old, ast.Constant) and type(old.value) is int and old.value >= 1000 and old.value % 100 == 0:
+                if (
+                    isinstance(old, ast.Constant)
+                    and type(old.value) is int
+                    and old.value >= 1000
+                    and old.value % 100 == 0
+                ):
                     for factor in (SHRUNK, GROWN):
                         yield s, _Edit(edit.owner, edit.field, edit.index, ast.Constant(int(old.value * factor)))
                     continue
             yield s, edit
 
 
-def mutants_of(root: Path, file: str, *, functions: bool = True, constants: bool = True, only: str | None = None) -> list[Mutant]:
-    """Return every mutant of ``file``: of its functions (``only`` that one) and of the module's constants, in the order of the lines."""
+def mutants_of(
+    root: Path, file: str, *, functions: bool = True, constants: bool = True, only: str | None = None
+) -> list[Mutant]:
+    """Return every mutant of ``file``: of its functions (``only`` that one) and of the module's constants, in the order
+    of the lines.
+    """
     tree = ast.parse((root / file).read_text(), file)
     seen: Counter[tuple[str, str, str]] = Counter()
     out: list[Mutant] = []
@@ -221,7 +231,9 @@ def mutants_of(root: Path, file: str, *, functions: bool = True, constants: bool
                 edit.swap(kept)
 
         head = s.test if isinstance(s, (ast.If, ast.While)) else s.iter if isinstance(s, ast.For) else s
-        out.append(Mutant(file, where, s.lineno, head.end_lineno or s.lineno, was, becomes, seen[where, was, becomes], code))
+        out.append(
+            Mutant(file, where, s.lineno, head.end_lineno or s.lineno, was, becomes, seen[where, was, becomes], code)
+        )
 
     if constants:
         for s, edit in _constants(tree):

@@ -1,4 +1,6 @@
-"""The rig: a truth simulator of engine, servo valve, actuator, linkage and sensors, independent of the product's plant. See docs/rig.md."""
+"""The rig: a truth simulator of engine, servo valve, actuator, linkage and sensors, independent of the product's plant.
+See docs/rig.md.
+"""
 
 from .controller import AsObject, Compiled, Controller, playback, stand_in
 from .effects import CATALOGUE, EFFECTS, OUTSIDE, Effect, Hidden, draw, neutral

@@ -20,13 +20,16 @@ class Controller(Protocol):
     state: int  # number of the mode
 
     def step(self, n_dem: float, n_r: float, x_lvdt: float, demand_fresh: bool, mode_request: int) -> float:
-        """Return the current (A) for the demand and speed (%) of the last frame and the stroke (m) as the LVDT gives it."""
+        """Return the current (A) for the demand and speed (%) of the last frame and the stroke (m) as the LVDT gives
+        it.
+        """
         ...
 
 
 @dataclass
 class Compiled:
-    """A compiled controller ``tick(inputs, state, calibration)`` that changes ``state`` in place, and where its signals are.
+    """A compiled controller ``tick(inputs, state, calibration)`` that changes ``state`` in place, and where its signals
+    are.
 
     inputs, state   float64 arrays to start from (copied for each run)
     n_dem .. fresh  places in ``inputs``: %, %, m, 1 on a tick with a new frame
@@ -34,7 +37,8 @@ class Compiled:
     current_limit   A
     vigv            place in ``inputs`` of the first of three stem angles (rad); -1: it takes none
     mode_request    place in ``inputs`` of the mode asked for (0 standby, 1 run); -1: it takes none
-    change          (effect name, parameters) -> another Compiled with that error in it, or None where the rig is to do it from outside
+    change          (effect name, parameters) -> another Compiled with that error in it, or None where the rig is to do
+                    it from outside
     """
 
     tick: Callable[..., None]
@@ -56,11 +60,25 @@ class Compiled:
     @property
     def slots(self) -> np.ndarray:
         """Places of the signals in the order the kernel wants them."""
-        return np.array([self.n_dem, self.n_r, self.x_lvdt, self.fresh, self.i_cmd, self.x_dem, self.mode, self.vigv, self.mode_request])
+        return np.array(
+            [
+                self.n_dem,
+                self.n_r,
+                self.x_lvdt,
+                self.fresh,
+                self.i_cmd,
+                self.x_dem,
+                self.mode,
+                self.vigv,
+                self.mode_request,
+            ]
+        )
 
 
 class Settings(NamedTuple):
-    """Calibration of the stand-in: scalars ``k`` = kp (A/m), ki (A/m/s), kff (A/(m/s)), trend (%), limit (A); stroke table (%, m, m)."""
+    """Calibration of the stand-in: scalars ``k`` = kp (A/m), ki (A/m/s), kff (A/(m/s)), trend (%), limit (A); stroke
+    table (%, m, m).
+    """
 
     k: np.ndarray
     table: np.ndarray
@@ -109,7 +127,9 @@ def stand_in_tick(inputs, state, calibration):
 
 
 def stroke_tables() -> np.ndarray:
-    """Speeds (%) and strokes (m) that put the VIGV on its schedule when extending and when retracting: half the play apart each way."""
+    """Speeds (%) and strokes (m) that put the VIGV on its schedule when extending and when retracting: half the play
+    apart each way.
+    """
     g = load()
     s = g.stages[0]
     x = np.linspace(0.0, 48e-3, 97)
@@ -117,7 +137,11 @@ def stroke_tables() -> np.ndarray:
     n, target = schedule()
     inverse = CubicSpline(angle, x)
     return np.array(
-        [n, np.clip(inverse(target + s.hysteresis / 2), 5e-4, 47.5e-3), np.clip(inverse(target - s.hysteresis / 2), 5e-4, 47.5e-3)]
+        [
+            n,
+            np.clip(inverse(target + s.hysteresis / 2), 5e-4, 47.5e-3),
+            np.clip(inverse(target - s.hysteresis / 2), 5e-4, 47.5e-3),
+        ]
     )
 
 
@@ -134,7 +158,9 @@ def stand_in(trend: float = 0.3) -> Compiled:
 
 
 class AsObject:
-    """A `Compiled` controller behind the Python face of `Controller` (its plain Python source runs), to test that both give the same."""
+    """A `Compiled` controller behind the Python face of `Controller` (its plain Python source runs), to test that both
+    give the same.
+    """
 
     def __init__(self, compiled: Compiled):
         self.c = replace(compiled, inputs=compiled.inputs.copy(), state=compiled.state.copy())
@@ -168,7 +194,11 @@ def playback_tick(inputs, state, calibration):
 
 
 def playback(i_cmd: np.ndarray, x_dem: np.ndarray | None = None, mode: np.ndarray | None = None) -> Compiled:
-    """Return a controller that plays currents back, one a tick from the first tick of the run-up on: the machine in open loop."""
+    """Return a controller that plays currents back, one a tick from the first tick of the run-up on: the machine in
+    open loop.
+    """
     i_cmd = np.ascontiguousarray(i_cmd, dtype=float)
-    tape = Tape(i_cmd, np.zeros_like(i_cmd) if x_dem is None else x_dem, np.full_like(i_cmd, 2.0) if mode is None else mode)
+    tape = Tape(
+        i_cmd, np.zeros_like(i_cmd) if x_dem is None else x_dem, np.full_like(i_cmd, 2.0) if mode is None else mode
+    )
     return Compiled(playback_tick, np.zeros(4), np.zeros(4), tape, 0, 1, 2, 3, 0, 1, 2)

@@ -1,6 +1,7 @@
 """What can be hidden in the machine: the library's effects by their names, and effects that no library has.
 
-Each entry says where it sits, its parameters with units, and five sizes from undetectable to gross. Equations are in docs/rig.md.
+Each entry says where it sits, its parameters with units, and five sizes from undetectable to gross. Equations are in
+docs/rig.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ ALL_STAGES = -1
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect: its slot in the kernel (the first of three where it belongs to one stage), unit, neutral value, meaning."""
+    """One number of an effect: its slot in the kernel (the first of three where it belongs to one stage), unit, neutral
+    value, meaning.
+    """
 
     slot: P | None
     unit: str
@@ -76,7 +79,21 @@ class Hidden:
 
 
 def _one(
-    name, stage, site, main, slot, unit, neutral, meaning, ladder, *, signed=False, stages=False, more=None, others=None, **kw
+    name,
+    stage,
+    site,
+    main,
+    slot,
+    unit,
+    neutral,
+    meaning,
+    ladder,
+    *,
+    signed=False,
+    stages=False,
+    more=None,
+    others=None,
+    **kw,
 ) -> Effect:
     """Build an entry with one laddered parameter and possibly ``more``."""
     first = Parameter(slot, unit, neutral, meaning, per_stage=stages, **kw)
@@ -145,7 +162,8 @@ EFFECTS = _table(
     _one("oil_compressibility", "actuator", "actuator", "compliance", P.compliance, "m/N", 0.0,
          "oil compliance beyond nominal", (1e-9, 1e-8, 1e-7, 1e-6, 4e-6)),
     _one("aero_load", "actuator", "actuator", "force", P.aero_force, "N", 0.0,
-         "force against extension at 100 %, grows with n_r squared", (10.0, 100.0, 1000.0, 4000.0, 10000.0), signed=True),
+         "force against extension at 100 %, grows with n_r squared", (10.0, 100.0, 1000.0, 4000.0, 10000.0),
+         signed=True),
     _one("end_stop_shift", "actuator", "actuator", "shift", P.stop_shift, "m", 0.0,
          "retraction stop in (> 0), extension stop in (< 0)", (5e-4, 1.5e-3, 3e-3, 5e-3, 8e-3), signed=True),
     # LVDT
@@ -155,7 +173,8 @@ EFFECTS = _table(
          "reading over stroke", (1.0001, 1.001, 1.01, 1.03, 1.1), signed=True),
     _one("lvdt_nonlinearity", "linkage", "lvdt", "amplitude", P.lvdt_nonlinearity, "m", 0.0,
          "one sine wave of error over the stroke", (1e-6, 1e-5, 1e-4, 4e-4, 1.5e-3), signed=True,
-         more={"cubic": Parameter(P.lvdt_cubic, "m", 0.0, "cube of the way from mid-stroke, its straight part taken out")}),
+         more={"cubic": Parameter(P.lvdt_cubic, "m", 0.0, "cube of the way from mid-stroke, its straight part taken "
+                                                          "out")}),
     _one("lvdt_lag", "actuator", "lvdt", "time_constant", P.lvdt_lag, "s", 0.0,
          "first-order lag behind the demodulator", (5e-5, 5e-4, 3e-3, 0.01, 0.03)),
     _one("lvdt_thermal_drift", "linkage", "lvdt", "coefficient", P.lvdt_thermal, "m/K", 0.0,
@@ -168,7 +187,8 @@ EFFECTS = _table(
     _one("linkage_friction", "linkage", "linkage", "width", P.friction_width_0, "rad", 0.0,
          "total width of a smooth loop at the vane", (5e-5, 5e-4, 3e-3, 8e-3, 2e-2),
          stages=True, at_vane=True,
-         more={"distance": Parameter(P.friction_distance, "rad", DEG, "turn of the ring after which the loop has closed to 1/e")},
+         more={"distance": Parameter(P.friction_distance, "rad", DEG, "turn of the ring after which the loop has "
+                                                                      "closed to 1/e")},
          others={"distance": 0.2 * DEG}),
     _one("linkage_wear", "linkage", "linkage", "rate", P.wear_0, "rad/s", 0.0,
          "growth of the total play at the vane", (5e-8, 5e-7, 1.5e-5, 5e-5, 1.5e-4), stages=True, at_vane=True),
@@ -219,7 +239,9 @@ OUTSIDE = _table(
          more={"damping": Parameter(P.ring_damping, "-", 0.1, "damping ratio")}, others={"damping": 0.05}),
     _one("pot_track_wear", "linkage", "pot", "error", P.track_error, "rad", 0.0,
          "error of the vigv reading where its track is worn", (1e-5, 1e-4, 3e-3, 1e-2, 4e-2),
-         signed=True, more={"angle": Parameter(P.track_angle, "rad", 0.0, "place"), "width": Parameter(P.track_width, "rad", DEG, "size")},
+         signed=True,
+         more={"angle": Parameter(P.track_angle, "rad", 0.0, "place"),
+         "width": Parameter(P.track_width, "rad", DEG, "size")},
          others={"angle": -5.0 * DEG, "width": 6.0 * DEG}),
     _one("driver_oscillation", "actuator", "valve", "amplitude", P.dither_amplitude, "A", 0.0,
          "current added by an oscillating driver", (3e-6, 2e-5, 1e-4, 5e-4, 2e-3),
@@ -243,7 +265,9 @@ CATALOGUE: Mapping[str, Effect] = MappingProxyType({**EFFECTS, **OUTSIDE})
 
 
 def draw(name: str, size: int, rng: np.random.Generator, onset: float = 0.0) -> Hidden:
-    """Return the effect in rung ``size`` (0 undetectable .. 4 gross) of its ladder, up to 20 % off, with a random sign and vane stage."""
+    """Return the effect in rung ``size`` (0 undetectable .. 4 gross) of its ladder, up to 20 % off, with a random sign
+    and vane stage.
+    """
     e = CATALOGUE[name]
     p = e.parameters[e.main]
     value = e.ladder[size]
@@ -271,7 +295,9 @@ def neutral(name: str) -> Hidden:
 
 
 def apply(hidden: Hidden, p: np.ndarray, geometry: Geometry) -> tuple[np.ndarray, Geometry]:
-    """Return parameters and geometry of the machine with the effect in it. What belongs to the controller is left alone."""
+    """Return parameters and geometry of the machine with the effect in it. What belongs to the controller is left
+    alone.
+    """
     effect = CATALOGUE[hidden.name]
     p = p.copy()
     which = int(hidden.parameters.get("stage", ALL_STAGES))

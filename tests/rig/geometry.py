@@ -5,9 +5,10 @@ Joints, in a plane (paper's letters)::
     J0 actuator mount (origin) --Lx--> J1 --Le-- J2 bell-crank pivot (x1, y1)
     J2 --Lb--> J3 --Lc--> J4 --Ld-- J5 ring centre = J2 + (dx, dy)
 
-J1 is where a circle of radius Lx about J0 meets one of radius Le about J2; J4 where a circle of radius Lc about J3 meets one of radius Ld
-about J5. The crank is rigid, so J3 turns with J1. Two intersections exist each time; the one next to the previous stroke's is kept.
-Ring angle (rad): ring turn from its neutral position; vane angle = asin(Ld' tan(ring) / L).
+J1 is where a circle of radius Lx about J0 meets one of radius Le about J2; J4 where a circle of radius Lc about J3
+meets one of radius Ld about J5. The crank is rigid, so J3 turns with J1. Two intersections exist each time; the one
+next to the previous stroke's is kept. Ring angle (rad): ring turn from its neutral position; vane angle = asin(Ld'
+tan(ring) / L).
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ def _meet(ax, ay, ra, bx, by, rb, near):
 
 
 def ring_angle(g: Geometry, stage: int, strokes: np.ndarray, start: float = 24e-3) -> np.ndarray:
-    """Return the ring angle (rad) of one stage at each stroke (m), walking outwards from the stroke ``start`` where the branch is known."""
+    """Return the ring angle (rad) of one stage at each stroke (m), walking outwards from the stroke ``start`` where the
+    branch is known.
+    """
     s = g.stages[stage]
     out = np.empty(len(strokes))
     middle = int(np.argmin(np.abs(strokes - start)))
@@ -95,7 +98,9 @@ def ring_angle(g: Geometry, stage: int, strokes: np.ndarray, start: float = 24e-
 
 
 def ring_tables(g: Geometry) -> np.ndarray:
-    """Return float64[3, n]: ring angle (rad) on the strokes X_LOW, X_LOW + X_STEP, ..., X_HIGH (a spline through every 0.25 mm)."""
+    """Return float64[3, n]: ring angle (rad) on the strokes X_LOW, X_LOW + X_STEP, ..., X_HIGH (a spline through every
+    0.25 mm).
+    """
     from scipy.interpolate import CubicSpline
 
     coarse = np.linspace(X_LOW, X_HIGH, 201)
@@ -109,10 +114,12 @@ def vane_angle(ring: np.ndarray, ratio: float) -> np.ndarray:
 
 
 def load(folder: Path = TABLES, rng: np.random.Generator | None = None) -> Geometry:
-    """Read ``geometry.toml``; with ``rng``, every length and angle is drawn uniformly within the tolerance that stands beside it.
+    """Read ``geometry.toml``; with ``rng``, every length and angle is drawn uniformly within the tolerance that stands
+    beside it.
 
-    Its ring centre is given as the paper has it (equations 11, 12): straight below the pivot at the distance La of (dx, dy), turned by
-    theta6, in the frame where the lower arm is the upper arm's prolongation J2 -> J1; the ring is neutral with J4 straight below J5.
+    Its ring centre is given as the paper has it (equations 11, 12): straight below the pivot at the distance La of (dx,
+    dy), turned by theta6, in the frame where the lower arm is the upper arm's prolongation J2 -> J1; the ring is
+    neutral with J4 straight below J5.
     """
     table = tomllib.loads((folder / "geometry.toml").read_text(encoding="utf-8"))
 

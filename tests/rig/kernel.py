@@ -1,7 +1,9 @@
-"""The machine between two servo ticks: engine, spool, two oil chambers, friction, pins, vanes, sensors. All compiled code of the rig.
+"""The machine between two servo ticks: engine, spool, two oil chambers, friction, pins, vanes, sensors. All compiled
+code of the rig.
 
-Equations, symbols and signs are in docs/rig.md. Units SI, speeds in %, temperatures in degC. State ``s`` is read by `S`, parameters ``p``
-by `P`. Slots and constants stand in this file with the code that uses them: numba's cache looks at one file's date only.
+Equations, symbols and signs are in docs/rig.md. Units SI, speeds in %, temperatures in degC. State ``s`` is read by
+`S`, parameters ``p`` by `P`. Slots and constants stand in this file with the code that uses them: numba's cache looks
+at one file's date only.
 """
 
 from __future__ import annotations
@@ -233,7 +235,9 @@ def engine(s, p, n_dem):
 
 @njit(cache=True, error_model="numpy")
 def torque_motor(s, p, i, t):
-    """Current that moves the spool: null bias, dither, magnetic hysteresis (Preisach: plays in parallel), silt after long rest."""
+    """Current that moves the spool: null bias, dither, magnetic hysteresis (Preisach: plays in parallel), silt after
+    long rest.
+    """
     i = i + p[P.null_bias]
     if p[P.dither_amplitude] != 0.0:
         i += p[P.dither_amplitude] * math.sin(2.0 * math.pi * p[P.dither_frequency] * t)
@@ -265,7 +269,8 @@ def torque_motor(s, p, i, t):
 def hydraulics(s, p, p_s, t_oil, n, h, steps):
     """Spool, chambers and piston over ``steps`` steps of ``h`` (s).
 
-    Spool by Heun; pressures, then speed, then stroke (symplectic order), friction's bristle and viscous part implicitly.
+    Spool by Heun; pressures, then speed, then stroke (symplectic order), friction's bristle and viscous part
+    implicitly.
     """
     u, w, i_lagged = s[S.u], s[S.w], s[S.i_lagged]
     p1, p2, p_valve = s[S.p1], s[S.p2], s[S.p_valve]
@@ -375,7 +380,9 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
 
 @njit(cache=True, error_model="numpy")
 def linkage(s, p, ring_table, n, t_oil, t, h):
-    """Rings, vanes and potentiometers over one step ``h`` (s): kinematics, then what bends or loosens the way to the vane."""
+    """Rings, vanes and potentiometers over one step ``h`` (s): kinematics, then what bends or loosens the way to the
+    vane.
+    """
     place = clip((s[S.x] - X_LOW) / X_STEP, 0.0, X_LAST - 1e-6)
     cell = int(place)
     part = place - cell
@@ -392,7 +399,9 @@ def linkage(s, p, ring_table, n, t_oil, t, h):
             ring_in += p[P.snag_depth] * d * math.exp(0.5 - 0.5 * d * d)
 
         # lost motion: pins in parallel, each with its own gap and a stiff, damped contact
-        half = p[P.half_gap_0 + k] + 0.5 * (p[P.gap_change_0 + k] + p[P.wear_0 + k] * max(t, 0.0) + p[P.gap_thermal] * warm)
+        half = p[P.half_gap_0 + k] + 0.5 * (
+            p[P.gap_change_0 + k] + p[P.wear_0 + k] * max(t, 0.0) + p[P.gap_thermal] * warm
+        )
         half = max(half, 0.0)
         ring = 0.0
         for j in range(PINS):
@@ -440,7 +449,9 @@ def linkage(s, p, ring_table, n, t_oil, t, h):
 
 @njit(cache=True, error_model="numpy")
 def advance(s, p, ring_table, i_cmd, n_dem, p_s, t_oil, t, steps):
-    """Move the machine from ``t`` to ``t`` + 1 ms under a constant current, in ``steps`` hydraulic steps (a multiple of LINKS)."""
+    """Move the machine from ``t`` to ``t`` + 1 ms under a constant current, in ``steps`` hydraulic steps (a multiple of
+    LINKS).
+    """
     torque_motor(s, p, i_cmd, t)
     if p[P.dip_depth] != 0.0:
         phase = (t / p[P.dip_period]) % 1.0
@@ -504,16 +515,20 @@ def start(s, p, ring_table, x, n, p_s):
         s[S.vane_0 + k] = s[S.pot_0 + k] = vane
 
 
-# ---- rows of the log and of the truth record -----------------------------------------------------------------------------------------
+# ---- rows of the log and of the truth record -------------------------------------------------------------------------
 LOG = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state")
 _ONES = ("x", "v", "u", "p1", "p2", "p_valve", "n", "i_valve", "friction", "work")
 TRUTH = (*_ONES, "ring_0", "ring_1", "ring_2", "vane_0", "vane_1", "vane_2")
-TRUTH_SLOTS = np.array([*(S[name] for name in _ONES), *(S.ring_0 + k for k in range(3)), *(S.vane_0 + k for k in range(3))])
+TRUTH_SLOTS = np.array(
+    [*(S[name] for name in _ONES), *(S.ring_0 + k for k in range(3)), *(S.vane_0 + k for k in range(3))]
+)
 
 
 @njit(cache=True, error_model="numpy")
 def ecu_frame(k, warm, p):
-    """Which ECU frame the controller has at tick ``k``: the newest that has arrived, or the one whose content is held (from t = 0 on)."""
+    """Which ECU frame the controller has at tick ``k``: the newest that has arrived, or the one whose content is held
+    (from t = 0 on).
+    """
     t = (k - warm) * TICK - p[P.can_delay]
     period = max(FRAME * TICK, p[P.frame_hold])
     held = math.floor((t + 1e-6) / period) * period
@@ -523,9 +538,11 @@ def ecu_frame(k, warm, p):
 
 @njit(cache=True, error_model="numpy")
 def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view):
-    """Sense at tick ``k``: fill ``view`` (n_dem, n_r, x_lvdt, fresh, x_lvdt as logged, mode request) with what the controller sees.
+    """Sense at tick ``k``: fill ``view`` (n_dem, n_r, x_lvdt, fresh, x_lvdt as logged, mode request) with what the
+    controller sees.
 
-    ``frames`` has a row every 10 ms: n_dem and n_r (written here), the mode asked for, and the newest frame that the controller hears then.
+    ``frames`` has a row every 10 ms: n_dem and n_r (written here), the mode asked for, and the newest frame that the
+    controller hears then.
     """
     f = k // FRAME
     if k % FRAME == 0:
@@ -598,7 +615,9 @@ def run_compiled(
     log,
     truth,
 ):
-    """The whole run with a compiled controller ``tick(inputs, state, calibration)``; ``slots`` says where its signals are."""
+    """The whole run with a compiled controller ``tick(inputs, state, calibration)``; ``slots`` says where its signals
+    are.
+    """
     view = np.zeros(6)
     total, count, row = 0.0, 0, 0
     segment = 0
@@ -616,7 +635,9 @@ def run_compiled(
         if slots[8] >= 0:
             inputs[slots[8]] = view[5]
         if slots[7] >= 0:
-            sample = min(max((k - warm) // every, 0), len(pot_noise) - 1)  # one number for all ticks of a row: noisier than a real one
+            sample = min(
+                max((k - warm) // every, 0), len(pot_noise) - 1
+            )  # one number for all ticks of a row: noisier than a real one
             for j in range(3):
                 inputs[slots[7] + j] = read_pot(s, p, j, pot_noise[sample, j])
         tick(inputs, state, calibration)

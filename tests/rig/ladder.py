@@ -19,7 +19,13 @@ def ladder(name: str, duration: float = 100.0, seed: int = 1) -> list[dict[str, 
     effect, controller = CATALOGUE[name], stand_in()
     out = []
     for value in effect.ladder:
-        run = simulate(manoeuvre(seed, duration), controller, [Hidden(name, {effect.main: value, **effect.others})], seed=seed, rate=1000)
+        run = simulate(
+            manoeuvre(seed, duration),
+            controller,
+            [Hidden(name, {effect.main: value, **effect.others})],
+            seed=seed,
+            rate=1000,
+        )
         out.append(stage_errors(run, controller))
     return out
 
@@ -32,7 +38,9 @@ def main(names: list[str]) -> None:
     for name in names or list(CATALOGUE):
         effect = CATALOGUE[name]
         for value, errors in zip(effect.ladder, ladder(name), strict=True):
-            print(f"{name:26s} {value:9.5g} " + " ".join(f"{s} {errors[s] / clean[s]:8.3f}" for s in STAGES), flush=True)
+            print(
+                f"{name:26s} {value:9.5g} " + " ".join(f"{s} {errors[s] / clean[s]:8.3f}" for s in STAGES), flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""What the engine test asks of the machine: rotor-speed demand, supply pressure and oil temperature over time, drawn by seed."""
+"""What the engine test asks of the machine: rotor-speed demand, supply pressure and oil temperature over time, drawn by
+seed.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def _wander(rng: np.random.Generator, t: np.ndarray, corner: float) -> np.ndarra
 
 
 def _oil(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Oil warming from 20..40 towards 65..90 degC within the test, with excursions of some kelvin as the cooler works."""
+    """Oil warming from 20..40 towards 65..90 degC within the test, with excursions of some kelvin as the cooler
+    works.
+    """
     first, last = rng.uniform(20.0, 40.0), rng.uniform(65.0, 88.0)
     tau = rng.uniform(0.3, 0.6) * max(t[-1], 1.0)
     warm = first + (last - first) * (1.0 - np.exp(-t / tau))
@@ -101,7 +105,9 @@ def _pieces(rng: np.random.Generator, duration: float) -> list[np.ndarray]:
 
 
 def manoeuvre(seed: int, duration: float = 300.0) -> Manoeuvre:
-    """Draw an engine test: dwells, ramps, steps, small reversals, slams, dithers, stairs; warming oil. 300 s excite most effects."""
+    """Draw an engine test: dwells, ramps, steps, small reversals, slams, dithers, stairs; warming oil. 300 s excite
+    most effects.
+    """
     rng = np.random.default_rng([seed, 1])
     t = _time(duration)
     n = np.concatenate(_pieces(rng, duration))[: len(t)]
@@ -113,7 +119,11 @@ def steady(seed: int, duration: float = 300.0) -> Manoeuvre:
     rng = np.random.default_rng([seed, 2])
     t = _time(duration)
     return Manoeuvre(
-        "steady", seed, np.full(len(t), rng.uniform(60.0, 95.0)), np.full(len(t), 21e6), np.full(len(t), rng.uniform(40.0, 70.0))
+        "steady",
+        seed,
+        np.full(len(t), rng.uniform(60.0, 95.0)),
+        np.full(len(t), 21e6),
+        np.full(len(t), rng.uniform(40.0, 70.0)),
     )
 
 
@@ -130,7 +140,9 @@ def slow_ramps(seed: int, duration: float = 300.0) -> Manoeuvre:
     rng = np.random.default_rng([seed, 4])
     t = _time(duration)
     turns = np.linspace(0.0, duration, max(3, int(duration / 60.0) + 1))
-    ends = np.where(np.arange(len(turns)) % 2 == 0, rng.uniform(40.0, 50.0, len(turns)), rng.uniform(93.0, 100.0, len(turns)))
+    ends = np.where(
+        np.arange(len(turns)) % 2 == 0, rng.uniform(40.0, 50.0, len(turns)), rng.uniform(93.0, 100.0, len(turns))
+    )
     return Manoeuvre("slow ramps", seed, np.interp(t, turns, ends), np.full(len(t), 21e6), np.full(len(t), 50.0))
 
 

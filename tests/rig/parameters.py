@@ -102,7 +102,9 @@ TOLERANCES = (
 
 
 def specimen(nominal: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-    """Return parameters of one machine: the nominal ones, or (with ``rng``) each drawn uniformly within its tolerance."""
+    """Return parameters of one machine: the nominal ones, or (with ``rng``) each drawn uniformly within its
+    tolerance.
+    """
     p = nominal.copy()
     if rng is not None:
         for t in TOLERANCES:

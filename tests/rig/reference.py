@@ -1,7 +1,8 @@
-"""The design's nominal equations, stage by stage, each driven by a run's own logged input: how far the rig departs from them.
+"""The design's nominal equations, stage by stage, each driven by a run's own logged input: how far the rig departs from
+them.
 
-Ideal flow gain, ideal play, clipped engine limits. Used to show that a clean run is clean at the noise floor, and to size the effects.
-Wants a run at 1000 Hz whose i_cmd is the current at the row (``mean_through=True``).
+Ideal flow gain, ideal play, clipped engine limits. Used to show that a clean run is clean at the noise floor, and to
+size the effects. Wants a run at 1000 Hz whose i_cmd is the current at the row (``mean_through=True``).
 """
 
 from __future__ import annotations
@@ -90,8 +91,8 @@ def by_window(d: np.ndarray, window: float, rate: int = 1000) -> np.ndarray:
 def linkage_residual(run: Run) -> np.ndarray:
     """Measured minus nominal angles (deg), float64[rows, 3]: kinematics of the logged stroke, ideal play, sensor lag.
 
-    The stroke is a centred mean over 21 ms: the noise of single samples would push an ideal play along by its extremes. Each play starts
-    where in its gap it fits the first second best.
+    The stroke is a centred mean over 21 ms: the noise of single samples would push an ideal play along by its extremes.
+    Each play starts where in its gap it fits the first second best.
     """
     tables = ring_tables(load())
     smooth = np.convolve(np.pad(run.log["x_lvdt"], 10, mode="edge"), np.full(21, 1.0 / 21.0), mode="valid")
@@ -121,10 +122,11 @@ def engine_residual(run: Run) -> np.ndarray:
 
 
 def controller_residual(run: Run, controller: Compiled) -> tuple[np.ndarray, np.ndarray]:
-    """Logged minus replayed stroke demand (mm) and current (mA): the unchanged controller fed with the logged frames and strokes.
+    """Logged minus replayed stroke demand (mm) and current (mA): the unchanged controller fed with the logged frames
+    and strokes.
 
-    The current's slow part is the controller's own integral and drifts in open loop. The log does not say in which state the controller
-    starts (the record does say from where it came); the first seconds are left out.
+    The current's slow part is the controller's own integral and drifts in open loop. The log does not say in which
+    state the controller starts (the record does say from where it came); the first seconds are left out.
     """
     log = run.log
     inputs, state = controller.inputs.copy(), controller.state.copy()
@@ -143,7 +145,9 @@ def controller_residual(run: Run, controller: Compiled) -> tuple[np.ndarray, np.
 
 
 def stage_errors(run: Run, controller: Compiled, stages: Sequence[str] = STAGES) -> dict[str, float]:
-    """RMS error of each stage: demand (mm), servo (mA), engine (%), actuator (mm), linkage (deg, the worst vane stage)."""
+    """RMS error of each stage: demand (mm), servo (mA), engine (%), actuator (mm), linkage (deg, the worst vane
+    stage).
+    """
     out = {}
     if "demand" in stages or "servo" in stages:
         demand, servo = controller_residual(run, controller)

@@ -36,7 +36,8 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Spell:
-    """Some seconds in which the controller is asked to stand by (``standby``) or hears no frame of the ECU (``deaf``), from ``start`` (s).
+    """Some seconds in which the controller is asked to stand by (``standby``) or hears no frame of the ECU (``deaf``),
+    from ``start`` (s).
 
     A logger hears the ECU all the same.
     """
@@ -108,11 +109,12 @@ def simulate(
     noise         False: sensors and speed without noise (converters still quantise)
     jitter        s: the logger's clock is late by up to this much, uniformly
     substeps      hydraulic steps a tick, a multiple of 10
-    run_up        s before the log starts, for the controller to reach its running mode: a second 3 % above or below the first demand,
-                  then at it. Which, is the seed's: logs start on either stroke table and with the pins on either side
+    run_up        s before the log starts, for the controller to reach its running mode: a second 3 % above or below the
+                  first demand, then at it. Which, is the seed's: logs start on either stroke table and with the pins on
+                  either side
     x0            m, stroke at the start of the run-up; None: where the schedule wants it
-    mean_through  i_cmd is the mean of the ticks since the last row, the one at the row included (as a frame sent after the tick); False: of
-                  the ticks before the row, which is the current that acted between the two rows
+    mean_through  i_cmd is the mean of the ticks since the last row, the one at the row included (as a frame sent after
+                  the tick); False: of the ticks before the row, which is the current that acted between the two rows
     parameters    array in the order of `kernel.P` in place of the drawn specimen
     geometry      links of this machine; None: those of the table (`geometry.load` draws some within their tolerance)
     spells        seconds in which the controller is asked to stand by, or hears nothing and takes care of itself
@@ -126,9 +128,14 @@ def simulate(
         raise ValueError(f"jitter (={jitter:g} s) must be in [0, {1.0 / rate:g})")
     geometry = geometry or load()
     streams = {
-        name: np.random.default_rng([seed, k]) for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
+        name: np.random.default_rng([seed, k])
+        for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
     }
-    p = specimen(machine(geometry), streams["specimen"] if randomised else None) if parameters is None else parameters.copy()
+    p = (
+        specimen(machine(geometry), streams["specimen"] if randomised else None)
+        if parameters is None
+        else parameters.copy()
+    )
 
     # segments between onsets, each with its parameters and ring tables
     warm = round(run_up / TICK / FRAME) * FRAME
@@ -241,8 +248,12 @@ def _scheduled_stroke(table: np.ndarray, p: np.ndarray, n: float) -> float:
     return float(np.clip(np.interp(np.interp(n, speeds, angles), vigv, strokes), 5e-4, 47.5e-3))
 
 
-def _change_controller(controller: Compiled | Controller, hidden: Sequence[Hidden]) -> tuple[Compiled | Controller, set[str]]:
-    """Let the controller put its own errors in. Those it did are named; the rig does what is left from outside, if that is possible."""
+def _change_controller(
+    controller: Compiled | Controller, hidden: Sequence[Hidden]
+) -> tuple[Compiled | Controller, set[str]]:
+    """Let the controller put its own errors in. Those it did are named; the rig does what is left from outside, if that
+    is possible.
+    """
     done: set[str] = set()
     for h in hidden:
         if h.name not in ("schedule_error", "trend_threshold_error", "controller_gain_error"):
@@ -253,7 +264,9 @@ def _change_controller(controller: Compiled | Controller, hidden: Sequence[Hidde
             controller = changed
             done.add(h.name)
         elif h.name == "trend_threshold_error" and h.parameters["factor"] != 1.0:
-            raise ValueError("trend_threshold_error lies inside the controller: hand in one whose `change` can make it, with onset 0")
+            raise ValueError(
+                "trend_threshold_error lies inside the controller: hand in one whose `change` can make it, with onset 0"
+            )
     return controller, done
 
 
@@ -295,7 +308,21 @@ def _run_object(
         if k >= warm and (k - warm) % every == 0:
             mean = float(np.mean(currents)) if currents else i
             kernel.write_row(
-                row, k, warm, s, p, frames, view, controller.x_dem, controller.state, mean, p_s[f], t_oil[f], pot_noise, log, truth
+                row,
+                k,
+                warm,
+                s,
+                p,
+                frames,
+                view,
+                controller.x_dem,
+                controller.state,
+                mean,
+                p_s[f],
+                t_oil[f],
+                pot_noise,
+                log,
+                truth,
             )
             row += 1
             currents.clear()

@@ -2,16 +2,18 @@
 
     host  this machine's own vcan0
     uml   user-mode Linux: a kernel that runs as a program on the host's own files; all tests
-    qemu  Debian's kernel in QEMU, every instruction emulated, on the host's own files; only the tests marked ``any_speed``
+    qemu  Debian's kernel in QEMU, every instruction emulated, on the host's own files; only the tests marked
+          ``any_speed``
 
-The last two boot a kernel that has CAN, run the tests there with this very checkout and Python environment, and bring back what was
-printed and the exit code. Nothing of the host's kernel is touched. ``VANELOOP_CAN`` = host, uml or qemu allows that way only.
-Arguments are handed to pytest::
+The last two boot a kernel that has CAN, run the tests there with this very checkout and Python environment, and bring
+back what was printed and the exit code. Nothing of the host's kernel is touched. ``VANELOOP_CAN`` = host, uml or qemu
+allows that way only. Arguments are handed to pytest::
 
     python -m tests.vcan.run [-k EXPRESSION ...]
 
-The last lines say in capitals what was not tested, and why. Exit code: pytest's; 1 where a kernel died or hung after the tests had begun;
-2 for a wrong ``VANELOOP_CAN``. Where no way leads to a vcan0: 0, or 1 with ``VANELOOP_CAN`` or ``VANELOOP_NEED_VCAN`` set.
+The last lines say in capitals what was not tested, and why. Exit code: pytest's; 1 where a kernel died or hung after
+the tests had begun; 2 for a wrong ``VANELOOP_CAN``. Where no way leads to a vcan0: 0, or 1 with ``VANELOOP_CAN`` or
+``VANELOOP_NEED_VCAN`` set.
 """
 
 from __future__ import annotations
@@ -40,17 +42,30 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 INTERFACE = "vcan0"
 MEMORY_MIB = 1536
-CAN_UTILS = {"candump": "can-utils", "cansend": "can-utils", "cangen": "can-utils", "canplayer": "can-utils", "ip": "iproute2"}
+CAN_UTILS = {
+    "candump": "can-utils",
+    "cansend": "can-utils",
+    "cangen": "can-utils",
+    "canplayer": "can-utils",
+    "ip": "iproute2",
+}
 IN_UML = CAN_UTILS | {"linux.uml": "user-mode-linux", "insmod": "kmod"}
 IN_QEMU = CAN_UTILS | {"qemu-system-x86_64": "qemu-system-x86", "insmod": "kmod", "dpkg-deb": "dpkg"}
 KERNEL, BUSYBOX = "linux-image-amd64", "busybox-static"  # taken apart in a folder of ours, never installed
-PCI = ("virtio_ring", "virtio", "virtio_pci_modern_dev", "virtio_pci_legacy_dev", "virtio_pci")  # modules, in the order of loading
+PCI = (
+    "virtio_ring",
+    "virtio",
+    "virtio_pci_modern_dev",
+    "virtio_pci_legacy_dev",
+    "virtio_pci",
+)  # modules, in the order of loading
 FILES = (*PCI, "netfs", "fscache", "9pnet", "9pnet_virtio", "9p")
 CAN = ("can", "can-raw", "can-bcm", "can-dev", "vcan")
 APT_LIMIT, DOWNLOAD_LIMIT, WARM_LIMIT = 900.0, 900.0, 900.0  # s
 NUMBA = ("NUMBA_CACHE_DIR", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_JIT")
 HANDED_ON = (*NUMBA, "HOME", "LANG", "LC_ALL", "PYTHONPATH", "TERM", "VANELOOP_DATA", "VIRTUAL_ENV")
-# Python runs, with what takes longest to load, and a socket can be had: from then on what fails is a test's failure, not the way's.
+# Python runs, with what takes longest to load, and a socket can be had: from then on what fails is a test's failure,
+# not the way's.
 CHECK = f"import socket, numba; socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).bind(({INTERFACE!r},))"
 
 
@@ -63,14 +78,18 @@ class Outcome(NamedTuple):
 
 
 class Kernel(NamedTuple):
-    """A kernel that can be booted with the host's files, and how long that may take on a machine that is slow and busy."""
+    """A kernel that can be booted with the host's files, and how long that may take on a machine that is slow
+    and busy.
+    """
 
     name: str
     command: list[str]
     boot_limit: float  # s, until Python runs; user-mode Linux takes a few seconds, QEMU half a minute
     test_limit: float  # s, for the tests; two to three minutes each
     short: bool = False  # only the tests marked any_speed
-    first: bool = False  # before ordinary work on this machine, where that is allowed: its controllers want to be on time
+    first: bool = (
+        False  # before ordinary work on this machine, where that is allowed: its controllers want to be on time
+    )
     settings: dict[str, str] = {}  # of the environment inside
 
 
@@ -108,7 +127,14 @@ def apt_get(*arguments: str, limit: float = APT_LIMIT, cwd: Path | None = None) 
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     try:
         done = subprocess.run(
-            command, check=False, env=environment, capture_output=True, text=True, timeout=limit, cwd=cwd, stdin=subprocess.DEVNULL
+            command,
+            check=False,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            cwd=cwd,
+            stdin=subprocess.DEVNULL,
         )
     except subprocess.TimeoutExpired:
         return f"apt-get {arguments[0]} did not end within {limit / 60:g} min"
@@ -141,7 +167,11 @@ def memory_folder() -> str | None:
             stat = os.statvfs(folder)
         except OSError:
             continue
-        if not stat.f_flag & os.ST_NOEXEC and stat.f_bavail * stat.f_frsize > MEMORY_MIB * 2**20 and os.access(folder, os.W_OK):
+        if (
+            not stat.f_flag & os.ST_NOEXEC
+            and stat.f_bavail * stat.f_frsize > MEMORY_MIB * 2**20
+            and os.access(folder, os.W_OK)
+        ):
             return folder
     return None
 
@@ -160,7 +190,8 @@ def warm_up(*commands: list[str], settings: dict[str, str] | None = None) -> Non
     for arguments in commands:
         try:
             subprocess.run(
-                [sys.executable, "-m", *arguments], cwd=ROOT, check=False, env=os.environ | (settings or {}), timeout=WARM_LIMIT,
+                [sys.executable, "-m", *arguments], cwd=ROOT, check=False, env=os.environ | (settings or {}),
+                timeout=WARM_LIMIT,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
@@ -173,10 +204,13 @@ LOOPS = (
     ["hil.replay", "examples/engine_run.blf", "--quiet"],
 )
 # The short list's twins on the embedded bus: what they compile is what the short list needs.
-EMBEDDED = ("tests/test_bus.py::TestLocal", "tests/test_realtime.py::test_controller_and_ecu_as_two_processes_on_the_embedded_bus")
+EMBEDDED = (
+    "tests/test_bus.py::TestLocal",
+    "tests/test_realtime.py::test_controller_and_ecu_as_two_processes_on_the_embedded_bus",
+)
 
 
-# ---- ways to a vcan0 ----------------------------------------------------------------------------------------------------------------
+# ---- ways to a vcan0 -------------------------------------------------------------------------------------------------
 
 
 def on_this_machine(arguments: list[str]) -> Outcome:
@@ -202,20 +236,42 @@ def in_user_mode_linux(arguments: list[str]) -> Outcome:
         return Outcome(None, f"user-mode Linux {why}")
     folder = memory_folder()
     if folder is None:
-        return Outcome(None, f"user-mode Linux needs {MEMORY_MIB} MiB in a folder from which code may run (/dev/shm, /tmp or TMPDIR)")
+        return Outcome(
+            None,
+            f"user-mode Linux needs {MEMORY_MIB} MiB in a folder from which code may run (/dev/shm, /tmp or TMPDIR)",
+        )
     warm_up(*LOOPS)
     with tempfile.TemporaryDirectory(prefix="vaneloop-uml-") as name:
         job = Path(name)
-        boot = [str(find("linux.uml")), f"mem={MEMORY_MIB}M", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", "quiet"]
-        boot += [f"init={job}/init.sh", f"VANELOOP_JOB={job}", "VANELOOP_MODULES=/usr/lib/uml/modules", f"uml_dir={job}"]
+        boot = [
+            str(find("linux.uml")),
+            f"mem={MEMORY_MIB}M",
+            "root=/dev/root",
+            "rootfstype=hostfs",
+            "rootflags=/",
+            "rw",
+            "quiet",
+        ]
+        boot += [
+            f"init={job}/init.sh",
+            f"VANELOOP_JOB={job}",
+            "VANELOOP_MODULES=/usr/lib/uml/modules",
+            f"uml_dir={job}",
+        ]
         boot += ["con=null", "con0=fd:0,fd:1", "panic=1"]
-        return in_guest(Kernel("user-mode Linux", ["env", f"TMPDIR={folder}", *boot], 300.0, 2400.0, first=True), arguments, job)
+        return in_guest(
+            Kernel("user-mode Linux", ["env", f"TMPDIR={folder}", *boot], 300.0, 2400.0, first=True), arguments, job
+        )
 
 
 def in_qemu(arguments: list[str]) -> Outcome:
-    """Inside QEMU, without the help of the processor: -accel kvm hangs inside some virtual machines that show /dev/kvm."""
+    """Inside QEMU, without the help of the processor: -accel kvm hangs inside some virtual machines that show
+    /dev/kvm.
+    """
     if platform.machine() != "x86_64":
-        return Outcome(None, f"QEMU: the kernel booted there needs x86-64 programs; this machine is {platform.machine()}")
+        return Outcome(
+            None, f"QEMU: the kernel booted there needs x86-64 programs; this machine is {platform.machine()}"
+        )
     why = install(IN_QEMU)
     if why is not None:
         return Outcome(None, f"QEMU {why}")
@@ -223,12 +279,23 @@ def in_qemu(arguments: list[str]) -> Outcome:
         parts = kernel_parts()
     except (OSError, subprocess.SubprocessError, tarfile.TarError, ValueError) as error:
         return Outcome(None, f"QEMU: the kernel to boot there could not be had: {error}")
-    # Host and guest share compiled code only for a processor that both have; without that the guest compiles for many minutes.
+    # Host and guest share compiled code only for a processor that both have; without that the guest compiles for many
+    # minutes.
     processor = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     warm_up(["pytest", "-p", "no:cacheprovider", *EMBEDDED], settings=processor | {"VANELOOP_NOT_TESTED": ""})
     with tempfile.TemporaryDirectory(prefix="vaneloop-qemu-") as name:
         job = Path(name)
-        boot = [str(find("qemu-system-x86_64")), "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", f"{MEMORY_MIB}"]
+        boot = [
+            str(find("qemu-system-x86_64")),
+            "-accel",
+            "tcg,thread=multi",
+            "-cpu",
+            "max",
+            "-smp",
+            "2",
+            "-m",
+            f"{MEMORY_MIB}",
+        ]
         boot += ["-nodefaults", "-no-user-config", "-display", "none", "-serial", "stdio", "-no-reboot"]
         boot += ["-kernel", str(parts / "vmlinuz"), "-initrd", str(initramfs(parts, job))]
         told = f"VANELOOP_JOB={job} VANELOOP_MODULES={parts}/modules"
@@ -242,11 +309,13 @@ def in_qemu(arguments: list[str]) -> Outcome:
 WAYS: dict[str, Callable[[list[str]], Outcome]] = {"host": on_this_machine, "uml": in_user_mode_linux, "qemu": in_qemu}
 
 
-# ---- what QEMU boots ----------------------------------------------------------------------------------------------------------------
+# ---- what QEMU boots -------------------------------------------------------------------------------------------------
 
 
 def kernel_parts() -> Path:
-    """Folder with Debian's kernel (vmlinuz), the modules that are wanted of it, and a static busybox; downloaded on first use."""
+    """Folder with Debian's kernel (vmlinuz), the modules that are wanted of it, and a static busybox; downloaded on
+    first use.
+    """
     folder = ROOT / "out" / "vcan" / hashlib.sha256(" ".join([KERNEL, *FILES, *CAN]).encode()).hexdigest()[:8]
     if folder.exists():
         return folder
@@ -255,7 +324,10 @@ def kernel_parts() -> Path:
         parts = Path(name) / "parts"
         parts.mkdir()
         package = kernel_package()
-        say(f"downloading {package} and {BUSYBOX}, some 70 MB, into {folder.parent.relative_to(ROOT)} (nothing is installed of them)")
+        say(
+            f"downloading {package} and {BUSYBOX}, some 70 MB, into {folder.parent.relative_to(ROOT)} (nothing is "
+            f"installed of them)"
+        )
         take_apart(fetch(package, Path(name)), parts)
         take_apart(fetch(BUSYBOX, Path(name)), parts)
         lacking = [f for f in ("vmlinuz", "busybox", "modules") if not (parts / f).exists()]
@@ -270,8 +342,12 @@ def kernel_package() -> str:
     for again in (False, True):
         if again and (os.geteuid() != 0 or apt_get("update") is not None):
             break
-        done = subprocess.run(["apt-cache", "depends", KERNEL], check=False, capture_output=True, text=True, timeout=120)
-        names = [line.split()[1] for line in done.stdout.splitlines() if line.strip().startswith("Depends: linux-image-")]
+        done = subprocess.run(
+            ["apt-cache", "depends", KERNEL], check=False, capture_output=True, text=True, timeout=120
+        )
+        names = [
+            line.split()[1] for line in done.stdout.splitlines() if line.strip().startswith("Depends: linux-image-")
+        ]
         if names:
             return names[0]
     raise ValueError(f"the package lists have no {KERNEL} (Debian's); apt-get update may help")
@@ -291,7 +367,9 @@ def fetch(package: str, folder: Path) -> Path:
 
 
 def take_apart(package: Path, into: Path) -> None:
-    """Write what is wanted of a Debian package: boot/vmlinuz-*, bin/busybox, and modules as modules/VERSION/kernel/..."""
+    """Write what is wanted of a Debian package: boot/vmlinuz-*, bin/busybox, and modules as
+    modules/VERSION/kernel/...
+    """
     wanted = {*FILES, *CAN}
     with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", str(package)], stdout=subprocess.PIPE) as unpacked:
         assert unpacked.stdout is not None
@@ -307,7 +385,9 @@ def take_apart(package: Path, into: Path) -> None:
                     (into / "busybox").write_bytes(held.read())
                     (into / "busybox").chmod(0o755)
                 elif path.name.split(".")[0] in wanted and ".ko" in path.suffixes and "modules" in path.parts:
-                    target = into.joinpath(*path.parts[path.parts.index("modules") :]).with_name(path.name.split(".")[0] + ".ko")
+                    target = into.joinpath(*path.parts[path.parts.index("modules") :]).with_name(
+                        path.name.split(".")[0] + ".ko"
+                    )
                     target.parent.mkdir(parents=True, exist_ok=True)
                     target.write_bytes(lzma.decompress(held.read()) if path.suffix == ".xz" else held.read())
     if unpacked.returncode:
@@ -322,7 +402,9 @@ def initramfs(parts: Path, job: Path) -> Path:
     shutil.copy(parts / "busybox", tree / "bin" / "busybox")
     shutil.copy(HERE / "initramfs.sh", tree / "init")
     (tree / "init").chmod(0o755)
-    modules = [f for name in FILES for f in (parts / "modules").rglob(f"{name}.ko")]  # later kernels have some of them built in
+    modules = [
+        f for name in FILES for f in (parts / "modules").rglob(f"{name}.ko")
+    ]  # later kernels have some of them built in
     for f in modules:
         shutil.copy(f, tree / "modules" / f.name)
     (tree / "modules" / "order").write_text("\n".join(f.name for f in modules), encoding="ascii")
@@ -330,30 +412,37 @@ def initramfs(parts: Path, job: Path) -> Path:
     packed = job / "initramfs.cpio"
     with packed.open("wb") as out:
         subprocess.run(
-            [parts / "busybox", "cpio", "-o", "-H", "newc"], cwd=tree, input=names.encode(), stdout=out, stderr=subprocess.DEVNULL,
+            [parts / "busybox", "cpio", "-o", "-H", "newc"], cwd=tree, input=names.encode(), stdout=out,
+            stderr=subprocess.DEVNULL,
             check=True, timeout=120,
         )  # fmt: skip
     return packed
 
 
-# ---- a booted kernel ----------------------------------------------------------------------------------------------------------------
+# ---- a booted kernel -------------------------------------------------------------------------------------------------
 
 
 def in_guest(kernel: Kernel, arguments: list[str], job: Path) -> Outcome:
-    """Boot, run the tests inside, print what they print, halt. ``job`` is the folder over which host and guest speak (init.sh)."""
+    """Boot, run the tests inside, print what they print, halt. ``job`` is the folder over which host and guest speak
+    (init.sh).
+    """
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
     settings = {k: os.environ[k] for k in HANDED_ON if k in os.environ} | {"PATH": path, **kernel.settings}
     settings |= {"VANELOOP_NEED_VCAN": "1", "VANELOOP_NOT_TESTED": f"{job}/not_tested"}
     exports = "".join(f"export {k}={shlex.quote(v)}\n" for k, v in settings.items())
     for file, inside in (("check", [sys.executable, "-c", CHECK]), ("command", command(arguments, short=kernel.short))):
-        (job / file).write_text(f"{exports}cd {shlex.quote(str(ROOT))} || exit 9\nexec {shlex.join(inside)}\n", encoding="utf-8")
+        (job / file).write_text(
+            f"{exports}cd {shlex.quote(str(ROOT))} || exit 9\nexec {shlex.join(inside)}\n", encoding="utf-8"
+        )
     shutil.copy(HERE / "init.sh", job / "init.sh")
     (job / "init.sh").chmod(0o755)
     say(f"booting {kernel.name}, which has a {INTERFACE}")
     # should this process be killed, the kernel it booted goes with it
     tied = ["setpriv", "--pdeathsig", "KILL"] if find("setpriv") else []
     with (job / "console").open("wb") as console:
-        guest = subprocess.Popen([*tied, *kernel.command], stdin=subprocess.DEVNULL, stdout=console, stderr=console, start_new_session=True)
+        guest = subprocess.Popen(
+            [*tied, *kernel.command], stdin=subprocess.DEVNULL, stdout=console, stderr=console, start_new_session=True
+        )
         if kernel.first:
             put_first(guest)
         try:
@@ -364,14 +453,21 @@ def in_guest(kernel: Kernel, arguments: list[str], job: Path) -> Outcome:
                 guest.wait()
     untested = lines_of(job / "not_tested")
     if kernel.short:
-        untested = (f"{kernel.name} EMULATES THE PROCESSOR: ONLY THE SHORT LIST WAS RUN, THE TESTS MARKED any_speed", *untested)
+        untested = (
+            f"{kernel.name} EMULATES THE PROCESSOR: ONLY THE SHORT LIST WAS RUN, THE TESTS MARKED any_speed",
+            *untested,
+        )
     if (job / "exit").exists():
         return Outcome(int((job / "exit").read_text()), untested=untested)
-    screen = [line for line in (job / "console").read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    screen = [
+        line for line in (job / "console").read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()
+    ]
     last_words = "; ".join(line.strip() for line in screen[-3:]) or f"exit code {guest.returncode}"
     if (job / "output").exists():
         limit = f"was stopped: the tests took longer than {kernel.test_limit:g} s"
-        return Outcome(1, f"{kernel.name} {limit if hung else 'died in the midst of the tests'}: {last_words}", untested)
+        return Outcome(
+            1, f"{kernel.name} {limit if hung else 'died in the midst of the tests'}: {last_words}", untested
+        )
     if (job / "failed").exists():
         last_words = (job / "failed").read_text(encoding="utf-8", errors="replace").strip()
     ended = f"did not come up here within {kernel.boot_limit:g} s" if hung else "did not come up here"
@@ -381,14 +477,17 @@ def in_guest(kernel: Kernel, arguments: list[str], job: Path) -> Outcome:
 def put_first(guest: subprocess.Popen[bytes]) -> None:
     """Let a guest and all it starts run before ordinary work, where this user may ask for it, and on one processor.
 
-    A real-time class would not do: what has it is stopped for 50 ms in every second in which it is busy. User-mode Linux hands over between
-    two processes at each call of a guest's program: on one processor that is quick, between two that had gone to sleep it is not.
+    A real-time class would not do: what has it is stopped for 50 ms in every second in which it is busy. User-mode
+    Linux hands over between two processes at each call of a guest's program: on one processor that is quick, between
+    two that had gone to sleep it is not.
     """
     with contextlib.suppress(OSError):
         os.sched_setaffinity(guest.pid, {max(os.sched_getaffinity(0))})
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, guest.pid, -20)
-        Path(f"/proc/{guest.pid}/autogroup").write_text("-20")  # where each session has its share, a process's priority counts within
+        Path(f"/proc/{guest.pid}/autogroup").write_text(
+            "-20"
+        )  # where each session has its share, a process's priority counts within
 
 
 def follow(guest: subprocess.Popen[bytes], job: Path, kernel: Kernel) -> bool:
@@ -414,7 +513,7 @@ def follow(guest: subprocess.Popen[bytes], job: Path, kernel: Kernel) -> bool:
         time.sleep(0.2)
 
 
-# ---- decision -----------------------------------------------------------------------------------------------------------------------
+# ---- decision --------------------------------------------------------------------------------------------------------
 
 
 def lines_of(file: Path) -> tuple[str, ...]:
@@ -423,11 +522,18 @@ def lines_of(file: Path) -> tuple[str, ...]:
 
 
 def conclude(outcome: Outcome, before: list[str], *, forced: bool) -> int:
-    """Say as the last lines what was not tested; return the exit code. ``before``: why the ways tried before did not lead there."""
-    earlier = lines_of(Path(os.environ.get("VANELOOP_NOT_TESTED") or os.devnull))  # what pytest skipped before, in `make test`
+    """Say as the last lines what was not tested; return the exit code. ``before``: why the ways tried before did not
+    lead there.
+    """
+    earlier = lines_of(
+        Path(os.environ.get("VANELOOP_NOT_TESTED") or os.devnull)
+    )  # what pytest skipped before, in `make test`
     lines: list[str] = []
     if outcome.code is None:
-        lines += [f"NOT TESTED ON A REAL {INTERFACE}: ANYTHING. NONE OF THE SOCKETCAN TESTS WAS RUN, because:", *(f"  {w}" for w in before)]
+        lines += [
+            f"NOT TESTED ON A REAL {INTERFACE}: ANYTHING. NONE OF THE SOCKETCAN TESTS WAS RUN, because:",
+            *(f"  {w}" for w in before),
+        ]
     elif outcome.why:
         lines += ["THE SOCKETCAN TESTS FAILED:", f"  {outcome.why}"]
     if outcome.untested:
@@ -451,7 +557,10 @@ def main(arguments: list[str]) -> int:
     """Run the marked tests where they can be run; return the exit code."""
     wanted = os.environ.get("VANELOOP_CAN", "")
     if wanted and wanted not in WAYS:
-        print(f"VANELOOP_CAN={wanted!r} is not known; allowed: {', '.join(WAYS)}, or nothing for the first that works", file=sys.stderr)
+        print(
+            f"VANELOOP_CAN={wanted!r} is not known; allowed: {', '.join(WAYS)}, or nothing for the first that works",
+            file=sys.stderr,
+        )
         return 2
     before: list[str] = []
     outcome = Outcome(None, f"SocketCAN is part of Linux; this is {sys.platform}")

@@ -16,7 +16,9 @@ from vaneloop.base.errors import InputError
 __all__ = ["Axis", "Bound", "Bounded", "Quantity", "Table", "load_toml", "path", "read"]
 
 _ROOM = Path(__file__).parent.parent
-MOST_BYTES = 1 << 20  # of a TOML file; the largest shipped has 6 kB. The parser takes up to 600 bytes for each of dotted keys
+MOST_BYTES = (
+    1 << 20
+)  # of a TOML file; the largest shipped has 6 kB. The parser takes up to 600 bytes for each of dotted keys
 MOST_PARTS = 16  # of a dotted key: the parser's memory grows with their square, 6.8 GB for 50,000
 _PART = rb"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _LONG_KEY = re.compile(rb"(?<![A-Za-z0-9_-])" + _PART + rb"(?:\.[ \t]*+" + _PART + rb"){%d}" % MOST_PARTS)
@@ -94,8 +96,8 @@ def path(name: str) -> Path:
 def load_toml(file: str | Path) -> dict[str, Any]:
     """The content of a TOML file, as it stands.
 
-    Raises InputError in one line for what cannot be read, is no TOML, has more than `MOST_BYTES` or a key of more than `MOST_PARTS` parts:
-    the parser would take more memory for it than any table of ours is worth.
+    Raises InputError in one line for what cannot be read, is no TOML, has more than `MOST_BYTES` or a key of more than
+    `MOST_PARTS` parts: the parser would take more memory for it than any table of ours is worth.
     """
     try:
         with Path(file).open("rb") as f:

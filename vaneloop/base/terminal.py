@@ -44,20 +44,6 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message} ({self.prog} --help explains)\n")
 
 
-
-
-
-
-
-
-
-
-
-
-
-
-
-
 def add_output_options(parser: argparse.ArgumentParser) -> None:
     """Options that say where results go."""
     group = parser.add_argument_group("output")
@@ -65,8 +51,12 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--quiet", action="store_true", help="no text, no progress bar")
 
 
-def pairs(options: list[str], name: str, allowed: Callable[[str], bool] | None = None, known: str = "") -> dict[str, str]:
-    """Split ``a=b`` options into a dict. Raises InputError for anything else, and for an ``a`` that is given two values."""
+def pairs(
+    options: list[str], name: str, allowed: Callable[[str], bool] | None = None, known: str = ""
+) -> dict[str, str]:
+    """Split ``a=b`` options into a dict. Raises InputError for anything else, and for an ``a`` that is given two
+    values.
+    """
     out: dict[str, str] = {}
     for option in options:
         key, eq, value = option.partition("=")
@@ -78,14 +68,6 @@ def pairs(options: list[str], name: str, allowed: Callable[[str], bool] | None =
         if before != value.strip():
             raise InputError(f"--{name} {option!r}: {key.strip()!r} has been given {before!r} before; allowed: once")
     return out
-
-
-
-
-
-
-
-
 
 
 def say(args: argparse.Namespace, text: str) -> None:
@@ -111,7 +93,10 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     for r in rows:
         table.add_row(*r)
     console = Console(
-        file=sys.stderr if args.json == "-" else sys.stdout, soft_wrap=False, width=None if sys.stdout.isatty() else 150, markup=False
+        file=sys.stderr if args.json == "-" else sys.stdout,
+        soft_wrap=False,
+        width=None if sys.stdout.isatty() else 150,
+        markup=False,
     )
     console.print(table)
 
@@ -150,7 +135,9 @@ def plain(v: Any) -> Any:
 
 @contextmanager
 def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no terminal."""
+    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no
+    terminal.
+    """
     if args.quiet or not sys.stderr.isatty():
         yield None
         return
@@ -167,7 +154,9 @@ DEFECT = 70  # exit code of sysexits.h for an internal error
 
 
 def start(prog: str, load: Callable[[], Any], argv: list[str] | None = None) -> int:
-    """Run a command from its words; return the exit code. ``load`` returns its module: DESCRIPTION, ``add_options``, ``command``."""
+    """Run a command from its words; return the exit code. ``load`` returns its module: DESCRIPTION, ``add_options``,
+    ``command``.
+    """
 
     def command() -> int:
         module = load()
@@ -179,7 +168,9 @@ def start(prog: str, load: Callable[[], Any], argv: list[str] | None = None) -> 
 
 
 def run(command: Callable[[], int]) -> int:
-    """Call ``command``; turn what users can cause into one line on standard error and an exit code, and so a defect of ours (`defect`)."""
+    """Call ``command``; turn what users can cause into one line on standard error and an exit code, and so a defect of
+    ours (`defect`).
+    """
     try:
         return command()
     except KeyboardInterrupt:
@@ -197,7 +188,9 @@ def run(command: Callable[[], int]) -> int:
 
 
 def defect(e: BaseException) -> str:
-    """One line for an error that no input should cause. The traceback goes into a file, or to standard error with VANELOOP_DEBUG=1."""
+    """One line for an error that no input should cause. The traceback goes into a file, or to standard error with
+    VANELOOP_DEBUG=1.
+    """
     import tempfile
     import traceback
     from pathlib import Path
@@ -214,7 +207,9 @@ def defect(e: BaseException) -> str:
         where = "traceback above"
     else:
         try:
-            with tempfile.NamedTemporaryFile("w", prefix="vaneloop-", suffix=".traceback", delete=False, encoding="utf-8") as f:
+            with tempfile.NamedTemporaryFile(
+                "w", prefix="vaneloop-", suffix=".traceback", delete=False, encoding="utf-8"
+            ) as f:
                 f.write(lines)
             where = f"traceback in {f.name}"
         except OSError:

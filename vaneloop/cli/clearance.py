@@ -11,15 +11,15 @@ from vaneloop.base import terminal
 from vaneloop.pages.mechanism import clearance_page
 
 if TYPE_CHECKING:
-
     pass
 from vaneloop.design.clearance import FITS, WORDS, clearance_study, study_rows
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Where hysteresis comes from: clearance in the joints and a ring whose centre can wander, in the mechanism closed in space.
-Each joint rests on the side that carries the load; the vanes resist motion, so all of them change sides at a reversal. Given the
-fits of the pins, the command finds the ring's freedom that explains each stage's nominal width, and shows what each joint adds.
+DESCRIPTION = """Where hysteresis comes from: clearance in the joints and a ring whose centre can wander, in the
+mechanism closed in space. Each joint rests on the side that carries the load; the vanes resist motion, so all of them
+change sides at a reversal. Given the fits of the pins, the command finds the ring's freedom that explains each stage's
+nominal width, and shows what each joint adds.
 
 examples:
   vaneloop clearance --report clearance.html
@@ -31,9 +31,15 @@ exit codes: 0 good, 2 bad input"""
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--geometry", metavar="F.toml", default="geometry.toml", help="the mechanism (default: the shipped one)")
     parser.add_argument(
-        "--width", metavar="STAGE=DEG", action="append", default=[], help="width to explain (default: the hysteresis of the geometry)"
+        "--geometry", metavar="F.toml", default="geometry.toml", help="the mechanism (default: the shipped one)"
+    )
+    parser.add_argument(
+        "--width",
+        metavar="STAGE=DEG",
+        action="append",
+        default=[],
+        help="width to explain (default: the hysteresis of the geometry)",
     )
     parser.add_argument(
         "--vane",
@@ -45,9 +51,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("total clearances, mm")
     for joint, value in FITS.items():
         group.add_argument(
-            f"--{joint.replace('_', '-')}", metavar="MM", type=float, default=value, help=f"{WORDS[joint]} (default {value:g})"
+            f"--{joint.replace('_', '-')}",
+            metavar="MM",
+            type=float,
+            default=value,
+            help=f"{WORDS[joint]} (default {value:g})",
         )
-    group.add_argument("--ring", metavar="MM", type=float, help=f"{WORDS['ring']} (default: found, so that the width comes out)")
+    group.add_argument(
+        "--ring", metavar="MM", type=float, help=f"{WORDS['ring']} (default: found, so that the width comes out)"
+    )
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
@@ -84,12 +96,17 @@ def command(args: argparse.Namespace) -> int:
     rows.append(["together", *(t for s in studies for t in ("", f"{s.made:.3f}", ""))])
     columns = ["joint", *(f"{s.stage} {w}" for s in studies for w in ("mm", "deg", "alone, mm"))]
     where = f"at the vane {args.vane:g} deg from the right clevis"
-    terminal.print_table(args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows)
+    terminal.print_table(
+        args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows
+    )
     rows = [[name.replace("_", " "), *(f"{s.freedoms[name]:.4f}" for s in studies)] for name in studies[0].freedoms]
     title = "the ring's four freedoms: change of the vane angle, deg for 1 mm, largest over the stroke"
     terminal.print_table(args, title, ["freedom", *STAGES], rows)
     unit = {"clearance": "mm", "width": "deg"}
     terminal.write_json(args, {"schema": 1, "unit": unit, "vane": args.vane, "stages": [asdict(s) for s in studies]})
     if args.report:
-        terminal.say(args, f"page: {clearance_page(studies, args.report, ' '.join(['vaneloop clearance', *sys.argv[2:]]), args.vane)}")
+        terminal.say(
+            args,
+            f"page: {clearance_page(studies, args.report, ' '.join(['vaneloop clearance', *sys.argv[2:]]), args.vane)}",
+        )
     return 0

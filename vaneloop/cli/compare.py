@@ -11,10 +11,11 @@ from vaneloop.cli.options import chain_of
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Compare the model with a log: the whole loop, as replay does, and each stage driven by its own logged inputs.
+DESCRIPTION = """Compare the model with a log: the whole loop, as replay does, and each stage driven by its own logged
+inputs.
 
-In closed loop the controller hides what the model lacks; stage by stage it cannot. Errors are in the signal's unit and in multiples of the
-noise floor.
+In closed loop the controller hides what the model lacks; stage by stage it cannot. Errors are in the signal's unit and
+in multiples of the noise floor.
 
 examples:
   vaneloop compare examples/hidden_effect.parquet
@@ -52,12 +53,20 @@ def command(args: argparse.Namespace) -> int:
         stages = [f.json() for f in figures]
         floors = {f.signal: f.noise_floor for f in figures}
         rows = [
-            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), f"{f.ratio:.2f}", f"{f.rms_as_given:.4g}", f.unit,
+            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), f"{f.ratio:.2f}",
+            f"{f.rms_as_given:.4g}", f.unit,
              f"{f.samples:,}"] for f in figures
         ]  # fmt: skip
-        rows += [[name, "not observed: " + why, "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()]
+        rows += [
+            [name, "not observed: " + why, "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()
+        ]
         columns = ["stage", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
-        terminal.print_table(args, "each stage on its own logged inputs, nominal parameters refitted within their tolerances", columns, rows)
+        terminal.print_table(
+            args,
+            "each stage on its own logged inputs, nominal parameters refitted within their tolerances",
+            columns,
+            rows,
+        )
         terminal.say(args, located_sentence(located))
         extra["not_observed"] = chain.not_observed
         extra["verdict"] = "fails" if any(x.fails for x in located) else "agrees"

@@ -11,8 +11,9 @@ from vaneloop.pages.design import design_page
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp, and the limit
-cycles that play inside the loop would cause, predicted by describing function and held against the time simulation.
+DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp,
+and the limit cycles that play inside the loop would cause, predicted by describing function and held against the time
+simulation.
 
 examples:
   vaneloop design --report design.html
@@ -26,7 +27,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kp", type=float, metavar="G", help="proportional gain, mA/mm (default: the calibration's)")
     parser.add_argument("--ki", type=float, metavar="G", help="integral gain, mA/(mm s)")
     parser.add_argument("--kff", type=float, metavar="G", help="feed-forward of the demanded speed, mA/(mm/s)")
-    parser.add_argument("--backlash-inside", type=float, metavar="MM", help="play between piston and LVDT to examine, mm")
+    parser.add_argument(
+        "--backlash-inside", type=float, metavar="MM", help="play between piston and LVDT to examine, mm"
+    )
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 

@@ -14,9 +14,10 @@ __all__ = ["DESCRIPTION", "add_options", "command", "show"]
 
 DESCRIPTION = """Find the physical effects that the model lacks, from a log.
 
-Every stage of the machine (demand, servo, engine, actuator, linkage) is driven by its own logged inputs. Each effect of the library is
-fitted, the leaders in pairs; what earns its place on data that it was not fitted to is named, with its probability, its parameters and the
-rivals that this log cannot tell apart. Where the library does not suffice the answer is "unknown", with the shape of what is left.
+Every stage of the machine (demand, servo, engine, actuator, linkage) is driven by its own logged inputs. Each effect of
+the library is fitted, the leaders in pairs; what earns its place on data that it was not fitted to is named, with its
+probability, its parameters and the rivals that this log cannot tell apart. Where the library does not suffice the
+answer is "unknown", with the shape of what is left.
 
 examples:
   vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
@@ -73,12 +74,18 @@ def show(args: argparse.Namespace, d: Any) -> None:
     terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
     for s in d.stages:
         for f in s.effects:
-            values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
+            values = ", ".join(
+                f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
+            )
             rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
             cause = f"; this log cannot tell its cause from {' or '.join(f.inseparable)}" if f.inseparable else ""
-            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}")
+            terminal.say(
+                args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}"
+            )
         for x in d.shapes.get(s.stage, []):
             terminal.say(args, f"unknown in {s.stage}: {x.text}")
         if s.verdict == "unknown" and s.nearest:
-            terminal.say(args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}")
+            terminal.say(
+                args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}"
+            )
     terminal.say(args, verdict_sentence(d))

@@ -17,13 +17,16 @@ from vaneloop.cli import options, station
 
 __all__ = ["DESCRIPTION", "add_options", "command", "demand_of"]
 
-DESCRIPTION = """The engine control unit on the CAN bus: sends ECU_DEMAND every 10 ms with the speed that its engine model has (or the log
-had), and watches the controller's frames. Start it before or after vaneloop run: its demand begins with the first good VGV_STATUS.
+DESCRIPTION = """The engine control unit on the CAN bus: sends ECU_DEMAND every 10 ms with the speed that its engine
+model has (or the log had), and watches the controller's frames. Start it before or after vaneloop run: its demand
+begins with the first good VGV_STATUS.
 
-The demand is a profile, a log, or what is typed: a number sets n_dem (%), +N or -N changes it, run and standby ask for the mode, quit ends;
-at a terminal the arrow keys change it by 1 %, page up and down by 5 %. The end of standard input leaves the last demand standing.
+The demand is a profile, a log, or what is typed: a number sets n_dem (%), +N or -N changes it, run and standby ask for
+the mode, quit ends; at a terminal the arrow keys change it by 1 %, page up and down by 5 %. The end of standard input
+leaves the last demand standing.
 
-profiles: idle, step, ramp, slam, staircase, sine, engine-test; a TOML file with lists t (s) and n_dem (%); a CSV file with columns t,n_dem
+profiles: idle, step, ramp, slam, staircase, sine, engine-test; a TOML file with lists t (s) and n_dem (%); a CSV file
+with columns t,n_dem
 
 examples:
   vaneloop ecu --bus vcan0 --profile staircase
@@ -37,25 +40,46 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bus", metavar="B", help=f"{station.BUS_HELP}; default: vcan0 if there is one, else local")
     parser.add_argument("--profile", metavar="F", help="speed demand: a name, or a file (.toml, .csv)")
-    parser.add_argument("--log", metavar="F", help="speed demand, and measured speed if it has one, from any log (docs/logs.md)")
     parser.add_argument(
-        "--duration", metavar="S", type=float, help="seconds from the first VGV_STATUS on (default: the profile's, the log's)"
+        "--log", metavar="F", help="speed demand, and measured speed if it has one, from any log (docs/logs.md)"
     )
     parser.add_argument(
-        "--timeout", metavar="S", type=float, default=0.5, help="give up after this long without a good VGV_STATUS (default 0.5)"
+        "--duration",
+        metavar="S",
+        type=float,
+        help="seconds from the first VGV_STATUS on (default: the profile's, the log's)",
     )
-    parser.add_argument("--wait", metavar="S", type=float, default=10.0, help="wait this long for the first VGV_STATUS (default 10)")
-    parser.add_argument("--mode", choices=("run", "standby"), default="run", help="mode asked for with a profile or log (default run)")
-    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects of the engine")
-    parser.add_argument("--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)")
+    parser.add_argument(
+        "--timeout",
+        metavar="S",
+        type=float,
+        default=0.5,
+        help="give up after this long without a good VGV_STATUS (default 0.5)",
+    )
+    parser.add_argument(
+        "--wait", metavar="S", type=float, default=10.0, help="wait this long for the first VGV_STATUS (default 10)"
+    )
+    parser.add_argument(
+        "--mode", choices=("run", "standby"), default="run", help="mode asked for with a profile or log (default run)"
+    )
+    parser.add_argument(
+        "--model", metavar="M.toml", help="model file: changed parameters and added effects of the engine"
+    )
+    parser.add_argument(
+        "--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)"
+    )
     options.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
     station.add_realtime_options(parser)
     terminal.add_output_options(parser)
-    parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
+    parser.add_argument(
+        "--live", action="store_true", help="a line every second on standard error, also where that is no terminal"
+    )
 
 
 def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
-    """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed one."""
+    """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed
+    one.
+    """
     from hil.loop import ecu
     from vaneloop.base.errors import InputError
     from vaneloop.base.tables import load_toml
@@ -80,7 +104,9 @@ def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
         n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
     if not path.suffix:
-        raise InputError(f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)")
+        raise InputError(
+            f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)"
+        )
     return ecu.read_profile(path, **reading)
 
 
@@ -99,7 +125,9 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
     name = station.bus_name(args)
     if name.partition(":")[0] == "lockstep":
-        raise InputError("--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own")
+        raise InputError(
+            "--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own"
+        )
     machine = station.machine_of(args)
     demand = demand_of(args)
     typed = Typed() if demand is None else None
@@ -112,14 +140,20 @@ def command(args: argparse.Namespace) -> int:
     )  # fmt: skip
     duration = args.duration if args.duration is not None or demand is None else demand.duration
     complaint = ""
-    with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus, _typing(args, typed):
+    with (
+        stop_on_signals() as stop,
+        station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus,
+        _typing(args, typed),
+    ):
         port = Port(bus)
         live = station.Live(args)
 
         def show(report: Any) -> None:
             v = ecu.ecu.values
             state = "waiting" if ecu.met is None else MODES[int(v["state"])]
-            faults = ", ".join(f for bit, f in enumerate(FAULTS) if v["faults"] == v["faults"] and int(v["faults"]) >> bit & 1)
+            faults = ", ".join(
+                f for bit, f in enumerate(FAULTS) if v["faults"] == v["faults"] and int(v["faults"]) >> bit & 1
+            )
             n_dem, n_r, _ = ecu.ecu.arrays.demand
             n_r = ecu.ecu.arrays.s[0, 0] if n_r != n_r else n_r
             note = typed.complaint if typed is not None else ""
@@ -140,7 +174,8 @@ def command(args: argparse.Namespace) -> int:
         try:
             with station.undisturbed(args) as notes:
                 report = run_realtime(
-                    ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop, live=show if live.on else None,
+                    ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
+                    live=show if live.on else None,
                     watch=watch,
                 )  # fmt: skip
         finally:
@@ -154,22 +189,41 @@ def command(args: argparse.Namespace) -> int:
     good, lost = int(receivers[:, 0].sum()), int(receivers[:, 7].sum())
     ended = f", ended by {report.ended}" if report.ended.startswith("SIG") else ""
     terminal.say(args, f"{ecu.t:,.3f} s of demand on {name}{ended}; controller: {state}")
-    terminal.say(args, f"frames: {report.sent:,} sent, {port.refused:,} not taken by the bus; from the controller {good:,} good, {lost:,} lost")
+    terminal.say(
+        args,
+        f"frames: {report.sent:,} sent, {port.refused:,} not taken by the bus; from the controller {good:,} good, "
+        f"{lost:,} lost",
+    )
     f = report.begin.figures()
-    terminal.say(args, f"lateness: p50 {f['p50_us']:,.1f}, p99 {f['p99_us']:,.1f}, max {f['max_us']:,.1f} us; missed ticks {report.missed:,}")
+    terminal.say(
+        args,
+        f"lateness: p50 {f['p50_us']:,.1f}, p99 {f['p99_us']:,.1f}, max {f['max_us']:,.1f} us; missed ticks "
+        f"{report.missed:,}",
+    )
     if complaint:
         print(f"vaneloop ecu: {complaint}", file=sys.stderr)
     terminal.write_json(args, {
         "schema": 1, "bus": name, "ended": report.ended or "done", "demand_s": ecu.t, "state": state, "values": values,
-        "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost, "lost_by_reader": port.lost},
+        "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost,
+        "lost_by_reader": port.lost},
         **station.realtime_json(report), "notes": notes, "complaint": complaint,
     })  # fmt: skip
     return 1 if complaint else 0
 
 
-# ---- typing -------------------------------------------------------------------------------------------------------------------------
+# ---- typing ----------------------------------------------------------------------------------------------------------
 
-KEYS = {"\x1b[A": "+1", "\x1b[B": "-1", "\x1b[5~": "+5", "\x1b[6~": "-5", "+": "+1", "-": "-1", "r": "run", "s": "standby", "q": "quit"}
+KEYS = {
+    "\x1b[A": "+1",
+    "\x1b[B": "-1",
+    "\x1b[5~": "+5",
+    "\x1b[6~": "-5",
+    "+": "+1",
+    "-": "-1",
+    "r": "run",
+    "s": "standby",
+    "q": "quit",
+}
 
 
 @contextlib.contextmanager

@@ -1,4 +1,6 @@
-"""The paper's engine test: more than 3,000 s with rises and falls, under the single mean curve and under the dual curves."""
+"""The paper's engine test: more than 3,000 s with rises and falls, under the single mean curve and under the dual
+curves.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,9 @@ from vaneloop.pages.replay import PAPER_TABLE_5
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 
-
-
-
-
-
-
-
-DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and falls, 1.6 deg of
-hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual curves, beside the figures of the paper's Table 5.
+DESCRIPTION = """The paper's engine test in simulation: more than 3,000 s (30,000 samples at 10 Hz), several rises and
+falls, 1.6 deg of hysteresis in the VIGV's linkage, under one mean stroke curve and under the dual curves, beside the
+figures of the paper's Table 5.
 
 --strategy adds further strategies to the table and the JSON; the page and the exit code are about the two.
 
@@ -40,16 +36,27 @@ exit codes: 0 the dual curves stay at or below the paper's figures, 1 they do no
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the shipped engine_test.toml)"
+        "--profile",
+        metavar="F.toml",
+        default="engine_test.toml",
+        help="speed demand (default: the shipped engine_test.toml)",
     )
     parser.add_argument(
-        "--strategy", metavar="S", action="append", default=[], help="run this one too: inverse or adaptive (may be repeated)"
+        "--strategy",
+        metavar="S",
+        action="append",
+        default=[],
+        help="run this one too: inverse or adaptive (may be repeated)",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
-    parser.add_argument("--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)")
+    parser.add_argument(
+        "--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)"
+    )
     options.add_tables_option(parser)
     parser.add_argument(
-        "--geometry", metavar="F.toml", help="the machine's own linkage where it is not what the tables were made for (default: theirs)"
+        "--geometry",
+        metavar="F.toml",
+        help="the machine's own linkage where it is not what the tables were made for (default: theirs)",
     )
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
@@ -73,16 +80,25 @@ def command(args: argparse.Namespace) -> int:
     results: dict[str, ReplayResult] = {}
     for strategy in calibrations:
         with terminal.progress_bar(args, f"engine test, {strategy}") as progress:
-            results[strategy] = engine_test(n_dem, strategy, args.seed, args.hysteresis, progress, machine, calibrations[strategy])
+            results[strategy] = engine_test(
+                n_dem, strategy, args.seed, args.hysteresis, progress, machine, calibrations[strategy]
+            )
     rows: list[list[str]] = []
     for strategy, r in results.items():
         for s in r.signals:
             rows.append(
-                [f"{strategy}: {s.signal}", *("-" if (v := getattr(s, k)) is None else f"{v:.3f}" for k in STATISTICS), f"{s.samples:,}"]
+                [
+                    f"{strategy}: {s.signal}",
+                    *("-" if (v := getattr(s, k)) is None else f"{v:.3f}" for k in STATISTICS),
+                    f"{s.samples:,}",
+                ]
             )
     rows.append(["paper, dual: vigv", "-", *(f"{PAPER_TABLE_5[k]:.2f}" for k in STATISTICS[1:]), "over 30,000"])
     dual = results["dual"]
-    title = f"engine test: {dual.simulated_s:,.0f} s under each strategy, {dual.wall_s:.1f} s of computing; error of the vane angles, deg"
+    title = (
+        f"engine test: {dual.simulated_s:,.0f} s under each strategy, {dual.wall_s:.1f} s of computing; error of "
+        f"the vane angles, deg"
+    )
     terminal.print_table(args, title, ["curves", "rms", "mean", "max", "mean 99-100 %", "samples"], rows)
     vigv = dual.signals[0]
     exceeded = [
@@ -92,7 +108,12 @@ def command(args: argparse.Namespace) -> int:
     ]
     for line in exceeded:
         terminal.say(args, f"exceeded: {line}")
-    out: dict[str, Any] = {"schema": 1, "paper": PAPER_TABLE_5, **{k: replay_json(r) for k, r in results.items()}, "exceeded": exceeded}
+    out: dict[str, Any] = {
+        "schema": 1,
+        "paper": PAPER_TABLE_5,
+        **{k: replay_json(r) for k, r in results.items()},
+        "exceeded": exceeded,
+    }
     terminal.write_json(args, out)
     if args.report:
         words = " ".join(["vaneloop engine-test", *sys.argv[2:]])

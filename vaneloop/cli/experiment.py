@@ -13,29 +13,14 @@ from vaneloop.discrepancy.models.experiment import recommend
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot tell apart is simulated with
-its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the other's run. The profile under which
-even the best refit stays farthest from the truth separates them best.
+DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot tell apart is
+simulated with its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the
+other's run. The profile under which even the best refit stays farthest from the truth separates them best.
 
 examples:
   vaneloop experiment examples/hidden_effect.parquet --out next_demand.csv --report experiment.html
 
 exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profile separates them, 2 bad input"""
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -62,9 +47,17 @@ def command(args: argparse.Namespace) -> int:
         terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": None, "profiles": []})
     else:
         rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
-        terminal.print_table(args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows)
+        terminal.print_table(
+            args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows
+        )
         terminal.say(args, e["text"])
-        best = {"profile": e["profile"], "nats": e["score"], "repeats": e["repeats"], "separates": e["separates"], "text": e["text"]}
+        best = {
+            "profile": e["profile"],
+            "nats": e["score"],
+            "repeats": e["repeats"],
+            "separates": e["separates"],
+            "text": e["text"],
+        }
         terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": best, "profiles": e["table"]})
         if args.out:
             write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})

@@ -17,12 +17,13 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 DESCRIPTION = """Add physical effects to the model, fit their parameters to a log, and write a model file that every
 command takes with --model.
 
-Effects that --model brings along are fitted again together with the new ones. Errors before and after are on data that the parameters were
-not fitted to, beside the noise floor that no model can undercut.
+Effects that --model brings along are fitted again together with the new ones. Errors before and after are on data that
+the parameters were not fitted to, beside the noise floor that no model can undercut.
 
 examples:
   vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
-  vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml --report extended.html
+  vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml --report
+  extended.html
 
 exit codes: 0 each stage extended is at its noise floor (within 10 %), 1 an error remains, or the effects
 bring the model no nearer to the log (nothing is written then), 2 bad input"""
@@ -32,7 +33,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     parser.add_argument("--model", metavar="M.toml", help="model file to extend (default: the nominal model)")
-    parser.add_argument("--effect", metavar="NAME", action="append", nargs="+", default=[], help="effect to add (docs/effects.md)")
+    parser.add_argument(
+        "--effect", metavar="NAME", action="append", nargs="+", default=[], help="effect to add (docs/effects.md)"
+    )
     parser.add_argument("--out", metavar="M2.toml", required=True, help="model file to write")
     own_model.add_options(parser)
     terminal.add_output_options(parser)
@@ -58,11 +61,14 @@ def command(args: argparse.Namespace) -> int:
 
             close = difflib.get_close_matches(name, EFFECTS, 1)
             raise InputError(
-                f"--effect {name!r} is not in the library{f'; probably {close[0]!r} is meant' if close else ''}; docs/effects.md lists it"
+                f"--effect {name!r} is not in the library{f'; probably {close[0]!r} is meant' if close else ''}; "
+                f"docs/effects.md lists it"
             )
     out = Path(args.out)
     if out.is_dir() or not out.parent.is_dir():  # before the fit, which takes a while
-        raise InputError(f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})")
+        raise InputError(
+            f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})"
+        )
     before = load_model(args.model) if args.model else Model()
     chain = chain_of(args, Model())
     started = time.perf_counter()
@@ -89,7 +95,10 @@ def command(args: argparse.Namespace) -> int:
             known = [p.name for p in EFFECTS[f.effect].parameters]
             effects[f.effect] = {k: float(v["value"]) for k, v in f.parameters.items() if k in known}  # type: ignore[arg-type]
     history = before.meta.get("history", [])
-    meta: dict[str, Any] = {**before.meta, "history": [*(history if isinstance(history, list) else [str(history)]), _words()]}
+    meta: dict[str, Any] = {
+        **before.meta,
+        "history": [*(history if isinstance(history, list) else [str(history)]), _words()],
+    }
     write_model(args.out, Model(parameters=parameters, effects=effects, meta=meta))
     rows = []
     for r in results:
@@ -100,10 +109,15 @@ def command(args: argparse.Namespace) -> int:
     terminal.print_table(args, "errors are RMS on held-out data", columns, rows)
     for r in results:
         for f in r.effects:
-            values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
+            values = ", ".join(
+                f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
+            )
             terminal.say(args, f"{f.effect}: {values}")
         terminal.say(
-            args, f"{r.stage}, in noise floors: " + " -> ".join(f"{name} {level:.2f}" for name, level in r.steps) + " -> noise floor 1.00"
+            args,
+            f"{r.stage}, in noise floors: "
+            + " -> ".join(f"{name} {level:.2f}" for name, level in r.steps)
+            + " -> noise floor 1.00",
         )
     terminal.say(args, f"model: {args.out}")
     d = Diagnosis("missing", results, {}, chain.not_observed, time.perf_counter() - started, list(chain.notes))

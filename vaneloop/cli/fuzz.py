@@ -9,11 +9,7 @@ import numba
 import numpy as np
 
 from controller import MODES, load_calibration
-from controller.firmware import (
-    CURRENT_LIMIT,
-    STROKE_MAX,
-    STROKE_MIN,
-)
+from controller.firmware import CURRENT_LIMIT, STROKE_MAX, STROKE_MIN
 from hil.inject.fuzz import CLAIMS, HELD, KINDS, RECOVERY, Campaign, fuzz, read_attack, run_attack, write_attack
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -22,24 +18,42 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Safety campaign: random and mutated frames against controller and plant in simulated time.
 
-In every tick: current and stroke demand within their limits, state finite, only the mode transitions of docs/controller.md; after every
-attack RUN must return on good frames. A failure is shrunk to the fewest frames and written as a candump log that --replay runs again."""
+In every tick: current and stroke demand within their limits, state finite, only the mode transitions of
+docs/controller.md; after every attack RUN must return on good frames. A failure is shrunk to the fewest frames and
+written as a candump log that --replay runs again.
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of ``vaneloop fuzz``."""
-    parser.add_argument("--frames", type=int, default=1_000_000, metavar="N", help="random and mutated frames (default 1,000,000)")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="the same seed gives the same frames (default 0)")
-    parser.add_argument("--out", default="fuzz_failure.log", metavar="F", help="candump log of the fewest frames, if something fails")
+    parser.add_argument(
+        "--frames", type=int, default=1_000_000, metavar="N", help="random and mutated frames (default 1,000,000)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="the same seed gives the same frames (default 0)"
+    )
+    parser.add_argument(
+        "--out", default="fuzz_failure.log", metavar="F", help="candump log of the fewest frames, if something fails"
+    )
     parser.add_argument("--replay", metavar="F", help="run this candump log from switch-on instead of random frames")
     parser.add_argument(
-        "--current-limit", type=float, metavar="mA", help="what the current must not exceed (default: the calibration's limit)"
+        "--current-limit",
+        type=float,
+        metavar="mA",
+        help="what the current must not exceed (default: the calibration's limit)",
     )
     parser.add_argument(
-        "--stroke-limit", type=float, metavar="mm", help="what the stroke demand must not exceed (default: the calibration's)"
+        "--stroke-limit",
+        type=float,
+        metavar="mm",
+        help="what the stroke demand must not exceed (default: the calibration's)",
     )
     parser.add_argument(
-        "--recovery", type=float, default=RECOVERY * 1e-3, metavar="S", help="s within which RUN must be back (default 2.5)"
+        "--recovery",
+        type=float,
+        default=RECOVERY * 1e-3,
+        metavar="S",
+        help="s within which RUN must be back (default 2.5)",
     )
     parser.epilog = """examples:
   vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
@@ -74,16 +88,26 @@ def command(args: argparse.Namespace) -> int:
         attack = read_attack(args.replay)
         claim, tick, took = run_attack(attack, limits, recovery)
         held = claim == CLAIMS[HELD]
-        said = f"everything held; RUN {took:.3f} s after the last frame" if held else f"FAILED: {claim}, at {tick * 1e-3:.3f} s"
+        said = (
+            f"everything held; RUN {took:.3f} s after the last frame"
+            if held
+            else f"FAILED: {claim}, at {tick * 1e-3:.3f} s"
+        )
         terminal.say(args, f"{args.replay}: {len(attack.at)} frames: {said}")
-        terminal.write_json(args, {"schema": 1, "log": args.replay, "frames": len(attack.at), "held": held, "claim": claim, "t": tick * 1e-3})
+        terminal.write_json(
+            args,
+            {"schema": 1, "log": args.replay, "frames": len(attack.at), "held": held, "claim": claim, "t": tick * 1e-3},
+        )
         return 0 if held else 1
     with terminal.progress_bar(args, "frames") as progress:
         campaign = fuzz(args.frames, args.seed, limits=limits, recovery=recovery, progress=progress)
     _tell(args, campaign)
     if campaign.failure is not None:
         n = len(campaign.failure.attack.at)
-        terminal.say(args, f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}")
+        terminal.say(
+            args,
+            f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}",
+        )
         try:
             write_attack(args.out, campaign.failure.attack)
         except OSError as e:
@@ -93,14 +117,26 @@ def command(args: argparse.Namespace) -> int:
 
 def _tell(args: argparse.Namespace, c: Campaign) -> None:
     """Say what the campaign saw."""
-    transitions = {f"{a} -> {b}": int(c.transitions[i, j]) for i, a in enumerate(MODES) for j, b in enumerate(MODES) if c.transitions[i, j]}
+    transitions = {
+        f"{a} -> {b}": int(c.transitions[i, j])
+        for i, a in enumerate(MODES)
+        for j, b in enumerate(MODES)
+        if c.transitions[i, j]
+    }
     rate = c.frames / c.elapsed_s if c.elapsed_s else 0.0
-    terminal.say(args, f"{c.frames:,} frames in {c.episodes:,} episodes, {c.ticks * 1e-3:,.0f} simulated s, {c.elapsed_s:.1f} s ({rate:,.0f}/s)")
+    terminal.say(
+        args,
+        f"{c.frames:,} frames in {c.episodes:,} episodes, {c.ticks * 1e-3:,.0f} simulated s, {c.elapsed_s:.1f} s "
+        f"({rate:,.0f}/s)",
+    )
     rows = [[name, f"{count:,}"] for name, count in zip(KINDS, c.kinds.tolist(), strict=True)]
     terminal.print_table(args, "frames sent, by kind", ["kind", "frames"], rows)
-    terminal.print_table(args, "what the receiver made of them, good frames after each attack included", ["verdict", "frames"],
+    terminal.print_table(args, "what the receiver made of them, good frames after each attack "
+                               "included", ["verdict", "frames"],
                     [[name, f"{count:,}"] for name, count in c.verdicts.items()])  # fmt: skip
-    terminal.print_table(args, "mode transitions", ["transition", "times"], [[name, f"{count:,}"] for name, count in transitions.items()])
+    terminal.print_table(
+        args, "mode transitions", ["transition", "times"], [[name, f"{count:,}"] for name, count in transitions.items()]
+    )
     if c.failure is None:
         terminal.say(args, f"held: limits, transitions, recovery to RUN (longest {c.longest_recovery_s:.3f} s)")
     f = c.failure
@@ -108,10 +144,12 @@ def _tell(args: argparse.Namespace, c: Campaign) -> None:
         args,
         {
             "schema": 1, "seed": c.seed, "frames": c.frames, "episodes": c.episodes, "simulated_s": c.ticks * 1e-3,
-            "elapsed_s": c.elapsed_s, "held": f is None, "longest_recovery_s": c.longest_recovery_s, "transitions": transitions,
+            "elapsed_s": c.elapsed_s, "held": f is None, "longest_recovery_s": c.longest_recovery_s,
+            "transitions": transitions,
             "seconds_in_mode": {name: c.ticks_in[i] * 1e-3 for i, name in enumerate(MODES)},
             "kinds": dict(zip(KINDS, c.kinds.tolist(), strict=True)), "verdicts": c.verdicts,
             "failure": None if f is None
-            else {"claim": f.claim, "t": f.tick * 1e-3, "episode": f.episode, "frames": len(f.attack.at), "log": args.out},
+            else {"claim": f.claim, "t": f.tick * 1e-3, "episode": f.episode, "frames": len(f.attack.at),
+            "log": args.out},
         },
     )  # fmt: skip

@@ -1,6 +1,8 @@
-"""``vaneloop hidden-effect``: the blind benchmark. The rig hides an effect, the diagnosis sees the log only, and every answer is counted.
+"""``vaneloop hidden-effect``: the blind benchmark. The rig hides an effect, the diagnosis sees the log only, and every
+answer is counted.
 
-The rig (``tests/rig``) is an independent simulator with other equations; it is part of a checkout, not of the installed package.
+The rig (``tests/rig``) is an independent simulator with other equations; it is part of a checkout, not of the installed
+package.
 """
 
 from __future__ import annotations
@@ -20,10 +22,10 @@ from vaneloop.base import terminal
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
-DESCRIPTION = """Blind benchmark of the diagnosis: logs with fresh seeds are drawn (25 % clean, 25 % with an effect that the library does
-not have, 20 % with two effects, the rest with one, from undetectable to gross), written, and diagnosed knowing only the log.
-Every machine's links are drawn within their tolerance; a fifth of the logs lacks rows, in a fifth the controller is for some seconds
-in another mode.
+DESCRIPTION = """Blind benchmark of the diagnosis: logs with fresh seeds are drawn (25 % clean, 25 % with an effect that
+the library does not have, 20 % with two effects, the rest with one, from undetectable to gross), written, and diagnosed
+knowing only the log. Every machine's links are drawn within their tolerance; a fifth of the logs lacks rows, in a fifth
+the controller is for some seconds in another mode.
 
 examples:
   vaneloop hidden-effect --logs 40 --out out/blind.parquet
@@ -45,11 +47,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of each log (default 300 s)")
     parser.add_argument("--rate", type=int, default=100, choices=(10, 100, 1000), help="rows a second (default 100)")
     parser.add_argument(
-        "--experiments", action="store_true", help="where rivals remain, run the recommended experiment too, and see whether it decides"
+        "--experiments",
+        action="store_true",
+        help="where rivals remain, run the recommended experiment too, and see whether it decides",
     )
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
     parser.add_argument(
-        "--out", metavar="F.parquet", default="out/hidden_effect.parquet", help="results, a row a log; an existing file is continued"
+        "--out",
+        metavar="F.parquet",
+        default="out/hidden_effect.parquet",
+        help="results, a row a log; an existing file is continued",
     )
     terminal.add_output_options(parser)
 
@@ -65,11 +72,15 @@ def _rig() -> Any:
     try:
         return importlib.import_module("tests.rig"), importlib.import_module("tests.firmware_on_rig")
     except ImportError:
-        raise InputError("hidden-effect needs the independent rig in tests/rig: run it from a checkout of the repository") from None
+        raise InputError(
+            "hidden-effect needs the independent rig in tests/rig: run it from a checkout of the repository"
+        ) from None
 
 
 def draw_case(seed: int, index: int, duration: float = 300.0) -> dict[str, Any]:
-    """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing simulated yet."""
+    """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing
+    simulated yet.
+    """
     import numpy as np
 
     rig, _ = _rig()
@@ -88,17 +99,27 @@ def draw_case(seed: int, index: int, duration: float = 300.0) -> dict[str, Any]:
     longest = min(10.0, duration / 10.0)
     gaps, modes = [], []
     if rng.random() < GAPS:
-        gaps = [(float(rng.uniform(0.05, 0.9) * duration), float(rng.uniform(1.0, longest))) for _ in range(rng.integers(1, 4))]
+        gaps = [
+            (float(rng.uniform(0.05, 0.9) * duration), float(rng.uniform(1.0, longest)))
+            for _ in range(rng.integers(1, 4))
+        ]
     if rng.random() < MODES:
         kind_of = str(rng.choice(["standby", "deaf"]))
-        modes = [rig.Spell(kind_of, round(float(rng.uniform(0.2, 0.8) * duration), 2), round(float(rng.uniform(1.0, longest)), 2))]
+        modes = [
+            rig.Spell(
+                kind_of, round(float(rng.uniform(0.2, 0.8) * duration), 2), round(float(rng.uniform(1.0, longest)), 2)
+            )
+        ]
     return {
-        "index": index, "kind": kind, "hidden": hidden, "machine_seed": machine_seed, "geometry": geometry, "gaps": gaps, "modes": modes,
+        "index": index, "kind": kind, "hidden": hidden, "machine_seed": machine_seed, "geometry": geometry,
+        "gaps": gaps, "modes": modes,
     }  # fmt: skip
 
 
 def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """True size of every hidden effect that was named, in border units, beside its interval (where both know the parameter)."""
+    """True size of every hidden effect that was named, in border units, beside its interval (where both know the
+    parameter).
+    """
     from plant.effects import EFFECTS
 
     rig, _ = _rig()
@@ -132,7 +153,10 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
     out = {"profile": e["profile"], "nats": e["score"], "separable": e["separates"], "resolved": False}
     if e["separates"]:
         n = len(e["n_dem"])
-        supply = {k: np.pad(v, (0, max(0, n - len(v))), mode="reflect")[:n] for k, v in (("p_s", test.p_s), ("t_oil", test.t_oil))}
+        supply = {
+            k: np.pad(v, (0, max(0, n - len(v))), mode="reflect")[:n]
+            for k, v in (("p_s", test.p_s), ("t_oil", test.t_oil))
+        }
         again = stages_of(case["hidden"], replace(test, n_dem=e["n_dem"], **supply))
         said = diagnosis_json(diagnose(again.stages, again.not_observed, workers=1), "")
         found = {x["effect"]: x["rivals"] for x in said["effects"]}
@@ -159,7 +183,8 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
 
     def stages_of(hidden: list[Any], test: Any = test) -> Any:
         run = rig.simulate(
-            test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"], gaps=case["gaps"],
+            test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"],
+            gaps=case["gaps"],
             spells=case["modes"],
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
@@ -173,7 +198,8 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
     elapsed = time.perf_counter() - started
     answer = diagnosis_json(d, f"case {index}")
     truth = [h.name for h in case["hidden"]]
-    # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3 spreads of the floor
+    # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3
+    # spreads of the floor
     detectable = []
     if truth:
         clean = stages_of([])
@@ -192,22 +218,29 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
             detectable.append(bool(best > 3.0))
     named = [e["effect"] for e in answer["effects"]]
     rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
-    tried = _experiment(d, case, test, stages_of) if experiments and any(h in _all_named(answer) for h in truth) else None
+    tried = (
+        _experiment(d, case, test, stages_of) if experiments and any(h in _all_named(answer) for h in truth) else None
+    )
     ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
     return {
         "seed": seed, "index": index, "kind": case["kind"], "truth": truth,
-        "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]), "geometry": json.dumps(asdict(case["geometry"])),
+        "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
+        "geometry": json.dumps(asdict(case["geometry"])),
         "gaps": json.dumps(case["gaps"]), "modes": json.dumps([asdict(s) for s in case["modes"]]),
         "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
-        "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed, "answer": json.dumps(terminal.plain(answer)),
-        "intervals": json.dumps(terminal.plain(_intervals(case["hidden"], answer))), "experiment": json.dumps(terminal.plain(tried)),
+        "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed,
+        "answer": json.dumps(terminal.plain(answer)),
+        "intervals": json.dumps(terminal.plain(_intervals(case["hidden"], answer))),
+        "experiment": json.dumps(terminal.plain(tried)),
     }  # fmt: skip
 
 
 def _too_easy(effect: dict[str, Any]) -> bool:
-    """Whether an effect was named improbable and without rival, or with a size on a bound that is not its neutral value."""
+    """Whether an effect was named improbable and without rival, or with a size on a bound that is not its neutral
+    value.
+    """
     from plant.effects import EFFECTS
     from vaneloop.discrepancy.models.vanes import SHAPES
 
@@ -217,7 +250,12 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     for p in declared:
         value = effect["parameters"].get(p.name, {}).get("value", p.neutral)
         near = 1e-6 * (p.high - p.low)
-        if not p.period and p.name not in SHAPES and abs(value - p.neutral) > near and (value <= p.low + near or value >= p.high - near):
+        if (
+            not p.period
+            and p.name not in SHAPES
+            and abs(value - p.neutral) > near
+            and (value <= p.low + near or value >= p.high - near)
+        ):
             return True
     return False
 
@@ -229,7 +267,11 @@ OTHER_CAUSE = {"play_temperature": ("linkage_wear", "oil temperature")}
 def _told(row: dict[str, Any]) -> bool:
     """Whether the answer says that it cannot tell the true law's cause from that of the one effect it names."""
     effects, truth = json.loads(row["answer"])["effects"], row["truth"][0]
-    return len(effects) == 1 and truth in OTHER_CAUSE and (effects[0]["effect"], *effects[0]["inseparable"]) == OTHER_CAUSE[truth]
+    return (
+        len(effects) == 1
+        and truth in OTHER_CAUSE
+        and (effects[0]["effect"], *effects[0]["inseparable"]) == OTHER_CAUSE[truth]
+    )
 
 
 def _all_named(answer: dict[str, Any]) -> set[str]:
@@ -251,7 +293,11 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
 
     single = [r for r in rows if r["kind"] == "single" and r["detectable"][0]]
-    alone = [r for r in single if r["verdict"] == "missing" and len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]]
+    alone = [
+        r
+        for r in single
+        if r["verdict"] == "missing" and len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]
+    ]
     pairs = [r for r in rows if r["kind"] == "pair" and all(r["detectable"])]
     outside = [r for r in rows if r["kind"] == "outside"]
     intervals = [i for r in rows for i in json.loads(r["intervals"])]
@@ -271,7 +317,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         ),
         "error after within 1.1 noise floors": share([r["after_over_floor"] <= 1.1 for r in found]),
         "90 % interval covers the truth": share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
-        "parameter within 5 % of the truth": share([abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]),
+        "parameter within 5 % of the truth": share(
+            [abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]
+        ),
         "separable ties decided by the experiment": share([e["resolved"] for e in tried if e["separable"]]),
         "effects named with P < 0.5 and no rival, or on a bound": share(
             [_too_easy(e) for r in rows for e in json.loads(r["answer"])["effects"]]
@@ -281,7 +329,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def reliability(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """How often effects named with a probability were hidden indeed: stated (mean), count, share right, 90 % interval."""
+    """How often effects named with a probability were hidden indeed: stated (mean), count, share right, 90 %
+    interval.
+    """
     from statsmodels.stats.proportion import proportion_confint
 
     said = [(p, n in r["truth"]) for r in rows for n, p in zip(r["named"], r["probabilities"], strict=True)]
@@ -292,12 +342,22 @@ def reliability(rows: list[dict[str, Any]]) -> list[list[str]]:
             k, n = sum(right for _, right in inside), len(inside)
             a, b = proportion_confint(k, n, 0.10, "wilson")
             stated = sum(p for p, _ in inside) / n
-            out.append([f"{low:g} to {min(high, 1.0):g}", f"{stated:.2f}", f"{k} of {n}", f"{k / n:.2f}", f"{a:.2f} to {b:.2f}"])
+            out.append(
+                [
+                    f"{low:g} to {min(high, 1.0):g}",
+                    f"{stated:.2f}",
+                    f"{k} of {n}",
+                    f"{k / n:.2f}",
+                    f"{a:.2f} to {b:.2f}",
+                ]
+            )
     return out
 
 
 def confusion(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """What was said of each hidden thing: a row a truth and an answer, with its count (answers: the names, none, unknown)."""
+    """What was said of each hidden thing: a row a truth and an answer, with its count (answers: the names, none,
+    unknown).
+    """
     from collections import Counter
 
     count: Counter[tuple[str, str]] = Counter()
@@ -313,13 +373,23 @@ def misses(rows: list[dict[str, Any]]) -> list[str]:
     """Every answer that is not what it should be, a line each."""
     out = []
     for r in rows:
-        what = f"#{r['index']} {r['kind']}: hidden {', '.join(r['truth']) or 'nothing'} {r['sizes']}, detectable {r['detectable']}"
+        what = (
+            f"#{r['index']} {r['kind']}: hidden {', '.join(r['truth']) or 'nothing'} {r['sizes']}, detectable "
+            f"{r['detectable']}"
+        )
         said = f"said {r['verdict']} {r['named']} rivals {r['rivals']} unknown {r['unknown_stages']}"
         wrong = (
             (r["kind"] == "clean" and r["verdict"] != "none")
-            or (r["kind"] in ("single", "pair") and any(d and not _hit(e, r) for e, d in zip(r["truth"], r["detectable"], strict=True)))
+            or (
+                r["kind"] in ("single", "pair")
+                and any(d and not _hit(e, r) for e, d in zip(r["truth"], r["detectable"], strict=True))
+            )
             or any(_too_easy(e) for e in json.loads(r["answer"])["effects"])
-            or (r["kind"] == "outside" and not _told(r) and (r["named"] or (r["verdict"] == "none" and r["detectable"][0])))
+            or (
+                r["kind"] == "outside"
+                and not _told(r)
+                and (r["named"] or (r["verdict"] == "none" and r["detectable"][0]))
+            )
         )
         if wrong:
             out.append(f"{what}; {said}")
@@ -367,17 +437,36 @@ def command(args: argparse.Namespace) -> int:
     rows.sort(key=lambda r: r["index"])
     s = summary(rows)
     table = [
-        [k, f"{v['hits']} of {v['of']}", "-" if v["share"] is None else f"{v['share']:.3f}", f"{v['low']:.3f} to {v['high']:.3f}"]
+        [
+            k,
+            f"{v['hits']} of {v['of']}",
+            "-" if v["share"] is None else f"{v['share']:.3f}",
+            f"{v['low']:.3f} to {v['high']:.3f}",
+        ]
         for k, v in s.items()
         if isinstance(v, dict)
     ]
-    terminal.print_table(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", ["what", "count", "share", "90 % interval"], table)
+    terminal.print_table(
+        args,
+        f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis",
+        ["what", "count", "share", "90 % interval"],
+        table,
+    )
     terminal.print_table(args, "what was hidden, what was said", ["hidden", "said", "logs"], confusion(rows))
-    terminal.print_table(args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows))
+    terminal.print_table(
+        args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows)
+    )
     for line in misses(rows):
         terminal.say(args, "miss " + line)
     terminal.write_json(
         args,
-        {"schema": 1, "seed": seed, "summary": s, "confusion": confusion(rows), "reliability": reliability(rows), "misses": misses(rows)},
+        {
+            "schema": 1,
+            "seed": seed,
+            "summary": s,
+            "confusion": confusion(rows),
+            "reliability": reliability(rows),
+            "misses": misses(rows),
+        },
     )
     return 0

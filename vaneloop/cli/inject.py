@@ -6,17 +6,15 @@ import argparse
 from pathlib import Path
 
 from hil.inject.injection import cannot, run
-from hil.inject.scenario import (
-    library,
-    load_scenario,
-)
+from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Frame and fault injection: do to the bus what a scenario says, and judge whether the controller reacted as it must.
+DESCRIPTION = """Frame and fault injection: do to the bus what a scenario says, and judge whether the controller reacted
+as it must.
 
 examples:
   vaneloop inject --list                     what ships
@@ -25,15 +23,18 @@ examples:
   vaneloop inject MY_DAY.toml                your own (docs/injection.md)
   vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
 
-On lockstep (default) controller, ECU and bus run in simulated time, bit for bit the same every time. On another bus only what an outsider
-can do is done (send, flood, babble, replay), and only what the controller's frames show is judged.
+On lockstep (default) controller, ECU and bus run in simulated time, bit for bit the same every time. On another bus
+only what an outsider can do is done (send, flood, babble, replay), and only what the controller's frames show is
+judged.
 
 exit codes: 0 every expectation held, 1 one did not, 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("scenario", metavar="SCENARIO", nargs="*", help="scenario files (.toml), or names of shipped ones")
+    parser.add_argument(
+        "scenario", metavar="SCENARIO", nargs="*", help="scenario files (.toml), or names of shipped ones"
+    )
     parser.add_argument("--all", action="store_true", help="all scenarios that ship")
     parser.add_argument("--list", action="store_true", help="list the scenarios that ship, and stop")
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
@@ -79,11 +80,18 @@ def command(args: argparse.Namespace) -> int:
 def _list(args: argparse.Namespace, known: dict[str, Path]) -> int:
     scenarios = {n: load_scenario(n) for n in known}
     rows = [[n, s.title, f"{s.duration:g} s", "any" if not cannot(s) else "lockstep"] for n, s in scenarios.items()]
-    terminal.print_table(args, f"{len(rows)} scenarios ship with VaneLoop", ["name", "what happens", "lasts", "bus"], rows)
+    terminal.print_table(
+        args, f"{len(rows)} scenarios ship with VaneLoop", ["name", "what happens", "lasts", "bus"], rows
+    )
     terminal.write_json(
-        args, {"schema": 1, "scenarios": [{"name": n, "title": s.title, "duration_s": s.duration} for n, s in scenarios.items()]}
+        args,
+        {
+            "schema": 1,
+            "scenarios": [{"name": n, "title": s.title, "duration_s": s.duration} for n, s in scenarios.items()],
+        },
     )
     return 0
+
 
 MARK = {True: "held", False: "BROKEN", None: "not seen"}
 
@@ -111,7 +119,10 @@ def _report(args: argparse.Namespace, outcomes: list[Outcome], skipped: list[tup
             for o in outcomes
         ]
         terminal.print_table(
-            args, f"{len(outcomes)} scenarios on {outcomes[0].bus}", ["scenario", "", "what happens", "last modes", "held"], rows
+            args,
+            f"{len(outcomes)} scenarios on {outcomes[0].bus}",
+            ["scenario", "", "what happens", "last modes", "held"],
+            rows,
         )
         for o in outcomes:
             for c in o.checks:
@@ -138,15 +149,21 @@ def _write_junit(file: str, outcomes: list[Outcome], skipped: list[tuple[str, st
     broken = sum(not o.held for o in outcomes)
     numbers = {"tests": len(outcomes) + len(skipped), "failures": broken, "errors": 0, "skipped": len(skipped)}
     seconds = f"{sum(o.wall_s for o in outcomes):.3f}"
-    suite = Xml.Element("testsuite", {"name": "vaneloop inject", "time": seconds, **{k: str(v) for k, v in numbers.items()}})
+    suite = Xml.Element(
+        "testsuite", {"name": "vaneloop inject", "time": seconds, **{k: str(v) for k, v in numbers.items()}}
+    )
     for o in outcomes:
-        case = Xml.SubElement(suite, "testcase", classname=f"vaneloop.inject.{o.bus}", name=o.name, time=f"{o.wall_s:.3f}")
+        case = Xml.SubElement(
+            suite, "testcase", classname=f"vaneloop.inject.{o.bus}", name=o.name, time=f"{o.wall_s:.3f}"
+        )
         first = next((c for c in o.checks if c.held is False), None)
         if first is not None:
             Xml.SubElement(case, "failure", message=f"{first.expected}; seen: {first.seen}").text = o.text()
         Xml.SubElement(case, "system-out").text = o.text()
     for name, _, why in skipped:
-        Xml.SubElement(Xml.SubElement(suite, "testcase", classname="vaneloop.inject", name=name, time="0"), "skipped", message=why)
+        Xml.SubElement(
+            Xml.SubElement(suite, "testcase", classname="vaneloop.inject", name=name, time="0"), "skipped", message=why
+        )
     root = Xml.Element("testsuites")
     root.append(suite)
     Xml.indent(root)

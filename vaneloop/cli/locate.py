@@ -11,9 +11,9 @@ from vaneloop.cli.options import add_model_option, chain_of, say_located
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Find where the model fails: stage, direction of motion, speed, distance since reversal, stroke, rotor speed, oil
-temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first. Significance is corrected for the number
-of conditions looked at.
+DESCRIPTION = """Find where the model fails: stage, direction of motion, speed, distance since reversal, stroke, rotor
+speed, oil temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first.
+Significance is corrected for the number of conditions looked at.
 
 examples:
   vaneloop locate examples/hidden_effect.parquet --report locate.html
@@ -42,7 +42,9 @@ def command(args: argparse.Namespace) -> int:
     for x in located:
         say_located(args, x)
     stages = [x.json() for x in located]
-    terminal.write_json(args, {"schema": 1, "log": args.log, "stages": stages, "not_observed": chain.not_observed, "notes": chain.notes})
+    terminal.write_json(
+        args, {"schema": 1, "log": args.log, "stages": stages, "not_observed": chain.not_observed, "notes": chain.notes}
+    )
     if args.report:
         from vaneloop.pages.diagnosis import compare_report
 

@@ -11,20 +11,44 @@ __all__ = ["COMMANDS", "main", "run"]
 
 # command -> (module with add_options, command and DESCRIPTION; one line of help)
 COMMANDS = {
-    "replay": ("vaneloop.cli.replay", "run a logged engine run through firmware and plant; errors in figures and pictures"),
-    "compare": ("vaneloop.cli.compare", "the model against a log: the whole loop, and each stage on its own logged inputs"),
+    "replay": (
+        "vaneloop.cli.replay",
+        "run a logged engine run through firmware and plant; errors in figures and pictures",
+    ),
+    "compare": (
+        "vaneloop.cli.compare",
+        "the model against a log: the whole loop, and each stage on its own logged inputs",
+    ),
     "locate": ("vaneloop.cli.locate", "which stage fails, under which conditions, since when"),
     "diagnose": ("vaneloop.cli.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
-    "engine-test": ("vaneloop.cli.engine_test", "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures"),
-    "strategies": ("vaneloop.cli.strategies", "control strategies against each other on worn, hot, noisy engines: errors and cost"),
+    "engine-test": (
+        "vaneloop.cli.engine_test",
+        "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures",
+    ),
+    "strategies": (
+        "vaneloop.cli.strategies",
+        "control strategies against each other on worn, hot, noisy engines: errors and cost",
+    ),
     "extend": ("vaneloop.cli.extend", "add effects to the model, fitted to a log; writes a model file"),
     "experiment": ("vaneloop.cli.experiment", "the demand profile that best tells the remaining rivals apart"),
-    "hidden-effect": ("vaneloop.cli.hidden_effect", "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)"),
-    "schedule": ("vaneloop.cli.schedule", "links and stroke tables from geometry, schedules and a measured stroke-angle loop"),
+    "hidden-effect": (
+        "vaneloop.cli.hidden_effect",
+        "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)",
+    ),
+    "schedule": (
+        "vaneloop.cli.schedule",
+        "links and stroke tables from geometry, schedules and a measured stroke-angle loop",
+    ),
     "spatial": ("vaneloop.cli.spatial", "the planar linkage against the mechanism in space, by constraint equations"),
     "clearance": ("vaneloop.cli.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
-    "inject": ("vaneloop.cli.inject", "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must"),
-    "fuzz": ("vaneloop.cli.fuzz", "safety campaign: random and mutated frames by the million; limits, transitions, recovery must hold"),
+    "inject": (
+        "vaneloop.cli.inject",
+        "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must",
+    ),
+    "fuzz": (
+        "vaneloop.cli.fuzz",
+        "safety campaign: random and mutated frames by the million; limits, transitions, recovery must hold",
+    ),
     "run": ("vaneloop.cli.run", "controller and plant as a node on the CAN bus, in real time or in lockstep"),
     "ecu": ("vaneloop.cli.ecu", "the engine control unit on the CAN bus: demand from a profile, a log or the keyboard"),
     "record": ("vaneloop.cli.record", "all frames of a CAN bus into MDF4, BLF, candump or Parquet; survives kill -9"),
@@ -42,7 +66,9 @@ first steps:
   vaneloop engine-test --report engine_test.html
   vaneloop replay LOG --report replay.html
 
-exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop (VANELOOP_DEBUG=1 prints the traceback)"""
+exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop (VANELOOP_DEBUG=1 prints the
+traceback)
+"""
 
 
 def main(argv: list[str]) -> int:

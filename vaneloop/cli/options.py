@@ -1,4 +1,6 @@
-"""Options that several commands share, and what they stand for: a log and how to read it, tables, a model file, stages."""
+"""Options that several commands share, and what they stand for: a log and how to read it, tables, a model file,
+stages.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,31 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 
-__all__ = ["CAN_SUFFIXES", "TABLES", "add_log_options", "add_model_option", "add_reading_options", "add_tables_option", "calibration_of", "chain_of", "log_options", "machine_of", "read_log_of", "say_located", "tables_of", "tell_search"]
+__all__ = [
+    "CAN_SUFFIXES",
+    "TABLES",
+    "add_log_options",
+    "add_model_option",
+    "add_reading_options",
+    "add_tables_option",
+    "calibration_of",
+    "chain_of",
+    "log_options",
+    "machine_of",
+    "read_log_of",
+    "say_located",
+    "tables_of",
+    "tell_search",
+]
 
 
 def add_model_option(parser: argparse.ArgumentParser) -> None:
     """Declare ``--model``."""
-    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects (written by vaneloop extend)")
+    parser.add_argument(
+        "--model",
+        metavar="M.toml",
+        help="model file: changed parameters and added effects (written by vaneloop extend)",
+    )
 
 
 def tell_search(say: Callable[[str], None]) -> None:
@@ -27,7 +48,9 @@ def tell_search(say: Callable[[str], None]) -> None:
 
 
 def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
-    """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``) describes."""
+    """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``)
+    describes.
+    """
     from hil.logs import LogError
     from hil.loop.lockstep import warm_up
     from plant import load_model
@@ -66,10 +89,19 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     """Options that say which name and unit a log uses."""
     group.add_argument("--dbc", metavar="F", help="database of a CAN log (default: the product's own vgv.dbc)")
     group.add_argument(
-        "--map", metavar="NAME=signal", action="append", default=[], help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem"
+        "--map",
+        metavar="NAME=signal",
+        action="append",
+        default=[],
+        help="the log's NAME is our signal, e.g. ENGINE_RPM=n_dem",
     )
-    group.add_argument("--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm")
-    group.add_argument("--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm")
+    group.add_argument(
+        "--unit", metavar="signal=unit", action="append", default=[], help="unit in the log, e.g. n_dem=rpm"
+    )
+    group.add_argument(
+        "--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm"
+    )
+
 
 TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
 
@@ -79,12 +111,15 @@ def add_tables_option(group: Any) -> None:
     group.add_argument(
         "--tables",
         metavar="DIR",
-        help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule --out writes one",
+        help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule "
+        f"--out writes one",
     )
 
 
 def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
-    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says which."""
+    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell``
+    says which.
+    """
     files = {name: f"{name}.toml" for name in TABLES}
     if getattr(args, "tables", None) is None:
         return files
@@ -116,7 +151,9 @@ def calibration_of(args: argparse.Namespace, strategy: str | None = None) -> Any
 
 
 def _mapping(options: list[str]) -> dict[str, str]:
-    """``--map`` as name in the log -> signal; where a name serves several signals, signal -> name for all but the first."""
+    """``--map`` as name in the log -> signal; where a name serves several signals, signal -> name for all but the
+    first.
+    """
     out: dict[str, str] = {}
     for option in options:
         for name, signal in terminal.pairs([option], "map").items():
@@ -127,14 +164,21 @@ def _mapping(options: list[str]) -> dict[str, str]:
 
 
 def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str, Any]:
-    """What the reading options say, as arguments of `hil.logs.read_log`; ``source`` is the file that they are for (default: the log).
+    """What the reading options say, as arguments of `hil.logs.read_log`; ``source`` is the file that they are for
+    (default: the log).
 
     Raises InputError for options without a file to read.
     """
     given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm}
     if (source or args.log) is None and (idle := next((k for k, v in given.items() if v not in (None, [])), None)):
         raise InputError(f"{idle} says how to read a log, but none is given (--log LOG)")
-    return {"dbc": args.dbc, "mapping": _mapping(args.map), "units": terminal.pairs(args.unit, "unit"), "design_rpm": args.design_rpm}
+    return {
+        "dbc": args.dbc,
+        "mapping": _mapping(args.map),
+        "units": terminal.pairs(args.unit, "unit"),
+        "design_rpm": args.design_rpm,
+    }
+
 
 CAN_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4")
 

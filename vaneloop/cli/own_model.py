@@ -16,10 +16,19 @@ __all__ = ["add_options", "asked", "command"]
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a user's own model."""
     group = parser.add_argument_group("a model of your own (docs/your_own_model.md)")
-    group.add_argument("--system", metavar="MY.py", help="Python file with a discrepancy.System in it, instead of the vane chain")
-    group.add_argument("--also", metavar="LOG", action="append", nargs="+", default=[], help="further logs to fit, with --system")
     group.add_argument(
-        "--test", metavar="LOG", action="append", nargs="+", default=[], help="logs that nothing is fitted to, with --system"
+        "--system", metavar="MY.py", help="Python file with a discrepancy.System in it, instead of the vane chain"
+    )
+    group.add_argument(
+        "--also", metavar="LOG", action="append", nargs="+", default=[], help="further logs to fit, with --system"
+    )
+    group.add_argument(
+        "--test",
+        metavar="LOG",
+        action="append",
+        nargs="+",
+        default=[],
+        help="logs that nothing is fitted to, with --system",
     )
 
 
@@ -51,10 +60,13 @@ def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
         try:
             data = dict(system.read(path))
         except Exception as e:
-            raise StageError(f"{path}: read() of system {system.name!r} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
+            raise StageError(
+                f"{path}: read() of system {system.name!r} failed: {type(e).__name__}: {' '.join(str(e).split())}"
+            ) from None
         if "t" not in data:
             raise StageError(
-                f"{path}: read() of system {system.name!r} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed"
+                f"{path}: read() of system {system.name!r} returned {', '.join(map(str, data)) or 'nothing'}; a time "
+                f"'t' is needed"
             )
         try:
             columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
@@ -63,7 +75,9 @@ def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
         return Record(name, columns.pop("t"), columns)
     from hil.logs import read_log
 
-    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {c: "" for c in (system.velocity,) if c}
+    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
+        c: "" for c in (system.velocity,) if c
+    }
     signals = {**motion, **system.inputs, **system.outputs}
     log = read_log(
         path, **options.log_options(args), require=[c for c in signals if c not in system.optional()], signals=signals,
@@ -108,7 +122,9 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
             raise InputError("extend needs at least one --effect NAME; vaneloop diagnose names candidates")
         out = Path(args.out)
         if out.is_dir() or not out.parent.is_dir():
-            raise InputError(f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})")
+            raise InputError(
+                f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})"
+            )
     if args.model:
         load_toml(args.model)  # refuses what would take the parser gigabytes
     model = own_model.load_model(args.model, system) if args.model else None
@@ -157,7 +173,8 @@ def _older(answer: Any) -> dict[str, Any]:
     d = answer.diagnosis
     signals = [
         {
-            "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured", "rms": d.error_before[k],
+            "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured",
+            "rms": d.error_before[k],
             "noise_floor": d.floor[k], "samples": int((answer.bound.measured[k] == answer.bound.measured[k]).sum()),
         }
         for k in range(len(d.outputs))
@@ -191,18 +208,28 @@ def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:
         if bound is not None and len(bound.logs) > 1:
             for k, output in enumerate(d.outputs):
                 figures = [f"{together[s][what][k]:.4g}" for s in steps]
-                relative = 100 * together[steps[-1]][what][k] / (float(np.sqrt(np.nanmean(bound.measured[k] ** 2))) or 1.0)
-                rows.append([f"all {len(bound.logs)} together", what, output, *figures, f"{relative:.3g} %", d.units[k]])
+                relative = (
+                    100 * together[steps[-1]][what][k] / (float(np.sqrt(np.nanmean(bound.measured[k] ** 2))) or 1.0)
+                )
+                rows.append(
+                    [f"all {len(bound.logs)} together", what, output, *figures, f"{relative:.3g} %", d.units[k]]
+                )
     heads = ["model", *(f"+ {s.split(' + ')[-1]}" for s in steps[1:])]
-    terminal.print_table(args, f"RMS error log by log ({answer.elapsed_s:.1f} s)", ["log", "", "signal", *heads, "of RMS", "unit"], rows)
+    terminal.print_table(
+        args, f"RMS error log by log ({answer.elapsed_s:.1f} s)", ["log", "", "signal", *heads, "of RMS", "unit"], rows
+    )
     if verb in ("compare", "locate"):
         if verb == "locate":
             say_located(args, answer.located, 6)
         return
     for p in answer.parameters():
-        terminal.say(args, f"parameter {p['parameter']}: {p['value']:.5g} [{p['low']:.5g}, {p['high']:.5g}] {p['unit']}")
+        terminal.say(
+            args, f"parameter {p['parameter']}: {p['value']:.5g} [{p['low']:.5g}, {p['high']:.5g}] {p['unit']}"
+        )
     for f in d.effects:
-        values = ", ".join(f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items())
+        values = ", ".join(
+            f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
+        )
         rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
         terminal.say(args, f"missing: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}")
     terminal.say(args, answer.sentence())

@@ -11,9 +11,10 @@ from vaneloop.cli import station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Record every frame on a CAN bus, with its time of arrival: candump (.log), BLF (.blf), MDF4 (.mf4) or Parquet (.parquet,
-with the signals of vgv.dbc in columns). The file can be opened at any time while it grows, and after any end, kill -9 too, which costs at
-most the last second. A file of that name that is there already is kept under another name.
+DESCRIPTION = """Record every frame on a CAN bus, with its time of arrival: candump (.log), BLF (.blf), MDF4 (.mf4) or
+Parquet (.parquet, with the signals of vgv.dbc in columns). The file can be opened at any time while it grows, and after
+any end, kill -9 too, which costs at most the last second. A file of that name that is there already is kept under
+another name.
 
 examples:
   vaneloop record run.mf4
@@ -28,7 +29,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", metavar="B", help=f"{station.BUS_HELP}; default: vcan0 if there is one, else local")
     parser.add_argument("--duration", metavar="S", type=float, help="seconds to record (default: until Ctrl-C)")
     terminal.add_output_options(parser)
-    parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
+    parser.add_argument(
+        "--live", action="store_true", help="a line every second on standard error, also where that is no terminal"
+    )
 
 
 def command(args: argparse.Namespace) -> int:
@@ -80,11 +83,22 @@ def command(args: argparse.Namespace) -> int:
             except InputError as e:
                 failed = failed or str(e)
     lost = port.lost
-    words = [f"{recorder.frames:,} frames in {args.out}", f"{lost:,} lost" if lost else "", f"ended by {stop.asked}" if stop.asked else ""]
+    words = [
+        f"{recorder.frames:,} frames in {args.out}",
+        f"{lost:,} lost" if lost else "",
+        f"ended by {stop.asked}" if stop.asked else "",
+    ]
     terminal.say(args, "; ".join(w for w in words if w))
     exceeded = ([failed] if failed else []) + ([f"the bus lost {lost:,} frames for this reader"] if lost else [])
     for line in exceeded:
         terminal.say(args, f"incomplete: {line}")
-    out: dict[str, Any] = {"schema": 1, "bus": name, "path": args.out, "frames": recorder.frames, "lost": lost, "exceeded": exceeded}
+    out: dict[str, Any] = {
+        "schema": 1,
+        "bus": name,
+        "path": args.out,
+        "frames": recorder.frames,
+        "lost": lost,
+        "exceeded": exceeded,
+    }
     terminal.write_json(args, out)
     return 1 if exceeded else 0

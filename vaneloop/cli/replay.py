@@ -12,7 +12,6 @@ from vaneloop.base import terminal
 from vaneloop.cli import options
 
 if TYPE_CHECKING:
-
     pass
 from hil.replay import STATISTICS, ReplayResult, replay, replay_json
 
@@ -20,8 +19,8 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Replay a logged engine run through the controller's firmware and the plant.
 
-The log's speed demand (and measured speed, supply pressure, oil temperature where logged) drives the loop; every other signal that the log
-measured is compared with the simulated one, and the vane angles with their schedule.
+The log's speed demand (and measured speed, supply pressure, oil temperature where logged) drives the loop; every other
+signal that the log measured is compared with the simulated one, and the vane angles with their schedule.
 
 examples:
   vaneloop replay examples/engine_run.blf --report replay.html
@@ -36,24 +35,35 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_log_options(parser)
     group = parser.add_argument_group("the model and the judgement")
     group.add_argument(
-        "--strategy", metavar="S", help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)"
+        "--strategy",
+        metavar="S",
+        help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)",
     )
-    group.add_argument("--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine")
+    group.add_argument(
+        "--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine"
+    )
     options.add_tables_option(group)
     group.add_argument(
         "--tolerance",
         metavar="signal=value",
         action="append",
         default=[],
-        help="largest RMS error allowed, in the signal's unit; signal.max_abs=value, signal.mean_abs=value for the other figures",
+        help="largest RMS error allowed, in the signal's unit; signal.max_abs=value, signal.mean_abs=value for the "
+        "other figures",
     )
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
-    parser.add_argument("--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)")
+    parser.add_argument(
+        "--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)"
+    )
 
 
-def command(args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None) -> int:
-    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit code."""
+def command(
+    args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None
+) -> int:
+    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit
+    code.
+    """
     from pathlib import Path
 
     from hil.logs import Channel, write_log
@@ -76,11 +86,20 @@ def command(args: argparse.Namespace, extra: dict[str, Any] | None = None, floor
         result = replay(log, plant=machine, calibration=calibration, progress=progress, floors=floors)
     exceeded = _exceeded(result, limits)
     rows = [
-        [s.signal, s.stage, s.reference, *(_figure(getattr(s, k)) for k in (*STATISTICS, "noise_floor")), s.unit, f"{s.samples:,}"]
+        [
+            s.signal,
+            s.stage,
+            s.reference,
+            *(_figure(getattr(s, k)) for k in (*STATISTICS, "noise_floor")),
+            s.unit,
+            f"{s.samples:,}",
+        ]
         for s in result.signals
     ]
     columns = ["signal", "stage", "against", "rms", "mean", "max", "mean 99-100 %", "noise floor", "unit", "samples"]
-    terminal.print_table(args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows)
+    terminal.print_table(
+        args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows
+    )
     for note in result.notes:
         terminal.say(args, f"note: {note}")
     for line in exceeded:
@@ -139,5 +158,7 @@ def _exceeded(result: ReplayResult, limits: dict[tuple[str, str], float]) -> lis
         value = getattr(judged, statistic)
         words = "measurement" if judged.reference == "measured" else "schedule"
         if value is not None and value > limit:
-            out.append(f"{signal} {statistic} {value:.4g} {judged.unit} against the {words} exceeds {limit:g} {judged.unit}")
+            out.append(
+                f"{signal} {statistic} {value:.4g} {judged.unit} against the {words} exceeds {limit:g} {judged.unit}"
+            )
     return out

@@ -10,9 +10,10 @@ from vaneloop.cli import options, station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Controller with its plant as a node on the CAN bus: it takes ECU_DEMAND and sends VGV_STATUS, VGV_SERVO, VGV_ANGLES and
-VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real time, until --duration or Ctrl-C; at the end it says how late
-its ticks were. On lockstep in simulated time with an ECU of its own, or with the frames of a record (--inputs).
+DESCRIPTION = """Controller with its plant as a node on the CAN bus: it takes ECU_DEMAND and sends VGV_STATUS,
+VGV_SERVO, VGV_ANGLES and VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real time, until
+--duration or Ctrl-C; at the end it says how late its ticks were. On lockstep in simulated time with an ECU of its own,
+or with the frames of a record (--inputs).
 
 examples:
   vaneloop run --bus vcan0                      (and in another terminal: vaneloop ecu --bus vcan0 --profile ramp)
@@ -20,37 +21,62 @@ examples:
   vaneloop run --bus lockstep --profile slam --record slam.log
   vaneloop run --bus lockstep --inputs run.mf4  the recorded run again: must send the same frames, bit for bit
 
-exit codes: 0 good (also after Ctrl-C), 1 a limit is exceeded, the repeated run differs or the record is incomplete, 2 bad input"""
+exit codes: 0 good (also after Ctrl-C), 1 a limit is exceeded, the repeated run differs or the record is incomplete, 2
+bad input
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--bus", metavar="B", help=f"{station.BUS_HELP}, or lockstep (simulated time); default: vcan0 if there is one, else local"
+        "--bus",
+        metavar="B",
+        help=f"{station.BUS_HELP}, or lockstep (simulated time); default: vcan0 if there is one, else local",
     )
     parser.add_argument(
-        "--duration", metavar="S", type=float, help="seconds to run (default: until Ctrl-C; in lockstep the profile's or the record's)"
+        "--duration",
+        metavar="S",
+        type=float,
+        help="seconds to run (default: until Ctrl-C; in lockstep the profile's or the record's)",
     )
     parser.add_argument(
-        "--record", metavar="F", help="record the frames taken and sent, at their ticks: .log (candump), .blf, .mf4 or .parquet"
+        "--record",
+        metavar="F",
+        help="record the frames taken and sent, at their ticks: .log (candump), .blf, .mf4 or .parquet",
     )
-    parser.add_argument("--limit-late-us", metavar="N", type=float, help="exit 1 if a tick began more than N us after its deadline")
     parser.add_argument(
-        "--limit-share", metavar="P", type=float, default=0.0, help="per cent of ticks that may be later than --limit-late-us (default 0)"
+        "--limit-late-us", metavar="N", type=float, help="exit 1 if a tick began more than N us after its deadline"
+    )
+    parser.add_argument(
+        "--limit-share",
+        metavar="P",
+        type=float,
+        default=0.0,
+        help="per cent of ticks that may be later than --limit-late-us (default 0)",
     )
     parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
-    parser.add_argument("--model", metavar="M.toml", help="model file: changed parameters and added effects of the machine")
     parser.add_argument(
-        "--start-speed", metavar="N", type=float, default=60.0, help="rotor speed, %%, that the machine starts at (default 60)"
+        "--model", metavar="M.toml", help="model file: changed parameters and added effects of the machine"
+    )
+    parser.add_argument(
+        "--start-speed",
+        metavar="N",
+        type=float,
+        default=60.0,
+        help="rotor speed, %%, that the machine starts at (default 60)",
     )
     group = parser.add_argument_group("lockstep")
-    group.add_argument("--inputs", metavar="RECORD", help="repeat a recorded run with the frames it took; compare the frames it sent")
+    group.add_argument(
+        "--inputs", metavar="RECORD", help="repeat a recorded run with the frames it took; compare the frames it sent"
+    )
     group.add_argument("--profile", metavar="F", help="demand of the run's own ECU: as in vaneloop ecu (default: ramp)")
     group.add_argument("--log", metavar="F", help="demand of the run's own ECU from a log")
     options.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
     station.add_realtime_options(parser)
     terminal.add_output_options(parser)
-    parser.add_argument("--live", action="store_true", help="a line every second on standard error, also where that is no terminal")
+    parser.add_argument(
+        "--live", action="store_true", help="a line every second on standard error, also where that is no terminal"
+    )
 
 
 def command(args: argparse.Namespace) -> int:
@@ -74,7 +100,9 @@ def command(args: argparse.Namespace) -> int:
     lockstep = name.partition(":")[0] == "lockstep"
     for option in ("inputs", "profile", "log"):
         if getattr(args, option) and not lockstep:
-            raise InputError(f"--{option} is for --bus lockstep; on {name} the demand comes from the bus: vaneloop ecu --bus {name}")
+            raise InputError(
+                f"--{option} is for --bus lockstep; on {name} the demand comes from the bus: vaneloop ecu --bus {name}"
+            )
     if lockstep and args.limit_late_us is not None:
         raise InputError("--limit-late-us is for real time; --bus lockstep is never late")
     if sum(bool(o) for o in (args.inputs, args.profile, args.log)) > 1:
@@ -101,7 +129,9 @@ def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
 
     rows = [LAG, ACCELERATION, DECELERATION, *rows_at("engine")]
     if args.model and (machine.p[rows] != build_plant().p[rows]).any():
-        terminal.say(args, f"note: the engine of {args.model} runs in the ECU: vaneloop ecu --bus {bus} --model {args.model}")
+        terminal.say(
+            args, f"note: the engine of {args.model} runs in the ECU: vaneloop ecu --bus {bus} --model {args.model}"
+        )
 
 
 def _node_json(node: Any) -> dict[str, Any]:
@@ -110,18 +140,28 @@ def _node_json(node: Any) -> dict[str, Any]:
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
     n_dem = float(node.arrays.z[N_DEM])
-    return {"mode": node.mode, "n_dem": n_dem, "faults": faults, "counts": node.counts, "state_hash": node.fingerprint()}
+    return {
+        "mode": node.mode,
+        "n_dem": n_dem,
+        "faults": faults,
+        "counts": node.counts,
+        "state_hash": node.fingerprint(),
+    }
 
 
 def _say_node(args: argparse.Namespace, node: Any) -> None:
     c, state = node.counts, _node_json(node)
     faults = ", ".join(state["faults"]) or "none"
     refused = sum(c[k] for k in ("wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind"))
-    terminal.say(args, f"controller: {node.mode}; faults now: {faults}; ECU_DEMAND good {c['good']:,}, lost {c['lost']:,}, refused {refused:,}")
+    terminal.say(
+        args,
+        f"controller: {node.mode}; faults now: {faults}; ECU_DEMAND good {c['good']:,}, lost {c['lost']:,}, refused "
+        f"{refused:,}",
+    )
     terminal.say(args, f"state hash: {state['state_hash']}")
 
 
-# ---- real time ----------------------------------------------------------------------------------------------------------------------
+# ---- real time -------------------------------------------------------------------------------------------------------
 
 
 def _in_real_time(args: argparse.Namespace, name: str) -> int:
@@ -139,12 +179,17 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         def show(report: Any) -> None:
             begin = report.begin
             live.say(
-                f"{report.ticks // 1000:>6} s  {node.mode:<9}  late: p99 {begin.quantile(0.99):.0f}, p99.9 {begin.quantile(0.999):.0f}, "
-                f"max {begin.worst_ns / 1000:.0f} us  missed {report.missed}  frames in {report.received}, out {report.sent}"
+                f"{report.ticks // 1000:>6} s  {node.mode:<9}  late: p99 {begin.quantile(0.99):.0f}, p99.9 "
+                f"{begin.quantile(0.999):.0f}, max {begin.worst_ns / 1000:.0f} us  missed {report.missed}  frames in "
+                f"{report.received}, out {report.sent}"
             )
 
         with station.recording(args, name) as recorder:
-            terminal.say(args, f"controller and plant on {name}, 1 kHz{'' if ticks is None else f', {args.duration:g} s'}; Ctrl-C ends")
+            terminal.say(
+                args,
+                f"controller and plant on {name}, 1 kHz{'' if ticks is None else f', {args.duration:g} s'}; Ctrl-C "
+                f"ends",
+            )
             try:
                 with station.undisturbed(args) as notes:
                     report = run_realtime(
@@ -158,14 +203,20 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         terminal.say(args, f"note: {note}")
     terminal.say(args, f"{report.ticks / 1000:,.3f} s on {name}{f', ended by {report.ended}' if report.ended else ''}")
     station.print_lateness(args, report)
-    terminal.say(args, f"frames: {report.received:,} taken, {report.sent:,} sent, {port.refused:,} not taken by the bus, {port.lost:,} lost")
+    terminal.say(
+        args,
+        f"frames: {report.received:,} taken, {report.sent:,} sent, {port.refused:,} not taken by the bus, "
+        f"{port.lost:,} lost",
+    )
     _say_node(args, node)
     exceeded = []
     if report.failed:
         exceeded.append(report.failed)
     if args.limit_late_us is not None:
         worst = report.begin.worst_ns * 1e-3
-        share = 100.0 * (report.begin.share_over(args.limit_late_us) if args.limit_share else float(worst > args.limit_late_us))
+        share = 100.0 * (
+            report.begin.share_over(args.limit_late_us) if args.limit_share else float(worst > args.limit_late_us)
+        )
         if share > args.limit_share:
             what = f"{share:.3f} % of ticks" if args.limit_share else f"a tick ({worst:,.1f} us)"
             allowed = f"; allowed: {args.limit_share:g} %" if args.limit_share else ""
@@ -176,7 +227,8 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
     terminal.write_json(args, {
         "schema": 1, "bus": name, "time": "real", "ended": report.ended, **station.realtime_json(report),
         "policy": args.policy, "realtime_priority": args.realtime_priority, "spin_us": args.spin_us, "notes": notes,
-        "frames": {"received": report.received, "sent": report.sent, "refused": port.refused, "lost": port.lost, "bus_errors": port.errors},
+        "frames": {"received": report.received, "sent": report.sent, "refused": port.refused, "lost": port.lost,
+        "bus_errors": port.errors},
         **_node_json(node), "record": record, "exceeded": exceeded,
     })  # fmt: skip
     return 1 if exceeded else 0
@@ -194,7 +246,7 @@ def _record_json(args: argparse.Namespace, recorder: Any, exceeded: list[str]) -
     return {"path": args.record, "frames": recorder.frames, "lost": recorder.lost, "error": recorder.error}
 
 
-# ---- lockstep -----------------------------------------------------------------------------------------------------------------------
+# ---- lockstep --------------------------------------------------------------------------------------------------------
 
 
 def _in_lockstep(args: argparse.Namespace) -> int:
@@ -215,16 +267,25 @@ def _in_lockstep(args: argparse.Namespace) -> int:
     ecu = Ecu(machine, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
     with terminal.progress_bar(args, "lockstep") as progress:
         run = run_lockstep(
-            profile[:, 0], profile[:, 1], vgv=node, ecu=ecu, duration=args.duration if args.duration is not None else demand.duration,
+            profile[:, 0], profile[:, 1], vgv=node, ecu=ecu,
+            duration=args.duration if args.duration is not None else demand.duration,
             keep=bool(args.record), progress=progress,
         )  # fmt: skip
     ticks = node.k
-    terminal.say(args, f"{run.simulated_s:,.3f} s simulated in {run.wall_s:.2f} s ({run.simulated_s / run.wall_s:,.0f} times real time)")
-    terminal.say(args, f"bus: {run.frames:,} frames, {run.error_frames:,} error frames, load {100 * run.load:.1f} % of 500 kbit/s")
+    terminal.say(
+        args,
+        f"{run.simulated_s:,.3f} s simulated in {run.wall_s:.2f} s ({run.simulated_s / run.wall_s:,.0f} times real "
+        f"time)",
+    )
+    terminal.say(
+        args,
+        f"bus: {run.frames:,} frames, {run.error_frames:,} error frames, load {100 * run.load:.1f} % of 500 kbit/s",
+    )
     _say_node(args, node)
     record = None
     if args.record:
-        # a frame is taken in the first tick that begins after its last bit; in which ticks frames were sent, the same ticks say again
+        # a frame is taken in the first tick that begins after its last bit; in which ticks frames were sent, the same
+        # ticks say again
         tick = -(-np.rint(run.t * BIT_RATE).astype(np.int64) // BITS_PER_TICK)
         taken = (run.rows[:, 0] & IDENT_MASK == ECU_DEMAND) & (tick < ticks)
         again = _node(args, machine)
@@ -234,8 +295,10 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         start = time.time_ns() // 10**9 * 1000
         record = _write_record(args, run.rows[taken], tick[taken], at, sent, start)
     terminal.write_json(args, {
-        "schema": 1, "bus": "lockstep", "time": "simulated", "ticks": ticks, "simulated_s": run.simulated_s, "wall_s": run.wall_s,
-        "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames}, **_node_json(node),
+        "schema": 1, "bus": "lockstep", "time": "simulated", "ticks": ticks, "simulated_s": run.simulated_s,
+        "wall_s": run.wall_s,
+        "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames},
+        **_node_json(node),
         "record": record, "exceeded": [],
     })  # fmt: skip
     return 0
@@ -253,21 +316,29 @@ def _repeat(args: argparse.Namespace) -> int:
 
     record = read_record(args.inputs)
     node = _node(args)
-    # the first frame sent is VGV_STATUS of tick 0; a record of another program's knows no directions and begins with its first frame
+    # the first frame sent is VGV_STATUS of tick 0; a record of another program's knows no directions and begins with
+    # its first frame
     start = record.ms[np.argmax(record.sent)] if record.sent.any() else record.ms[0]
     tick = record.ms - start
     taken = ~record.sent
     if (tick[taken] < 0).any():
-        raise InputError(f"{args.inputs}: frames were taken before the first one was sent: not a record of vaneloop run")
+        raise InputError(
+            f"{args.inputs}: frames were taken before the first one was sent: not a record of vaneloop run"
+        )
     last = int(tick[-1]) + 1
-    ticks = last if args.duration is None else round(args.duration * 1000)  # a run ends up to 9 ticks after the last frame it sent
+    ticks = (
+        last if args.duration is None else round(args.duration * 1000)
+    )  # a run ends up to 9 ticks after the last frame it sent
     started = time.perf_counter()
     received = noted(record.rows[taken])
     at, sent = replay(node, tick[taken], received, ticks)
     wall = time.perf_counter() - started
     held = record.sent & (tick < ticks)
     was_at, was = tick[held], record.rows[held]
-    terminal.say(args, f"{ticks / 1000:,.3f} s of {args.inputs} repeated in {wall:.2f} s ({ticks / 1000 / wall:,.0f} times real time)")
+    terminal.say(
+        args,
+        f"{ticks / 1000:,.3f} s of {args.inputs} repeated in {wall:.2f} s ({ticks / 1000 / wall:,.0f} times real time)",
+    )
     exceeded: list[str] = []
     if not len(was):
         terminal.say(args, "the record says of no frame that it was sent: nothing to compare with")
@@ -277,7 +348,8 @@ def _repeat(args: argparse.Namespace) -> int:
         if not same.all():
             k = int(np.argmin(same))
             before, now = (
-                f"tick {int(tick):,} {NAMES.get(int(row[0]) & 0x7FF, '?')} {int(row[1]).to_bytes(8, 'little', signed=True).hex().upper()}"
+                f"tick {int(tick):,} {NAMES.get(int(row[0]) & 0x7FF, '?')} "
+                f"{int(row[1]).to_bytes(8, 'little', signed=True).hex().upper()}"
                 for tick, row in ((was_at[k], was[k]), (at[k], sent[k]))
             )
             needed = "the same --seed, --model and --start-speed are needed"
@@ -290,7 +362,8 @@ def _repeat(args: argparse.Namespace) -> int:
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
     terminal.write_json(args, {
-        "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks, "simulated_s": ticks / 1000,
+        "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks,
+        "simulated_s": ticks / 1000,
         "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "exceeded": exceeded,
     })  # fmt: skip
     if args.record:
@@ -298,8 +371,12 @@ def _repeat(args: argparse.Namespace) -> int:
     return 1 if exceeded else 0
 
 
-def _write_record(args: argparse.Namespace, received: Any, received_at: Any, at: Any, sent: Any, start: int) -> dict[str, Any]:
-    """Record a run in lockstep as one in real time is: frames taken and sent, with their ticks; ``start`` in ms since 1970."""
+def _write_record(
+    args: argparse.Namespace, received: Any, received_at: Any, at: Any, sent: Any, start: int
+) -> dict[str, Any]:
+    """Record a run in lockstep as one in real time is: frames taken and sent, with their ticks; ``start`` in ms since
+    1970.
+    """
     import numpy as np
 
     from hil.logs.recorder import Recorder
@@ -309,7 +386,9 @@ def _write_record(args: argparse.Namespace, received: Any, received_at: Any, at:
     if recorder.kept is not None:
         terminal.say(args, f"{args.record} was there already: it is now {recorder.kept}")
     ticks = np.union1d(received_at, at)
-    ends = [np.searchsorted(these, ticks, side=side).tolist() for these in (received_at, at) for side in ("left", "right")]
+    ends = [
+        np.searchsorted(these, ticks, side=side).tolist() for these in (received_at, at) for side in ("left", "right")
+    ]
     for n, (k, a, b, c, d) in enumerate(zip(ticks.tolist(), *ends, strict=True), 1):
         recorder.put(packed((start + k) * 10**6, received[a:b], sent[c:d]))
         if n % 10_000 == 0:

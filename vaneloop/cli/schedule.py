@@ -1,4 +1,6 @@
-"""``vaneloop schedule``: from geometry, schedules and a measured loop to links, stroke tables and the errors that remain."""
+"""``vaneloop schedule``: from geometry, schedules and a measured loop to links, stroke tables and the errors that
+remain.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,12 @@ from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
-DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links of VGV1 and
-VGV2 that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves, made into stroke tables.
+DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links
+of VGV1 and VGV2 that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves, made
+into stroke tables.
 
-The log needs x_lvdt and vigv (vgv1, vgv2 where they were measured), the machine as built (lb of the geometry) driven there and back:
-any format that replay reads. Without a log the play is the geometry's own.
+The log needs x_lvdt and vigv (vgv1, vgv2 where they were measured), the machine as built (lb of the geometry) driven
+there and back: any format that replay reads. Without a log the play is the geometry's own.
 
 examples:
   vaneloop schedule --report schedule.html
@@ -23,31 +26,63 @@ examples:
   vaneloop schedule --log LOOP.mf4 --map STROKE=x_lvdt --map IGV=vigv --step 0.25 --criterion max
   vaneloop engine-test --tables engine7/
 
-exit codes: 0 good, 2 bad input (a mechanism that cannot be assembled, a schedule that no length meets, a log without a loop)"""
+exit codes: 0 good, 2 bad input (a mechanism that cannot be assembled, a schedule that no length meets, a log without a
+loop)
+"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     group = parser.add_argument_group("the engine")
-    group.add_argument("--geometry", metavar="F.toml", default="geometry.toml", help="the mechanism as built (default: the shipped one)")
-    group.add_argument("--schedules", metavar="F.toml", default="schedules.toml", help="target angles over speed (default: shipped)")
-    group.add_argument("--log", metavar="LOG", help="measured stroke-angle loop: candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
-    group = parser.add_argument_group("adjusting VGV1 and VGV2")
-    group.add_argument("--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)")
-    group.add_argument("--lb-range", metavar="MM", type=float, default=5.0, help="largest change of a bell crank (default 5 mm)")
-    group.add_argument("--lc-range", metavar="MM", type=float, default=5.0, help="largest change of a vertical link (default 5 mm)")
-    group.add_argument("--adjust", metavar="NAMES", default="lb,lc", help="lengths that may change: lb,lc (default), lb, lc or none")
     group.add_argument(
-        "--criterion", metavar="C", default="rms", help="best by: rms (default) or max error, or design: error at 100 %% plus rms"
+        "--geometry",
+        metavar="F.toml",
+        default="geometry.toml",
+        help="the mechanism as built (default: the shipped one)",
     )
     group.add_argument(
-        "--limit", metavar="DEG", type=float, default=1.0, help="refuse a schedule that no length meets within it, 40 to 102 %% (default 1)"
+        "--schedules", metavar="F.toml", default="schedules.toml", help="target angles over speed (default: shipped)"
+    )
+    group.add_argument(
+        "--log",
+        metavar="LOG",
+        help="measured stroke-angle loop: candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet",
+    )
+    group = parser.add_argument_group("adjusting VGV1 and VGV2")
+    group.add_argument(
+        "--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)"
+    )
+    group.add_argument(
+        "--lb-range", metavar="MM", type=float, default=5.0, help="largest change of a bell crank (default 5 mm)"
+    )
+    group.add_argument(
+        "--lc-range", metavar="MM", type=float, default=5.0, help="largest change of a vertical link (default 5 mm)"
+    )
+    group.add_argument(
+        "--adjust", metavar="NAMES", default="lb,lc", help="lengths that may change: lb,lc (default), lb, lc or none"
+    )
+    group.add_argument(
+        "--criterion",
+        metavar="C",
+        default="rms",
+        help="best by: rms (default) or max error, or design: error at 100 %% plus rms",
+    )
+    group.add_argument(
+        "--limit",
+        metavar="DEG",
+        type=float,
+        default=1.0,
+        help="refuse a schedule that no length meets within it, 40 to 102 %% (default 1)",
     )
     group = parser.add_argument_group("reading the log (docs/logs.md)")
     options.add_reading_options(group)
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
-    parser.add_argument("--out", metavar="DIR", help="write stroke_tables, vane_angles, geometry, schedules .toml; --tables DIR loads it")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="write stroke_tables, vane_angles, geometry, schedules .toml; --tables DIR loads it",
+    )
 
 
 def log_of(args: argparse.Namespace) -> Any:
@@ -77,9 +112,18 @@ def command(args: argparse.Namespace) -> int:
             figures = (s.at_design[name], s.rms[name], s.largest[name])
             rows.append([f"{s.stage}: {words}", f"{lb:g}", f"{lc:g}", *(f"{v:.3f}" for v in figures)])
         for name, words in (("extension", "on the extension curve"), ("retraction", "on the retraction curve")):
-            rows.append([f"{s.stage}: {words}", "", "", *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))])
+            rows.append(
+                [
+                    f"{s.stage}: {words}",
+                    "",
+                    "",
+                    *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name])),
+                ]
+            )
     columns = ["error of the vane angle, deg", "Lb, mm", "Lc, mm", "at 100 %", "rms", "max"]
-    terminal.print_table(args, "links, and what remains (target minus angle; rms and max over 40 to 102 % speed)", columns, rows)
+    terminal.print_table(
+        args, "links, and what remains (target minus angle; rms and max over 40 to 102 % speed)", columns, rows
+    )
     pick = [i for i, n in enumerate(result.speed) if n % 10 == 0 or n >= 95 or i == len(result.speed) - 1]
     rows = [
         [
@@ -102,7 +146,17 @@ def command(args: argparse.Namespace) -> int:
             ]
             for name, m in result.loops.items()
         ]  # fmt: skip
-        columns = ["loop", "width, deg", "offset", "Lb equiv., mm", "Lc equiv.", "misfit, deg", "noise", "drift", "lag, ms"]
+        columns = [
+            "loop",
+            "width, deg",
+            "offset",
+            "Lb equiv., mm",
+            "Lc equiv.",
+            "misfit, deg",
+            "noise",
+            "drift",
+            "lag, ms",
+        ]
         columns += ["extension, mm", "retraction"]
         terminal.print_table(args, f"measured in {result.log}", columns, rows)
     for note in result.notes:
@@ -113,5 +167,7 @@ def command(args: argparse.Namespace) -> int:
     if args.report:
         from vaneloop.pages.schedule import schedule_page
 
-        terminal.say(args, f"page: {schedule_page(result, args.report, ' '.join(['vaneloop schedule', *sys.argv[2:]]))}")
+        terminal.say(
+            args, f"page: {schedule_page(result, args.report, ' '.join(['vaneloop schedule', *sys.argv[2:]]))}"
+        )
     return 0

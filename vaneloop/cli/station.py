@@ -15,7 +15,8 @@ from typing import Any
 from vaneloop.base import terminal
 
 __all__ = [
-    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "bus_name", "check_realtime_options", "check_seconds", "joined",
+    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "bus_name", "check_realtime_options",
+    "check_seconds", "joined",
     "machine_of", "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
 ]  # fmt: skip
 
@@ -29,13 +30,21 @@ def add_realtime_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a loop in real time."""
     group = parser.add_argument_group("real time (docs/real_time.md)")
     group.add_argument(
-        "--realtime-priority", metavar="P", type=int, help="SCHED_FIFO with priority 1..99 (root or ulimit -r): no other program delays it"
+        "--realtime-priority",
+        metavar="P",
+        type=int,
+        help="SCHED_FIFO with priority 1..99 (root or ulimit -r): no other program delays it",
     )
     group.add_argument("--cpu", metavar="N", type=int, help="stay on processor N")
     group.add_argument(
-        "--policy", choices=("catch-up", "skip"), default="catch-up", help="late ticks are caught up (default), or skipped and counted"
+        "--policy",
+        choices=("catch-up", "skip"),
+        default="catch-up",
+        help="late ticks are caught up (default), or skipped and counted",
     )
-    group.add_argument("--spin-us", metavar="N", type=float, default=50.0, help="us before a deadline not slept but spun (default 50)")
+    group.add_argument(
+        "--spin-us", metavar="N", type=float, default=50.0, help="us before a deadline not slept but spun (default 50)"
+    )
 
 
 def check_realtime_options(args: argparse.Namespace) -> None:
@@ -73,7 +82,9 @@ def undisturbed(args: argparse.Namespace) -> Iterator[list[str]]:
             notes = stack.enter_context(realtime.undisturbed(args.realtime_priority, args.cpu))
         except OSError as e:
             p = args.realtime_priority
-            raise InputError(f"--realtime-priority {p}: {e.strerror}; run as root, or allow it with ulimit -r {p}") from None
+            raise InputError(
+                f"--realtime-priority {p}: {e.strerror}; run as root, or allow it with ulimit -r {p}"
+            ) from None
         yield notes
 
 
@@ -86,7 +97,9 @@ def bus_name(args: argparse.Namespace) -> str:
 
 @contextlib.contextmanager
 def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[Any]:
-    """Open the bus and leave it at the end. The broker of an embedded bus works with this participant's real-time priority."""
+    """Open the bus and leave it at the end. The broker of an embedded bus works with this participant's real-time
+    priority.
+    """
     from hil.bus.port import open_bus
 
     if name.partition(":")[0] == "local":
@@ -137,7 +150,9 @@ def recording(args: argparse.Namespace, channel: str) -> Iterator[Any]:
 
 
 class Live:
-    """A line a second on standard error, written by a thread so that a slow terminal delays nobody; what it cannot take is left out."""
+    """A line a second on standard error, written by a thread so that a slow terminal delays nobody; what it cannot take
+    is left out.
+    """
 
     def __init__(self, args: argparse.Namespace):
         self.terminal = sys.stderr.isatty()
@@ -176,7 +191,8 @@ class Live:
 
 
 class BusWatch:
-    """A line on standard error when the bus takes no more frames (interface down, bus-off, queue full), and one when it does again.
+    """A line on standard error when the bus takes no more frames (interface down, bus-off, queue full), and one when it
+    does again.
 
     Called at every tick; frames are sent every tenth. Standard error may be slow, so the lines are written by threads.
     """
@@ -201,7 +217,10 @@ class BusWatch:
             self.bad, self.last = bad, k
         elif self.first >= 0 and k - self.last > self.CLEAN:
             gone = self.port.refused - self.refused + 1
-            self._say(f"{self.name}: takes frames again after {(self.last - self.first + 1) * 1e-3:.1f} s; {gone:,} were not sent")
+            self._say(
+                f"{self.name}: takes frames again after {(self.last - self.first + 1) * 1e-3:.1f} s; {gone:,} were "
+                f"not sent"
+            )
             self.first = -1
 
     def _why(self) -> str:
@@ -213,7 +232,9 @@ class BusWatch:
 
     def _say(self, text: str) -> None:
         if not self.quiet:
-            threading.Thread(target=lambda: print(f"vaneloop: {text}", file=sys.stderr, flush=True), daemon=True).start()
+            threading.Thread(
+                target=lambda: print(f"vaneloop: {text}", file=sys.stderr, flush=True), daemon=True
+            ).start()
 
 
 def realtime_json(report: Any) -> dict[str, Any]:
@@ -247,9 +268,19 @@ def print_lateness(args: argparse.Namespace, report: Any) -> None:
     if not report.ticks:
         return
     rows = []
-    for name, h in (("begins after its deadline", report.begin), ("has sent its frames", report.end), ("takes", report.work)):
+    for name, h in (
+        ("begins after its deadline", report.begin),
+        ("has sent its frames", report.end),
+        ("takes", report.work),
+    ):
         f = h.figures()
-        rows.append([name, *(f"{f[k]:,.1f}" for k in ("p50_us", "p99_us", "p999_us", "max_us")), f"{100 * f['over_500us']:.3f} %"])
+        rows.append(
+            [
+                name,
+                *(f"{f[k]:,.1f}" for k in ("p50_us", "p99_us", "p999_us", "max_us")),
+                f"{100 * f['over_500us']:.3f} %",
+            ]
+        )
     terminal.print_table(args, "a tick ...", ["us", "p50", "p99", "p99.9", "max", "over 500 us"], rows)
     shown = [(label, n) for label, n in report.begin.shown() if n]
     most = max(n for _, n in shown)
@@ -257,9 +288,17 @@ def print_lateness(args: argparse.Namespace, report: Any) -> None:
         terminal.say(args, f"  {label:>9} {n:>10,}  {'#' * max(1, round(50 * n / most))}")
     worst = report.begin
     when = datetime.fromtimestamp(report.started_ns * 1e-9 + worst.worst_tick * 1e-3).strftime("%H:%M:%S.%f")[:-3]
-    terminal.say(args, f"worst tick: {worst.worst_ns * 1e-3:,.1f} us late at t = {worst.worst_tick * 1e-3:.3f} s ({when})")
-    terminal.say(args, f"missed ticks (later than the next deadline): {report.missed:,} of {report.ticks:,}; skipped: {report.skipped:,}")
+    terminal.say(
+        args, f"worst tick: {worst.worst_ns * 1e-3:,.1f} us late at t = {worst.worst_tick * 1e-3:.3f} s ({when})"
+    )
+    terminal.say(
+        args,
+        f"missed ticks (later than the next deadline): {report.missed:,} of {report.ticks:,}; skipped: "
+        f"{report.skipped:,}",
+    )
     if report.pauses:
-        terminal.say(args, f"stood still for 50 ms or more: {report.pauses:,} times; frames dropped for it: {report.dropped:,}")
+        terminal.say(
+            args, f"stood still for 50 ms or more: {report.pauses:,} times; frames dropped for it: {report.dropped:,}"
+        )
     if report.missed and args.realtime_priority is None:
         terminal.say(args, "other programs delayed it; --realtime-priority 50 (root or ulimit -r) keeps them from that")

@@ -34,10 +34,11 @@ from vaneloop.pages.strategies import report
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Compare the control strategies on the same engine run: single (one mean curve), dual (one curve a direction, the paper's),
-inverse (follows the play and crosses it when the vanes must turn round), adaptive (the same, and learns play and offset from the
-stem potentiometers). Six machines: nominal, worn, with thermal growth, dithered near 99 to 100 %, noisy, and all of it together;
-then the potentiometers fail in the middle of the last one. docs/strategies.md explains the strategies.
+DESCRIPTION = """Compare the control strategies on the same engine run: single (one mean curve), dual (one curve a
+direction, the paper's), inverse (follows the play and crosses it when the vanes must turn round), adaptive (the same,
+and learns play and offset from the stem potentiometers). Six machines: nominal, worn, with thermal growth, dithered
+near 99 to 100 %, noisy, and all of it together; then the potentiometers fail in the middle of the last one.
+docs/strategies.md explains the strategies.
 
 examples:
   vaneloop strategies --report strategies.html
@@ -57,10 +58,14 @@ _OPTIONS = {  # name -> default, low, high, unit, meaning
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the engine test's)")
+    parser.add_argument(
+        "--profile", metavar="F.toml", default="engine_test.toml", help="speed demand (default: the engine test's)"
+    )
     for name, (default, _, _, unit, text) in _OPTIONS.items():
         meta = unit.replace("%", "PCT").upper()
-        parser.add_argument(f"--{name}", type=float, metavar=meta, default=default, help=f"{text} (default {default:g})")
+        parser.add_argument(
+            f"--{name}", type=float, metavar=meta, default=default, help=f"{text} (default {default:g})"
+        )
     options.add_tables_option(parser)
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
     terminal.add_output_options(parser)
@@ -71,7 +76,9 @@ def _checked(args: argparse.Namespace) -> None:
     for name, (_, low, high, unit, _) in _OPTIONS.items():
         v = getattr(args, name)
         if not low <= v <= high:
-            raise InputError(f"--{name} (={v:g}{'' if unit in ('X', 'SHARE') else ' ' + unit}) must be in [{low:g}, {high:g}]")
+            raise InputError(
+                f"--{name} (={v:g}{'' if unit in ('X', 'SHARE') else ' ' + unit}) must be in [{low:g}, {high:g}]"
+            )
     if args.seed < 0:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
 
@@ -107,14 +114,18 @@ def command(args: argparse.Namespace) -> int:
             all_runs = pool.map(lambda p: run(p[0], n_dem, calibrations[p[1]], args.seed, base=plant), pairs)
             outcomes = {(o.scenario, o.strategy): o for o in counted(all_runs)}
             healthy, dual = (outcomes[last.name, s] for s in ("adaptive", "dual"))
-            again = pool.map(lambda f: failing(f[0], f[1], healthy, dual, last, n_dem, adaptive, args.seed, plant), tried)
+            again = pool.map(
+                lambda f: failing(f[0], f[1], healthy, dual, last, n_dem, adaptive, args.seed, plant), tried
+            )
             failures = list(counted(again))
     best = min(STRATEGIES, key=lambda s: outcomes[last.name, s].figures["vigv"]["mean_abs"] or 0.0)
     goals = judged(rows, outcomes, [f for f, _ in failures], best)
     _print(args, n_dem, outcomes, [f for f, _ in failures], goals)
     for during, words in _MOMENTS.items():
         if not any(f.during == during for f, _ in failures):
-            terminal.say(args, f"note: after its middle the profile never {words}; potentiometers failing then were not tried")
+            terminal.say(
+                args, f"note: after its middle the profile never {words}; potentiometers failing then were not tried"
+            )
     missed = [g for g in goals if not g["held"]]
     for g in missed:
         terminal.say(args, f"missed: {g['goal']}: {g['value']:.3g}, limit {g['limit']:.3g}")
@@ -122,7 +133,8 @@ def command(args: argparse.Namespace) -> int:
         args,
         {
             "schema": 1, "simulated_s": len(n_dem) * 1e-2, "seed": args.seed, "best": best,
-            "rows": [o.to_dict() for o in outcomes.values()], "failures": [asdict(f) for f, _ in failures], "goals": goals,
+            "rows": [o.to_dict() for o in outcomes.values()], "failures": [asdict(f) for f, _ in failures],
+            "goals": goals,
         },
     )  # fmt: skip
     if args.report:
@@ -131,26 +143,41 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, f"page: {page}")
     return 1 if missed else 0
 
+
 _MOMENTS = {"at rest": "rests at 99 % or more for 15 s", "in motion": "moves at more than 3 %/s for 1 s with 10 s left"}
 
 
-def _print(args: argparse.Namespace, n_dem: Array, outcomes: Outcomes, failures: list[Failure], goals: list[dict[str, Any]]) -> None:
+def _print(
+    args: argparse.Namespace, n_dem: Array, outcomes: Outcomes, failures: list[Failure], goals: list[dict[str, Any]]
+) -> None:
     rows: list[list[str]] = []
     for (scenario, strategy), o in outcomes.items():
         angles = [" ".join("-" if (v := o.figures[s][k]) is None else f"{v:.3f}" for k in FIGURES) for s in STAGES]
         first = scenario if strategy == STRATEGIES[0] else ""
         rows.append([first, strategy, *angles, f"{o.travel:,.0f}", f"{o.reversals:,}", f"{o.current:.2f}"])
-    title = f"{len(n_dem) * 1e-2:,.0f} s under each strategy; error of the true angles, deg: mean, max, mean at 99 to 100 % speed"
-    terminal.print_table(args, title, ["machine", "strategy", *STAGES, "travel mm", "reversals", "current mA rms"], rows)
+    title = (
+        f"{len(n_dem) * 1e-2:,.0f} s under each strategy; error of the true angles, deg: mean, max, mean at 99 to "
+        f"100 % speed"
+    )
+    terminal.print_table(
+        args, title, ["machine", "strategy", *STAGES, "travel mm", "reversals", "current mA rms"], rows
+    )
     if failures:
         when = {f.during: f.at for f in failures}
         text = [
-            [f.during if i == 0 or failures[i - 1].during != f.during else "", f.failure, f"{f.step:.3f}", f"{f.departure:.3f}",
+            [f.during if i == 0 or failures[i - 1].during != f.during else "", f.failure, f"{f.step:.3f}",
+            f"{f.departure:.3f}",
              f"{f.crossings}", f"{f.mean_abs:.3f}", f"{f.mean_abs_dual:.3f}"]
             for i, f in enumerate(failures)
         ]  # fmt: skip
-        title = "adaptive, all together, all potentiometers failing " + " or ".join(f"{d} at {at:,.1f} s" for d, at in when.items())
+        title = "adaptive, all together, all potentiometers failing " + " or ".join(
+            f"{d} at {at:,.1f} s" for d, at in when.items()
+        )
         columns = ["", "failure", "within 1 s deg", "in 10 s deg", "crossings", "mean VIGV error since", "of dual"]
         terminal.print_table(args, title, columns, text)
     held = sum(g["held"] for g in goals)
-    terminal.say(args, f"goals held: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least {goals[0]['limit']:g})")
+    terminal.say(
+        args,
+        f"goals held: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least "
+        f"{goals[0]['limit']:g})",
+    )

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FITS", "ClearanceStudy", "clearance_study"]
 
-# mm. Chosen: running fits as new (H8/f7 on 10 to 18 mm: 0.016 to 0.061 mm) at the pivots, as much in each spherical joint, two of
-# which hold the actuator; a close fit at the lever arms' ends. What these leave of the hysteresis is the ring's own freedom.
+# mm. Chosen: running fits as new (H8/f7 on 10 to 18 mm: 0.016 to 0.061 mm) at the pivots, as much in each spherical
+# joint, two of which hold the actuator; a close fit at the lever arms' ends. What these leave of the hysteresis is the
+# ring's own freedom.
 FITS = {"actuator": 0.10, "crank_pivot": 0.04, "crank_link": 0.05, "link_clevis": 0.05, "lever_pin": 0.03}
 WORDS = {
     "actuator": "actuator, both ends",
@@ -36,7 +37,8 @@ class ClearanceStudy:
     per_mm      width for 1 mm of clearance of each joint
     alone       clearance that each joint would need if it made the whole width by itself (None: more than 5 mm)
     freedoms    change of the vane angle for 1 mm of each of the ring's four freedoms, largest over the stroke
-    stroke, extension, retraction   the loop in space; play: half the width of a play operator at the ring, seen at the vane
+    stroke, extension, retraction   the loop in space; play: half the width of a play operator at the ring, seen at the
+                                    vane
     around, width_around            width over the vane's place on the ring, deg from the right clevis
     """
 
@@ -59,7 +61,8 @@ class ClearanceStudy:
 def clearance_study(
     geometry: Geometry, stage: str, width: float, fits: Clearances, vane: float = -90.0, ring: float | None = None
 ) -> ClearanceStudy:
-    """Find the ring's clearance that, beside ``fits``, gives the stage's ``width`` (deg) at the vane; ``ring`` (mm) takes it as given.
+    """Find the ring's clearance that, beside ``fits``, gives the stage's ``width`` (deg) at the vane; ``ring`` (mm)
+    takes it as given.
 
     vane  deg along the ring from the right clevis to the measured vane; -90 is the lowest
     Raises InputError where the fits alone are wider than the width, or no clearance reaches it.
@@ -105,20 +108,16 @@ def clearance_study(
     )
 
 
-
-
-
-
-
-
 def study_rows(studies: list[ClearanceStudy]) -> list[list[str]]:
     """Per joint and stage: clearance, width, and the clearance that alone would make the whole width."""
     return [
-        [WORDS[j], *(t for s in studies for t in (f"{getattr(s.clearances, j):.3f}", f"{s.parts[j]:.3f}", _or(s.alone[j])))] for j in WORDS
+        [
+            WORDS[j],
+            *(t for s in studies for t in (f"{getattr(s.clearances, j):.3f}", f"{s.parts[j]:.3f}", _or(s.alone[j]))),
+        ]
+        for j in WORDS
     ]
 
 
 def _or(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
-
-

@@ -1,7 +1,8 @@
-"""One stage of the mechanism as a 3-D multibody system in Exudyn: the check that the planar model's source makes with ADAMS.
+"""One stage of the mechanism as a 3-D multibody system in Exudyn: the check that the planar model's source makes with
+ADAMS.
 
-Four rigid bodies (bell crank, vertical link, unison ring with its clevis, lever arm with its vane) and ground. Joints as in the paper's
-Table 3, and the lever that gives the axial motion of equation (17):
+Four rigid bodies (bell crank, vertical link, unison ring with its clevis, lever arm with its vane) and ground. Joints
+as in the paper's Table 3, and the lever that gives the axial motion of equation (17):
 
     crank - ground   revolute about the crank's pivot
     crank - link     spherical             link - clevis   spherical
@@ -9,8 +10,9 @@ Table 3, and the lever that gives the axial motion of equation (17):
     lever - ground   revolute about the vane's stem, which points to the engine's axis
     lever - ring     the lever's end slides radially in the ring: square to it, it is held
 
-The actuator is a given distance between its mount and the crank's upper arm. No formula of the planar model is used: lengths only.
-Exudyn (J. Gerstmayr, Multibody System Dynamics 60 (2024) 447-477) is an optional dependency: ``pip install 'vaneloop[multibody]'``.
+The actuator is a given distance between its mount and the crank's upper arm. No formula of the planar model is used:
+lengths only. Exudyn (J. Gerstmayr, Multibody System Dynamics 60 (2024) 447-477) is an optional dependency: ``pip
+install 'vaneloop[multibody]'``.
 """
 
 from __future__ import annotations
@@ -41,7 +43,13 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
     """
     try:
         import exudyn as exu
-        from exudyn.itemInterface import CoordinateConstraint, MarkerBodyRigid, MarkerNodeCoordinate, NodePointGround, SphericalJoint
+        from exudyn.itemInterface import (
+            CoordinateConstraint,
+            MarkerBodyRigid,
+            MarkerNodeCoordinate,
+            NodePointGround,
+            SphericalJoint,
+        )
         from exudyn.utilities import InertiaCuboid
     except ImportError:
         raise InputError("the multibody check needs the package exudyn: pip install 'vaneloop[multibody]'") from None
@@ -53,7 +61,11 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
     turn = cmath.exp(-1j * arms)
     j2 = complex(c.x1.value, c.y1.value) * MM
     j5 = j2 + complex(dx, dy)
-    upper, lower, clevis = -1j * le, -1j * lb * turn, -1j * ld * turn  # seen from pivot and centre, upper arm upright, ring at rest
+    upper, lower, clevis = (
+        -1j * le,
+        -1j * lb * turn,
+        -1j * ld * turn,
+    )  # seen from pivot and centre, upper arm upright, ring at rest
     z = offset * MM
 
     def at(p: complex, height: float = 0.0) -> list[float]:
@@ -75,7 +87,9 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
     across = np.cross([0.0, 0.0, 1.0], along)
     across /= np.linalg.norm(across)
     frame = np.column_stack([across, np.cross(along, across), along])
-    link = mbs.CreateRigidBody(inertia=block, referencePosition=0.5 * (a + b), referenceRotationMatrix=frame, nodeType=turning)
+    link = mbs.CreateRigidBody(
+        inertia=block, referencePosition=0.5 * (a + b), referenceRotationMatrix=frame, nodeType=turning
+    )
     spin = mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=mbs.GetObject(link)["nodeNumber"], coordinate=5))
     held = mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=mbs.AddNode(NodePointGround()), coordinate=0))
     mbs.AddObject(CoordinateConstraint(markerNumbers=[held, spin]))  # the link's idle rotation about itself
@@ -89,10 +103,15 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
     stem = at(j5 + ldp * outward, lever)
     arm = mbs.CreateRigidBody(inertia=block, referencePosition=stem, nodeType=turning)
     axis = np.column_stack([at(tangent), [0.0, 0.0, 1.0], at(outward)])  # third column: the stem
-    mbs.CreateGenericJoint(itemNumbers=[ground, arm], position=stem, rotationMatrixAxes=axis, constrainedAxes=[1, 1, 1, 1, 1, 0])
+    mbs.CreateGenericJoint(
+        itemNumbers=[ground, arm], position=stem, rotationMatrixAxes=axis, constrainedAxes=[1, 1, 1, 1, 1, 0]
+    )
     slot = np.column_stack([at(outward), at(tangent), [0.0, 0.0, 1.0]])  # first column: free to slide
     mbs.CreateGenericJoint(
-        itemNumbers=[ring, arm], position=at(j5 + ldp * outward), rotationMatrixAxes=slot, constrainedAxes=[0, 1, 1, 0, 0, 0]
+        itemNumbers=[ring, arm],
+        position=at(j5 + ldp * outward),
+        rotationMatrixAxes=slot,
+        constrainedAxes=[0, 1, 1, 0, 0, 0],
     )
     first = abs(j2 + upper)
     actuator = mbs.CreateDistanceConstraint(itemNumbers=[ground, crank], localPosition1=at(upper), distance=first)
@@ -115,7 +134,9 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
         except exu.SolverError:
             solved = False
         if not solved:
-            raise InputError(f"{stage}: the multibody system does not close at stroke {(length - c.lx0.value * MM) / MM:.4g} mm")
+            raise InputError(
+                f"{stage}: the multibody system does not close at stroke {(length - c.lx0.value * MM) / MM:.4g} mm"
+            )
         end = mbs.GetObjectOutputBody(arm, exu.OutputVariableType.Position, localPosition=[0.0, 0.0, -lever])
         sideways = (end[0] - stem[0]) * tangent.real + (end[1] - stem[1]) * tangent.imag
         return math.degrees(math.atan2(sideways, stem[2] - end[2]))

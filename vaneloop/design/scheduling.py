@@ -1,14 +1,18 @@
-"""The stepwise scheduling method: mechanism -> VIGV strokes -> links of VGV1 and VGV2 -> measured loop -> two curves -> tables.
+"""The stepwise scheduling method: mechanism -> VIGV strokes -> links of VGV1 and VGV2 -> measured loop -> two curves ->
+tables.
 
-Source: Kim & Ki, Appl. Sci. 2020, 10, 6643, sections 4 and 5, figures 7 to 13. Pure functions: inputs in, a dataclass out; the command
-line is `vaneloop.cli.schedule`, the page `vaneloop.pages.schedule`. Lengths in mm and angles in deg, as at every border; rotor speed in per cent.
+Source: Kim & Ki, Appl. Sci. 2020, 10, 6643, sections 4 and 5, figures 7 to 13. Pure functions: inputs in, a dataclass
+out; the command line is `vaneloop.cli.schedule`, the page `vaneloop.pages.schedule`. Lengths in mm and angles in deg,
+as at every border; rotor speed in per cent.
 
     schedule(geometry, schedules, log=...) -> ScheduleResult       everything below in one call
     measure_loop(stroke, angle, geometry, stage) -> MeasuredLoop    one stage's loop split into its two curves
     adjust_links(geometry, schedules, ...) -> list[LinkChange]      Lb and Lc that best meet the schedules
     stroke_tables(geometry, schedules) -> float64[4, n]             the controller's tables from the model's play
-    vane_angle_table(geometry) -> float64[4, n]                     what the strategies inverse and adaptive know of the linkage
-    write_tables(result, folder)                                    stroke_tables.toml, vane_angles.toml, geometry.toml, schedules.toml
+    vane_angle_table(geometry) -> float64[4, n]                     what the strategies inverse and adaptive know of the
+                                                                    linkage
+    write_tables(result, folder)                                    stroke_tables.toml, vane_angles.toml, geometry.toml,
+                                                                    schedules.toml
 """
 
 from __future__ import annotations
@@ -89,7 +93,8 @@ class ScheduleOptions:
     lc_range   mm, largest change of a vertical link
     adjust     the lengths that may change, out of lb and lc
     criterion  rms or max of the error over the working speeds (40 to 102 %), or design: error at 100 % plus rms
-    limit      deg, largest error of VGV1 and VGV2 at a working speed; a schedule that no length brings below it is refused
+    limit      deg, largest error of VGV1 and VGV2 at a working speed; a schedule that no length brings below it is
+               refused
     """
 
     step: float = 0.5
@@ -117,7 +122,10 @@ class ScheduleOptions:
                 raise InputError(f"--adjust: {name!r} is not a length that can be adjusted; allowed: lb, lc, none")
         pairs = (2 * int(self.lb_range / self.step) + 1) * (2 * int(self.lc_range / self.step) + 1)
         if pairs > MAX_CANDIDATES:
-            raise InputError(f"--step (={self.step:g} mm) is too fine for the ranges: {pairs:,} pairs of lengths; limit {MAX_CANDIDATES:,}")
+            raise InputError(
+                f"--step (={self.step:g} mm) is too fine for the ranges: {pairs:,} pairs of lengths; limit "
+                f"{MAX_CANDIDATES:,}"
+            )
 
 
 @dataclass(frozen=True)
@@ -127,10 +135,12 @@ class MeasuredLoop:
     width             total width of the loop at the vane at mid-stroke (as `hysteresis` in geometry.toml)
     width_sigma       its standard error
     offset            measured mean curve minus the geometry's, mean over the stroke covered
-    lb, lc            lengths with which the model has the measured mean curve (equivalent, not necessarily what a gauge would read)
+    lb, lc            lengths with which the model has the measured mean curve (equivalent, not necessarily what a gauge
+                      would read)
     misfit            rms of what the model with lb, lc leaves of the measured mean curve
     noise             rms scatter of the angle about its branch
-    drift             span of the slow drift of the angle that was taken off; None where the log has fewer than two loops
+    drift             span of the slow drift of the angle that was taken off; None where the log has fewer than two
+                      loops
     lag               s by which the angle lags the stroke
     extension_covered, retraction_covered   strokes (low, high) that each branch was measured over
     stroke            grid for the curves; extension, retraction, mean: angles on it
@@ -163,11 +173,13 @@ class MeasuredLoop:
 
 @dataclass(frozen=True)
 class LinkChange:
-    """Lengths of one stage and how well they meet its schedule. mm, deg; errors are target minus angle, over ``speed`` of the result.
+    """Lengths of one stage and how well they meet its schedule. mm, deg; errors are target minus angle, over ``speed``
+    of the result.
 
     lb_built, lc_built       as in the geometry table (lb as first built: lb_initial)
     lb, lc                   after the adjustment
-    error_initial            with lb_initial; error_built: as the machine is (measured where there is a log); error: adjusted
+    error_initial            with lb_initial; error_built: as the machine is (measured where there is a log); error:
+                             adjusted
     error_extension, error_retraction  adjusted, with the play and both stroke tables: what remains in either direction
     """
 
@@ -216,7 +228,9 @@ class ScheduleResult:
 
 
 def table_speeds(schedules: Schedules) -> Array:
-    """Speeds (%) of the stroke tables: every per cent from where the VIGV's schedule begins to rise to its end, and its breakpoints."""
+    """Speeds (%) of the stroke tables: every per cent from where the VIGV's schedule begins to rise to its end, and its
+    breakpoints.
+    """
     n, angles = schedules.arrays()
     rises = np.flatnonzero(np.diff(angles[:, 0]) > 0.0)
     start, end = float(n[rises[0]]), float(n[-1])
@@ -228,8 +242,9 @@ def table_speeds(schedules: Schedules) -> Array:
 def stroke_tables(geometry: Geometry, schedules: Schedules, speed: Array | None = None) -> Array:
     """Return float64[4, n]: speed (%), strokes (mm) for extension, retraction and the single mean curve.
 
-    While the stroke extends, the VIGV lags behind by half the hysteresis: the stroke that gives the target then is the stroke of
-    (target + half), and of (target - half) while it retracts. Raises InputError, naming the speed, where no stroke gives the angle.
+    While the stroke extends, the VIGV lags behind by half the hysteresis: the stroke that gives the target then is the
+    stroke of (target + half), and of (target - half) while it retracts. Raises InputError, naming the speed, where no
+    stroke gives the angle.
     """
     n = table_speeds(schedules) if speed is None else speed
     target = schedules.targets(n)[:, 0]
@@ -251,21 +266,27 @@ def _refuse_outside(speed: Array, target: Array, low: float, high: float) -> Non
     if outside.size:
         i = outside[int(np.argmax(np.maximum(low - target[outside], target[outside] - high)))]
         raise InputError(
-            f"vigv: no stroke meets the schedule at {speed[i]:g} % speed: target angle (={target[i]:.4g} deg) must be in "
-            f"[{low:.4g}, {high:.4g}], what {STROKE_LIMITS[0]:g} to {STROKE_LIMITS[1]:g} mm of stroke give"
+            f"vigv: no stroke meets the schedule at {speed[i]:g} % speed: target angle (={target[i]:.4g} deg) must be "
+            f"in [{low:.4g}, {high:.4g}], what {STROKE_LIMITS[0]:g} to {STROKE_LIMITS[1]:g} mm of stroke give"
         )
 
 
 def write_stroke_tables(table: Array, path: str | Path, origin: str) -> None:
     """Write ``stroke_tables.toml`` as the controller loads it; ``table`` as from `stroke_tables`."""
-    lines = ["# Stroke against rotor speed for the VIGV schedule: one curve per direction of the demand, and their mean.", ""]
-    for name, unit, row in zip(("speed", "extension", "retraction", "single"), ("%", "mm", "mm", "mm"), table, strict=True):
+    lines = [
+        "# Stroke against rotor speed for the VIGV schedule: one curve per direction of the demand, and their mean.",
+        "",
+    ]
+    for name, unit, row in zip(
+        ("speed", "extension", "retraction", "single"), ("%", "mm", "mm", "mm"), table, strict=True
+    ):
         lines += _axis(name, unit, origin, row)
     _write(path, "\n".join(lines))
 
 
 def vane_angle_table(geometry: Geometry, stroke: Array | None = None) -> Array:
-    """Return float64[4, n]: stroke (mm; default 0 to 48 in steps of 1) and the angles (deg) of VIGV, VGV1, VGV2 in the middle of the play.
+    """Return float64[4, n]: stroke (mm; default 0 to 48 in steps of 1) and the angles (deg) of VIGV, VGV1, VGV2 in the
+    middle of the play.
 
     Between the strokes a straight line is off by at most 0.002 deg.
     """
@@ -274,8 +295,14 @@ def vane_angle_table(geometry: Geometry, stroke: Array | None = None) -> Array:
 
 
 def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin: str) -> None:
-    """Write ``vane_angles.toml`` as the controller loads it: ``table`` as from `vane_angle_table`, the plays of ``geometry``."""
-    lines = ["# Vane angles against stroke in the middle of the play, and the play: what the strategies inverse and adaptive know.", ""]
+    """Write ``vane_angles.toml`` as the controller loads it: ``table`` as from `vane_angle_table`, the plays of
+    ``geometry``.
+    """
+    lines = [
+        "# Vane angles against stroke in the middle of the play, and the play: what the strategies inverse and "
+        "adaptive know.",
+        "",
+    ]
     for stage in STAGES:
         q = getattr(geometry, stage).hysteresis
         lines.append(f'play_{stage} = {{ value = {q.value!r}, unit = "deg", origin = {_quoted(q.origin)} }}')
@@ -288,7 +315,10 @@ def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin
 def _axis(name: str, unit: str, origin: str, row: Array) -> list[str]:
     """Lines of a list of numbers, ten a line."""
     lines = [f"[{name}]", f'unit = "{unit}"', f"origin = {_quoted(origin)}", "values = ["]
-    lines += ["  " + ", ".join(f"{v:.4f}".rstrip("0").rstrip(".") for v in row[i : i + 10]) + "," for i in range(0, len(row), 10)]
+    lines += [
+        "  " + ", ".join(f"{v:.4f}".rstrip("0").rstrip(".") for v in row[i : i + 10]) + ","
+        for i in range(0, len(row), 10)
+    ]
     return [*lines, "]", ""]
 
 
@@ -297,10 +327,12 @@ def _axis(name: str, unit: str, origin: str, row: Array) -> list[str]:
 
 @njit(cache=True)
 def _branches(x, width, tolerance):
-    """Branch of each sample of the stroke x: 1 where a play of ``width`` is surely driven in extension, -1 in retraction, 0 else.
+    """Branch of each sample of the stroke x: 1 where a play of ``width`` is surely driven in extension, -1 in
+    retraction, 0 else.
 
-    Two plays of that width start at either end of their gap; where both say the same the unknown start is forgotten. A play of a wider gap
-    is in contact only where every narrower one is (nested contact sets), so a width above the machine's own gives no wrong sample.
+    Two plays of that width start at either end of their gap; where both say the same the unknown start is forgotten. A
+    play of a wider gap is in contact only where every narrower one is (nested contact sets), so a width above the
+    machine's own gives no wrong sample.
     """
     half = 0.5 * width
     a, b = x[0] - half, x[0] + half
@@ -330,11 +362,14 @@ def measure_loop(
     geometry        the mechanism as built; what the measurement does not cover follows it
     lag             s, expected lag of the angle behind the stroke (potentiometer minus LVDT) and its standard deviation
 
-    1. Samples are told apart by a play operator on the stroke, wider than the machine's gap: only what surely lies on a branch counts.
-       Dither inside the gap, partial reversals and the way across the gap are left out. The width is found by iteration.
+    1. Samples are told apart by a play operator on the stroke, wider than the machine's gap: only what surely lies on a
+       branch counts. Dither inside the gap, partial reversals and the way across the gap are left out. The width is
+       found by iteration.
     2. In the angle of the ring, where play has one width, one robust least-squares fit takes all samples at once:
-       y = model(x) + c(x) -+ h(x)/2 + drift(t) - lag dy/dt; c, h piecewise linear and smooth, drift only where loops repeat.
-    3. The equivalent Lb and Lc are those with which the model has the measured mean curve; what they leave stays in the curves.
+       y = model(x) + c(x) -+ h(x)/2 + drift(t) - lag dy/dt; c, h piecewise linear and smooth, drift only where loops
+       repeat.
+    3. The equivalent Lb and Lc are those with which the model has the measured mean curve; what they leave stays in the
+       curves.
 
     Raises LogError: no motion, one branch only, a stage that moves the wrong way, too few samples.
     """
@@ -343,8 +378,8 @@ def measure_loop(
     travel = float(np.ptp(np.quantile(x, [0.001, 0.999])))
     if travel < LEAST_MOTION:
         raise LogError(
-            f"{source}: x_lvdt moves only {travel:.3g} mm ({x.min():.4g} to {x.max():.4g} mm): no motion to see a loop in; "
-            f"at least {LEAST_MOTION:g} mm is needed"
+            f"{source}: x_lvdt moves only {travel:.3g} mm ({x.min():.4g} to {x.max():.4g} mm): no motion to see a loop "
+            f"in; at least {LEAST_MOTION:g} mm is needed"
         )
     g = geometry.arrays()
     o = N_CRANK + k * N_PER_STAGE
@@ -357,7 +392,9 @@ def measure_loop(
     outside = (x < grid[0]) | (x > grid[-1])
     if outside.mean() > 0.02:
         worst = x[outside][int(np.argmax(np.abs(x[outside] - 24.0)))]
-        raise LogError(f"{source}: x_lvdt (={worst:.4g} mm) must be in [{grid[0]:g}, {grid[-1]:g}] mm; is its unit right?")
+        raise LogError(
+            f"{source}: x_lvdt (={worst:.4g} mm) must be in [{grid[0]:g}, {grid[-1]:g}] mm; is its unit right?"
+        )
     _right_way(x, y, grid, np.rad2deg(vane_angles(grid * 1e-3, g)[:, k]), stage, source)
 
     tolerance = min(max(5.0 * _raster_noise(x), 0.02), 0.2)
@@ -381,7 +418,9 @@ def measure_loop(
     width = float(np.mean(gap[inside]))
     notes = []
     if fit.drift is None:
-        notes.append("fewer than two loops there and back: a drift of the angle could not be told from the loop's width")
+        notes.append(
+            "fewer than two loops there and back: a drift of the angle could not be told from the loop's width"
+        )
     reach = min(fit.covered[1][1], fit.covered[-1][1]), max(fit.covered[1][0], fit.covered[-1][0])
     if covered[0] > STROKE_LIMITS[0] + 3.0 or covered[1] < STROKE_LIMITS[1] - 4.0:
         notes.append(
@@ -424,16 +463,19 @@ def _aligned(stroke: Channel, angle: Channel, stage: str, source: str) -> tuple[
     i = np.clip(np.searchsorted(stroke.t, angle.t, side="right"), 1, len(stroke.t) - 1)
     good = (angle.t >= stroke.t[0]) & (angle.t <= stroke.t[-1]) & (stroke.t[i] - stroke.t[i - 1] <= gap)
     if good.sum() < 20:
-        raise LogError(f"{source}: {stage} and x_lvdt have {int(good.sum())} samples at the same time; a loop needs at least 20")
+        raise LogError(
+            f"{source}: {stage} and x_lvdt have {int(good.sum())} samples at the same time; a loop needs at least 20"
+        )
     t = angle.t[good]
     return t, np.interp(t, stroke.t, x_all), angle.values[good]
 
 
 def _without_spikes(x: Array) -> Array:
-    """The stroke without leaps of one to three samples, which no actuator makes: they would reset the play that tells branches apart.
+    """The stroke without leaps of one to three samples, which no actuator makes: they would reset the play that tells
+    branches apart.
 
-    A leap is 0.3 mm and more than a usual step off the median of the seven samples around it and off both lines, through the two samples
-    before and the two after it; the corner of a ramp lies on one of them.
+    A leap is 0.3 mm and more than a usual step off the median of the seven samples around it and off both lines,
+    through the two samples before and the two after it; the corner of a ramp lies on one of them.
     """
     from scipy.ndimage import median_filter
 
@@ -453,15 +495,21 @@ def _without_spikes(x: Array) -> Array:
 
 
 def _raster_noise(x: Array) -> float:
-    """Rms of what changes from sample to sample: third differences, by their median (a dither of some samples a period hardly counts)."""
+    """Rms of what changes from sample to sample: third differences, by their median (a dither of some samples a period
+    hardly counts).
+    """
     d = np.diff(x, 3)
     return float(np.median(np.abs(d))) / (0.6745 * math.sqrt(20.0)) if d.size else 0.0
 
 
 def _right_way(x: Array, y: Array, grid: Array, model: Array, stage: str, source: str) -> None:
-    """Refuse a stage whose angle does not follow the stroke roughly as the mechanism says: a wrong sign, channel or unit."""
+    """Refuse a stage whose angle does not follow the stroke roughly as the mechanism says: a wrong sign, channel or
+    unit.
+    """
     if np.ptp(y) == 0.0:
-        raise LogError(f"{source}: {stage} stays at {y[0]:.4g} deg while x_lvdt moves from {x.min():.4g} to {x.max():.4g} mm")
+        raise LogError(
+            f"{source}: {stage} stays at {y[0]:.4g} deg while x_lvdt moves from {x.min():.4g} to {x.max():.4g} mm"
+        )
     edges = np.linspace(x.min(), x.max(), 25)
     bins = np.clip(np.digitize(x, edges) - 1, 0, 23)
     used = np.unique(bins)
@@ -473,8 +521,8 @@ def _right_way(x: Array, y: Array, grid: Array, model: Array, stage: str, source
     expected = float(np.polyfit(xm, np.interp(xm, grid, model), 1)[0])
     if not 0.4 <= measured / expected <= 2.5:
         raise LogError(
-            f"{source}: {stage} changes by {measured:.3g} deg/mm of stroke between {x.min():.4g} and {x.max():.4g} mm, the geometry gives "
-            f"{expected:.3g}; allowed: 0.4 to 2.5 times that (sign, unit or name of a channel?)"
+            f"{source}: {stage} changes by {measured:.3g} deg/mm of stroke between {x.min():.4g} and {x.max():.4g} mm, "
+            f"the geometry gives {expected:.3g}; allowed: 0.4 to 2.5 times that (sign, unit or name of a channel?)"
         )
 
 
@@ -513,7 +561,16 @@ class _Fit:
 
 
 def _fit_with_width(
-    t: Array, x: Array, r: Array, s: Array, v: Array, travel: float, tolerance: float, lag: tuple[float, float], stage: str, source: str
+    t: Array,
+    x: Array,
+    r: Array,
+    s: Array,
+    v: Array,
+    travel: float,
+    tolerance: float,
+    lag: tuple[float, float],
+    stage: str,
+    source: str,
 ) -> _Fit:
     """Find the play width that tells the samples apart: wide first, then 1.25 times the gap that the fit shows."""
     width = 0.0
@@ -562,9 +619,10 @@ def _one_branch(x: Array, missing: str, width: float, stage: str, source: str) -
         )
     other, had, got = ("retraction", rise, fall) if missing == "retraction" else ("extension", fall, rise)
     return LogError(
-        f"{source}: {stage}: the loop has one branch only, {missing} is missing: x_lvdt from {x.min():.4g} to {x.max():.4g} mm moves "
-        f"{'back' if other == 'retraction' else 'forward'} by {got:.3g} mm at most ({had:.3g} mm the other way); "
-        f"more than {max(width, LEAST_OVERLAP) + LEAST_OVERLAP:.3g} mm is needed to cross the gap and measure"
+        f"{source}: {stage}: the loop has one branch only, {missing} is missing: x_lvdt from {x.min():.4g} to "
+        f"{x.max():.4g} mm moves {'back' if other == 'retraction' else 'forward'} by {got:.3g} mm at most ({had:.3g} "
+        f"mm the other way); more than {max(width, LEAST_OVERLAP) + LEAST_OVERLAP:.3g} mm is needed to cross the gap "
+        "and measure"
     )
 
 
@@ -589,7 +647,9 @@ def _fit(t: Array, x: Array, r: Array, s: Array, v: Array, branch: NDArray[np.in
         size = -(-on.size // MAX_SAMPLES)
         n = on.size // size * size
         group = [a[:n].reshape(-1, size) for a in (ton, xon, ron, son, von, d)]
-        same = (np.abs(group[5].mean(axis=1)) == 1.0) & (np.ptp(group[0], axis=1) < 5.0 * size * float(np.median(np.diff(ton))))
+        same = (np.abs(group[5].mean(axis=1)) == 1.0) & (
+            np.ptp(group[0], axis=1) < 5.0 * size * float(np.median(np.diff(ton)))
+        )
         ton, xon, son, von, d = (a[same].mean(axis=1) for a in (*group[:2], *group[3:]))
         ron = np.median(group[2][same], axis=1)
     covered = {side: (float(xon[d == side].min()), float(xon[d == side].max())) for side in (1, -1)}
@@ -644,7 +704,9 @@ def _fit(t: Array, x: Array, r: Array, s: Array, v: Array, branch: NDArray[np.in
 
 
 def _loop_times(t: Array, x: Array, branch: NDArray[np.int8]) -> Array:
-    """Times at which the loops begin, and the end: passes along a branch over a third of the log's stroke, two a loop; 16 at most."""
+    """Times at which the loops begin, and the end: passes along a branch over a third of the log's stroke, two a loop;
+    16 at most.
+    """
     need = np.ptp(x) / 3.0
     edges = np.concatenate([[0], np.flatnonzero(np.diff(branch)) + 1, [branch.size]])
     starts = [t[a] for a, b in zip(edges[:-1], edges[1:], strict=True) if np.ptp(x[a:b]) >= need]
@@ -655,7 +717,9 @@ def _loop_times(t: Array, x: Array, branch: NDArray[np.int8]) -> Array:
 
 
 def _equivalent(geometry: Geometry, k: int, stroke: Array, ring: Array, scale: float) -> tuple[float, float]:
-    """Lb and Lc, mm, of stage k with which the model's ring has the measured mean curve; a short stroke moves Lb little (weak prior)."""
+    """Lb and Lc, mm, of stage k with which the model's ring has the measured mean curve; a short stroke moves Lb little
+    (weak prior).
+    """
     stage = geometry.stages()[k]
     g = geometry.arrays()
     o = N_CRANK + k * N_PER_STAGE
@@ -683,14 +747,18 @@ def _rising(y: Array) -> Array:
 def geometry_with(
     geometry: Geometry, changes: dict[str, dict[str, float]], origins: dict[str, str] | None = None, check: bool = True
 ) -> Geometry:
-    """A geometry with other lengths (mm) or hysteresis (deg) of some stages: {"vgv1": {"lb": 49.0}}. Refuses what does not assemble."""
+    """A geometry with other lengths (mm) or hysteresis (deg) of some stages: {"vgv1": {"lb": 49.0}}. Refuses what does
+    not assemble.
+    """
     stages: dict[str, Stage] = {}
     for name in STAGES:
         stage: Stage = getattr(geometry, name)
         update = {}
         for key, value in changes.get(name, {}).items():
             q = getattr(stage, key)
-            update[key] = q.model_copy(update={"value": float(value), "origin": (origins or {}).get(f"{name}.{key}", q.origin)})
+            update[key] = q.model_copy(
+                update={"value": float(value), "origin": (origins or {}).get(f"{name}.{key}", q.origin)}
+            )
         stages[name] = stage.model_copy(update=update)
     changed = geometry.model_copy(update=stages)
     if check:
@@ -710,7 +778,8 @@ def adjust_links(
     """Changes (mm) of Lb and Lc of one stage that best meet its schedule at the strokes (mm) scheduled for the VIGV.
 
     correction  deg over stroke (mm): measured mean curve minus the geometry's
-    Returns the two changes and the remaining error (deg) at each speed. Raises InputError where no lengths meet the schedule.
+    Returns the two changes and the remaining error (deg) at each speed. Raises InputError where no lengths meet the
+    schedule.
     """
     k = STAGES.index(stage)
     built: Stage = getattr(geometry, stage)
@@ -743,7 +812,9 @@ def adjust_links(
             break
         change = float(grids[0][i]), float(grids[1][j])
         try:
-            changed = geometry_with(geometry, {stage: {"lb": built.lb.value + change[0], "lc": built.lc.value + change[1]}})
+            changed = geometry_with(
+                geometry, {stage: {"lb": built.lb.value + change[0], "lc": built.lc.value + change[1]}}
+            )
         except InputError as e:
             fault = fault or e
             continue
@@ -753,8 +824,9 @@ def adjust_links(
             reach_lb = f"lb (={built.lb.value:g} mm) within {abs(grids[0]).max():g} mm"
             reach_lc = f"lc (={built.lc.value:g} mm) within {abs(grids[1]).max():g} mm"
             raise InputError(
-                f"{stage}: no length meets the schedule at {speed[worst]:g} % speed (stroke {stroke[worst]:.4g} mm): with {reach_lb} and "
-                f"{reach_lc} an error of {error[worst]:.3g} deg remains; allowed: {options.limit:g} deg (--limit, --lb-range, --lc-range)"
+                f"{stage}: no length meets the schedule at {speed[worst]:g} % speed (stroke {stroke[worst]:.4g} mm): "
+                f"with {reach_lb} and {reach_lc} an error of {error[worst]:.3g} deg remains; allowed: "
+                f"{options.limit:g} deg (--limit, --lb-range, --lc-range)"
             )
         return change[0], change[1], error
     raise fault or InputError(f"{stage}: no pair of lb and lc within the ranges can be assembled")
@@ -781,7 +853,8 @@ def schedule(
     schedules  target angles over rotor speed
     log        stroke and angle of at least the VIGV, measured on the machine as built; None: the geometry's own play
 
-    Raises InputError in one line: a mechanism that cannot be assembled, a schedule that cannot be met, a log without a loop.
+    Raises InputError in one line: a mechanism that cannot be assembled, a schedule that cannot be met, a log without a
+    loop.
     """
     o = options or ScheduleOptions()
     o.check()
@@ -810,10 +883,16 @@ def schedule(
     works = (speed >= WORKING_SPEED[0]) & (speed <= WORKING_SPEED[1])
     if not works.any():
         low, high = WORKING_SPEED
-        raise InputError(f"schedules: vigv rises from {speed[0]:g} to {speed[-1]:g} % speed; it must reach into {low:g} to {high:g} %")
+        raise InputError(
+            f"schedules: vigv rises from {speed[0]:g} to {speed[-1]:g} % speed; it must reach into {low:g} to "
+            f"{high:g} %"
+        )
     if not speed[0] <= DESIGN_SPEED <= speed[-1]:
         nearest = speed[schedules_at_design(speed)]
-        notes.append(f"the schedule's table runs from {speed[0]:g} to {speed[-1]:g} %: figures at 100 % speed are those at {nearest:g} %")
+        notes.append(
+            f"the schedule's table runs from {speed[0]:g} to {speed[-1]:g} %: figures at 100 % speed are those at "
+            f"{nearest:g} %"
+        )
     target = np.rad2deg(schedules.targets(speed))
     design = schedules_at_design(speed)
     table = _tables(geometry, schedules, speed, loops.get("vigv"), notes)
@@ -825,7 +904,9 @@ def schedule(
         built: Stage = getattr(geometry, name)
         loop = loops.get(name)
         correction = _correction(loop, geometry, k)
-        initial = target[:, k] - np.rad2deg(vane_angles(stroke_of_model(geometry, schedules, speed), geometry.arrays(True))[:, k])
+        initial = target[:, k] - np.rad2deg(
+            vane_angles(stroke_of_model(geometry, schedules, speed), geometry.arrays(True))[:, k]
+        )
         as_built = target[:, k] - np.rad2deg(vane_angles(mean_stroke * 1e-3, geometry)[:, k]) - correction(mean_stroke)
         d_lb, d_lc, error = 0.0, 0.0, as_built
         if name != "vigv" and o.adjust:
@@ -836,14 +917,21 @@ def schedule(
         if loop is not None:
             for key, q, value, change in (("lb", built.lb, lb, d_lb), ("lc", built.lc, lc, d_lc)):
                 origins[f"{name}.{key}"] = (
-                    f"measured: {file}, {value:.3f} mm equivalent where the geometry has {q.value:g} mm; adjusted by {change:+g} mm"
+                    f"measured: {file}, {value:.3f} mm equivalent where the geometry has {q.value:g} mm; adjusted by "
+                    f"{change:+g} mm"
                 )
-            origins[f"{name}.hysteresis"] = f"measured: {file}, width of the loop, standard error {loop.width_sigma:.3f} deg"
+            origins[f"{name}.hysteresis"] = (
+                f"measured: {file}, width of the loop, standard error {loop.width_sigma:.3f} deg"
+            )
         else:
             if d_lb:
-                origins[f"{name}.lb"] = f"derived: vaneloop schedule, {built.lb.value:g} mm as built, adjusted by {d_lb:+g} mm"
+                origins[f"{name}.lb"] = (
+                    f"derived: vaneloop schedule, {built.lb.value:g} mm as built, adjusted by {d_lb:+g} mm"
+                )
             if d_lc:
-                origins[f"{name}.lc"] = f"derived: vaneloop schedule, {built.lc.value:g} mm as built, adjusted by {d_lc:+g} mm"
+                origins[f"{name}.lc"] = (
+                    f"derived: vaneloop schedule, {built.lc.value:g} mm as built, adjusted by {d_lc:+g} mm"
+                )
         links.append((name, built, d_lb, d_lc, initial, as_built, error))
     if loops:
         changes = {n: {k: round(v, 4) for k, v in c.items()} for n, c in changes.items()}
@@ -852,13 +940,16 @@ def schedule(
         check_assembly(machine.arrays(initial=True))
     except InputError:  # the arms as first built do not go with the new links
         machine = geometry_with(machine, {n: {"lb_initial": getattr(machine, n).lb.value} for n in STAGES})
-    both = [_branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(STAGES)]
+    both = [
+        _branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(STAGES)
+    ]
     out = []
     for (name, built, d_lb, d_lc, initial, as_built, error), (up, down) in zip(links, both, strict=True):
         columns = {"initial": initial, "built": as_built, "adjusted": error, "extension": up, "retraction": down}
         out.append(
             LinkChange(
-                name, built.lb_initial.value, built.lb.value, built.lc.value, built.lb.value + d_lb, built.lc.value + d_lc,
+                name, built.lb_initial.value, built.lb.value, built.lc.value, built.lb.value + d_lb,
+                built.lc.value + d_lc,
                 initial, as_built, error, up, down,
                 at_design={c: float(e[design]) for c, e in columns.items()},
                 rms={c: float(np.sqrt(np.mean(e[works] ** 2))) for c, e in columns.items()},
@@ -890,7 +981,9 @@ def _correction(loop: MeasuredLoop | None, geometry: Geometry, k: int) -> Callab
     return lambda x: np.interp(x, grid, difference)
 
 
-def _tables(geometry: Geometry, schedules: Schedules, speed: Array, loop: MeasuredLoop | None, notes: list[str]) -> Array:
+def _tables(
+    geometry: Geometry, schedules: Schedules, speed: Array, loop: MeasuredLoop | None, notes: list[str]
+) -> Array:
     """The controller's stroke tables, between the actuator's stops; ``notes`` gains where a stop cuts a branch off."""
     if loop is None:
         table = stroke_tables(geometry, schedules, speed)
@@ -906,8 +999,8 @@ def _tables(geometry: Geometry, schedules: Schedules, speed: Array, loop: Measur
         if beyond.max() > 0.0:
             i = int(np.argmax(beyond))
             notes.append(
-                f"{name}: the stop at {cut[row, i]:g} mm cuts the table off at {int((beyond > 0).sum())} speeds, most at {speed[i]:g} % "
-                f"({beyond[i]:.2f} mm): the gap is not crossed in full there"
+                f"{name}: the stop at {cut[row, i]:g} mm cuts the table off at {int((beyond > 0).sum())} speeds, most "
+                f"at {speed[i]:g} % ({beyond[i]:.2f} mm): the gap is not crossed in full there"
             )
     # the controller wants rising rows, extension above the mean above retraction
     up, down, mean = cut
@@ -918,9 +1011,17 @@ def _tables(geometry: Geometry, schedules: Schedules, speed: Array, loop: Measur
 
 
 def _branch_errors(
-    machine: Geometry, built: Geometry, k: int, table: Array, target: Array, loop: MeasuredLoop | None, change: Sequence[Any]
+    machine: Geometry,
+    built: Geometry,
+    k: int,
+    table: Array,
+    target: Array,
+    loop: MeasuredLoop | None,
+    change: Sequence[Any],
 ) -> tuple[Array, Array]:
-    """Errors (deg) of stage k with the dual tables, in extension and in retraction: target minus the angle on its own branch."""
+    """Errors (deg) of stage k with the dual tables, in extension and in retraction: target minus the angle on its own
+    branch.
+    """
     out = []
     for row, side, name in ((1, -1.0, "extension"), (2, 1.0, "retraction")):
         stroke = table[row]
@@ -931,7 +1032,9 @@ def _branch_errors(
             o = N_CRANK + k * N_PER_STAGE
             ldp, lever = float(g[o + G_LDP]), float(g[o + G_L])
             half = 0.5 * math.radians(getattr(machine, STAGES[k]).hysteresis.value) * lever / ldp
-            angle = np.array([vane_angle(stage_ring_angle(x * 1e-3, g, k) + side * half, ldp, lever) for x in stroke]) * DEG
+            angle = (
+                np.array([vane_angle(stage_ring_angle(x * 1e-3, g, k) + side * half, ldp, lever) for x in stroke]) * DEG
+            )
         out.append(target[:, k] - angle)
     return out[0], out[1]
 
@@ -940,7 +1043,9 @@ def _branch_errors(
 
 
 def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
-    """Write stroke_tables, vane_angles, geometry, schedules (.toml) into ``folder``, made where missing; each number with its origin."""
+    """Write stroke_tables, vane_angles, geometry, schedules (.toml) into ``folder``, made where missing; each number
+    with its origin.
+    """
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -961,7 +1066,9 @@ def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage o
         lines.append(f"[{name}]")
         for key, q in getattr(geometry, name):
             tolerance = f", tolerance = {q.tolerance!r}" if q.tolerance else ""
-            lines.append(f'{key} = {{ value = {q.value!r}, unit = "{q.unit}"{tolerance}, origin = {_quoted(q.origin)} }}')
+            lines.append(
+                f'{key} = {{ value = {q.value!r}, unit = "{q.unit}"{tolerance}, origin = {_quoted(q.origin)} }}'
+            )
         lines.append("")
     _write(path, "\n".join(lines))
 
@@ -970,11 +1077,29 @@ def write_schedules(schedules: Schedules, path: str | Path) -> None:
     """Write schedules as `plant.load_schedules` reads them."""
     lines = ["# Target vane angles over rotor speed.", ""]
     for name, axis in schedules:
-        lines += [f"[{name}]", f'unit = "{axis.unit}"', f"origin = {_quoted(axis.origin)}", f"values = {axis.values!r}", ""]
+        lines += [
+            f"[{name}]",
+            f'unit = "{axis.unit}"',
+            f"origin = {_quoted(axis.origin)}",
+            f"values = {axis.values!r}",
+            "",
+        ]
     _write(path, "\n".join(lines))
 
 
-LOOP_FIGURES = ("width", "width_sigma", "offset", "lb", "lc", "misfit", "noise", "drift", "lag", "extension_covered", "retraction_covered")
+LOOP_FIGURES = (
+    "width",
+    "width_sigma",
+    "offset",
+    "lb",
+    "lc",
+    "misfit",
+    "noise",
+    "drift",
+    "lag",
+    "extension_covered",
+    "retraction_covered",
+)
 
 
 def result_json(result: ScheduleResult) -> dict[str, Any]:
@@ -1002,13 +1127,7 @@ def result_json(result: ScheduleResult) -> dict[str, Any]:
             }
             for k, s in enumerate(result.links)
         ],
-        "loops": {
-            name: {
-                key: getattr(m, key)
-                for key in LOOP_FIGURES
-            }
-            for name, m in result.loops.items()
-        },
+        "loops": {name: {key: getattr(m, key) for key in LOOP_FIGURES} for name, m in result.loops.items()},
         "notes": result.notes,
     }
 

@@ -1,4 +1,5 @@
-"""Design of the servo loop: margins, noise, steps and the limit cycles that play makes, each predicted and held against the simulation.
+"""Design of the servo loop: margins, noise, steps and the limit cycles that play makes, each predicted and held against
+the simulation.
 
 The loop, broken at the stroke (positive current extends)::
 
@@ -6,15 +7,16 @@ The loop, broken at the stroke (positive current extends)::
     u'' + 2 zeta w u' + w^2 u = w^2 i / i_rated,   dx/dt = g sqrt(p_s/p_ref) u       valve, actuator
     x_lvdt' = (x - x_lvdt) / tau                                                     LVDT
 
-    L(s) = (kp + ki/s) w^2 / (i_rated (s^2 + 2 zeta w s + w^2)) g sqrt(p_s/p_ref) / s  1 / (tau s + 1)  exp(-s T (1/2 + d))
+    L(s) = (kp + ki/s) w^2 / (i_rated (s^2 + 2 zeta w s + w^2)) g sqrt(p_s/p_ref) / s  1 / (tau s + 1)  exp(-s T (1/2 +
+                                                                                       d))
 
-Timing: the LVDT is read at the tick and the current of that tick is written at once and held, so a tick costs half a tick of delay; ``d``
-is a computation delay in whole ticks on top of it. The design must stand for d = 0 and d = 1.
+Timing: the LVDT is read at the tick and the current of that tick is written at once and held, so a tick costs half a
+tick of delay; ``d`` is a computation delay in whole ticks on top of it. The design must stand for d = 0 and d = 1.
 
 Units: SI in the code, the border's units (mm, mA, deg, Hz) in every figure of a `DesignResult`, as its names say.
 
-Sources: Merritt, Hydraulic Control Systems (1967), ch. 6 and 7; Seiler, Packard, Gahinet, An Introduction to Disk Margins, IEEE Control
-Systems Magazine 40 (2020); Gelb, Vander Velde, Multiple-Input Describing Functions (1968), ch. 3.
+Sources: Merritt, Hydraulic Control Systems (1967), ch. 6 and 7; Seiler, Packard, Gahinet, An Introduction to Disk
+Margins, IEEE Control Systems Magazine 40 (2020); Gelb, Vander Velde, Multiple-Input Describing Functions (1968), ch. 3.
 """
 
 from __future__ import annotations
@@ -177,7 +179,9 @@ def _s_plant(plant: ServoPlant) -> control.TransferFunction:
 
 
 def continuous_loop(gains: Gains, plant: ServoPlant, order: int = 4) -> control.TransferFunction:
-    """Loop transfer function L(s) with the delay of half a tick and of the computation as a Pade approximation of ``order``."""
+    """Loop transfer function L(s) with the delay of half a tick and of the computation as a Pade approximation of
+    ``order``.
+    """
     import control as ct
 
     pi = ct.tf([gains.kp, gains.ki], [1.0, 0.0]) if gains.ki else ct.tf([gains.kp], [1.0])
@@ -320,10 +324,14 @@ class Corner:
 
 
 def _corners(gains: Gains, plant: ServoPlant) -> list[Corner]:
-    """Margins at every corner: flow 5 %, valve bandwidth and damping 15 %, 19 to 22 MPa, 0 or 1 tick of computation delay."""
+    """Margins at every corner: flow 5 %, valve bandwidth and damping 15 %, 19 to 22 MPa, 0 or 1 tick of computation
+    delay.
+    """
     out = []
     omega = _grid(plant, 500)
-    for flow, band, damp, mpa, delay in itertools.product((0.95, 1.05), (0.85, 1.15), (0.85, 1.15), (19.0, 22.0), (0, 1)):
+    for flow, band, damp, mpa, delay in itertools.product(
+        (0.95, 1.05), (0.85, 1.15), (0.85, 1.15), (19.0, 22.0), (0, 1)
+    ):
         p = replace(
             plant,
             flow_gain=plant.flow_gain * flow,
@@ -389,9 +397,10 @@ def play_describing_function(amplitude: ArrayLike, gap: float) -> Complex:
 def limit_cycles(response: Any, gap: float, low: float, high: float) -> list[LimitCycle]:
     """Every (A, omega) with L(j omega) N(A) = -1 between ``low`` and ``high`` rad/s.
 
-    response: function of omega (array, rad/s) that gives L. The inverse of N has a phase of its own for each amplitude, so for each omega
-    the amplitude that makes the phase right is found first, then the omegas where the magnitude is right too. Only oscillations that hold
-    themselves (a greater amplitude decays) are returned: at a crossing of the other kind the loop leaves it.
+    response: function of omega (array, rad/s) that gives L. The inverse of N has a phase of its own for each amplitude,
+    so for each omega the amplitude that makes the phase right is found first, then the omegas where the magnitude is
+    right too. Only oscillations that hold themselves (a greater amplitude decays) are returned: at a crossing of the
+    other kind the loop leaves it.
     """
     from scipy.optimize import brentq
 
@@ -427,11 +436,14 @@ def limit_cycles(response: Any, gap: float, low: float, high: float) -> list[Lim
     return found
 
 
-def harmonic_balance(response: Any, gap: float, start: LimitCycle, highest: float, count: int = 12) -> LimitCycle | None:
-    """The limit cycle near ``start`` with the odd harmonics 1, 3, 5, ... kept: X_k = -L(j k w) Y_k, Y the harmonics of play(x).
+def harmonic_balance(
+    response: Any, gap: float, start: LimitCycle, highest: float, count: int = 12
+) -> LimitCycle | None:
+    """The limit cycle near ``start`` with the odd harmonics 1, 3, 5, ... kept: X_k = -L(j k w) Y_k, Y the harmonics of
+    play(x).
 
-    The describing function is this with one harmonic. At most ``count`` harmonics, none above ``highest`` rad/s. None if the balance is not
-    found. Source: Gelb, Vander Velde (1968), ch. 3.
+    The describing function is this with one harmonic. At most ``count`` harmonics, none above ``highest`` rad/s. None
+    if the balance is not found. Source: Gelb, Vander Velde (1968), ch. 3.
     """
     from scipy.optimize import root
 
@@ -468,7 +480,8 @@ def harmonic_balance(response: Any, gap: float, start: LimitCycle, highest: floa
 
 
 def _holds(response: Any, w: float, ratio: float) -> bool:
-    """Loeb's criterion. With H = 1/L + N = 0, a change dA of amplitude makes it grow at a rate dsigma/dA = Im(H_A conj(H_w)) / |H_w|^2.
+    """Loeb's criterion. With H = 1/L + N = 0, a change dA of amplitude makes it grow at a rate dsigma/dA = Im(H_A
+    conj(H_w)) / |H_w|^2.
 
     The oscillation holds itself where this is negative.
     """
@@ -497,7 +510,9 @@ class Trajectory:
 
 
 def ramp_demand(points: ArrayLike, plant: ServoPlant) -> tuple[Array, Array]:
-    """Servo reference (m) and its rate (m/s) at each tick from stroke demands every 10 ms: straight lines, as the firmware draws them."""
+    """Servo reference (m) and its rate (m/s) at each tick from stroke demands every 10 ms: straight lines, as the
+    firmware draws them.
+    """
     p = np.asarray(points, dtype=float)
     n = round(10e-3 / plant.tick)
     start = np.concatenate([[p[0]], p[:-1]])
@@ -528,7 +543,8 @@ def simulate(
     outside         total gap (m of stroke) between piston and vanes
     noise_seed      None for a noise-free LVDT
     null_bias       A, added to the current in the valve
-    start           m, stroke at t = 0 (default the reference's); ``play`` then stands at its edge, as if the piston had come from below
+    start           m, stroke at t = 0 (default the reference's); ``play`` then stands at its edge, as if the piston had
+                    come from below
     integral        A, integral part at t = 0
     """
     from controller import firmware as fw
@@ -579,7 +595,8 @@ def simulate(
 
 
 def steady_cycle(t: Array, signal: Array, smallest: float) -> LimitCycle | None:
-    """The oscillation in the second half of a run: fundamental amplitude and frequency, None if below ``smallest`` peak to peak.
+    """The oscillation in the second half of a run: fundamental amplitude and frequency, None if below ``smallest`` peak
+    to peak.
 
     ``after`` is half the peak-to-peak value, to tell how far from a sine it is.
     """
@@ -635,7 +652,9 @@ class PlayFigures:
     simulated_hz: float | None
     simulated_lvdt_mm: float  # half of peak to peak of what the LVDT sees in the second half of the run
     without_integral: float | None  # predicted amplitude with ki = 0
-    grazing: bool  # the piston hardly leaves the gap: the signal after the play is far from a sine, expect 30 % in frequency
+    grazing: (
+        bool  # the piston hardly leaves the gap: the signal after the play is far from a sine, expect 30 % in frequency
+    )
 
 
 @dataclass(frozen=True)
@@ -683,7 +702,9 @@ MIDDLE = 24e-3  # m: simulations run about mid-stroke, away from the stops
 
 
 def _step_figures(gains: Gains, plant: ServoPlant, curves: dict[str, Any]) -> dict[str, float]:
-    """Linear step (no feed-forward, no limit), and 10 mm as a bare step and as the firmware would draw it (100 mm/s)."""
+    """Linear step (no feed-forward, no limit), and 10 mm as a bare step and as the firmware would draw it (100
+    mm/s).
+    """
     import control as ct
 
     closed = ct.feedback(sampled_loop(gains, plant), 1)
@@ -728,7 +749,11 @@ def _bias_figures(gains: Gains, plant: ServoPlant) -> dict[str, float]:
     run = simulate(gains, plant, np.full(3000, MIDDLE), null_bias=1e-3)
     error = 1e3 * np.abs(run.x - MIDDLE)
     outside = np.flatnonzero(error > 0.005)
-    return {"current_ma": 1.0, "peak_mm": float(error.max()), "settled_s": plant.tick * float(outside[-1] + 1 if outside.size else 0)}
+    return {
+        "current_ma": 1.0,
+        "peak_mm": float(error.max()),
+        "settled_s": plant.tick * float(outside[-1] + 1 if outside.size else 0),
+    }
 
 
 def _rest_figures(gains: Gains, plant: ServoPlant) -> dict[str, float]:
@@ -746,7 +771,9 @@ def _rest_figures(gains: Gains, plant: ServoPlant) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class _Predicted:
-    """Limit cycles of a play of width 1: by the describing function, with harmonics, and without the integral. All scale with the gap."""
+    """Limit cycles of a play of width 1: by the describing function, with harmonics, and without the integral. All
+    scale with the gap.
+    """
 
     plain: LimitCycle | None
     harmonic: LimitCycle | None
@@ -766,7 +793,9 @@ def _predict(gains: Gains, plant: ServoPlant) -> _Predicted:
         return response, max(limit_cycles(response, 1.0, low, high), key=lambda c: c.amplitude, default=None)
 
     response, top = greatest(gains)
-    return _Predicted(top, harmonic_balance(response, 1.0, top, high) if top else None, greatest(replace(gains, ki=0.0))[1])
+    return _Predicted(
+        top, harmonic_balance(response, 1.0, top, high) if top else None, greatest(replace(gains, ki=0.0))[1]
+    )
 
 
 def _play_figures(
@@ -776,7 +805,9 @@ def _play_figures(
     inside = play.site != "vanes"
     scale, unit = 1e3, "mA" if play.site == "valve" else "mm"
     gap = scale * play.gap
-    top, better, bare = (predicted.plain, predicted.harmonic, predicted.proportional) if inside and gap > 0.0 else (None, None, None)
+    top, better, bare = (
+        (predicted.plain, predicted.harmonic, predicted.proportional) if inside and gap > 0.0 else (None, None, None)
+    )
     n = round(seconds / plant.tick)
     if inside:
         # start on the predicted oscillation: a servo that comes to rest inside its play stays there
@@ -848,7 +879,9 @@ def design(
     curves["continuous"] = continuous_response(gains, plant, omega)
     if not stable:  # nothing else means anything
         checks = [Check("stable at every corner", 0.0, 1.0, "-", False, next(a for a, m in everywhere if not m.stable))]
-        return DesignResult(gains, plant, limits, nominal, worst, worst_at, corners, math.nan, {}, {}, {}, {}, [], checks, False, curves)
+        return DesignResult(
+            gains, plant, limits, nominal, worst, worst_at, corners, math.nan, {}, {}, {}, {}, [], checks, False, curves
+        )
 
     noise = 1e3 * noise_current(gains, plant)
     step = _step_figures(gains, plant, curves)
@@ -883,22 +916,24 @@ def design(
                 ("hunting by the valve's hysteresis", play[1].simulated_lvdt_mm, limits.hunting_mm, "mm"),
             )
         ),
-        Check("hunting by play outside the loop", play[2].simulated_lvdt_mm, 1e-4, "mm", play[2].simulated_lvdt_mm <= 1e-4),
+        Check(
+            "hunting by play outside the loop", play[2].simulated_lvdt_mm, 1e-4, "mm", play[2].simulated_lvdt_mm <= 1e-4
+        ),
     ]
     ok = all(c.ok for c in checks)
-    return DesignResult(gains, plant, limits, nominal, worst, worst_at, corners, noise, step, ramp, bias, rest, play, checks, ok, curves)
+    return DesignResult(
+        gains, plant, limits, nominal, worst, worst_at, corners, noise, step, ramp, bias, rest, play, checks, ok, curves
+    )
 
 
 def evaluate(
-    *,
-    kp: float | None = None,
-    ki: float | None = None,
-    kff: float | None = None,
-    backlash_inside: float | None = None,
+    *, kp: float | None = None, ki: float | None = None, kff: float | None = None, backlash_inside: float | None = None
 ) -> tuple[DesignResult, int]:
-    """``vaneloop design``: the calibrated gains with overrides (kp A/m, ki A/(m s), kff A/(m/s)), play inside the loop in mm.
+    """``vaneloop design``: the calibrated gains with overrides (kp A/m, ki A/(m s), kff A/(m/s)), play inside the loop
+    in mm.
 
-    Returns the result and the exit code: 0 all stated limits hold, 1 not. Raises InputError for a value outside its range.
+    Returns the result and the exit code: 0 all stated limits hold, 1 not. Raises InputError for a value outside its
+    range.
     """
     base = default_gains()
     gains = Gains(base.kp if kp is None else kp, base.ki if ki is None else ki, base.kff if kff is None else kff)
@@ -913,8 +948,8 @@ def summary(result: DesignResult) -> list[str]:
     g, m = result.gains, result.nominal
     lines = [
         f"gains: kp {g.kp:g} mA/mm, ki {g.ki:g} mA/(mm s), kff {g.kff:g} mA/(mm/s)",
-        f"nominal: crossover {m.crossover_hz:.1f} Hz, gain margin {m.gain_margin_db:.1f} dB, phase margin {m.phase_margin_deg:.1f} deg, "
-        f"disk margin {m.disk_margin:.2f}, bandwidth {m.bandwidth_hz:.1f} Hz",
+        f"nominal: crossover {m.crossover_hz:.1f} Hz, gain margin {m.gain_margin_db:.1f} dB, phase margin "
+        f"{m.phase_margin_deg:.1f} deg, disk margin {m.disk_margin:.2f}, bandwidth {m.bandwidth_hz:.1f} Hz",
     ]
     for c in result.checks:
         at = f", at {c.at}" if c.at else ""
@@ -925,25 +960,23 @@ def summary(result: DesignResult) -> list[str]:
 
 def _say_play(p: PlayFigures) -> str:
     """One line about one play."""
-    where = {"lvdt": "between piston and LVDT", "valve": "in the valve", "vanes": "between piston and vanes (outside the loop)"}[p.site]
+    where = {
+        "lvdt": "between piston and LVDT",
+        "valve": "in the valve",
+        "vanes": "between piston and vanes (outside the loop)",
+    }[p.site]
 
     def cycle(a: float | None, hz: float | None) -> str:
         return "none" if a is None or hz is None else f"{a:.3g} {p.unit} at {hz:.2f} Hz"
 
     return (
         f"play of {p.gap:g} {p.unit} {where}: limit cycle predicted {cycle(p.predicted_amplitude, p.predicted_hz)}, "
-        f"with harmonics {cycle(p.harmonic_amplitude, p.harmonic_hz)}, simulated {cycle(p.simulated_amplitude, p.simulated_hz)}"
+        f"with harmonics {cycle(p.harmonic_amplitude, p.harmonic_hz)}, simulated "
+        f"{cycle(p.simulated_amplitude, p.simulated_hz)}"
     )
 
 
 # ---------------------------------------------------------------- report
 
 
-
-
 # ---------------------------------------------------------------- command line
-
-
-
-
-

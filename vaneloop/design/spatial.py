@@ -19,7 +19,8 @@ class SpatialCheck:
 
     planar     the paper's analytic model
     newton     constraint equations in space, Newton's method (`plant.spatial`)
-    multibody  the same joints in a general multibody library (`vaneloop.design.multibody`); empty where Exudyn is not installed
+    multibody  the same joints in a general multibody library (`vaneloop.design.multibody`); empty where Exudyn is not
+               installed
     """
 
     stroke: np.ndarray
@@ -58,18 +59,12 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     newton = {s: spatial_angles(geometry, s, stroke, offset) for s in STAGES}
     multibody, notes = {}, []
     if importlib.util.find_spec("exudyn") is None:
-        notes.append("exudyn is not installed (pip install 'vaneloop[multibody]'): constraint equations by Newton's method only")
+        notes.append(
+            "exudyn is not installed (pip install 'vaneloop[multibody]'): constraint equations by Newton's method only"
+        )
     else:
         for i, s in enumerate(STAGES):
             multibody[s] = multibody_angles(geometry, s, stroke, offset)
             if progress is not None:
                 progress((i + 1) / len(STAGES))
     return SpatialCheck(stroke, planar, newton, multibody, notes)
-
-
-
-
-
-
-
-

@@ -1,8 +1,9 @@
 """Control strategies side by side: the same engine run under each of them, what the vanes get and what it costs.
 
-Scenarios spoil the machine in the ways that a schedule's curves cannot know; the last one does it in all of them at once. Errors are those
-of the true vane angles against the schedule at the true speed, every 10 ms: no sensor's noise is in them. After that the potentiometers
-fail in the middle of the run, in several ways, and the strategy that uses them has to go on without a step.
+Scenarios spoil the machine in the ways that a schedule's curves cannot know; the last one does it in all of them at
+once. Errors are those of the true vane angles against the schedule at the true speed, every 10 ms: no sensor's noise is
+in them. After that the potentiometers fail in the middle of the run, in several ways, and the strategy that uses them
+has to go on without a step.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ EVERY = 10  # ticks between samples that are kept
 class Scenario:
     """What is wrong with the machine.
 
-    play    deg, total play at the VIGV; the other stages' grow in proportion, as pins do that wear alike; None: as built
+    play    deg, total play at the VIGV; the other stages' grow in proportion, as pins do that wear alike; None: as
+            built
     growth  deg, by which the casing's heat turns the vanes of every stage at full speed
     noise   factor on the noise of all sensors
     dither  %, amplitude of what the ECU adds to the demand between 99 and 100 %
@@ -113,7 +115,9 @@ Outcomes = dict[tuple[str, str], Outcome]  # (scenario, strategy)
 
 @compiled
 def _motions(x, least, total, start):
-    """Add travel and turning points of ``x`` to total = [travel, turns]; start = [turn, extreme, direction] goes on from call to call."""
+    """Add travel and turning points of ``x`` to total = [travel, turns]; start = [turn, extreme, direction] goes on
+    from call to call.
+    """
     for i in range(x.shape[0]):
         v = x[i]
         if start[2] == 0.0:
@@ -133,7 +137,10 @@ def _motions(x, least, total, start):
 class _Recorder:
     """Keeps of every tick's states what the figures need."""
 
-    KEPT = (*(len(STATE) + row for row in (chain.N_R, *range(chain.RING, chain.RING + 3))), *map(STATE.index, ("x_dem",)))
+    KEPT = (
+        *(len(STATE) + row for row in (chain.N_R, *range(chain.RING, chain.RING + 3))),
+        *map(STATE.index, ("x_dem",)),
+    )
     LEARNED = tuple(map(STATE.index, ("offset_in_use", "width_in_use", "crossing")))
 
     def __init__(self) -> None:
@@ -163,7 +170,9 @@ def machine(scenario: Scenario, plant: Plant) -> Plant:
 
 
 def casing(n_dem: Array) -> Array:
-    """Temperature (degC) that the casing has under a demand (%, every 10 ms): first-order lag behind the engine's power."""
+    """Temperature (degC) that the casing has under a demand (%, every 10 ms): first-order lag behind the engine's
+    power.
+    """
     from scipy.signal import lfilter
 
     share = 1e-2 / HEATING
@@ -193,7 +202,9 @@ def run(
     """
     plant, recorder = machine(scenario, base or build_plant()), _Recorder()
     stimulus = Stimulus.of(dithered(n_dem, scenario.dither), t_oil=casing(n_dem))
-    done = lockstep(stimulus, calibration=calibration, plant=plant, seed=seed, every=100, hashed=False, pots=pots, watch=recorder)
+    done = lockstep(
+        stimulus, calibration=calibration, plant=plant, seed=seed, every=100, hashed=False, pots=pots, watch=recorder
+    )
     a = np.vstack(recorder.rows)
     n_r, x_dem = a[:, 0], a[:, 4]
     vanes = np.empty((len(a), 3))
@@ -229,12 +240,17 @@ def run(
 
 def _figures(error: Array, n_r: Array) -> dict[str, float | None]:
     e, near = np.abs(error), (n_r > 99.0) & (n_r < 100.0)
-    return {"mean_abs": float(e.mean()), "max_abs": float(e.max()), "mean_abs_99_100": float(e[near].mean()) if near.any() else None}
+    return {
+        "mean_abs": float(e.mean()),
+        "max_abs": float(e.max()),
+        "mean_abs_99_100": float(e[near].mean()) if near.any() else None,
+    }
 
 
-# ---- potentiometers that fail -------------------------------------------------------------------------------------------------------
+# ---- potentiometers that fail ----------------------------------------------------------------------------------------
 
-# name -> (share of the reading, offset in deg at once, in deg/s from then on, noise in deg); stuck: at the angle of that moment
+# name -> (share of the reading, offset in deg at once, in deg/s from then on, noise in deg); stuck: at the angle of
+# that moment
 FAILURES: dict[str, tuple[float, float, float, float]] = {
     "no signal": (1.0, np.nan, 0.0, 0.0),
     "out of range": (0.0, 120.0, 0.0, 0.0),
@@ -253,10 +269,11 @@ class Failure:
     """What followed a failure of the potentiometers of ``stages``.
 
     during  at rest or in motion: what the demand did at the time ``at`` (s)
-    step    deg, VIGV: what the failure changed within 1 s, in the first 10 s of the vane or of the angle that is aimed at (both against
-            the healthy run), or at any later time of the compensation in use
+    step    deg, VIGV: what the failure changed within 1 s, in the first 10 s of the vane or of the angle that is aimed
+            at (both against the healthy run), or at any later time of the compensation in use
     departure  deg, VIGV: largest difference to the healthy run in the first 10 s
-    crossings  how often more than in the healthy run the stroke crossed the gap in the first 10 s (the vane stands meanwhile)
+    crossings  how often more than in the healthy run the stroke crossed the gap in the first 10 s (the vane stands
+               meanwhile)
     mean_abs, mean_abs_dual  deg, VIGV's error from then on, of this run and of dual
     """
 
@@ -272,7 +289,8 @@ class Failure:
 
 
 def moments(n_dem: Array) -> dict[str, int]:
-    """Samples after the middle at which to let the potentiometers fail: during -> sample; what the profile does not offer is left out.
+    """Samples after the middle at which to let the potentiometers fail: during -> sample; what the profile does not
+    offer is left out.
 
     at rest    the demand has stood at 99 % or more for 5 s and will for 10 s
     in motion  the demand has moved faster than 3 %/s for 1 s, and 10 s are left
@@ -281,7 +299,11 @@ def moments(n_dem: Array) -> dict[str, int]:
 
     def first(ok: NDArray[np.bool_], length: int, after: int) -> int | None:
         hits = np.flatnonzero(np.convolve(ok[half:], np.ones(length), "valid") > length - 0.5)
-        return int(hits[0]) + half + after if hits.size and int(hits[0]) + half + after + int(AFTER / 1e-2) < len(n_dem) else None
+        return (
+            int(hits[0]) + half + after
+            if hits.size and int(hits[0]) + half + after + int(AFTER / 1e-2) < len(n_dem)
+            else None
+        )
 
     found = {"at rest": first((rate < 1e-7) & (n_dem >= 99.0), 1500, 500), "in motion": first(rate > QUICK, 100, 100)}
     return {during: at for during, at in found.items() if at is not None}
@@ -310,7 +332,9 @@ def failing(
     out = run(scenario, n_dem, calibration, seed, pots, base)
     first = slice(at, at + int(AFTER / 1e-2))
     changes = [(a - b)[first] for a, b in ((out.vanes[:, 0], healthy.vanes[:, 0]), (out.aim, healthy.aim))]
-    compensation = np.abs(out.offset[at + lag :] - out.offset[at:-lag]) + 0.5 * np.abs(out.width[at + lag :] - out.width[at:-lag])
+    compensation = np.abs(out.offset[at + lag :] - out.offset[at:-lag]) + 0.5 * np.abs(
+        out.width[at + lag :] - out.width[at:-lag]
+    )
     step = max(float(compensation.max()), *(float(np.abs(c[lag:] - c[:-lag]).max()) for c in changes))
     departure = max(float(np.abs(c).max()) for c in changes)
     rest = [float(np.abs(o.errors[at:, 0]).mean()) for o in (out, dual)]
@@ -318,15 +342,7 @@ def failing(
     return Failure(name, during, stages, at * 1e-2, step, departure, max(crossings[0] - crossings[1], 0), *rest), out
 
 
-# ---- the command --------------------------------------------------------------------------------------------------------------------
-
-
-
-
-
-
-
-
+# ---- the command -----------------------------------------------------------------------------------------------------
 
 
 def judged(rows: tuple[Scenario, ...], outcomes: Outcomes, failures: list[Failure], best: str) -> list[dict[str, Any]]:
@@ -334,11 +350,15 @@ def judged(rows: tuple[Scenario, ...], outcomes: Outcomes, failures: list[Failur
     goals: list[dict[str, Any]] = []
 
     def judge(goal: str, value: float, limit: float, least: bool = False) -> None:
-        goals.append({"goal": goal, "value": value, "limit": limit, "held": bool(value >= limit if least else value <= limit)})
+        goals.append(
+            {"goal": goal, "value": value, "limit": limit, "held": bool(value >= limit if least else value <= limit)}
+        )
 
     last = rows[-1].name
     mean = {s: outcomes[last, s].figures["vigv"]["mean_abs"] or 0.0 for s in ("dual", best)}
-    judge(f"{last}: mean VIGV error of dual over that of {best}", mean["dual"] / max(mean[best], 1e-9), GAIN, least=True)
+    judge(
+        f"{last}: mean VIGV error of dual over that of {best}", mean["dual"] / max(mean[best], 1e-9), GAIN, least=True
+    )
     for row in rows:
         mine, dual = outcomes[row.name, best], outcomes[row.name, "dual"]
         judge(f"{row.name}: travel of {best} over that of dual", mine.travel / max(dual.travel, 1e-9), TRAVEL)
@@ -352,7 +372,3 @@ def judged(rows: tuple[Scenario, ...], outcomes: Outcomes, failures: list[Failur
 
 
 WORDS = {"mean_abs": "mean", "max_abs": "maximum", "mean_abs_99_100": "mean at 99 to 100 %"}
-
-
-
-

@@ -4,13 +4,15 @@ Model, one step of T = 10 ms, n the demand (%), r its rate (%/s)::
 
     n(k+1) = n(k) + T r(k) + T^2/2 a(k),   r(k+1) = r(k) + T a(k),   y(k) = n(k) + v(k)
 
-a is white with standard deviation sigma_a (%/s^2), v with sigma_v (%). The Kalman filter of this model settles to constant gains
-K = [alpha, beta/T], and then is the alpha-beta filter that the firmware runs (`controller.firmware.trend_step`)::
+a is white with standard deviation sigma_a (%/s^2), v with sigma_v (%). The Kalman filter of this model settles to
+constant gains K = [alpha, beta/T], and then is the alpha-beta filter that the firmware runs
+(`controller.firmware.trend_step`)::
 
     n- = n + T r,   e = y - n-,   n = n- + alpha e,   r = r + beta e / T
 
-filterpy designs and checks it; the Riccati equation solved by scipy checks filterpy. Source: Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation (2001), section 6.5 (alpha-beta filter, tracking index).
+filterpy designs and checks it; the Riccati equation solved by scipy checks filterpy. Source: Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), section 6.5 (alpha-beta filter, tracking
+index).
 """
 
 from __future__ import annotations
@@ -114,7 +116,9 @@ def riccati_gain(model: TrendModel) -> tuple[float, float]:
 
 
 def tracking_index_gain(model: TrendModel) -> tuple[float, float]:
-    """(alpha, beta) in closed form, from the tracking index lambda = sigma_a T^2 / sigma_v (Kalata; Bar-Shalom 6.5.3)."""
+    """(alpha, beta) in closed form, from the tracking index lambda = sigma_a T^2 / sigma_v (Kalata; Bar-Shalom
+    6.5.3).
+    """
     index = model.acceleration * model.step**2 / model.sigma
     r = (4.0 + index - math.sqrt(8.0 * index + index * index)) / 4.0
     alpha = 1.0 - r * r
@@ -124,8 +128,12 @@ def tracking_index_gain(model: TrendModel) -> tuple[float, float]:
 # ---------------------------------------------------------------- the same estimates
 
 
-def filterpy_estimates(model: TrendModel, n_dem: ArrayLike, gain: tuple[float, float] | None = None) -> tuple[Array, Array]:
-    """Demand and rate (%, %/s) as filterpy's filter estimates them, started in its steady state, at rest on the first sample."""
+def filterpy_estimates(
+    model: TrendModel, n_dem: ArrayLike, gain: tuple[float, float] | None = None
+) -> tuple[Array, Array]:
+    """Demand and rate (%, %/s) as filterpy's filter estimates them, started in its steady state, at rest on the first
+    sample.
+    """
     from scipy.linalg import solve_discrete_are
 
     y = np.asarray(n_dem, dtype=float)
@@ -143,7 +151,9 @@ def filterpy_estimates(model: TrendModel, n_dem: ArrayLike, gain: tuple[float, f
 
 
 def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Array, Array]:
-    """Demand, rate (%, %/s) and direction (+1, -1) as the firmware's `trend_step` finds them; one sample every 10 ms."""
+    """Demand, rate (%, %/s) and direction (+1, -1) as the firmware's `trend_step` finds them; one sample every
+    10 ms.
+    """
     from controller import firmware as fw
 
     y = np.asarray(n_dem, dtype=float)
@@ -228,7 +238,9 @@ def _error_system(alpha: float, beta: float, step: float) -> tuple[Array, Array]
 
 
 def rate_noise(alpha: float, beta: float, model: TrendModel) -> tuple[float, float]:
-    """(rms of the rate in %/s, its correlation from one step to the next) under the demand's noise, by the Lyapunov equation."""
+    """(rms of the rate in %/s, its correlation from one step to the next) under the demand's noise, by the Lyapunov
+    equation.
+    """
     from scipy.linalg import solve_discrete_lyapunov
 
     a, b = _error_system(alpha, beta, model.step)
@@ -239,15 +251,20 @@ def rate_noise(alpha: float, beta: float, model: TrendModel) -> tuple[float, flo
 def false_turns_per_hour(alpha: float, beta: float, rate_on: float, model: TrendModel) -> float:
     """How often per hour noise alone carries the rate beyond ``rate_on``, on either side.
 
-    Rice's formula in discrete time: a Gaussian sequence with step-to-step correlation rho crosses 0 upwards arccos(rho)/(2 pi) times a
-    step, and a level of u standard deviations exp(-u^2/2) times as often.
+    Rice's formula in discrete time: a Gaussian sequence with step-to-step correlation rho crosses 0 upwards
+    arccos(rho)/(2 pi) times a step, and a level of u standard deviations exp(-u^2/2) times as often.
     """
     sigma, rho = rate_noise(alpha, beta, model)
     return 2.0 * 3600.0 / model.step * math.acos(rho) / (2.0 * math.pi) * math.exp(-0.5 * (rate_on / sigma) ** 2)
 
 
 def recommend(
-    model: TrendModel | None = None, *, rate_on: float = 0.06, change: float = 0.5, hold: float = 0.1, slowest: float = 0.1
+    model: TrendModel | None = None,
+    *,
+    rate_on: float = 0.06,
+    change: float = 0.5,
+    hold: float = 0.1,
+    slowest: float = 0.1,
 ) -> TrendDesign:
     """The trend's calibration for ``model``, and how safe it is.
 

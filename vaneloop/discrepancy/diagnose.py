@@ -1,12 +1,15 @@
 """Which effects is a stage missing? Screening, pairs of the leaders, pruning, rivals, and what is left.
 
-A candidate must earn its place on data that it was not fitted to. Two measures, both from the held-out errors of the log's blocks:
+A candidate must earn its place on data that it was not fitted to. Two measures, both from the held-out errors of the
+log's blocks:
 
-- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats itself n times is
-  one observation, not n);
-- *spreads*: the fall of the RMS error in units of the noise floor's own spread, over the whole log, or within the blocks where it acts.
+- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats
+  itself n times is one observation, not n);
+- *spreads*: the fall of the RMS error in units of the noise floor's own spread, over the whole log, or within the
+  blocks where it acts.
 
-A gain counts when it passes both thresholds. They are set on the maximum over the library under "nothing missing" (docs/diagnosis.md).
+A gain counts when it passes both thresholds. They are set on the maximum over the library under "nothing missing"
+(docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -43,15 +46,18 @@ NATS = 12.0  # gain that the best of a library of useless effects reaches in few
 SPREADS = 3.0  # the definition of detectable
 BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
 RIVAL_NATS = 3.0  # odds of 20 to 1, by which one of two effects that both earn their place beats the other
-RIVAL_SPREADS = 0.3  # and the fall of the error: more than an effect that is not there gains by the errors of form of a clean log
+RIVAL_SPREADS = (
+    0.3  # and the fall of the error: more than an effect that is not there gains by the errors of form of a clean log
+)
 CREDIBLE = 0.9  # an effect and its rivals have at least this probability together
 RIVAL_SHARE = 0.25  # and share of what it leaves above the floor itself: the library's equations are not nature's
 LEADERS = 5  # effects tried in pairs
 FINISHED = 3  # leading sets whose fits are finished
 MOST = 4  # effects in one stage
 TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
-# Share of the excess over the floor that a further effect must explain (less is one effect patching another's equation), and that
-# a model of the right kind may leave (its equation is not nature's): what is left then would not have earned a further effect either.
+# Share of the excess over the floor that a further effect must explain (less is one effect patching another's
+# equation), and that a model of the right kind may leave (its equation is not nature's): what is left then would not
+# have earned a further effect either.
 LEAST_SHARE = 0.15
 EXPLAINED = 0.5  # share of the excess over the floor that all effects named in a stage must explain together
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
@@ -59,12 +65,16 @@ SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
 SCREENED = 32  # starts simulated at one time
 DIRECTIONS = 12  # from which a fit of an effect with a direction may start
-LEFT_FLOORS = 3.0  # noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
+LEFT_FLOORS = (
+    3.0  # noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
+)
 
 
 @dataclass
 class Candidate:
-    """An effect as a candidate: its gain on held-out data when it is added alone (or in the pair named) to the nominal model."""
+    """An effect as a candidate: its gain on held-out data when it is added alone (or in the pair named) to the nominal
+    model.
+    """
 
     effect: str
     nats: float
@@ -127,7 +137,8 @@ class Search:
         self.fits: dict[frozenset[str], Fit] = {}
         self.finished: set[frozenset[str]] = set()
         self.base = self.of(())
-        # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the largest sizes
+        # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the
+        # largest sizes
         self.quiet = not _above_floor(judge, self.base, 1.0)
         self.starts = self._screen()
 
@@ -141,7 +152,9 @@ class Search:
         return self.fits[key]
 
     def _screen(self) -> dict[str, list[Array]]:
-        """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal model."""
+        """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal
+        model.
+        """
         stage, judge = self.stage, self.judge
         index = stage.index()
         thetas, owner = [], []
@@ -179,10 +192,12 @@ class Search:
         return out
 
     def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
-        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that are best there.
+        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
+        are best there.
 
-        Size and direction are polar coordinates: from a wrong direction a fit comes to the right one by a long way round. In a fixed
-        direction the sizes act linearly near neutral, so that their best values follow from one simulation.
+        Size and direction are polar coordinates: from a wrong direction a fit comes to the right one by a long way
+        round. In a fixed direction the sizes act linearly near neutral, so that their best values follow from one
+        simulation.
 
         e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
         """
@@ -208,7 +223,9 @@ class Search:
             own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
             flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
             a = flat @ flat.T + np.diag(prior + 1e-9)
-            step = bounded_step(a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale)
+            step = bounded_step(
+                a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale
+            )
             theta[columns] += step * scale
         return thetas
 
@@ -229,16 +246,20 @@ class Search:
             best = min(fits, key=self.judge.total_of)
             if 0.5 * float(self.base.cost.sum() - best.cost.sum()) > 0.5 * NATS:  # worth finishing
                 turns = any(p.period for p in self.stage.effect(name).parameters)
-                best = yield from self.judge.fitting((name,), best, 30 if turns else 8)  # along a curve from direction to direction
+                best = yield from self.judge.fitting(
+                    (name,), best, 30 if turns else 8
+                )  # along a curve from direction to direction
                 best = yield from self._refine(name, best)
             self.fits[key] = yield from self._no_worse(best)
             self.tick()
         return self.fits[key]
 
     def _no_worse(self, fit: Fit) -> Task[Fit]:
-        """The fit, or a better one from the best fit of a part of its effects: with more effects a fit never ends higher.
+        """The fit, or a better one from the best fit of a part of its effects: with more effects a fit never ends
+        higher.
 
-        A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher than it starts.
+        A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher
+        than it starts.
         """
         mine = frozenset(fit.effects)
         parts = [f for key, f in self.fits.items() if key < mine]
@@ -249,7 +270,9 @@ class Search:
         return min(again, fit, key=self.judge.total_of)
 
     def _refine(self, name: str, fit: Fit) -> Task[Fit]:
-        """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no slope to follow."""
+        """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no
+        slope to follow.
+        """
         starts = np.unique([s[0] for s in self.stage.effect(name).starts])
         column = self.stage.index()[name].start
         at = fit.theta[column]
@@ -325,7 +348,8 @@ class Search:
 def correlation_of(judge: Judge, fit: Fit) -> float:
     """Return how many samples of the fit's error count as one observation, at most 50.
 
-    Variance inflation of a sum of the squared errors: 1 + 2 sum of the squared autocorrelations up to the first that is not positive.
+    Variance inflation of a sum of the squared errors: 1 + 2 sum of the squared autocorrelations up to the first that is
+    not positive.
     """
     e = judge.errors(fit.theta[None])[0]
     worst = 1.0
@@ -360,7 +384,8 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
 
 
 def _above_floor(judge: Judge, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
-    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the floor's spread.
+    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the
+    floor's spread.
 
     known  relative error of the noise floor
     """
@@ -381,16 +406,18 @@ def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bo
     return nats > NATS + (extra - 1) and spreads > SPREADS
 
 
-def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None) -> StageDiagnosis:
+def diagnose_stage(
+    stage: Stage, floor: Array, keep: Array | None = None, tick: Callable[[], None] | None = None
+) -> StageDiagnosis:
     """Search the stage's library for what is missing; see `_search`.
 
     floor  RMS of each output's error when nothing is missing
     keep   samples that count
     tick   called after every fit, for a progress bar
 
-    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most. What is found
-    there is fitted to the whole log and has to earn its place again; where the whole log shows more, a second excerpt is taken from
-    what is left.
+    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most.
+    What is found there is fitted to the whole log and has to earn its place again; where the whole log shows more, a
+    second excerpt is taken from what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG:
         return _to_the_floor(stage, floor, keep, tick)
@@ -409,7 +436,9 @@ def diagnose_stage(stage: Stage, floor: Array, keep: Array | None = None, tick: 
 
 
 def _excerpt(judge: Judge, fit: Fit) -> Array:
-    """Samples to search on: pieces of whole windows, half of them evenly spaced, the others where ``fit`` fails most."""
+    """Samples to search on: pieces of whole windows, half of them evenly spaced, the others where ``fit`` fails
+    most.
+    """
     stage = judge.stage
     n = len(stage.t)
     dt = float(np.median(np.diff(stage.t)))
@@ -445,7 +474,9 @@ def _confirm(stage: Stage, keep: Array | None, floor: Array, base: Fit, said: St
         if not idle:
             break
         chosen, current = rest[idle[0]], without[idle[0]]
-    effects = [replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen]
+    effects = [
+        replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen
+    ]
     steps = [("nominal", float(np.sqrt(nominal.held_out.sum() / max(judge.n, 1))))]
     if chosen:
         steps.append((" + ".join(chosen), float(np.sqrt(current.held_out.sum() / max(judge.n, 1)))))
@@ -483,7 +514,8 @@ def _to_the_floor(stage: Stage, floor: Array, keep: Array | None, tick: Callable
 def _search(
     stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None, known: float = FLOOR_KNOWN
 ) -> tuple[Search, Fit, list[Candidate], float, list[tuple[str, float]]]:
-    """Search the stage's library for what is missing: the search, the best model, all effects alone, correlation of errors, steps.
+    """Search the stage's library for what is missing: the search, the best model, all effects alone, correlation of
+    errors, steps.
 
     known  relative error of the noise floor
     """
@@ -559,8 +591,8 @@ def _conclude(
 ) -> StageDiagnosis:
     """Give the verdict on the best model found.
 
-    A name is only given where it explains the error: not by half, not with a size at the end of what is physically possible, and not
-    where the same law with another cause (`Stage.twins`) does clearly better.
+    A name is only given where it explains the error: not by half, not with a size at the end of what is physically
+    possible, and not where the same law with another cause (`Stage.twins`) does clearly better.
     """
     stage = judge.stage
     n = max(judge.n, 1)
@@ -614,7 +646,9 @@ def as_close(judge: Judge, d: StageDiagnosis, fit: Fit) -> bool:
 
 
 def at_bound(stage: Stage, fit: Fit, name: str) -> bool:
-    """Whether a size of the effect stands at a physical bound that is not its neutral value: the data would have it go on."""
+    """Whether a size of the effect stands at a physical bound that is not its neutral value: the data would have it go
+    on.
+    """
     columns = stage.index()[name]
     for value, p in zip(fit.theta[columns], stage.effect(name).parameters, strict=True):
         near = 1e-6 * (p.high - p.low) if np.isfinite(p.high - p.low) else 0.0
@@ -632,9 +666,11 @@ def rms_per_output(judge: Judge, fit: Fit) -> Array:
 
 
 def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[list[Found], Fit]:
-    """For each effect of the model found: which others would do as well in its place, how probable it is, its parameters.
+    """For each effect of the model found: which others would do as well in its place, how probable it is, its
+    parameters.
 
-    Of effects that do equally well the one that has less freedom to do so is named. Returns the fit with the effects named, too.
+    Of effects that do equally well the one that has less freedom to do so is named. Returns the fit with the effects
+    named, too.
     """
     judge, chosen = search.judge, current.effects
     rng = np.random.default_rng(0)
@@ -647,7 +683,9 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
         _widen_steps(judge, current, name, correlation)
         alternatives = {name: current}
         # those that lead alone, and those that did best beside the rest, where that was tried
-        tried = sorted((f for f in search.beside(rest) if name not in f.effects), key=lambda f: float(f.held_out.sum()))[:5]
+        tried = sorted(
+            (f for f in search.beside(rest) if name not in f.effects), key=lambda f: float(f.held_out.sum())
+        )[:5]
         near = [*leading, *(m for f in tried for m in f.effects if m not in (*rest, *leading))]
         for f in search.best_of([(*rest, other) for other in near if other not in rest]):
             alternatives[next(e for e in f.effects if e not in rest)] = f
@@ -658,13 +696,18 @@ def _name(search: Search, current: Fit, candidates: list[Candidate]) -> tuple[li
         score = {m: -0.5 * f.held_out / (correlation * soft) for m, f in alternatives.items()}
         best, *others = sorted(alternatives, key=lambda m: freedom[m] - float(score[m].sum()))
         if at_bound(judge.stage, alternatives[best], best):  # it gives way to one that does as well within
-            as_good = {m: not _worse(judge, alternatives[m], alternatives[best], correlation, freedom[m] - freedom[best]) for m in others}
+            as_good = {
+                m: not _worse(judge, alternatives[m], alternatives[best], correlation, freedom[m] - freedom[best])
+                for m in others
+            }
             best = next((m for m in others if as_good[m] and not at_bound(judge.stage, alternatives[m], m)), best)
         alternatives = {m: f for m, f in alternatives.items() if m == best or not at_bound(judge.stage, f, m)}
         current = alternatives[best]
         nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
         freer = {m: freedom[m] - freedom[best] for m in alternatives}
-        rivals = [m for m, f in alternatives.items() if m != best and not _worse(judge, f, current, correlation, freer[m])]
+        rivals = [
+            m for m, f in alternatives.items() if m != best and not _worse(judge, f, current, correlation, freer[m])
+        ]
         table = np.array([score[m][blocks].sum(axis=1) - freedom[m] for m in alternatives])
         weight = np.exp(table - table.max(axis=0))
         shares = dict(zip(alternatives, (weight / weight.sum(axis=0)).mean(axis=1).tolist(), strict=True))
@@ -694,7 +737,9 @@ def with_rivals(best: str, rivals: list[str], shares: dict[str, float]) -> list[
 
 
 def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
-    """Give an effect that acts in steps (a threshold), whose slope is zero, the interval of sizes that are as good: 90 %, in the fit."""
+    """Give an effect that acts in steps (a threshold), whose slope is zero, the interval of sizes that are as good: 90
+    %, in the fit.
+    """
     column = judge.stage.index()[name].start
     k = int(np.flatnonzero(fit.free == column)[0])
     parameter, at = judge.stage.effect(name).parameters[0], float(fit.theta[column])
@@ -712,10 +757,12 @@ def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
 
 
 def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
-    """How much more the fit's parameters could have been than the data let them be, in nats: 0.5 log det(data + prior) / det(prior).
+    """How much more the fit's parameters could have been than the data let them be, in nats: 0.5 log det(data + prior)
+    / det(prior).
 
-    The price of flexibility in the marginal likelihood by Laplace's method. A shape may be anywhere within its bounds; what is known of a
-    size beforehand counts as one observation. MacKay (1992), Bayesian interpolation; Kass and Wasserman (1995), unit information.
+    The price of flexibility in the marginal likelihood by Laplace's method. A shape may be anywhere within its bounds;
+    what is known of a size beforehand counts as one observation. MacKay (1992), Bayesian interpolation; Kass and
+    Wasserman (1995), unit information.
     """
     # parameters that stayed at neutral, such as those of the other two vanes, made nothing possible
     columns = [judge.stage.all_parameters()[c] for c in fit.free]
@@ -727,7 +774,9 @@ def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
     data = fit.normals.sum(axis=0) / correlation
     # a size is known beforehand as well as one observation tells it, but not so well that the size found could not be
     found = np.abs(fit.theta[fit.free] - neutral) / scale
-    one = np.minimum(np.maximum(np.diag(data) * correlation / max(judge.n, 1), 1e-12), 1.0 / np.maximum(found, 1e-9) ** 2)
+    one = np.minimum(
+        np.maximum(np.diag(data) * correlation / max(judge.n, 1), 1e-12), 1.0 / np.maximum(found, 1e-9) ** 2
+    )
     prior = np.where(fit.prior > 0.0, fit.prior * scale**2, np.where(shape, 12.0 * (scale / width) ** 2, one))[used]
     return 0.5 * float(np.linalg.slogdet(data[np.ix_(used, used)] + np.diag(prior))[1] - np.log(prior).sum())
 
@@ -751,7 +800,9 @@ def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
 
 
 def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float) -> bool:
-    """True when the log can tell that ``other`` is not it: it explains less than ``best``, or no more though it is ``freer`` (nats)."""
+    """True when the log can tell that ``other`` is not it: it explains less than ``best``, or no more though it is
+    ``freer`` (nats).
+    """
     nats, spreads = gain(judge, other, best, correlation)
     less = nats > max(RIVAL_NATS, RIVAL_SHARE * _left(judge, best, correlation)) and spreads > RIVAL_SPREADS
     return less or min(nats, 0.0) + freer > RIVAL_NATS
@@ -770,7 +821,18 @@ def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
             p = stage.parameters[c]
             low, high = float(fit.low[k]), float(fit.high[k])
             if not low <= p.value <= high:
-                limit = abs(fit.theta[c] - p.value) >= 0.999 * p.tolerance  # the data pull on beyond what the tolerance allows
+                limit = (
+                    abs(fit.theta[c] - p.value) >= 0.999 * p.tolerance
+                )  # the data pull on beyond what the tolerance allows
                 value = float(fit.theta[c])
-                out.append({"parameter": p.name, "value": value, "low": low, "high": high, "unit": p.unit, "at_limit": bool(limit)})
+                out.append(
+                    {
+                        "parameter": p.name,
+                        "value": value,
+                        "low": low,
+                        "high": high,
+                        "unit": p.unit,
+                        "at_limit": bool(limit),
+                    }
+                )
     return out

@@ -1,16 +1,18 @@
-"""What is a user's own model missing? The fits of `vaneloop.discrepancy.diagnose`, judged against what the best model leaves, not a noise floor.
+"""What is a user's own model missing? The fits of `vaneloop.discrepancy.diagnose`, judged against what the best model
+leaves, not a noise floor.
 
-On real data no model reaches the sensor's noise: small effects that nobody models dominate what is left. A threshold in noise floors or
-in nats then "finds" everything, since the errors of a wrong model are large, correlated and alike from sample to sample. So a law must earn
-its place by what it does to the *held-out error itself*, block by block (blocks as in `vaneloop.discrepancy.fit`):
+On real data no model reaches the sensor's noise: small effects that nobody models dominate what is left. A threshold in
+noise floors or in nats then "finds" everything, since the errors of a wrong model are large, correlated and alike from
+sample to sample. So a law must earn its place by what it does to the *held-out error itself*, block by block (blocks as
+in `vaneloop.discrepancy.fit`):
 
 - `LEAST_FALL`: the held-out sum of squares falls by at least this share;
-- `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of small motion,
-  which is wrong by a constant that suits the large motions, counts as much as they do;
+- `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of
+  small motion, which is wrong by a constant that suits the large motions, counts as much as they do;
 - at least two blocks agree.
 
-The order in which sets of laws are preferred is `score`: the mean of the log error over all samples and of the log errors of the
-blocks, and 1 % for every parameter.
+The order in which sets of laws are preferred is `score`: the mean of the log error over all samples and of the log
+errors of the blocks, and 1 % for every parameter.
 """
 
 from __future__ import annotations
@@ -21,7 +23,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import Candidate, Found, StageDiagnosis, found_of, parameters_of, recalibrated, rms_per_output
+from vaneloop.discrepancy.diagnose import (
+    Candidate,
+    Found,
+    StageDiagnosis,
+    found_of,
+    parameters_of,
+    recalibrated,
+    rms_per_output,
+)
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.stage import Array, Stage
@@ -37,7 +47,9 @@ MOST = 6  # laws in one model
 FITTED = 12  # leaders of the screening that are fitted
 FINISHED = 5  # leaders of these whose fits are finished
 PAIRED = 4  # leaders tried in pairs where none alone helps
-STRUCTURE = 0.25  # share of the remaining error that the logged channels predict, from which it is called unknown physics
+STRUCTURE = (
+    0.25  # share of the remaining error that the logged channels predict, from which it is called unknown physics
+)
 
 
 @dataclass
@@ -77,11 +89,15 @@ def worth(judge: Judge, before: Fit, after: Fit) -> Evidence:
 
 
 def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
-    """Log of the held-out error, half over all samples, half over the blocks; less is better. ``blocks``: a resampling of them."""
+    """Log of the held-out error, half over all samples, half over the blocks; less is better. ``blocks``: a resampling
+    of them.
+    """
     s, m = _levels(judge, fit)
     if blocks is not None:
         s, m = s[blocks], m[blocks]
-    return 0.25 * float(np.log(s.sum() / m.sum())) + 0.25 * float(np.mean(np.log(s / m))) + PER_PARAMETER * len(fit.free)
+    return (
+        0.25 * float(np.log(s.sum() / m.sum())) + 0.25 * float(np.mean(np.log(s / m))) + PER_PARAMETER * len(fit.free)
+    )
 
 
 class _Judge(Judge):
@@ -129,7 +145,9 @@ class Explorer:
             self.out.add((fit.effects, name))
         for name in list(screened)[:fitted]:
             effects = (*fit.effects, name)
-            quick.append(min((self.judge.fit(effects, s, 3) for s in screened[name]), key=lambda f: float(f.cost.sum())))
+            quick.append(
+                min((self.judge.fit(effects, s, 3) for s in screened[name]), key=lambda f: float(f.cost.sum()))
+            )
             self.tick()
         if not fit.effects and self.guess is not None:
             quick = self._from_guess(new, quick)
@@ -142,7 +160,9 @@ class Explorer:
         return sorted(known, key=lambda f: score(self.judge, f))
 
     def _from_guess(self, names: list[str], quick: list[Fit]) -> list[Fit]:
-        """Fits that start where the user's own values stand: fitted without a gross law, a model may go where no law helps it any more."""
+        """Fits that start where the user's own values stand: fitted without a gross law, a model may go where no law
+        helps it any more.
+        """
         assert self.guess is not None
         index, best = self.stage.index(), {f.effects[-1]: f for f in quick}
         tries: list[tuple[float, int, str, Array]] = []
@@ -163,7 +183,9 @@ class Explorer:
         return list(best.values())
 
     def _screen(self, fit: Fit, names: list[str]) -> dict[str, list[Array]]:
-        """Up to two starts for each law on top of ``fit``, the best after one linear refit of what is free already; best law first."""
+        """Up to two starts for each law on top of ``fit``, the best after one linear refit of what is free already;
+        best law first.
+        """
         stage, judge = self.stage, self.judge
         index = stage.index()
         free = fit.free
@@ -204,7 +226,6 @@ class Explorer:
             self.fits[key] = min(tries, key=lambda f: float(f.cost.sum()))
         return self.fits[key]
 
-
     def less(self, fit: Fit, drop: str) -> Fit:
         """Fit without one law: the known one, or where the other parameters of ``fit`` lead, if that is better.
 
@@ -234,8 +255,8 @@ def diagnose_system(
     """Search all laws at all places of a user's model for what is missing; what was decided by other logs, in words.
 
     floor   RMS of the noise of every output, as far as its samples tell it
-    decide  function from parameters to the mean log error on logs that were not fitted: it chooses among rivals that the fitted ones cannot
-            tell apart, and nothing else
+    decide  function from parameters to the mean log error on logs that were not fitted: it chooses among rivals that
+            the fitted ones cannot tell apart, and nothing else
     guess   the user's own values of all parameters
     """
     judge = _Judge(stage, floor)
@@ -257,7 +278,9 @@ def diagnose_system(
             leaders = [f.effects[-1] for f in singles if f.effects[-1] not in current.effects][:PAIRED]
             for a, b in itertools.combinations(leaders, 2):
                 f = explorer.of((*current.effects, a, b))
-                if worth(judge, current, f).good and all(worth(judge, explorer.of((*current.effects, one)), f).good for one in (a, b)):
+                if worth(judge, current, f).good and all(
+                    worth(judge, explorer.of((*current.effects, one)), f).good for one in (a, b)
+                ):
                     options.append(f)
         if not options:
             break
@@ -279,7 +302,9 @@ def diagnose_system(
             for other in rivals:
                 f = _spare(judge, explorer.of((*rest, other)))
                 if decide(f.theta) < here - RIVAL:
-                    decided.append(f"{name} and {other} do equally well on the fitted log; the test logs prefer {other}")
+                    decided.append(
+                        f"{name} and {other} do equally well on the fitted log; the test logs prefer {other}"
+                    )
                     explorer.fits[frozenset(f.effects)] = f
                     current, here = f, decide(f.theta)
         if decided:
@@ -294,15 +319,19 @@ def diagnose_system(
     share = structure(judge, current)
     verdict = "missing" if effects else "unknown" if share > STRUCTURE and not agrees(rms(current), 1.0) else "none"
     d = StageDiagnosis(
-        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict=verdict, floor=judge.floor, base=base, final=current,
-        error_before=before, error_after=after, effects=effects, recalibrated=recalibrated(stage, current), candidates=candidates,
+        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict=verdict, floor=judge.floor, base=base,
+        final=current,
+        error_before=before, error_after=after, effects=effects, recalibrated=recalibrated(stage, current),
+        candidates=candidates,
         correlation=1.0, steps=steps, excess=rms(current),
     )  # fmt: skip
     return d, decided
 
 
 def _spare(judge: _Judge, fit: Fit) -> Fit:
-    """Set to zero what the model itself does not need any more: coefficients not below 0 that only stood in for what was missing."""
+    """Set to zero what the model itself does not need any more: coefficients not below 0 that only stood in for what
+    was missing.
+    """
     if not fit.effects:
         return fit
     for k, p in enumerate(judge.stage.parameters):
@@ -346,13 +375,19 @@ def _swap(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
 
 
 def _simpler(explorer: Explorer, fit: Fit, names: list[str]) -> Fit:
-    """Exchange a law of many parameters for two with fewer in all, where they do as well: a flexible law stands in for whatever bends."""
+    """Exchange a law of many parameters for two with fewer in all, where they do as well: a flexible law stands in for
+    whatever bends.
+    """
     judge, stage = explorer.judge, explorer.stage
     size = {e.name: len(e.parameters) for e in stage.effects}
     for drop in [e for e in fit.effects if size[e] > 2]:
         rest = explorer.of(tuple(e for e in fit.effects if e != drop))
-        one = [f for f in explorer.add(rest, names, 3, 6) if size[f.effects[-1]] == 1 and worth(judge, rest, f).good][:2]
-        two = [g for f in one for g in explorer.add(f, names, 3, 6) if size[g.effects[-1]] == 1 and worth(judge, f, g).good]
+        one = [f for f in explorer.add(rest, names, 3, 6) if size[f.effects[-1]] == 1 and worth(judge, rest, f).good][
+            :2
+        ]
+        two = [
+            g for f in one for g in explorer.add(f, names, 3, 6) if size[g.effects[-1]] == 1 and worth(judge, f, g).good
+        ]
         options = [f for f in (*one, *two) if score(judge, f) < score(judge, fit) + PER_PARAMETER]
         if options:
             fit = min(options, key=lambda f: score(judge, f))
@@ -415,17 +450,19 @@ def extend_system(stage: Stage, floor: Array, wanted: tuple[str, ...]) -> StageD
     before, after = (rms_per_output(judge, f) for f in (explorer.base, current))
     found = found_of(judge, current, current.effects)
     return StageDiagnosis(
-        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if found else "none", floor=judge.floor,
+        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if found else "none",
+        floor=judge.floor,
         base=explorer.base, final=current, error_before=before, error_after=after, effects=found,
         recalibrated=recalibrated(stage, current), candidates=[], correlation=1.0, steps=steps, excess=rms(current),
     )  # fmt: skip
 
 
 def structure(judge: Judge, fit: Fit) -> float:
-    """Share of the remaining error that present and past inputs and outputs predict on blocks that the prediction was not fitted to.
+    """Share of the remaining error that present and past inputs and outputs predict on blocks that the prediction was
+    not fitted to.
 
-    A linear regression on the logged channels, their magnitudes, signs and squares, now and at some past times. What a correct
-    model leaves is not predicted by what it was driven with.
+    A linear regression on the logged channels, their magnitudes, signs and squares, now and at some past times. What a
+    correct model leaves is not predicted by what it was driven with.
     """
     stage = judge.stage
     e = judge.errors(fit.theta[None])[0]
@@ -462,8 +499,8 @@ def structure(judge: Judge, fit: Fit) -> float:
 def noise_of_channel(y: Array) -> float:
     """RMS of the white noise that evenly sampled values can hold at most; 0 is possible.
 
-    The smaller of two bounds: third differences over the quieter half of the stretches (motion is smooth), and the quietest tenth of the
-    spectrum (white noise is everywhere).
+    The smaller of two bounds: third differences over the quieter half of the stretches (motion is smooth), and the
+    quietest tenth of the spectrum (white noise is everywhere).
     """
     from scipy.signal import welch
 

@@ -1,11 +1,12 @@
 """Fit a stage's parameters to its log, and judge a fit on data that it has not seen.
 
-Errors are divided by the noise floor and, where a stage integrates, freed of one constant per window. The fit is Levenberg-Marquardt with
-bounds; all difference steps and all damping trials of an iteration are one call of the stage's ``run`` (many parameter sets side by side).
-Nominal parameters carry a prior of the width of their tolerance.
+Errors are divided by the noise floor and, where a stage integrates, freed of one constant per window. The fit is
+Levenberg-Marquardt with bounds; all difference steps and all damping trials of an iteration are one call of the stage's
+``run`` (many parameter sets side by side). Nominal parameters carry a prior of the width of their tolerance.
 
-The log is cut into blocks. Leaving one block out changes the least-squares solution by a step that follows from the blocks' normal
-equations, so the held-out error of every block costs no further simulation (exact for a linear model, first order otherwise).
+The log is cut into blocks. Leaving one block out changes the least-squares solution by a step that follows from the
+blocks' normal equations, so the held-out error of every block costs no further simulation (exact for a linear model,
+first order otherwise).
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from vaneloop.discrepancy.stage import Array, Stage
 __all__ = ["Fit", "Judge", "Task", "bounded_step", "recalibrate"]
 
 Answer = TypeVar("Answer")
-Task = Generator[Array, Array, Answer]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
+Task = Generator[
+    Array, Array, Answer
+]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
 
 MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
 BLOCK_S = 10.0  # s, longer than the memory of any stage here
 MAX_SETS = 64  # parameter sets in one call of run
 MAX_VALUES = 8_000_000  # errors of several tasks held at one time
-# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an error of form does not
-# average out however long the log. Set on logs of the rig, so that intervals cover the truth as often as they say (docs/diagnosis.md).
+# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
+# error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
+# often as they say (docs/diagnosis.md).
 EVIDENCE = 200.0
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
@@ -42,7 +46,8 @@ class Fit:
     free      columns of theta that were fitted
     cost      whitened sum of squares of every block, float64[blocks], with the parameters fitted to all blocks
     held_out  the same with the parameters fitted to the other blocks
-    low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the value is in
+    low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the
+    value is in
     """
 
     effects: tuple[str, ...]
@@ -61,7 +66,9 @@ class Judge:
     """Everything that fits of one stage share: whitening, windows, blocks, base fit."""
 
     def __init__(self, stage: Stage, floor: Array, keep: Array | None = None):
-        """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured ones)."""
+        """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured
+        ones).
+        """
         self.stage, self.floor = stage, np.asarray(floor, dtype=float)
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
@@ -114,7 +121,9 @@ class Judge:
         return out
 
     def lost(self) -> Array:
-        """Squared error that the log's raster makes expect in each sample, whitened: float64[outputs, samples], 1 on average."""
+        """Squared error that the log's raster makes expect in each sample, whitened: float64[outputs, samples], 1 on
+        average.
+        """
         if self.stage.lost is None:
             return np.ones_like(self.measured)
         squares = self._whiten(self.measured - self.stage.lost[None])[0] ** 2
@@ -129,7 +138,9 @@ class Judge:
         return np.asarray(np.maximum(np.add.reduceat(lost, self.block_start) / np.maximum(self.samples, 1), 0.1))
 
     def _whiten(self, model: Array, out: Array | None = None) -> Array:
-        """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the cache."""
+        """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the
+        cache.
+        """
         out = np.empty(np.shape(model)) if out is None else out
         for e, m in zip(out, model, strict=True):
             np.subtract(self.measured, m, out=e)
@@ -158,10 +169,16 @@ class Judge:
         return np.array(free, dtype=int)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself has no bound."""
+        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself
+        has no bound.
+        """
         s = self.stage
-        low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [p.low for e in s.effects for p in e.parameters]
-        high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [p.high for e in s.effects for p in e.parameters]
+        low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [
+            p.low for e in s.effects for p in e.parameters
+        ]
+        high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [
+            p.high for e in s.effects for p in e.parameters
+        ]
         endless = np.array([p.period > 0.0 for p in s.all_parameters()], dtype=bool)
         return np.where(endless, -np.inf, low), np.where(endless, np.inf, high)
 
@@ -173,7 +190,9 @@ class Judge:
         return theta
 
     def totals(self, errors: Array, thetas: Array) -> Array:
-        """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior, float64[sets]."""
+        """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior,
+        float64[sets].
+        """
         tolerance = np.array([p.tolerance for p in self.stage.all_parameters()])
         prior = np.where(tolerance > 0.0, 3.0 / np.where(tolerance > 0.0, tolerance, 1.0) ** 2, 0.0)
         prior = np.where(np.isfinite(prior), prior, 0.0)
@@ -183,7 +202,9 @@ class Judge:
         """What the fit has minimised."""
         return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.neutral())[fit.free] ** 2))
 
-    def fit(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Fit:
+    def fit(
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None
+    ) -> Fit:
         """Fit the nominal parameters and those of ``effects`` from ``start``.
 
         start    parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
@@ -194,8 +215,8 @@ class Judge:
     def together(self, tasks: Sequence[Task[Answer]]) -> list[Answer]:
         """Run tasks side by side; return what each returns, in their order.
 
-        A task yields parameter sets and gets their whitened errors. What all tasks ask for at one time is simulated in few calls of the
-        stage's ``run``, many sets side by side.
+        A task yields parameter sets and gets their whitened errors. What all tasks ask for at one time is simulated in
+        few calls of the stage's ``run``, many sets side by side.
         """
         answers: list[Any] = [None] * len(tasks)
         asked: list[tuple[int, Array]] = []
@@ -222,7 +243,9 @@ class Judge:
                 at += len(thetas)
         return answers
 
-    def fitting(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None) -> Task[Fit]:
+    def fitting(
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None
+    ) -> Task[Fit]:
         """`fit` as a task for `together`."""
         s = self.stage
         free = self.columns(effects)
@@ -282,7 +305,9 @@ class Judge:
         return self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear)
 
     def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
-        """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives (`linearise`)."""
+        """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives
+        (`linearise`).
+        """
         rows = np.concatenate([e[None], jac])
         ends = np.append(self.block_start[1:], e.shape[1])
         grams = np.zeros((self.n_blocks, len(rows), len(rows)))
@@ -292,14 +317,18 @@ class Judge:
         return grams[:, 0, 0], grams[:, 1:, 0], grams[:, 1:, 1:]
 
     def linearise(self, theta: Array, free: Array) -> tuple[Array, Array]:
-        """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs, samples)."""
+        """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs,
+        samples).
+        """
         thetas, derivative = self._differences(theta, free, self.scale[free], self.bounds()[1])
         return derivative(self.errors(thetas))
 
     def _differences(
         self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
     ) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
-        """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta, if they are."""
+        """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta,
+        if they are.
+        """
         names = self.stage.outputs
         owner = [names.index(p.output) if p.output in names else None for p in self.stage.all_parameters()]
         row = np.zeros(len(free), dtype=int)
@@ -333,7 +362,8 @@ class Judge:
         return thetas if known is None else thetas[1:], derivative
 
     def _finish(
-        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array, low: Array, high: Array,
+        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array,
+        low: Array, high: Array,
         cost: Array, gradients: Array, normals: Array,
     ) -> Fit:  # fmt: skip
         k = len(free)
@@ -365,15 +395,34 @@ class Judge:
             turn = np.array([p.period or np.inf for p in self.stage.all_parameters()])[free]
             half = np.minimum(half, 0.5 * turn)
         return Fit(
-            effects, theta, free, cost, np.maximum(held, cost * 0.5), gradients, normals, prior, theta[free] - half, theta[free] + half
+            effects,
+            theta,
+            free,
+            cost,
+            np.maximum(held, cost * 0.5),
+            gradients,
+            normals,
+            prior,
+            theta[free] - half,
+            theta[free] + half,
         )
 
     def _held_out(
-        self, cost: Array, theta: Array, free: Array, scale: Array, low: Array, high: Array, move: Array, gradients: Array, normals: Array
+        self,
+        cost: Array,
+        theta: Array,
+        free: Array,
+        scale: Array,
+        low: Array,
+        high: Array,
+        move: Array,
+        gradients: Array,
+        normals: Array,
     ) -> Array:
         """Cost of each block with the effects' parameters fitted to the other blocks.
 
-        Nominal parameters are calibrated on the whole log: a lag that only one manoeuvre shows is no reason to distrust the model.
+        Nominal parameters are calibrated on the whole log: a lag that only one manoeuvre shows is no reason to distrust
+        the model.
         """
         mine = move & (free >= len(self.stage.parameters))
         if not mine.any():
@@ -388,7 +437,8 @@ class Judge:
 
 
 def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
-    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest is solved again.
+    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest
+    is solved again.
 
     A step that is only cut off at the bounds is no descent where parameters can stand in for each other.
     """
@@ -407,5 +457,7 @@ def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
 
 
 def recalibrate(judge: Judge) -> Fit:
-    """The stage with nothing added, its nominal parameters refitted within their tolerances: what every verb starts from."""
+    """The stage with nothing added, its nominal parameters refitted within their tolerances: what every verb starts
+    from.
+    """
     return judge.fit((), judge.stage.neutral())

@@ -3,13 +3,16 @@
 A law acts at a *place* of a model (`vaneloop.discrepancy.models.system.System`):
 
 - on a **signal**, an input or an output: y = law(u), `SIGNAL_LAWS`;
-- as a **force** added where things move (or to the derivative of a velocity), from velocity v and displacement x: `FORCE_LAWS`;
+- as a **force** added where things move (or to the derivative of a velocity), from velocity v and displacement x:
+  `FORCE_LAWS`;
 - on the derivative of a **state** x of first order (a level, a pressure, a temperature): `STATE_LAWS`.
 
-Every law has neutral parameters at which it is an exact identity (or adds exactly nothing). Bounds and starting values follow from the
-`Size` of the data at the place, never from constants of one machine; the laws themselves are dimensionally right for any unit.
+Every law has neutral parameters at which it is an exact identity (or adds exactly nothing). Bounds and starting values
+follow from the `Size` of the data at the place, never from constants of one machine; the laws themselves are
+dimensionally right for any unit.
 
-Laws with memory keep it in a state row of `MEMORY` numbers. All steps are numba functions at module level, called sample by sample.
+Laws with memory keep it in a state row of `MEMORY` numbers. All steps are numba functions at module level, called
+sample by sample.
 """
 
 from __future__ import annotations
@@ -106,18 +109,21 @@ class Law:
     constant: Callable[[Size], float] | None = None
 
 
-# ---- laws on a signal ---------------------------------------------------------------------------------------------------------------
+# ---- laws on a signal ------------------------------------------------------------------------------------------------
 
-BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION, SMOOTH_SATURATION, QUANTISATION = range(1, 11)
+BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION, SMOOTH_SATURATION, QUANTISATION = (
+    range(1, 11)
+)
 PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME = range(11, 16)
 
 
 @_jit
 def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> float:
-    """Law ``code`` on sample ``k`` of the signal ``u`` at times ``t`` (s), with parameters ``p`` and memory ``s`` (changed in place).
+    """Law ``code`` on sample ``k`` of the signal ``u`` at times ``t`` (s), with parameters ``p`` and memory ``s``
+    (changed in place).
 
-    Samples after ``k`` are not looked at, so that the same function serves inside a loop. At k = 0 the memory is set up: laws start
-    at rest at the first value.
+    Samples after ``k`` are not looked at, so that the same function serves inside a loop. At k = 0 the memory is set
+    up: laws start at rest at the first value.
     """
     x = u[k]
     dt = t[k] - t[k - 1] if k > 0 else 0.0
@@ -164,7 +170,9 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
         ramp = (1.0 - e) / a if a > 1e-6 else 1.0 - 0.5 * a
         s[0] = e * s[0] + (ramp - e) * u[k - 1] + (1.0 - ramp) * x
         return s[0]
-    if code == SECOND_ORDER_LAG:  # p[0] = 1/natural frequency, p[1] = damping; trapezoidal, input straight between samples
+    if (
+        code == SECOND_ORDER_LAG
+    ):  # p[0] = 1/natural frequency, p[1] = damping; trapezoidal, input straight between samples
         if k == 0 or p[0] <= 0.0:
             s[0], s[1] = x, 0.0
             return x
@@ -208,9 +216,11 @@ def apply(code: int, t: Array, u: Array, p: Array) -> Array:
     return out
 
 
-# ---- laws of forces -----------------------------------------------------------------------------------------------------------------
+# ---- laws of forces --------------------------------------------------------------------------------------------------
 
-FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, ELASTIC_PLASTIC, BOUC_WEN = range(21, 30)
+FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, ELASTIC_PLASTIC, BOUC_WEN = range(
+    21, 30
+)
 BACKLASH_GAP, FRICTION_ASYMMETRY = 30, 31
 
 
@@ -221,7 +231,9 @@ def _slip(v: float, small: float) -> float:
 
 
 @_jit
-def force_of(code: int, v: float, x: float, first: bool, p: Array, gap: float, asymmetry: float, small: float, s: Array) -> float:
+def force_of(
+    code: int, v: float, x: float, first: bool, p: Array, gap: float, asymmetry: float, small: float, s: Array
+) -> float:
     """Force of law ``code`` at velocity ``v`` and displacement ``x``, positive where it opposes positive motion.
 
     gap        lost motion between the displacement and every elastic element
@@ -260,7 +272,9 @@ def force_of(code: int, v: float, x: float, first: bool, p: Array, gap: float, a
             f = -down
             s[0] = x + h + down / p[0]
         return f
-    if code == BOUC_WEN:  # p[0] stiffness, p[1] level, p[2] sharpness n; s[0] force, s[1] last x, s[2] place within the gap
+    if (
+        code == BOUC_WEN
+    ):  # p[0] stiffness, p[1] level, p[2] sharpness n; s[0] force, s[1] last x, s[2] place within the gap
         if first:
             s[0], s[1], s[2] = 0.0, x, 0.0
         if p[0] <= 0.0 or p[1] <= 0.0:
@@ -301,7 +315,9 @@ def force_of(code: int, v: float, x: float, first: bool, p: Array, gap: float, a
 
 @_jit
 def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: float, s: Array) -> float:
-    """Set up the memory of a hysteretic law so that at displacement ``x`` it carries the force ``held``, or its friction; return that."""
+    """Set up the memory of a hysteretic law so that at displacement ``x`` it carries the force ``held``, or its
+    friction; return that.
+    """
     f = min(max(held, -p[1] * (1.0 - asymmetry)), p[1] * (1.0 + asymmetry))
     side = 0.5 * gap if f > 0.0 else -0.5 * gap
     if code == ELASTIC_PLASTIC:
@@ -311,14 +327,16 @@ def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: floa
     return f
 
 
-# ---- laws of a state of first order -------------------------------------------------------------------------------------------------
+# ---- laws of a state of first order ----------------------------------------------------------------------------------
 
 STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT = range(41, 48)
 
 
 @_jit
 def state_rate(code: int, x: float, p: Array) -> float:
-    """What law ``code`` takes off the derivative of the state ``x``. The two limits take nothing off; the simulation applies them."""
+    """What law ``code`` takes off the derivative of the state ``x``. The two limits take nothing off; the simulation
+    applies them.
+    """
     if code == STATE_OFFSET:
         return p[0]
     if code == LEAK:
@@ -332,7 +350,7 @@ def state_rate(code: int, x: float, p: Array) -> float:
     return 0.0
 
 
-# ---- parameters from the size of the data --------------------------------------------------------------------------------------------
+# ---- parameters from the size of the data ----------------------------------------------------------------------------
 
 _Made = tuple[tuple[Parameter, ...], tuple[tuple[float, ...], ...]]
 _TINY = (0.01, 0.05, 0.2, 0.6)  # of a place's size: from hardly seen to gross
@@ -376,7 +394,9 @@ def _cubic(z: Size) -> _Made:
 
 
 def _dead_zone(z: Size) -> _Made:
-    return _one("half_width", z.unit, 0.0, 0.0, z.greatest, [part * z.greatest for part in (0.01, 0.03, 0.1, 0.25, 0.5)])
+    return _one(
+        "half_width", z.unit, 0.0, 0.0, z.greatest, [part * z.greatest for part in (0.01, 0.03, 0.1, 0.25, 0.5)]
+    )
 
 
 def _saturation(z: Size) -> _Made:
@@ -389,7 +409,14 @@ def _saturation(z: Size) -> _Made:
 
 
 def _smooth_saturation(z: Size) -> _Made:
-    return _one("inverse_limit", f"1/({z.unit})", 0.0, 0.0, 10.0 / z.greatest, [part / z.greatest for part in (0.2, 0.6, 1.2, 2.5)])
+    return _one(
+        "inverse_limit",
+        f"1/({z.unit})",
+        0.0,
+        0.0,
+        10.0 / z.greatest,
+        [part / z.greatest for part in (0.2, 0.6, 1.2, 2.5)],
+    )
 
 
 def _quantisation(z: Size) -> _Made:
@@ -405,7 +432,9 @@ def _rate_limit(z: Size) -> _Made:
     most = max(1e3 * z.fastest, 1e6 * least)
     starts = np.geomspace(2.0 * least, max(z.fastest, 4.0 * least), 10)
     scale = float(np.sqrt(starts[0] * starts[-1]))
-    return (Parameter("rate", most, f"({z.unit})/s", 0.1 * least, most, scale=scale),), tuple((float(v),) for v in starts)
+    return (Parameter("rate", most, f"({z.unit})/s", 0.1 * least, most, scale=scale),), tuple(
+        (float(v),) for v in starts
+    )
 
 
 def _times(z: Size, least: float = 0.5, points: int = 7) -> list[float]:
@@ -431,7 +460,9 @@ def _force_offset(z: Size) -> _Made:
 
 def _viscous(z: Size) -> _Made:
     c = z.force / z.speed
-    return _one("coefficient", f"({z.force_unit})/({z.speed_unit})", 0.0, 0.0, 20.0 * c, [part * c for part in (0.02, 0.1, 0.5)])
+    return _one(
+        "coefficient", f"({z.force_unit})/({z.speed_unit})", 0.0, 0.0, 20.0 * c, [part * c for part in (0.02, 0.1, 0.5)]
+    )
 
 
 def _coulomb(z: Size) -> _Made:
@@ -444,22 +475,35 @@ def _stribeck(z: Size) -> _Made:
         Parameter("breakaway_excess", 0.0, z.force_unit, -2.0 * z.force, 5.0 * z.force),
         Parameter("speed", 0.3 * z.speed, z.speed_unit, 0.01 * z.speed, 5.0 * z.speed),
     )
-    return ps, tuple((f * z.force, e * f * z.force, w * z.speed) for f in (0.1, 0.5) for e in (0.5, -0.5) for w in (0.1, 0.5))
+    return ps, tuple(
+        (f * z.force, e * f * z.force, w * z.speed) for f in (0.1, 0.5) for e in (0.5, -0.5) for w in (0.1, 0.5)
+    )
 
 
 def _quadratic_drag(z: Size) -> _Made:
     c = z.force / z.speed**2
-    return _one("coefficient", f"({z.force_unit})/({z.speed_unit})^2", 0.0, -20.0 * c, 20.0 * c, _both(c, (0.02, 0.1, 0.5)))
+    return _one(
+        "coefficient", f"({z.force_unit})/({z.speed_unit})^2", 0.0, -20.0 * c, 20.0 * c, _both(c, (0.02, 0.1, 0.5))
+    )
 
 
 def _spring(z: Size) -> _Made:
     k = z.force / z.travel
-    return _one("stiffness", f"({z.force_unit})/({z.travel_unit})", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5)))
+    return _one(
+        "stiffness", f"({z.force_unit})/({z.travel_unit})", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5))
+    )
 
 
 def _cubic_spring(z: Size) -> _Made:
     k = z.force / z.travel**3
-    return _one("stiffness", f"({z.force_unit})/({z.travel_unit})^3", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5, 2.5, 10.0)))
+    return _one(
+        "stiffness",
+        f"({z.force_unit})/({z.travel_unit})^3",
+        0.0,
+        -20.0 * k,
+        100.0 * k,
+        _both(k, (0.02, 0.1, 0.5, 2.5, 10.0)),
+    )
 
 
 def _slider(z: Size) -> tuple[list[Parameter], list[tuple[float, float]]]:
@@ -496,7 +540,12 @@ def _state_offset(z: Size) -> _Made:
 def _power(z: Size, n: float, unit: str, signs: bool = True) -> _Made:
     c = z.rate / z.greatest**n
     return _one(
-        "coefficient", unit, 0.0, -30.0 * c if signs else 0.0, 100.0 * c, _both(c, (0.05, 0.3, 1.0, 3.0)) if signs else [0.1 * c, c]
+        "coefficient",
+        unit,
+        0.0,
+        -30.0 * c if signs else 0.0,
+        100.0 * c,
+        _both(c, (0.05, 0.3, 1.0, 3.0)) if signs else [0.1 * c, c],
     )
 
 
@@ -529,7 +578,13 @@ LAWS: dict[str, dict[str, Law]] = {
                 _asymmetric_gain,
                 "the error changes with the sign",
             ),
-            Law("absolute_value", ABSOLUTE, "the sign is lost (wholly at share 1)", _absolute, "the output never turns negative"),
+            Law(
+                "absolute_value",
+                ABSOLUTE,
+                "the sign is lost (wholly at share 1)",
+                _absolute,
+                "the output never turns negative",
+            ),
             Law(
                 "square_root",
                 SQUARE_ROOT,
@@ -539,15 +594,42 @@ LAWS: dict[str, dict[str, Law]] = {
                 constant=_greatest,
             ),
             Law("cubic", CUBIC, "a cubic term", _cubic, "grows at both ends"),
-            Law("dead_zone", DEAD_ZONE, "nothing passes near zero", _dead_zone, "no answer to small values, a constant lack beyond"),
+            Law(
+                "dead_zone",
+                DEAD_ZONE,
+                "nothing passes near zero",
+                _dead_zone,
+                "no answer to small values, a constant lack beyond",
+            ),
             Law("saturation", SATURATION, "nothing passes beyond a limit", _saturation, "flat tops"),
             Law("smooth_saturation", SMOOTH_SATURATION, "limits by and by (tanh)", _smooth_saturation, "rounded tops"),
             Law("quantisation", QUANTISATION, "moves in steps", _quantisation, "stairs"),
             Law("play", PLAY, "lost motion at each reversal", _play, "flat after each reversal, then parallel", True),
-            Law("rate_limit", RATE_LIMIT, "cannot change faster than a limit", _rate_limit, "straight ramps after steps", True),
+            Law(
+                "rate_limit",
+                RATE_LIMIT,
+                "cannot change faster than a limit",
+                _rate_limit,
+                "straight ramps after steps",
+                True,
+            ),
             Law("lag", LAG, "first-order lag", _lag, "exponential after steps", True),
-            Law("second_order_lag", SECOND_ORDER_LAG, "second-order lag", _second_order_lag, "rounded start, perhaps overshoot", True),
-            Law("dead_time", DEAD_TIME, "comes later, otherwise unchanged", _dead_time, "nothing at all, then everything", True),
+            Law(
+                "second_order_lag",
+                SECOND_ORDER_LAG,
+                "second-order lag",
+                _second_order_lag,
+                "rounded start, perhaps overshoot",
+                True,
+            ),
+            Law(
+                "dead_time",
+                DEAD_TIME,
+                "comes later, otherwise unchanged",
+                _dead_time,
+                "nothing at all, then everything",
+                True,
+            ),
         )
     },
     "force": {
@@ -555,7 +637,13 @@ LAWS: dict[str, dict[str, Law]] = {
         for law in (
             Law("force_offset", FORCE_OFFSET, "a constant force", _force_offset),
             Law("viscous", VISCOUS, "friction proportional to velocity", _viscous),
-            Law("coulomb", COULOMB, "friction of constant size against the motion", _coulomb, "jumps where the direction changes"),
+            Law(
+                "coulomb",
+                COULOMB,
+                "friction of constant size against the motion",
+                _coulomb,
+                "jumps where the direction changes",
+            ),
             Law("quadratic_drag", QUADRATIC_DRAG, "friction with the square of velocity", _quadratic_drag),
             Law("spring", SPRING, "force proportional to displacement", _spring),
             Law("cubic_spring", CUBIC_SPRING, "hardening spring", _cubic_spring),
@@ -567,8 +655,21 @@ LAWS: dict[str, dict[str, Law]] = {
                 "ramps over a distance after reversals",
                 True,
             ),
-            Law("stribeck", STRIBECK, "Coulomb friction that is larger (or smaller) at small speed", _stribeck, "spikes at reversals"),
-            Law("bouc_wen", BOUC_WEN, "smooth hysteresis: a spring that yields by and by", _bouc_wen, "rounded loops", True),
+            Law(
+                "stribeck",
+                STRIBECK,
+                "Coulomb friction that is larger (or smaller) at small speed",
+                _stribeck,
+                "spikes at reversals",
+            ),
+            Law(
+                "bouc_wen",
+                BOUC_WEN,
+                "smooth hysteresis: a spring that yields by and by",
+                _bouc_wen,
+                "rounded loops",
+                True,
+            ),
             Law(
                 "backlash_gap",
                 BACKLASH_GAP,
@@ -588,11 +689,23 @@ LAWS: dict[str, dict[str, Law]] = {
             Law("square_root", STATE_SQUARE_ROOT, "outflow as the square root (Torricelli)", _state_square_root),
             Law("quadratic_drag", STATE_QUADRATIC, "loses with its square", _state_quadratic),
             Law("cubic", STATE_CUBIC, "loses with its cube", _state_cubic),
-            Law("saturation", STATE_LIMIT, "cannot leave a range (an overflow, an end stop)", _saturation, "flat tops", True),
-            Law("rate_limit", STATE_RATE_LIMIT, "cannot change faster than a limit", _rate_limit, "straight ramps", True),
+            Law(
+                "saturation",
+                STATE_LIMIT,
+                "cannot leave a range (an overflow, an end stop)",
+                _saturation,
+                "flat tops",
+                True,
+            ),
+            Law(
+                "rate_limit", STATE_RATE_LIMIT, "cannot change faster than a limit", _rate_limit, "straight ramps", True
+            ),
         )
     },
 }
 SIGNAL_LAWS, FORCE_LAWS, STATE_LAWS = LAWS["signal"], LAWS["force"], LAWS["state"]
 HYSTERETIC = (ELASTIC_PLASTIC, BOUC_WEN)  # carry a force at rest: where they start is unknown
-MODIFIERS = (BACKLASH_GAP, FRICTION_ASYMMETRY)  # add no force of their own: they change what the friction and spring laws add
+MODIFIERS = (
+    BACKLASH_GAP,
+    FRICTION_ASYMMETRY,
+)  # add no force of their own: they change what the friction and spring laws add

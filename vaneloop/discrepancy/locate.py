@@ -1,6 +1,7 @@
 """By how much does a stage fail, where, since when, and what is the shape of what no effect in the library explains?
 
-`locate` is the only place that says whether a stage agrees with its log: terminal, JSON, pages, workbench and users' own models draw it.
+`locate` is the only place that says whether a stage agrees with its log: terminal, JSON, pages, workbench and users'
+own models draw it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,22 @@ from vaneloop.discrepancy.diagnose import rms_per_output
 from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.stage import Array, without_jumps
 
-__all__ = ["AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "bins_of", "locate", "onset", "regimes", "shape"]
+__all__ = [
+    "AGREES",
+    "Located",
+    "Regime",
+    "Shape",
+    "StageFigures",
+    "agrees",
+    "bins_of",
+    "locate",
+    "onset",
+    "regimes",
+    "shape",
+]
 
-AGREES = 1.1  # noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
+# noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
+AGREES = 1.1
 CORRELATION = 2.0  # samples that count as one where errors are looked at bin by bin: what clean logs show at most
 BINS = 8
 LEVEL = 0.01  # chance that any bin of any regime is called significant when nothing is missing
@@ -96,7 +110,8 @@ class Regime:
     def json(self) -> dict[str, Any]:
         """The condition as the commands' JSON."""
         return {
-            "signal": self.output, "unit": self.unit, "condition": self.condition, "condition_unit": self.condition_unit,
+            "signal": self.output, "unit": self.unit, "condition": self.condition,
+            "condition_unit": self.condition_unit,
             "edges": self.edges, "rms": self.rms, "noise_floors": self.ratio, "samples": self.samples,
             "significant": [bool(b) for b in self.significant], "contrast": self.contrast,
         }  # fmt: skip
@@ -104,7 +119,8 @@ class Regime:
 
 @dataclass(frozen=True)
 class Located:
-    """What one stage says with nothing added: how large its error is, whether that is more than noise, under which conditions.
+    """What one stage says with nothing added: how large its error is, whether that is more than noise, under which
+    conditions.
 
     fit      the stage's nominal parameters, refitted within their tolerances; no effect
     floor    noise floor of every output
@@ -139,26 +155,35 @@ class Located:
         """Whether it agrees or fails, in words."""
         if not self.fails:
             return "agrees everywhere"
-        where = f"{len(self.hot)} of {len(self.regimes)} conditions" if self.hot else "no single condition more than in others"
+        where = (
+            f"{len(self.hot)} of {len(self.regimes)} conditions"
+            if self.hot
+            else "no single condition more than in others"
+        )
         return f"fails in {where}: {self.worst.signal} at {self.worst.ratio:.2f} noise floors"
 
     def json(self) -> dict[str, Any]:
         """The stage as the JSON of ``vaneloop locate``."""
         return {
-            "stage": self.stage, "fails": self.fails, "verdict": "fails" if self.fails else "agrees", "onset_s": self.onset,
+            "stage": self.stage, "fails": self.fails, "verdict": "fails" if self.fails else "agrees",
+            "onset_s": self.onset,
             "signals": [s.json() for s in self.signals], "regimes": [r.json() for r in self.regimes],
         }  # fmt: skip
 
 
 def locate(judge: Judge, fit: Fit | None = None) -> Located:
-    """Where the stage fails with nothing added. ``fit``: its nominal parameters refitted, where that has been done (`recalibrate`)."""
+    """Where the stage fails with nothing added. ``fit``: its nominal parameters refitted, where that has been done
+    (`recalibrate`).
+    """
     stage = judge.stage
     fit = fit or recalibrate(judge)
     given = judge.errors(stage.neutral()[None])[0]
     rms, n = rms_per_output(judge, fit), judge.valid.sum(axis=1)
     as_given = np.sqrt(np.sum(given * given, axis=1) / np.maximum(n, 1)) * judge.floor
     signals = tuple(
-        StageFigures(stage.name, signal, stage.units[k], float(rms[k]), float(as_given[k]), float(judge.floor[k]), int(n[k]))
+        StageFigures(
+            stage.name, signal, stage.units[k], float(rms[k]), float(as_given[k]), float(judge.floor[k]), int(n[k])
+        )
         for k, signal in enumerate(stage.outputs)
     )
     found = tuple(regimes(judge, fit, CORRELATION))
@@ -177,11 +202,17 @@ def _edges(values: Array) -> Array:
     return edges
 
 
-def bins_of(found: Sequence[Regime], figure: Callable[[Regime], Array]) -> tuple[list[list[float | None]], list[str], list[str]]:
-    """Lay out a failure map: ``figure`` of each condition's bins, None where 20 samples or fewer say it; names of bins; of conditions."""
+def bins_of(
+    found: Sequence[Regime], figure: Callable[[Regime], Array]
+) -> tuple[list[list[float | None]], list[str], list[str]]:
+    """Lay out a failure map: ``figure`` of each condition's bins, None where 20 samples or fewer say it; names of bins;
+    of conditions.
+    """
     width = max(len(figure(r)) for r in found)
     values = [
-        [float(v) if n > 20 else None for v, n in zip(figure(r), r.samples, strict=True)] + [None] * (width - len(figure(r))) for r in found
+        [float(v) if n > 20 else None for v, n in zip(figure(r), r.samples, strict=True)]
+        + [None] * (width - len(figure(r)))
+        for r in found
     ]
     names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in found]
     return values, [f"bin {i + 1}" for i in range(width)], names
@@ -204,7 +235,9 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
             edges = _edges(values[use])
             bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
             n = np.bincount(bin_of, minlength=len(edges) - 1)
-            ms, floor = (np.bincount(bin_of, x[k, use], minlength=len(edges) - 1) / np.maximum(n, 1) for x in (e**2, lost))
+            ms, floor = (
+                np.bincount(bin_of, x[k, use], minlength=len(edges) - 1) / np.maximum(n, 1) for x in (e**2, lost)
+            )
             looks += len(n)
             raw.append((k, output, name, edges, n, ms / np.maximum(floor, 1.0)))
     out = []
@@ -269,7 +302,8 @@ class Shape:
 def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
     """Describe the remaining error of each output: the feature that explains most of it, and how.
 
-    For a stage that integrates, the slope of the error is described (an effect there adds speed); else the error itself.
+    For a stage that integrates, the slope of the error is described (an effect there adds speed); else the error
+    itself.
     """
     from scipy.signal import periodogram
 
@@ -282,8 +316,8 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
     for o, output in enumerate(stage.outputs):
         valid = judge.valid[o].copy()
         y, unit, what = e[o].copy(), stage.units[o], f"error of {output}"
-        # rates of the error with its jumps closed: one that drifts through a window is no sawtooth, and yet nothing is told at the
-        # windows' own rate, at which each of them starts alike
+        # rates of the error with its jumps closed: one that drifts through a window is no sawtooth, and yet nothing is
+        # told at the windows' own rate, at which each of them starts alike
         whole = without_jumps(stage, stage.measured[o] - stage.run(fit.theta[None])[0, o])
         rate = np.diff(whole) / dt
         f, power = periodogram(np.where(np.isfinite(rate), rate, 0.0), 1.0 / dt)
@@ -316,7 +350,9 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
         total = float(np.mean((y[use] - y[use].mean()) ** 2)) + float(y[use].mean() ** 2)
         features: dict[str, tuple[Array, Array, str]] = {}
         direction = stage.regimes.get("direction")
-        for name, v in sorted(stage.regimes.items(), key=lambda item: item[0] == "time"):  # time explains what nothing physical does
+        for name, v in sorted(
+            stage.regimes.items(), key=lambda item: item[0] == "time"
+        ):  # time explains what nothing physical does
             features[name] = (v, y, stage.regime_units.get(name, ""))
             if direction is not None and name != "direction":
                 features[f"{name}, against the motion"] = (v, y * direction, stage.regime_units.get(name, ""))
@@ -327,7 +363,9 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
                 continue
             edges = _edges(v[ok])
             b = np.clip(np.digitize(v[ok], edges) - 1, 0, len(edges) - 2)
-            half = (np.arange(ok.sum()) // max(1, int(5.0 / dt))) % 2 == 0  # curves from half of the stretches must hold for the other
+            half = (
+                np.arange(ok.sum()) // max(1, int(5.0 / dt))
+            ) % 2 == 0  # curves from half of the stretches must hold for the other
             n1, n2 = np.bincount(b[half], minlength=len(edges) - 1), np.bincount(b, minlength=len(edges) - 1)
             mean = np.bincount(b[half], target[ok][half], minlength=len(edges) - 1) / np.maximum(n1, 1)
             rest = float(np.mean((target[ok][~half] - mean[b[~half]]) ** 2))

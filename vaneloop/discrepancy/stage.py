@@ -1,7 +1,9 @@
-"""What a model is to the search: stages with inputs, outputs, parameters, and effects that can be set free. Nothing here knows vanes.
+"""What a model is to the search: stages with inputs, outputs, parameters, and effects that can be set free. Nothing
+here knows vanes.
 
-A stage is one part of the machine driven by its own *logged* inputs, so that one part's error does not hide in another's, as it does in a
-closed loop. It is a function from parameters to outputs, nothing more; the search does the rest.
+A stage is one part of the machine driven by its own *logged* inputs, so that one part's error does not hide in
+another's, as it does in a closed loop. It is a function from parameters to outputs, nothing more; the search does the
+rest.
 """
 
 from __future__ import annotations
@@ -27,12 +29,14 @@ class Parameter:
 
     value      nominal value of a stage's parameter, neutral value of an effect's
     low, high  physical bounds
-    tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted. Of an effect's parameter: how
-               well it is known beforehand; 0: not at all
-    output     the only output that it moves, if there is one: parameters of different outputs are then varied in one simulation
+    tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted. Of an
+               effect's parameter: how well it is known beforehand; 0: not at all
+    output     the only output that it moves, if there is one: parameters of different outputs are then varied in one
+               simulation
     scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
     shape      of an effect's parameter: it says how the effect acts, not how much, and has no neutral value of its own
-    period     after which it repeats itself, as an angle does: ``low`` and ``high`` are where one turn is cut, no bounds. 0: it does not
+    period     after which it repeats itself, as an angle does: ``low`` and ``high`` are where one turn is cut, no
+               bounds. 0: it does not
     """
 
     name: str
@@ -56,7 +60,8 @@ class Effect:
     """A physical effect that may be missing.
 
     parameters  what it sets free; at their (neutral) values the effect is not there
-    starts      parameter vectors from which a fit is tried; they span undetectable to gross, both signs where the sign is free
+    starts      parameter vectors from which a fit is tried; they span undetectable to gross, both signs where the sign
+                is free
     excites     what a log needs to show it, in words
     """
 
@@ -70,25 +75,28 @@ class Effect:
 class Stage:
     """One part of the machine on one log.
 
-    run       function from parameter sets, float64[sets, parameters], to outputs, float64[sets, outputs, samples]. The columns are the
-              stage's parameters, then each effect's in the order of ``effects`` (`index`)
+    run       function from parameter sets, float64[sets, parameters], to outputs, float64[sets, outputs, samples]. The
+              columns are the stage's parameters, then each effect's in the order of ``effects`` (`index`)
     t         s, float64[samples]
     measured  float64[outputs, samples]; NaN where not measured
-    window    s: within each window of this length the initial state is free, so one constant per output is taken off the error there;
-              None for stages that do not integrate
+    window    s: within each window of this length the initial state is free, so one constant per output is taken off
+              the error there; None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
-    lost      one draw of the error that the raster causes in each output, float64[outputs, samples]: it need not be even; None: it is
-    hidden    function from one parameter set to the RMS of what the raster hides from each output with these parameters: an effect may
-              turn on what happens between two rows; None: no more than ``raster_error``
+    lost      one draw of the error that the raster causes in each output, float64[outputs, samples]: it need not be
+              even; None: it is
+    hidden    function from one parameter set to the RMS of what the raster hides from each output with these
+              parameters: an effect may turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
-    quiet     upper bounds on the RMS of the noise in each output that do not rest on this model, float64[outputs]; None: there are none
+    quiet     upper bounds on the RMS of the noise in each output that do not rest on this model, float64[outputs];
+              None: there are none
     finer     ``run`` with a finer step of its own, for stages that have one: their difference is the numerical error
-    noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once the best model is
-              known, whose errors hold less of the machine's motion
-    twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of theirs)
-    excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long log is searched on
-              an excerpt, and the answer confirmed on the whole; None: always searched whole
+    noise     function from times and errors to the RMS of the noise in them; with it the floor is measured again once
+              the best model is known, whose errors hold less of the machine's motion
+    twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of
+              theirs)
+    excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
+              log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
     """
 
     name: str
@@ -124,7 +132,10 @@ class Stage:
         for e in self.effects:
             for s in e.starts:
                 if len(s) != len(e.parameters):
-                    raise StageError(f"stage {self.name!r}, effect {e.name!r}: a start has {len(s)} values; {len(e.parameters)} are needed")
+                    raise StageError(
+                        f"stage {self.name!r}, effect {e.name!r}: a start has {len(s)} values; {len(e.parameters)} "
+                        f"are needed"
+                    )
 
     def all_parameters(self) -> tuple[Parameter, ...]:
         """Columns of ``run``'s argument."""
@@ -151,7 +162,9 @@ KNOWN_TO = 0.05  # share by which two estimates of one noise differ on clean log
 
 
 def reach_of(stage: Stage, floor: Array, theta: Array) -> Array:
-    """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make of what happens between two rows."""
+    """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make of what happens
+    between two rows.
+    """
     if stage.hidden is None or np.array_equal(theta[len(stage.parameters) :], stage.neutral()[len(stage.parameters) :]):
         return floor
     reach = np.hypot(floor, stage.hidden(theta))
@@ -167,15 +180,18 @@ def without_jumps(stage: Stage, error: Array) -> Array:
     step = np.zeros(len(error))
     step[first] = error[first] - error[first - 1]
     if len(error) > 2:  # keep what the neighbours say the step would have been without a jump
-        step[first] -= 0.5 * (error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first])
+        step[first] -= 0.5 * (
+            error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first]
+        )
     return np.asarray(error - np.cumsum(np.where(np.isfinite(step), step, 0.0)))
 
 
 def noise_of(stage: Stage, theta: Array) -> Array:
     """Noise floor of every output: the noise in the error with parameters ``theta``, and what the raster hides.
 
-    The error of a model that lacks much moves, and motion can pass for noise: where ``stage.quiet`` is clearly less, that is the noise.
-    Where windows have a free constant the model may jump from one to the next; the jumps are closed first, so that they are not noise.
+    The error of a model that lacks much moves, and motion can pass for noise: where ``stage.quiet`` is clearly less,
+    that is the noise. Where windows have a free constant the model may jump from one to the next; the jumps are closed
+    first, so that they are not noise.
     """
     assert stage.noise is not None
     out = []

@@ -30,7 +30,8 @@ from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, lo
 from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
 
 __all__ = [
-    "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage", "floor_of", "locate_stages",
+    "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage",
+    "floor_of", "locate_stages",
     "no_better",
 ]  # fmt: skip
 
@@ -48,7 +49,9 @@ class Diagnosis:
 
 
 def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None] | None = None) -> list[Located]:
-    """Every stage with nothing added, driven by its own logged inputs: how large its error is, and under which conditions."""
+    """Every stage with nothing added, driven by its own logged inputs: how large its error is, and under which
+    conditions.
+    """
     out = []
     for i, stage in enumerate(stages):
         if progress:
@@ -79,9 +82,14 @@ def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
 
 
 def diagnose(
-    stages: Sequence[Stage], not_observed: dict[str, str] | None = None, progress: Callable[[float], None] | None = None, workers: int = 2
+    stages: Sequence[Stage],
+    not_observed: dict[str, str] | None = None,
+    progress: Callable[[float], None] | None = None,
+    workers: int = 2,
 ) -> Diagnosis:
-    """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can fork."""
+    """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can
+    fork.
+    """
     started = time.perf_counter()
     _WORK[:] = list(stages)
     # the longest first
@@ -108,27 +116,33 @@ def diagnose(
 
 
 def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
-    """Let the stages settle each other's answers: an effect that acts in two stages must do so in both by the same amount.
+    """Let the stages settle each other's answers: an effect that acts in two stages must do so in both by the same
+    amount.
 
-    Among an effect and its rivals those go that another stage contradicts; those stay alone that another stage names too. Where all of
-    them are contradicted, with any size near theirs, the next best of those that were tried takes the place if it explains as much;
-    else the stage's answer is "unknown".
+    Among an effect and its rivals those go that another stage contradicts; those stay alone that another stage names
+    too. Where all of them are contradicted, with any size near theirs, the next best of those that were tried takes the
+    place if it explains as much; else the stage's answer is "unknown".
     """
     for d in results:
         judge = Judge(stages[d.stage], d.floor)
         for k, f in enumerate(d.effects):
             elsewhere = {
-                m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()] for m in f.fits
+                m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()]
+                for m in f.fits
             }
             options = [f.effect, *f.rivals]
             left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])]
             if not left:
                 left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
-            beside = {g.effect: d.final for g in d.effects if g is not f}  # they may have changed since the rivals were fitted
+            beside = {
+                g.effect: d.final for g in d.effects if g is not f
+            }  # they may have changed since the rivals were fitted
             refitted: dict[str, Fit] = {}
             for m in () if left else sorted((m for m in f.shares if m not in options), key=lambda m: -f.shares[m]):
                 if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m]):
-                    refitted[m] = _with(judge, {**beside, m: f.fits[m]})  # where an excerpt was searched, to the whole log now
+                    refitted[m] = _with(
+                        judge, {**beside, m: f.fits[m]}
+                    )  # where an excerpt was searched, to the whole log now
                     if as_close(judge, d, refitted[m]):
                         left = [m]
                         break
@@ -167,7 +181,9 @@ def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
     return judge.fit(tuple(sources), start, 4)
 
 
-def _fits(stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str, near: float = 0.0) -> bool:
+def _fits(
+    stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str, near: float = 0.0
+) -> bool:
     """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too.
 
     near  share of its size by which the interval is widened
@@ -206,12 +222,15 @@ def _one_by_one(
 def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
     """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
 
-    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step. Errors are held-out.
+    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step.
+    Errors are held-out.
     Raises StageError for an effect that the stage does not have.
     """
     for e in effects:
         if all(e != x.name for x in stage.effects):
-            raise StageError(f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}")
+            raise StageError(
+                f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
+            )
     floor = floor_of(stage)
     for attempt in range(3):
         judge, search, order, fits = _one_by_one(stage, floor, effects, tick)
@@ -238,23 +257,31 @@ def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None
     found = found_of(judge, final, effects)
     before, after = (rms_per_output(judge, f) for f in (search.base, final))
     return StageDiagnosis(
-        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if effects else "none", floor=judge.floor,
-        base=search.base, final=final, error_before=before, error_after=after, effects=found, recalibrated=recalibrated(stage, final),
+        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if effects else "none",
+        floor=judge.floor,
+        base=search.base, final=final, error_before=before, error_after=after, effects=found,
+        recalibrated=recalibrated(stage, final),
         candidates=[], correlation=1.0, steps=steps, excess=rms(final),
     )  # fmt: skip
 
 
 def no_better(r: StageDiagnosis) -> str | None:
-    """Say in one line that the effects of `extend_stage` or `extend_system` do not bring the model nearer to the log; None: they do.
+    """Say in one line that the effects of `extend_stage` or `extend_system` do not bring the model nearer to the log;
+    None: they do.
 
     Errors are held-out; on the data that it was fitted to, a model with more effects is never farther off.
     """
     before = r.steps[0][1]
     if not r.final.effects or r.excess < before:
         return None
-    on_bound = [f"{f.effect} {n}" for f in r.effects for n, p in f.parameters.items() if p["low"] == p["value"] == p["high"]]
+    on_bound = [
+        f"{f.effect} {n}" for f in r.effects for n, p in f.parameters.items() if p["low"] == p["value"] == p["high"]
+    ]
     why = f"; on a bound or neutral: {', '.join(on_bound)}" if on_bound else ""
-    return f"{r.stage}: {', '.join(r.final.effects)} takes the error from {before:.4g} to {r.excess:.4g} noise floors, no better{why}"
+    return (
+        f"{r.stage}: {', '.join(r.final.effects)} takes the error from {before:.4g} to {r.excess:.4g} noise "
+        f"floors, no better{why}"
+    )
 
 
 def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
@@ -276,7 +303,8 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
         for f in s.effects:
             effects.append(
                 {
-                    "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals,
+                    "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters,
+                    "rivals": f.rivals,
                     "inseparable": f.inseparable,
                 }
             )  # fmt: skip
@@ -290,7 +318,8 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
     for name, why in d.not_observed.items():
         stages.append(
             {
-                "stage": name, "verdict": "not_observed", "signal": None, "unit": None, "error_before": None, "error_after": None,
+                "stage": name, "verdict": "not_observed", "signal": None, "unit": None, "error_before": None,
+                "error_after": None,
                 "noise_floor": None, "reason": why,
             }
         )  # fmt: skip

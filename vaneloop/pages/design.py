@@ -38,8 +38,9 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
 
     page.section(
         "Open loop",
-        "Loop gain and phase, with the loop sampled as the firmware closes it and as a continuous loop with half a tick of delay. "
-        "They agree far beyond crossover, so the tick of 1 ms costs half a millisecond and nothing else.",
+        "Loop gain and phase, with the loop sampled as the firmware closes it and as a continuous loop with half a "
+        "tick of delay. They agree far beyond crossover, so the tick of 1 ms costs half a millisecond and nothing "
+        "else.",
     )
     hz = c["omega"] / (2.0 * math.pi)
     phase = [np.degrees(np.unwrap(np.angle(c[k]))) for k in ("sampled", "continuous")]
@@ -51,13 +52,18 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
                 "gain [dB]",
                 [
                     Line("sampled", hz[show], 20.0 * np.log10(np.abs(c["sampled"][show])), "model"),
-                    Line("continuous", hz[show], 20.0 * np.log10(np.abs(c["continuous"][show])), "measured", dash="dot"),
+                    Line(
+                        "continuous", hz[show], 20.0 * np.log10(np.abs(c["continuous"][show])), "measured", dash="dot"
+                    ),
                 ],
                 marks={"0 dB": 0.0},
             ),
             Panel(
                 "phase [deg]",
-                [Line("sampled", hz[show], phase[0][show], "model"), Line("continuous", hz[show], phase[1][show], "measured", dash="dot")],
+                [
+                    Line("sampled", hz[show], phase[0][show], "model"),
+                    Line("continuous", hz[show], phase[1][show], "measured", dash="dot"),
+                ],
                 marks={"-180 deg": -180.0},
             ),
         ],
@@ -68,8 +74,8 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
 
     page.section(
         "Nyquist curve and disk",
-        "The loop stays outside the disk. Inside it lie all points that some gain and phase error of the disk margin's size would carry "
-        "to -1.",
+        "The loop stays outside the disk. Inside it lie all points that some gain and phase error of the disk margin's "
+        "size would carry to -1.",
     )
     near = (np.abs(c["sampled"]) < 4.0) & (np.abs(c["sampled"]) > 1e-3)
     turn = np.linspace(0.0, 2.0 * math.pi, 200)
@@ -88,7 +94,10 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
         page.text("A corner is unstable, so no time response is shown.")
         return page.write(path)
 
-    page.section("Steps and ramp", "A bare step of 10 mm saturates the valve; the firmware draws it as a ramp of 100 mm/s, which does not.")
+    page.section(
+        "Steps and ramp",
+        "A bare step of 10 mm saturates the valve; the firmware draws it as a ramp of 100 mm/s, which does not.",
+    )
     bare, drawn, ramp = c["step_bare"], c["step_drawn"], c["ramp"]
     show_t = bare.t < 0.5
     page.plot(
@@ -117,25 +126,47 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
     page.plot(
         overlay(
             [
-                Panel("stroke [mm]", [Line("demand", ramp.t, 1e3 * ramp.x_dem, "target"), Line("piston", ramp.t, 1e3 * ramp.x, "model")]),
-                Panel("error at the LVDT [mm]", [Line("error", ramp.t, 1e3 * (ramp.x_dem - ramp.x_lvdt), "error")], zero=True),
+                Panel(
+                    "stroke [mm]",
+                    [Line("demand", ramp.t, 1e3 * ramp.x_dem, "target"), Line("piston", ramp.t, 1e3 * ramp.x, "model")],
+                ),
+                Panel(
+                    "error at the LVDT [mm]",
+                    [Line("error", ramp.t, 1e3 * (ramp.x_dem - ramp.x_lvdt), "error")],
+                    zero=True,
+                ),
             ]
         ),
         half=True,
     )
-    step = overlay([Panel("x_lvdt / x_dem", [Line("linear step", c["step_t"], c["step_linear"], "model")], marks={"1": 1.0})])
+    step = overlay(
+        [Panel("x_lvdt / x_dem", [Line("linear step", c["step_t"], c["step_linear"], "model")], marks={"1": 1.0})]
+    )
     page.plot(step, "Linear closed loop, no feed-forward, no limit.")
 
     page.section(
         "Limit cycles by play",
-        "With an integral in the controller any play inside the loop sustains a slow oscillation: the loop must cross the curve -1/N(A). "
-        "Its size is about half the gap and it grows with ki/kp. Play between piston and vanes is not seen by the LVDT and is not in the "
-        "loop: nothing to cross, no oscillation, only lost motion.\n\nThe describing function takes the motion before the play for a "
-        "sine. Where the piston hardly leaves its gap (grazing), it is not: the amplitude holds within some 10 %, the frequency within "
-        "some 50 %. The column 'with harmonics' solves the same balance with all odd harmonics and has no such error.",
+        "With an integral in the controller any play inside the loop sustains a slow oscillation: the loop must cross "
+        "the curve -1/N(A). Its size is about half the gap and it grows with ki/kp. Play between piston and vanes is "
+        "not seen by the LVDT and is not in the loop: nothing to cross, no oscillation, only lost motion.\n\nThe "
+        "describing function takes the motion before the play for a sine. Where the piston hardly leaves its gap "
+        "(grazing), it is not: the amplitude holds within some 10 %, the frequency within some 50 %. The column 'with "
+        "harmonics' solves the same balance with all odd harmonics and has no such error.",
     )
     page.table(
-        ["where", "gap", "unit", "predicted", "Hz", "with harmonics", "Hz", "simulated", "Hz", "predicted with ki = 0", "grazing"],
+        [
+            "where",
+            "gap",
+            "unit",
+            "predicted",
+            "Hz",
+            "with harmonics",
+            "Hz",
+            "simulated",
+            "Hz",
+            "predicted with ki = 0",
+            "grazing",
+        ],
         [
             [
                 {"lvdt": "piston to LVDT", "valve": "valve", "vanes": "piston to vanes"}[p.site],
@@ -160,7 +191,9 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
     wide = (np.abs(curve) < 60.0) & (np.abs(curve) > 1e-3)
     diagram = loop(
         [
-            Line("loop", np.degrees(np.angle(curve[wide])) % 360.0 - 360.0, 20.0 * np.log10(np.abs(curve[wide])), "model"),
+            Line(
+                "loop", np.degrees(np.angle(curve[wide])) % 360.0 - 360.0, 20.0 * np.log10(np.abs(curve[wide])), "model"
+            ),
             Line("-1/N(A)", np.degrees(np.angle(inverse)) % 360.0 - 360.0, 20.0 * np.log10(np.abs(inverse)), "error"),
         ],
         "phase [deg]",

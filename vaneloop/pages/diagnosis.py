@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located, bins_of, locate
 from vaneloop.discrepancy.models.vanes import Chain
 from vaneloop.discrepancy.workflow import Diagnosis
-from vaneloop.pages.page import Line, Page, Panel, heat, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.page import TONE_OF, Line, Page, Panel, heat, loop, number, overlay, ranking, waterfall
 
 __all__ = ["compare_report", "diagnosis_report", "located_sentence", "located_tone", "verdict_sentence"]
 
@@ -56,17 +56,23 @@ def located_tone(located: Sequence[Located]) -> Literal["good", "neutral", "bad"
 
 def compare_report(located: Sequence[Located], chain: Chain, path: str | Path, command: str, log: str) -> Path:
     """Write the page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
-    page = Page(f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log)
+    page = Page(
+        f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
+    )
     page.section(
         "Stage by stage",
-        "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does in closed loop. "
-        "Nominal parameters are refitted within their tolerances; beside it the error with the parameters as given.",
+        "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does "
+        "in closed loop. Nominal parameters are refitted within their tolerances; beside it the error with the "
+        "parameters as given.",
     )
     rows: list[list[object]] = [
-        [x.stage, "fails" if x.fails else "agrees", f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit, f.samples]
+        [x.stage, "fails" if x.fails else "agrees", f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit,
+        f.samples]
         for x in located for f in x.signals
     ]  # fmt: skip
-    rows += [[name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in chain.not_observed.items()]
+    rows += [
+        [name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in chain.not_observed.items()
+    ]
     page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
@@ -77,11 +83,11 @@ def compare_report(located: Sequence[Located], chain: Chain, path: str | Path, c
 
 
 def diagnosis_report(
-    d: Diagnosis, chain: Chain, path: str | Path, command: str, log: str, experiment: dict[str, object] | None = None
+    d: Diagnosis, chain: Chain, path: str | Path, command: str, log: str, experiment: dict[str, Any] | None = None
 ) -> Path:
     """Write the page of ``vaneloop diagnose`` or ``extend``."""
-    tone = {"none": "good", "missing": "neutral", "unknown": "bad"}[d.verdict]
-    page = Page(f"Diagnosis of {Path(log).name}", verdict_sentence(d), tone=tone, command=command, log=log)  # type: ignore[arg-type]
+    title = f"Diagnosis of {Path(log).name}"
+    page = Page(title, verdict_sentence(d), tone=TONE_OF[d.verdict], command=command, log=log)
     for s in d.stages:
         k = int(np.argmax(s.error_before / s.floor))
         page.tile(
@@ -90,8 +96,8 @@ def diagnosis_report(
         )  # fmt: skip
     page.section(
         "What each stage says",
-        "A stage is judged on its own logged inputs. Errors are RMS on data that the parameters were not fitted to; a complete model "
-        "stands at its noise floor.",
+        "A stage is judged on its own logged inputs. Errors are RMS on data that the parameters were not fitted to; a "
+        "complete model stands at its noise floor.",
     )
     rows: list[list[object]] = []
     for s in d.stages:
@@ -102,7 +108,8 @@ def diagnosis_report(
     found = [(s, f) for s in d.stages for f in s.effects]
     if found:
         page.section(
-            "Effects found", "Parameters with their 90 % intervals. Rivals explain this log as well: another experiment must decide."
+            "Effects found",
+            "Parameters with their 90 % intervals. Rivals explain this log as well: another experiment must decide.",
         )
         rows = []
         for s, f in found:
@@ -127,19 +134,31 @@ def diagnosis_report(
         _stage_story(page, s, chain)
         for x in d.shapes.get(s.stage, []):
             page.text(x.text[0].upper() + x.text[1:] + ".")
-            page.plot(loop([Line("what is left", x.x, x.y, "error", 2.0)], f"{x.feature} [{x.x_unit}]", f"{x.output} [{x.y_unit}]"))
+            page.plot(
+                loop(
+                    [Line("what is left", x.x, x.y, "error", 2.0)],
+                    f"{x.feature} [{x.x_unit}]",
+                    f"{x.output} [{x.y_unit}]",
+                )
+            )
     recal = [r for s in d.stages for r in s.recalibrated]
     if recal:
         page.section("Recalibrated", "Nominal parameters that moved within their tolerance: not a missing effect.")
         page.table(
-            ["parameter", "value", "low", "high", "unit"], [[r["parameter"], r["value"], r["low"], r["high"], r["unit"]] for r in recal]
+            ["parameter", "value", "low", "high", "unit"],
+            [[r["parameter"], r["value"], r["low"], r["high"], r["unit"]] for r in recal],
         )
     if experiment:
         page.section("Next experiment", str(experiment["text"]))
-        page.plot(overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])]))  # type: ignore[arg-type]
+        page.plot(
+            overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
+        )
     unseen = [[c.effect, s.stage, c.reason] for s in d.stages for c in s.candidates if c.reason]
     if unseen:
-        page.section("What this log cannot show", "These effects would have left no trace here, however large: their absence is not shown.")
+        page.section(
+            "What this log cannot show",
+            "These effects would have left no trace here, however large: their absence is not shown.",
+        )
         page.table(["effect", "stage", "what would excite it"], unseen)
     return page.write(path)
 
@@ -147,7 +166,10 @@ def diagnosis_report(
 def _stage_story(page: Page, s: StageDiagnosis, chain: Chain) -> None:
     stage = chain.stage(s.stage)
     judge = Judge(stage, s.floor)
-    page.section(f"The {s.stage} stage", f"Verdict: {s.verdict}. Noise is correlated by a factor of {s.correlation:.1f} in variance.")
+    page.section(
+        f"The {s.stage} stage",
+        f"Verdict: {s.verdict}. Noise is correlated by a factor of {s.correlation:.1f} in variance.",
+    )
     curves = [("nominal model", s.base.theta, "error")]
     if s.final.effects:
         curves.append(("with " + " + ".join(s.final.effects), s.final.theta, "model"))
@@ -173,7 +195,10 @@ def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]],
     for k, output in enumerate(stage.outputs):
         y = np.where(judge.valid[k], stage.measured[k], np.nan)
         panels.append(Panel(f"{output} [{stage.units[k]}]", [Line("measured", stage.t, y, "measured")], height=1.0))
-        lines = [Line(name, stage.t, np.where(judge.valid[k], e[i, k], np.nan), role, 1.0) for i, (name, _, role) in enumerate(models)]
+        lines = [
+            Line(name, stage.t, np.where(judge.valid[k], e[i, k], np.nan), role, 1.0)
+            for i, (name, _, role) in enumerate(models)
+        ]
         panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=1.0))
     page.plot(overlay(panels), caption + ". The grey band is three noise floors to each side.")
 

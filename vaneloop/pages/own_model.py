@@ -9,7 +9,7 @@ import numpy as np
 
 from vaneloop.discrepancy.locate import bins_of
 from vaneloop.discrepancy.models.own_model import NO_HELP, Answer
-from vaneloop.pages.page import Line, Page, Panel, bars, heat, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.page import TONE_OF, Line, Page, Panel, Tone, bars, heat, loop, number, overlay, ranking, waterfall
 
 __all__ = ["own_report", "short_names"]
 
@@ -26,8 +26,9 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         if looks
         else answer.sentence()
     )
-    tone = "neutral" if looks else {"none": "good", "missing": "neutral", "unknown": "bad"}[d.verdict]
-    page = Page(f"{answer.verb.capitalize()}: {d.stage} on {Path(log).name}", sentence, tone=tone, command=command, log=log)  # type: ignore[arg-type]
+    tone: Tone = "neutral" if looks else TONE_OF[d.verdict]
+    title = f"{answer.verb.capitalize()}: {d.stage} on {Path(log).name}"
+    page = Page(title, sentence, tone=tone, command=command, log=log)
     for i, name in enumerate(d.outputs):
         own = float(np.sqrt(np.nanmean(b.measured[i] ** 2))) or 1.0
         page.tile(
@@ -41,8 +42,8 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
     steps = list(answer.logs)
     page.section(
         "Log by log",
-        "RMS error of the model as it was given, then with each law added, every step fitted anew to the fitted logs alone. A law that "
-        "only imitates what is missing makes some test log worse.",
+        "RMS error of the model as it was given, then with each law added, every step fitted anew to the fitted logs "
+        "alone. A law that only imitates what is missing makes some test log worse.",
     )
     fitted = set(b.logs)
     short = short_names(list(answer.logs[steps[0]]))
@@ -50,7 +51,13 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
     for name in answer.logs[steps[0]]:
         for i, output in enumerate(d.outputs):
             rows.append(
-                [short[name], "fitted" if name in fitted else "test", output, *(float(answer.logs[s][name][i]) for s in steps), d.units[i]]
+                [
+                    short[name],
+                    "fitted" if name in fitted else "test",
+                    output,
+                    *(float(answer.logs[s][name][i]) for s in steps),
+                    d.units[i],
+                ]
             )
     together = answer.together()
     for what, bound in (("fitted", b), ("test", answer.test)):
@@ -65,12 +72,15 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         names = list(answer.ablation)
         logs = list(answer.logs[steps[0]])
         page.section(
-            "Which law helps where", "Error with the law over error without it; 1: it does nothing there, above 1: it does harm there."
+            "Which law helps where",
+            "Error with the law over error without it; 1: it does nothing there, above 1: it does harm there.",
         )
         page.table(["law", *(short[x] for x in logs)], [[n, *(answer.ablation[n][x] for x in logs)] for n in names])
         page.plot(
             bars(
-                [short[x] for x in logs], {n: [answer.ablation[n][x] for x in logs] for n in names}, "error with the law / without",
+                [short[x] for x in logs],
+                {n: [answer.ablation[n][x] for x in logs] for n in names},
+                "error with the law / without",
                 marks={"no help": 1.0},
             ),  # fmt: skip
             "Short bars help.",
@@ -81,12 +91,15 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
                 page.text(f"{n} hardly helps, or does harm, on {', '.join(short[x] for x in idle)}.")
     if d.effects:
         page.section(
-            "Laws found", "Parameters with their 90 % intervals. Rivals do as well on the fitted logs: another experiment must decide."
+            "Laws found",
+            "Parameters with their 90 % intervals. Rivals do as well on the fitted logs: another experiment must "
+            "decide.",
         )
         page.table(
             ["law", "wins", "parameter", "value", "low", "high", "unit", "rivals"],
             [
-                [f.effect, f"{100 * f.probability:.0f} %", n, p["value"], p["low"], p["high"], p["unit"], ", ".join(f.rivals) or "none"]
+                [f.effect, f"{100 * f.probability:.0f} %", n, p["value"], p["low"], p["high"], p["unit"],
+                ", ".join(f.rivals) or "none"]
                 for f in d.effects for n, p in f.parameters.items()
             ],
         )  # fmt: skip
@@ -100,7 +113,8 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
     if not looks:
         page.plot(
             waterfall(
-                [(n.split(" + ")[-1] if n != "model" else n, v * float(d.floor[0])) for n, v in d.steps], f"held-out error [{d.units[0]}]"
+                [(n.split(" + ")[-1] if n != "model" else n, v * float(d.floor[0])) for n, v in d.steps],
+                f"held-out error [{d.units[0]}]",
             )
             if len(d.outputs) == 1
             else waterfall([(n.split(" + ")[-1], v) for n, v in d.steps], "held-out error [noise of the samples]"),
@@ -120,7 +134,11 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
     _map(page, answer)
     for s in answer.shapes:
         page.section("What is left", s.text[0].upper() + s.text[1:] + ".")
-        page.plot(loop([Line("what is left", s.x, s.y, "error", 2.0)], f"{s.feature} [{s.x_unit}]", f"{s.output} [{s.y_unit}]"))
+        page.plot(
+            loop(
+                [Line("what is left", s.x, s.y, "error", 2.0)], f"{s.feature} [{s.x_unit}]", f"{s.output} [{s.y_unit}]"
+            )
+        )
     if answer.notes:
         page.section("Notes")
         for n in answer.notes:
@@ -130,7 +148,10 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
 
 def short_names(names: Sequence[str], width: int = 28) -> dict[str, str]:
     """File names as they fit into tables and axes: their ends, without the suffix, where that keeps them apart."""
-    stems = {n: Path(n).stem if Path(n).suffix.lower() in (".csv", ".json", ".mat", ".parquet", ".mf4", ".txt") else n for n in names}
+    stems = {
+        n: Path(n).stem if Path(n).suffix.lower() in (".csv", ".json", ".mat", ".parquet", ".mf4", ".txt") else n
+        for n in names
+    }
     cut = {n: s if len(s) <= width else "…" + s[1 - width :] for n, s in stems.items()}
     return next((d for d in (cut, stems) if len(set(d.values())) == len(names)), {n: n for n in names})
 
@@ -167,7 +188,11 @@ def _pictures(page: Page, answer: Answer) -> None:
                 if not looks:
                     lines.append(Line("with the laws", x, y[1, 0, at], "model", 1.0))
                 page.plot(
-                    loop(lines, f"displacement [{bound.system.units.get('position', 'm')}]", f"{d.outputs[0]} [{d.units[0]}]"),
+                    loop(
+                        lines,
+                        f"displacement [{bound.system.units.get('position', 'm')}]",
+                        f"{d.outputs[0]} [{d.units[0]}]",
+                    ),
                     f"{name}: force over displacement.",
                 )
 

@@ -7,9 +7,9 @@
     page.table(["signal", "rms"], [["vigv", 0.21]])
     page.write("out.html")
 
-A plot is a plain dictionary in Plotly's JSON form; a `plotly.graph_objects.Figure` works too. Colours are names of roles
-(``@measured``, ``@model``, ``@target``, ``@error``, ...), which the page resolves for the reader's light or dark scheme.
-All text that enters a page is escaped: names out of logs cannot become markup.
+A plot is a plain dictionary in Plotly's JSON form; a `plotly.graph_objects.Figure` works too. Colours are names of
+roles (``@measured``, ``@model``, ``@target``, ``@error``, ...), which the page resolves for the reader's light or dark
+scheme. All text that enters a page is escaped: names out of logs cannot become markup.
 """
 
 from __future__ import annotations
@@ -50,11 +50,13 @@ __all__ = [
 Array = NDArray[np.float64]
 Figure = dict[str, Any]
 Tone = Literal["neutral", "good", "bad"]
+TONE_OF: dict[str, Tone] = {"none": "good", "missing": "neutral", "unknown": "bad"}  # verdict of a diagnosis
 
 MAX_POINTS = 4500  # points a line, three times the pixels of a wide plot; 48 kB of the file
 GAP = 10.0  # a hole in the samples this many times the usual distance breaks the line
 
-# Blue and orange stay apart for all common colour-vision deficiencies; both themes keep a contrast above 4.5 on their background.
+# Blue and orange stay apart for all common colour-vision deficiencies; both themes keep a contrast above 4.5 on their
+# background.
 THEMES: dict[str, dict[str, str]] = {
     "light": {
         "measured": "#1f6fc4",
@@ -101,7 +103,9 @@ THEMES: dict[str, dict[str, str]] = {
 
 
 def number(value: object, digits: int = 3) -> str:
-    """Return ``value`` for a reader: three significant digits, no exponent between 0.001 and 100,000, an en dash for nothing."""
+    """Return ``value`` for a reader: three significant digits, no exponent between 0.001 and 100,000, an en dash for
+    nothing.
+    """
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -140,8 +144,8 @@ def break_at_holes(x: Array, y: Array) -> tuple[Array, Array]:
 def decimate(x: ArrayLike, y: ArrayLike, limit: int = MAX_POINTS) -> tuple[Array, Array]:
     """Thin a long line to at most ``limit`` points and keep what the eye would see: every extreme and every gap.
 
-    The samples are cut into equal groups; of each group its least value, its greatest value and one NaN, if it has any, stay.
-    A hole in ``x`` of more than 10 times the usual distance becomes a NaN, so that no line is drawn across it.
+    The samples are cut into equal groups; of each group its least value, its greatest value and one NaN, if it has any,
+    stay. A hole in ``x`` of more than 10 times the usual distance becomes a NaN, so that no line is drawn across it.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if x.shape != y.shape:
@@ -169,8 +173,9 @@ def decimate(x: ArrayLike, y: ArrayLike, limit: int = MAX_POINTS) -> tuple[Array
 def _thin_path(x: Array, y: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
     """Thin a path in the plane to what the eye can tell apart.
 
-    The plane is divided into cells of about two pixels. A sample stays where the path enters a cell; a step between two cells that was
-    drawn before is not drawn again. So dwells cost nothing, and no chord cuts across a fast motion. Cells grow until ``limit`` is met.
+    The plane is divided into cells of about two pixels. A sample stays where the path enters a cell; a step between two
+    cells that was drawn before is not drawn again. So dwells cost nothing, and no chord cuts across a fast motion.
+    Cells grow until ``limit`` is met.
     """
     good = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if x.size <= limit or good.size == 0:
@@ -194,7 +199,9 @@ def _thin_path(x: Array, y: Array, limit: int = MAX_POINTS) -> tuple[Array, Arra
     if steps.size == 0:
         return x[:1], y[:1]
     ends = np.concatenate([jumps, [steps.size]])
-    at = np.insert(enters[steps], ends, enters[steps[ends - 1] + 1])  # each stroke of the pen ends where its last step does
+    at = np.insert(
+        enters[steps], ends, enters[steps[ends - 1] + 1]
+    )  # each stroke of the pen ends where its last step does
     lifts = ends[:-1] + np.arange(1, ends.size)
     return np.insert(x[at], lifts, np.nan), np.insert(y[at], lifts, np.nan)
 
@@ -308,12 +315,21 @@ def _band_and_marks(layout: Figure, panel: Panel, axis: str) -> None:
     """Draw the grey band and the level marks of one panel."""
     across = {"xref": "x domain", "x0": 0, "x1": 1, "yref": axis, "layer": "below"}
     if panel.band:
-        rect = {"type": "rect", "y0": -panel.band, "y1": panel.band, "fillcolor": "@noise", "opacity": 0.22, "line": {"width": 0}}
+        rect = {
+            "type": "rect",
+            "y0": -panel.band,
+            "y1": panel.band,
+            "fillcolor": "@noise",
+            "opacity": 0.22,
+            "line": {"width": 0},
+        }
         layout["shapes"].append(across | rect)
         edge = {"type": "line", "line": {"color": "@text", "width": 1, "dash": "dot"}, "opacity": 0.7, "layer": "above"}
         layout["shapes"] += [across | edge | {"y0": level, "y1": level} for level in (-panel.band, panel.band)]
     for name, level in panel.marks.items():
-        layout["shapes"].append(across | {"type": "line", "y0": level, "y1": level, "line": {"color": "@soft", "width": 1, "dash": "dot"}})
+        layout["shapes"].append(
+            across | {"type": "line", "y0": level, "y1": level, "line": {"color": "@soft", "width": 1, "dash": "dot"}}
+        )
         layout["annotations"].append(
             {
                 "xref": "x domain",
@@ -330,7 +346,11 @@ def _band_and_marks(layout: Figure, panel: Panel, axis: str) -> None:
 
 
 def histogram(
-    errors: Mapping[str, ArrayLike], x_title: str, roles: Mapping[str, str] | None = None, noise: float | None = None, bins: int = 81
+    errors: Mapping[str, ArrayLike],
+    x_title: str,
+    roles: Mapping[str, str] | None = None,
+    noise: float | None = None,
+    bins: int = 81,
 ) -> Figure:
     """Share of the samples at each size of error. Outermost bins hold what lies beyond the 99.8 % range.
 
@@ -454,7 +474,9 @@ def bars(
     return {"data": data, "layout": layout}
 
 
-def waterfall(steps: Sequence[tuple[str, float]], y_title: str, floor: float | None = None, height: int = 400) -> Figure:
+def waterfall(
+    steps: Sequence[tuple[str, float]], y_title: str, floor: float | None = None, height: int = 400
+) -> Figure:
     """How an error falls step by step: the level after each step, the fall hanging from the level before.
 
     steps  (name, level reached); the first is where it starts, the last where it ends
@@ -557,10 +579,14 @@ def heat(
 
     signed: colours diverge about zero (bias); otherwise they grow from zero (size of an error).
     """
-    z = np.array([[math.nan if v is None else float(v) for v in row] for row in np.asarray(values, dtype=object)], dtype=float)
+    z = np.array(
+        [[math.nan if v is None else float(v) for v in row] for row in np.asarray(values, dtype=object)], dtype=float
+    )
     text = [["" if not math.isfinite(v) else number(v, 2) for v in row] for row in z]
     reach = float(np.nanmax(np.abs(z))) if np.isfinite(z).any() else 1.0
-    scale = [[0, "@cold"], [0.5, "@heat0"], [1, "@heat2"]] if signed else [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]]
+    scale = (
+        [[0, "@cold"], [0.5, "@heat0"], [1, "@heat2"]] if signed else [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]]
+    )
     trace = {
         "type": "heatmap",
         "z": [[None if not math.isfinite(v) else float(v) for v in row] for row in z],
@@ -582,7 +608,12 @@ def heat(
         "layout": {
             "height": 120 + 38 * max(3, len(rows)),
             "xaxis": {"type": "category", "title": {"text": _label(x_title)}, "showgrid": False},
-            "yaxis": {"type": "category", "title": {"text": _label(y_title)}, "autorange": "reversed", "showgrid": False},
+            "yaxis": {
+                "type": "category",
+                "title": {"text": _label(y_title)},
+                "autorange": "reversed",
+                "showgrid": False,
+            },
         },
     }
 
@@ -627,12 +658,15 @@ class Page:
         """Add a key figure; ``note`` says in a few words what it means."""
         e = html.escape
         self._tiles.append(
-            f'<div class="tile {e(tone)}"><div class="label">{e(label)}</div>'
-            f'<div class="value">{e(number(value))}<span class="unit">{e(unit)}</span></div><div class="note">{e(note)}</div></div>'
+            f'<div class="tile {e(tone)}"><div class="label">{e(label)}</div><div '
+            f'class="value">{e(number(value))}<span class="unit">{e(unit)}</span></div><div '
+            f'class="note">{e(note)}</div></div>'
         )
 
     def section(self, title: str, text: str = "") -> None:
-        """Begin a section: a heading and what its plots say in plain words; an empty line in ``text`` begins a new paragraph."""
+        """Begin a section: a heading and what its plots say in plain words; an empty line in ``text`` begins a new
+        paragraph.
+        """
         self._end_grid()
         self._sections.append(title)
         self._body.append(f'<h2 id="s{len(self._sections)}">{html.escape(title)}</h2>')
@@ -654,17 +688,24 @@ class Page:
             self._end_grid()
         height = int(figure.get("layout", {}).get("height") or 400)
         note = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-        self._body.append(f'<figure><div class="plot" id="p{len(self._figures)}" style="height:{height}px"></div>{note}</figure>')
+        self._body.append(
+            f'<figure><div class="plot" id="p{len(self._figures)}" style="height:{height}px"></div>{note}</figure>'
+        )
         self._figures.append(figure)
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "") -> None:
         """Add a table; numbers are rounded to three digits and set flush right."""
         self._end_grid()
         e = html.escape
-        head = "".join(f"<th{_right(all(_is_number(r[i]) for r in rows) and bool(rows))}>{e(str(c))}</th>" for i, c in enumerate(columns))
+        head = "".join(
+            f"<th{_right(all(_is_number(r[i]) for r in rows) and bool(rows))}>{e(str(c))}</th>"
+            for i, c in enumerate(columns)
+        )
         body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
-        self._body.append(f'<div class="scroll"><table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+        self._body.append(
+            f'<div class="scroll"><table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
 
     def html(self) -> str:
         """Return the whole page."""
@@ -678,11 +719,13 @@ class Page:
             "<!doctype html>",
             '<html lang="en"><head><meta charset="utf-8">',
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" '
+            'content="light dark">',
             f"<title>{e(self.title)}</title>",
             f"<style>{_css()}</style>",
             "</head><body><main>",
-            f'<header><p class="kicker">VaneLoop{" · " + e(self.subtitle) if self.subtitle else ""}</p><h1>{e(self.title)}</h1>'
+            f"<header><p "
+            f'class="kicker">VaneLoop{" · " + e(self.subtitle) if self.subtitle else ""}</p><h1>{e(self.title)}</h1>'
             f'<p class="verdict {e(self.tone)}">{e(self.verdict)}</p></header>',
             f'<div class="tiles">{"".join(self._tiles)}</div>' if self._tiles else "",
             f'<nav aria-label="contents">{toc}</nav>' if len(self._sections) > 1 else "",
@@ -708,7 +751,9 @@ class Page:
 
 
 def write_atomically(path: str | Path, text: str) -> Path:
-    """Write UTF-8 text into a temporary file beside ``path`` and rename it. Raises InputError when it cannot be written."""
+    """Write UTF-8 text into a temporary file beside ``path`` and rename it. Raises InputError when it cannot be
+    written.
+    """
     file = Path(path)
     temporary = ""
     try:
@@ -725,7 +770,9 @@ def write_atomically(path: str | Path, text: str) -> Path:
         if temporary and os.path.exists(temporary):
             os.unlink(temporary)
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{file}: report cannot be written ({reason}); the folder must exist and be writable") from None
+        raise InputError(
+            f"{file}: report cannot be written ({reason}); the folder must exist and be writable"
+        ) from None
     return file
 
 
@@ -776,7 +823,8 @@ def _finite(data: Any) -> Any:
 
 
 _POLICY = (  # no network at all, whatever a page may hold
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
+    "form-action 'none'"
 )
 
 
@@ -795,7 +843,8 @@ body{margin:0;background:var(--page);color:var(--text);
 main{max-width:1560px;margin:0 auto;padding:28px 36px 40px}
 .kicker{margin:0;color:var(--soft);font-size:14px;letter-spacing:.04em}
 h1{margin:2px 0 10px;font-size:26px;line-height:1.25;overflow-wrap:anywhere}
-.verdict{margin:0 0 22px;padding:14px 20px;border-left:6px solid var(--measured);background:var(--panel);border-radius:6px;
+.verdict{margin:0 0 22px;padding:14px 20px;border-left:6px solid var(--measured);background:var(--panel);
+  border-radius:6px;
  font-size:22px;line-height:1.4;max-width:78ch;overflow-wrap:anywhere}
 .verdict.good{border-color:var(--good)}.verdict.bad{border-color:var(--bad)}
 .tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(190px,1fr));gap:14px;margin-bottom:20px}
@@ -809,7 +858,8 @@ nav{display:flex;flex-wrap:wrap;gap:4px 18px;margin-bottom:6px;font-size:15px}
 nav a{color:var(--measured)}
 h2{margin:34px 0 4px;font-size:20px;overflow-wrap:anywhere}
 p{margin:6px 0 12px;max-width:92ch}
-figure{margin:12px 0;background:var(--panel);border:1px solid var(--grid);border-radius:8px;padding:8px 10px 10px;min-width:0}
+figure{margin:12px 0;background:var(--panel);border:1px solid var(--grid);border-radius:8px;padding:8px 10px 10px;
+  min-width:0}
 figcaption{color:var(--soft);font-size:14px;padding:2px 10px 2px;max-width:110ch}
 .pair{display:grid;grid-template-columns:repeat(2,minmax(0,1fr));gap:0 14px}
 @media (max-width:900px){.pair{grid-template-columns:minmax(0,1fr)}main{padding:18px 14px}}
@@ -825,7 +875,8 @@ footer{margin-top:36px;border-top:1px solid var(--grid);color:var(--soft);font-s
 dl{display:grid;gap:2px;margin:12px 0}dl div{display:flex;gap:12px}dt{flex:0 0 90px}
 dd{margin:0;font-family:ui-monospace,"DejaVu Sans Mono",monospace;font-size:12.5px;overflow-wrap:anywhere}
 @page{size:A4 landscape;margin:11mm}
-@media print{body{font-size:12px}main{padding:0;max-width:none}nav{display:none}.verdict{font-size:18px}.tile .value{font-size:20px}
+@media print{body{font-size:12px}main{padding:0;max-width:none}nav{display:none}.verdict{font-size:18px}
+  .tile .value{font-size:20px}
  h2,h2+p{break-after:avoid}.modebar{display:none!important}figure,.tile,tr,.scroll{break-inside:avoid}.pair{grid-template-columns:repeat(2,minmax(0,1fr))}
  *{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """
@@ -851,10 +902,13 @@ _SCRIPT = """
     }
     return x;
   };
-  const axis = c => ({gridcolor: c.grid, linecolor: c.muted, zerolinecolor: c.muted, zerolinewidth: 1, tickcolor: c.muted,
-    automargin: true, title: {standoff: 8}, spikecolor: c.muted, spikethickness: 1, spikedash: "solid", spikemode: "across"});
+  const axis = c => ({gridcolor: c.grid, linecolor: c.muted, zerolinecolor: c.muted, zerolinewidth: 1,
+    tickcolor: c.muted,
+    automargin: true, title: {standoff: 8}, spikecolor: c.muted, spikethickness: 1, spikedash: "solid",
+    spikemode: "across"});
   const template = c => ({layout: {
-    font: {family: 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif', size: 13, color: c.text},
+    font: {family: 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif',
+      size: 13, color: c.text},
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", xaxis: axis(c), yaxis: axis(c),
     margin: {l: 66, r: 44, t: 44, b: 50}, dragmode: "zoom", showlegend: true,
     legend: {orientation: "h", x: 0, xanchor: "left", y: 1, yanchor: "bottom", yref: "container"},
@@ -868,8 +922,10 @@ _SCRIPT = """
     const c = themes[name], painted = paint(figure, c), element = document.getElementById("p" + i);
     painted.layout.template = template(c);
     painted.layout.uirevision = "keep";
-    painted.layout.legend = Object.assign({orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container"}, painted.layout.legend);
-    if (width) painted.layout.width = element.closest(".pair") ? width / 2 - 24 : width - 24; else painted.layout.autosize = true;
+    painted.layout.legend = Object.assign({orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container"},
+      painted.layout.legend);
+    if (width) painted.layout.width = element.closest(".pair") ? width / 2 - 24 : width - 24;
+    else painted.layout.autosize = true;
     Plotly.react(element, painted.data, painted.layout, config);
   });
   const screen = () => draw(dark.matches ? "dark" : "light");

@@ -49,7 +49,12 @@ class Result(Protocol):
     def measured(self) -> Mapping[str, Any]: ...
 
 
-PAPER_TABLE_5 = {"max_abs": 2.17, "mean_abs": 0.55, "mean_abs_99_100": 0.47, "hysteresis": 1.6}  # deg, VIGV; Kim & Ki 2020
+PAPER_TABLE_5 = {
+    "max_abs": 2.17,
+    "mean_abs": 0.55,
+    "mean_abs_99_100": 0.47,
+    "hysteresis": 1.6,
+}  # deg, VIGV; Kim & Ki 2020
 
 NAMES = {
     "n_dem": ("rotor speed demand", "%"),
@@ -88,11 +93,10 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
 
     page.section(
         "All figures",
-        "Error is simulated minus reference. The reference is either the signal as the log measured it, or, for vane angles, the "
-        "angle that "
-        "the schedule asks for at the measured rotor speed. The noise floor is the scatter of the sensor itself: a perfect model has "
-        "an RMS error of "
-        "1 noise floor, so the last column tells how much is left to explain.",
+        "Error is simulated minus reference. The reference is either the signal as the log measured it, or, for vane "
+        "angles, the angle that the schedule asks for at the measured rotor speed. The noise floor is the scatter of "
+        "the sensor itself: a perfect model has an RMS error of 1 noise floor, so the last column tells how much is "
+        "left to explain.",
     )
     _figures_table(page, result.signals)
 
@@ -102,9 +106,8 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
     if measured:
         page.section(
             "Signal by signal",
-            "Blue is what was measured, orange what the model says. The error below each pair has a grey band three noise floors "
-            "wide on each "
-            "side of zero: what stays inside cannot be told from sensor noise.",
+            "Blue is what was measured, orange what the model says. The error below each pair has a grey band three "
+            "noise floors wide on each side of zero: what stays inside cannot be told from sensor noise.",
         )
         worst_first = sorted(measured, key=lambda s: -_ratio(s))
         for s in worst_first:
@@ -113,9 +116,9 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
         _worst_moment(page, result, worst_first[0])
         page.section(
             "How the errors are spread",
-            "Share of samples at each size of error. A hill on zero as narrow as the dotted curve is noise alone; a shifted hill is "
-            "a bias, two "
-            "hills are a hysteresis that the model has too wide or too narrow, a long tail is a disagreement in a few moments.",
+            "Share of samples at each size of error. A hill on zero as narrow as the dotted curve is noise alone; a "
+            "shifted hill is a bias, two hills are a hysteresis that the model has too wide or too narrow, a long tail "
+            "is a disagreement in a few moments.",
         )
         for s in worst_first:
             if s.signal in result.model and s.signal in result.measured:
@@ -134,9 +137,8 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
     if any(v in result.target for v in vanes):
         page.section(
             "Vane angle against rotor speed",
-            "The job of the whole system: at each speed the vanes shall stand where the schedule (green) says. Distance from the "
-            "green curve is "
-            "the error the compressor feels.",
+            "The job of the whole system: at each speed the vanes shall stand where the schedule (green) says. "
+            "Distance from the green curve is the error the compressor feels.",
         )
         for v in vanes:
             if v in result.target:
@@ -145,13 +147,10 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
 
 
 def engine_test_report(
-    single: Result,
-    dual: Result,
-    paper: Mapping[str, float] | None,
-    path: str | Path,
-    command: str = "",
+    single: Result, dual: Result, paper: Mapping[str, float] | None, path: str | Path, command: str = ""
 ) -> Path:
-    """Write the page of the engine test: one mean curve against two curves, beside the paper's Table 5; return its path.
+    """Write the page of the engine test: one mean curve against two curves, beside the paper's Table 5; return its
+    path.
 
     paper  max_abs, mean_abs, mean_abs_99_100 and hysteresis in deg; None: `PAPER_TABLE_5`
     """
@@ -161,10 +160,10 @@ def engine_test_report(
     within = all(v is not None and v <= paper[k] for k, v in _three(two).items())
     page = Page(
         "Engine test: one schedule curve against two",
-        f"With separate curves for rising and falling speed the VIGV stays within {number(two.mean_abs)} deg of its target on average "
-        f"({number(two.max_abs)} deg at worst); the published engine test had {number(paper['mean_abs'])} "
-        f"and {number(paper['max_abs'])} deg. "
-        f"With a single mean curve it is {number(one.mean_abs)} deg: the linkage's hysteresis stays in.",
+        f"With separate curves for rising and falling speed the VIGV stays within {number(two.mean_abs)} deg of its "
+        f"target on average ({number(two.max_abs)} deg at worst); the published engine test had "
+        f"{number(paper['mean_abs'])} and {number(paper['max_abs'])} deg. With a single mean curve it is "
+        f"{number(one.mean_abs)} deg: the linkage's hysteresis stays in.",
         tone="good" if within else "bad",
         subtitle="VIGV, closed loop of firmware and plant",
         command=command,
@@ -182,13 +181,15 @@ def engine_test_report(
         page.tile(label, value, "deg", note, _tone(value, paper[key]))
     note = f"mean over speed; one curve {number(gap_one)}, linkage alone {number(paper['hysteresis'])}"
     page.tile("Gap between rise and fall", gap_two, "deg", note)
-    page.tile("Length of the test", dual.simulated_s, "s", f"{two.samples:,} samples, computed in {number(dual.wall_s)} s")
+    page.tile(
+        "Length of the test", dual.simulated_s, "s", f"{two.samples:,} samples, computed in {number(dual.wall_s)} s"
+    )
 
     page.section(
         "Against the published engine test",
-        "Three figures of the VIGV's error against the schedule's target at the measured speed, as in Table 5 of Kim & Ki 2020. Lower is "
-        "better. The "
-        f"hysteresis of the linkage itself, from its clearances, is {paper['hysteresis']:g} deg between rise and fall.",
+        "Three figures of the VIGV's error against the schedule's target at the measured speed, as in Table 5 of Kim & "
+        "Ki 2020. Lower is better. The hysteresis of the linkage itself, from its clearances, is "
+        f"{paper['hysteresis']:g} deg between rise and fall.",
     )
     labels = ["maximum", "mean", "mean, 99 to 100 % speed"]
     keys = list(_three(two))
@@ -216,29 +217,33 @@ def engine_test_report(
 
     page.section(
         "Where the hysteresis goes",
-        "Mean error at each rotor speed, separately while the speed rises (solid) and while it falls (dashed). With one curve the "
-        "two lie on "
-        "opposite sides of zero, half the hysteresis each: a compromise for both directions. With two curves they close up. Dips "
-        "stand where "
-        "the run often turns back: there the clearance is just being crossed.",
+        "Mean error at each rotor speed, separately while the speed rises (solid) and while it falls (dashed). With "
+        "one curve the two lie on opposite sides of zero, half the hysteresis each: a compromise for both directions. "
+        "With two curves they close up. Dips stand where the run often turns back: there the clearance is just being "
+        "crossed.",
     )
     lines = []
     for name, run, role in (("one curve", single, "model"), ("two curves", dual, "measured")):
         speed, rise, fall = _rise_and_fall(run)
-        lines += [Line(f"{name}, rising", speed, rise, role, 2.4), Line(f"{name}, falling", speed, fall, role, 2.4, "dash")]
+        lines += [
+            Line(f"{name}, rising", speed, rise, role, 2.4),
+            Line(f"{name}, falling", speed, fall, role, 2.4, "dash"),
+        ]
     page.plot(overlay([Panel("mean VIGV error [deg]", lines, zero=True, height=1.35)], "rotor speed [%]"))
 
     page.section(
         "VIGV angle against rotor speed",
-        "The whole run, all rises and falls on top of each other; green is the schedule's target. The paper shows this picture as "
-        "its figure 14.",
+        "The whole run, all rises and falls on top of each other; green is the schedule's target. The paper shows this "
+        "picture as its figure 14.",
     )
     page.plot(_against_speed(single, "vigv", "one mean curve", "model"), "One mean curve.", half=True)
     page.plot(_against_speed(dual, "vigv", "two curves", "measured"), "Two curves.", half=True)
 
     page.section("Error over the run", f"VIGV angle minus its target, and the rotor speed that caused it. {ZOOM}")
     both = [_error_line(single, "one curve", "model"), _error_line(dual, "two curves", "measured")]
-    page.plot(overlay([Panel("VIGV error [deg]", both, zero=True, height=1.3), Panel("rotor speed [%]", _speed_lines(dual))]))
+    page.plot(
+        overlay([Panel("VIGV error [deg]", both, zero=True, height=1.3), Panel("rotor speed [%]", _speed_lines(dual))])
+    )
 
     page.section(
         "How the errors are spread",
@@ -254,9 +259,9 @@ def engine_test_report(
 
     page.section(
         "The linkage's own hysteresis",
-        "VIGV angle against stroke. The loop is a property of the joints' clearances and the same under both schedules: the "
-        "controller cannot "
-        "take it out, it can only aim at the right side of it. On the right the mean curve is taken off, so that the width can be read.",
+        "VIGV angle against stroke. The loop is a property of the joints' clearances and the same under both "
+        "schedules: the controller cannot take it out, it can only aim at the right side of it. On the right the mean "
+        "curve is taken off, so that the width can be read.",
     )
     runs = [("one curve", single, "model"), ("two curves", dual, "measured")]
     paths = [(n, r.model["x_lvdt"], r.model["vigv"], role) for n, r, role in runs if "x_lvdt" in r.model]
@@ -267,42 +272,79 @@ def engine_test_report(
 # ---------------------------------------------------------------- sentences and figures
 
 
-def _replay_verdict(result: Result, measured: Sequence[SignalError], schedule: Sequence[SignalError]) -> tuple[str, Tone]:
+def _replay_verdict(
+    result: Result, measured: Sequence[SignalError], schedule: Sequence[SignalError]
+) -> tuple[str, Tone]:
     """One sentence that a newcomer understands, and whether it is good news."""
     if measured:
         worst = max(measured, key=_ratio)
         ratio = _ratio(worst)
         what, size = _name(worst.signal), f"{number(worst.mean_abs)} {worst.unit} on average"
         at = _time_of_worst(result, worst.signal)
-        peak = f"{number(worst.max_abs)} {worst.unit} at worst" + (f", at t = {number(at, 4)} s" if at is not None else "")
+        peak = f"{number(worst.max_abs)} {worst.unit} at worst" + (
+            f", at t = {number(at, 4)} s" if at is not None else ""
+        )
         if ratio <= AGREES:
-            text = f"The model follows the log to within the sensors' noise: the largest disagreement, in {what}, is {size} and {peak}."
+            text = (
+                f"The model follows the log to within the sensors' noise: the largest disagreement, in {what}, is "
+                f"{size} and {peak}."
+            )
             return text, "good"
-        times = f"{number(ratio, 2)} times what sensor noise explains" if np.isfinite(ratio) else "and its sensor shows no noise"
+        times = (
+            f"{number(ratio, 2)} times what sensor noise explains"
+            if np.isfinite(ratio)
+            else "and its sensor shows no noise"
+        )
         return f"The largest disagreement is in {what}: {size} ({peak}), {times}.", "neutral" if ratio < 3 else "bad"
     if schedule:
         worst = max(schedule, key=lambda s: s.mean_abs)
         return (
             "The log holds no signal to hold the model against. Driven by its demand, the simulated vanes stay within "
-            f"{number(worst.mean_abs)} deg of their schedules on average ({number(worst.max_abs)} deg at worst, {_name(worst.signal)}).",
+            f"{number(worst.mean_abs)} deg of their schedules on average ({number(worst.max_abs)} deg at worst, "
+            f"{_name(worst.signal)}).",
             "neutral",
         )
-    return "The log's demand was run through firmware and plant; it holds no signal to compare the result with.", "neutral"
+    return (
+        "The log's demand was run through firmware and plant; it holds no signal to compare the result with.",
+        "neutral",
+    )
 
 
 def _replay_tiles(page: Page, result: Result, measured: Sequence[SignalError], schedule: Sequence[SignalError]) -> None:
     for s in sorted(measured, key=lambda s: -_ratio(s))[:3]:
-        note = (f"{number(_ratio(s), 2)} noise floors, " if s.noise_floor else "") + f"worst {number(s.max_abs)} {s.unit}"
+        note = (
+            f"{number(_ratio(s), 2)} noise floors, " if s.noise_floor else ""
+        ) + f"worst {number(s.max_abs)} {s.unit}"
         page.tile(f"{_name(s.signal)} against measurement, RMS", s.rms, s.unit, note)
     for s in [s for s in schedule if s.signal == "vigv"] or list(schedule)[:1]:
-        page.tile(f"{_name(s.signal)} against schedule, mean", s.mean_abs, s.unit, f"worst {number(s.max_abs)} {s.unit}")
+        page.tile(
+            f"{_name(s.signal)} against schedule, mean", s.mean_abs, s.unit, f"worst {number(s.max_abs)} {s.unit}"
+        )
     speed = result.simulated_s / result.wall_s if result.wall_s > 0 else None
-    page.tile("Length of the run", result.simulated_s, "s", f"computed in {number(result.wall_s)} s, {number(speed)} times real time")
+    page.tile(
+        "Length of the run",
+        result.simulated_s,
+        "s",
+        f"computed in {number(result.wall_s)} s, {number(speed)} times real time",
+    )
 
 
 def _figures_table(page: Page, signals: Sequence[SignalError]) -> None:
     page.table(
-        ["signal", "", "stage", "against", "unit", "RMS", "mean", "maximum", "mean, 99 to 100 %", "noise floor", "RMS/noise", "samples"],
+        [
+            "signal",
+            "",
+            "stage",
+            "against",
+            "unit",
+            "RMS",
+            "mean",
+            "maximum",
+            "mean, 99 to 100 %",
+            "noise floor",
+            "RMS/noise",
+            "samples",
+        ],
         [
             [
                 s.signal,
@@ -320,14 +362,21 @@ def _figures_table(page: Page, signals: Sequence[SignalError]) -> None:
             ]
             for s in sorted(signals, key=lambda s: (s.reference, -_ratio(s)))
         ],
-        "Mean and maximum are of the absolute error; the column 99 to 100 % is its mean near the design point of the engine.",
+        "Mean and maximum are of the absolute error; the column 99 to 100 % is its mean near the design point of the "
+        "engine.",
     )
 
 
 def _in_words(s: SignalError) -> str:
-    text = f"{_capital(_name(s.signal))}: on average {number(s.mean_abs)} {s.unit} off, at worst {number(s.max_abs)} {s.unit}"
+    text = (
+        f"{_capital(_name(s.signal))}: on average {number(s.mean_abs)} {s.unit} off, at worst {number(s.max_abs)} "
+        f"{s.unit}"
+    )
     if s.noise_floor:
-        text += f"; RMS {number(s.rms)} {s.unit} is {number(_ratio(s), 2)} times the noise floor of {number(s.noise_floor)} {s.unit}"
+        text += (
+            f"; RMS {number(s.rms)} {s.unit} is {number(_ratio(s), 2)} times the noise floor of "
+            f"{number(s.noise_floor)} {s.unit}"
+        )
     return text + "."
 
 
@@ -390,7 +439,10 @@ def _error_lines(t: Array, e: Array) -> list[Line]:
     when = t[: e.size // width * width].reshape(-1, width)
     whole = np.isfinite(groups).all(axis=1) & (np.ptp(when, axis=1) < 2.0)
     mean = np.where(whole, groups.mean(axis=1), np.nan)
-    return [Line("simulated − measured", t, e, "error", 1.0, opacity=0.4), Line("its mean over 1 s", when.mean(axis=1), mean, "error", 1.7)]
+    return [
+        Line("simulated − measured", t, e, "error", 1.0, opacity=0.4),
+        Line("its mean over 1 s", when.mean(axis=1), mean, "error", 1.7),
+    ]
 
 
 def _time_of_worst(result: Result, signal: str) -> float | None:
@@ -507,13 +559,19 @@ def _worst_moment(page: Page, result: Result, s: SignalError) -> None:
         values.append(Line("schedule", result.t, result.target[s.signal], "target", 1.3, "dash"))
     panels = [
         Panel(_axis(s.signal, s.unit), [part(v) for v in values], height=1.2),
-        Panel(f"error [{s.unit}]", [part(Line("simulated − measured", t, e, "error"))], band=3 * s.noise_floor, height=0.8, zero=True),
+        Panel(
+            f"error [{s.unit}]",
+            [part(Line("simulated − measured", t, e, "error"))],
+            band=3 * s.noise_floor,
+            height=0.8,
+            zero=True,
+        ),
         Panel("rotor speed [%]", [part(v) for v in _speed_lines(result) if v.shown], height=0.8),
     ]
     page.section(
         "The worst moment",
-        f"{_capital(_name(s.signal))} around t = {number(at, 4)} s, where its error is greatest. "
-        "What the rotor speed does just then is the first hint at the cause: an error that changes sign with the direction of motion is "
+        f"{_capital(_name(s.signal))} around t = {number(at, 4)} s, where its error is greatest. What the rotor speed "
+        "does just then is the first hint at the cause: an error that changes sign with the direction of motion is "
         "hysteresis or friction, one that appears only in motion is a lag, one that stays is a bias.",
     )
     page.plot(overlay(panels))
@@ -534,7 +592,9 @@ def _against_speed(result: Result, vane: str, name: str = "simulated", role: str
         where = np.digitize(n, edges) - 1
         count = np.bincount(where, minlength=200)[:200]
         visited = count > 0
-        mean_n, mean_target = (np.bincount(where, weights=a, minlength=200)[:200][visited] / count[visited] for a in (n, target))
+        mean_n, mean_target = (
+            np.bincount(where, weights=a, minlength=200)[:200][visited] / count[visited] for a in (n, target)
+        )
         lines.append(Line("schedule", mean_n, mean_target, "target", 2.6))
     return loop(lines, "rotor speed [%]", _axis(vane))
 
@@ -554,12 +614,15 @@ def _hysteresis_section(page: Page, result: Result, vanes: Sequence[str]) -> Non
             pictures.append((v, paths))
     if not pictures:
         return
-    compare = " If the measured (blue) and the simulated (orange) loop differ in width, height or tilt, the linkage model misses something."
+    compare = (
+        " If the measured (blue) and the simulated (orange) loop differ in width, height or tilt, the linkage "
+        "model misses something."
+    )
     page.section(
         "Hysteresis between stroke and vane angle",
-        "The joints between actuator and vane have clearance, so the vane stands elsewhere after extending than after retracting. "
-        "Left: the angle itself. Right: the same with the mean curve taken off, so that the width of the loop and its shape can be read."
-        + (compare if any(len(paths) > 1 for _, paths in pictures) else ""),
+        "The joints between actuator and vane have clearance, so the vane stands elsewhere after extending than after "
+        "retracting. Left: the angle itself. Right: the same with the mean curve taken off, so that the width of the "
+        "loop and its shape can be read." + (compare if any(len(paths) > 1 for _, paths in pictures) else ""),
     )
     for v, paths in pictures:
         _loops(page, v, paths)
@@ -605,4 +668,7 @@ def _middle_curve(x: Array, y: Array) -> Any:
     degree = min(3, int(open_loop.sum()) - 1)
     if degree < 1:
         return line
-    return line.convert() + np.polynomial.Polynomial.fit(at[open_loop], 0.5 * (low_side + high_side)[open_loop], degree).convert()
+    return (
+        line.convert()
+        + np.polynomial.Polynomial.fit(at[open_loop], 0.5 * (low_side + high_side)[open_loop], degree).convert()
+    )

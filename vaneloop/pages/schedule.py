@@ -1,4 +1,6 @@
-"""The page of ``vaneloop schedule``: what the paper's in-house tool showed (figures 9 to 13), in one self-contained file."""
+"""The page of ``vaneloop schedule``: what the paper's in-house tool showed (figures 9 to 13), in one self-contained
+file.
+"""
 
 from __future__ import annotations
 
@@ -45,15 +47,20 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     one, two = result.links[1], result.links[2]
     design = int(np.argmin(np.abs(result.speed - DESIGN_SPEED)))
     verdict = "; ".join(
-        f"{NAMES[s.stage]} with Lb {s.lb:g} mm and Lc {s.lc:g} mm: {s.rms['adjusted']:.2f} deg rms ({s.rms['built']:.2f} as it is, "
-        f"{s.rms['initial']:.2f} as first built), {s.at_design['adjusted']:.2f} deg at 100 % speed ({s.at_design['built']:.2f} as it is, "
-        f"{s.at_design['initial']:.2f} as first built)"
+        f"{NAMES[s.stage]} with Lb {s.lb:g} mm and Lc {s.lc:g} mm: {s.rms['adjusted']:.2f} deg rms "
+        f"({s.rms['built']:.2f} as it is, {s.rms['initial']:.2f} as first built), {s.at_design['adjusted']:.2f} deg at "
+        f"100 % speed ({s.at_design['built']:.2f} as it is, {s.at_design['initial']:.2f} as first built)"
         for s in (one, two)
     )
     page = Page("Stroke schedule and links", verdict + ".", subtitle="schedule", command=command, log=result.log)
     page.tile("stroke at 100 %", float(result.table[3, design]), "mm", "mean curve, VIGV on its schedule")
     for s in (one, two):
-        page.tile(f"{NAMES[s.stage]} worst error", s.largest["adjusted"], "deg", f"40 to 102 %; was {s.largest['built']:.2f} deg")
+        page.tile(
+            f"{NAMES[s.stage]} worst error",
+            s.largest["adjusted"],
+            "deg",
+            f"40 to 102 %; was {s.largest['built']:.2f} deg",
+        )
     if "vigv" in result.loops:
         m = result.loops["vigv"]
         page.tile("VIGV hysteresis", m.width, "deg", f"measured, ± {max(m.width_sigma, 0.001):.3f} deg")
@@ -62,8 +69,8 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
 
     page.section(
         "Mechanism at three strokes",
-        "Actuator from its mount (0, 0) to the bell crank, lower arm, vertical link, unison ring; drawn to scale, lengths as adjusted. "
-        "A longer stroke turns crank, ring and vanes anticlockwise.",
+        "Actuator from its mount (0, 0) to the bell crank, lower arm, vertical link, unison ring; drawn to scale, "
+        "lengths as adjusted. A longer stroke turns crank, ring and vanes anticlockwise.",
     )
     strokes = (STROKE_LIMITS[0], 0.5 * sum(STROKE_LIMITS), STROKE_LIMITS[1])
     page.plot(mechanism_figure(result.geometry, "vigv", strokes), "VIGV", half=True)
@@ -72,7 +79,8 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
 
     page.section(
         "Vane angle against stroke",
-        "Solid: lengths as adjusted. Dotted: the geometry as entered. The bell crank's lower arm changes the slope, the link the offset.",
+        "Solid: lengths as adjusted. Dotted: the geometry as entered. The bell crank's lower arm changes the slope, "
+        "the link the offset.",
     )
     x = np.linspace(*STROKE_LIMITS, 193)
     after, before = (np.rad2deg(vane_angles(x * 1e-3, g)) for g in (result.geometry, result.built))
@@ -88,9 +96,13 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     angle_lines, error_lines = [], []
     for k, s in enumerate(result.links):
         angle_lines.append(Line(f"{NAMES[s.stage]} target", result.speed, result.target[:, k], "text", 1.2, "dot"))
-        angle_lines.append(Line(f"{NAMES[s.stage]} adjusted", result.speed, result.target[:, k] - s.error, ROLES[k], 1.8))
+        angle_lines.append(
+            Line(f"{NAMES[s.stage]} adjusted", result.speed, result.target[:, k] - s.error, ROLES[k], 1.8)
+        )
     for k, s in enumerate(result.links[1:], start=1):
-        error_lines.append(Line(f"{NAMES[s.stage]} as first built", result.speed, s.error_initial, ROLES[k], 1.2, "dot"))
+        error_lines.append(
+            Line(f"{NAMES[s.stage]} as first built", result.speed, s.error_initial, ROLES[k], 1.2, "dot")
+        )
         error_lines.append(Line(f"{NAMES[s.stage]} as it is", result.speed, s.error_built, ROLES[k], 1.4, "dash"))
         error_lines.append(Line(f"{NAMES[s.stage]} adjusted", result.speed, s.error, ROLES[k], 2.2))
     panels = [Panel("vane angle [deg]", angle_lines, height=1.3), Panel("error [deg]", error_lines, zero=True)]
@@ -117,13 +129,18 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
         for name in ("extension", "retraction"):
             figures = (s.at_design[name], s.rms[name], s.largest[name])
             rows.append([NAMES[s.stage], f"on the {name} curve", "", "", *(f"{v:.3f}" for v in figures)])
-    page.table(columns, rows, "Errors of the mean curve, and on either branch with both stroke tables; rms and max over 40 to 102 % speed.")
+    page.table(
+        columns,
+        rows,
+        "Errors of the mean curve, and on either branch with both stroke tables; rms and max over 40 to 102 % speed.",
+    )
 
     for name, m in result.loops.items():
         page.section(
             f"{NAMES[name]}: measured loop and its two curves",
-            f"Width {m.width:.2f} deg at the vane. Samples inside the gap (crossing it, or dithering in it) belong to neither curve. "
-            f"The geometry with Lb {m.lb:.2f} mm and Lc {m.lc:.2f} mm has the measured mean curve to {m.misfit:.3f} deg rms.",
+            f"Width {m.width:.2f} deg at the vane. Samples inside the gap (crossing it, or dithering in it) belong to "
+            f"neither curve. The geometry with Lb {m.lb:.2f} mm and Lc {m.lc:.2f} mm has the measured mean curve to "
+            f"{m.misfit:.3f} deg rms.",
         )
         sx, sy, side = m.samples
         pick = np.linspace(0, sx.size - 1, min(sx.size, 6000)).astype(int)
@@ -137,19 +154,33 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
             Line("inside the gap", sx[side == 0], sy[side == 0], "muted"),
         ]
         points = [p for p in points if np.size(p.x)]
-        curves = [Line("extension", g, m.extension[inside], "measured", 2.0), Line("retraction", g, m.retraction[inside], "model", 2.0)]
+        curves = [
+            Line("extension", g, m.extension[inside], "measured", 2.0),
+            Line("retraction", g, m.retraction[inside], "model", 2.0),
+        ]
         page.plot(_with_points(points, curves, "vane angle [deg]"), "Angle against stroke.")
-        points = [Line(p.name, p.x, np.asarray(p.y) - np.interp(np.asarray(p.x), m.stroke, base), p.role) for p in points]
+        points = [
+            Line(p.name, p.x, np.asarray(p.y) - np.interp(np.asarray(p.x), m.stroke, base), p.role) for p in points
+        ]
         curves = [Line(c.name, c.x, np.asarray(c.y) - base[inside], c.role, c.width) for c in curves]
         caption = "The same less the geometry's own curve: the gap is seen by itself."
         page.plot(_with_points(points, curves, "angle less model as entered [deg]"), caption)
 
-    page.section("Stroke tables", "What the controller loads: the curve of the direction in which the speed demand moves, or their mean.")
+    page.section(
+        "Stroke tables",
+        "What the controller loads: the curve of the direction in which the speed demand moves, or their mean.",
+    )
     lines = [Line(n, result.speed, result.table[r], role, 1.8, dash) for r, n, role, dash in
-             ((1, "extension", "measured", "solid"), (2, "retraction", "model", "solid"), (3, "mean", "text", "dot"))]  # fmt: skip
+             ((1, "extension", "measured", "solid"), (2, "retraction", "model", "solid"),
+             (3, "mean", "text", "dot"))]  # fmt: skip
     page.plot(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]", 420))
-    rows = [[f"{c[0]:g}", *(f"{v:.3f}" for v in c[1:]), *(f"{s.error[i]:.3f}" for s in (one, two))] for i, c in enumerate(result.table.T)]
-    page.table(["speed [%]", "extension [mm]", "retraction [mm]", "mean [mm]", "VGV1 error [deg]", "VGV2 error [deg]"], rows)
+    rows = [
+        [f"{c[0]:g}", *(f"{v:.3f}" for v in c[1:]), *(f"{s.error[i]:.3f}" for s in (one, two))]
+        for i, c in enumerate(result.table.T)
+    ]
+    page.table(
+        ["speed [%]", "extension [mm]", "retraction [mm]", "mean [mm]", "VGV1 error [deg]", "VGV2 error [deg]"], rows
+    )
     if result.notes:
         page.section("Notes", "\n\n".join(result.notes))
     return page.write(path)
@@ -159,6 +190,10 @@ def _with_points(points: list[Line], curves: list[Line], y_title: str) -> dict[s
     """Measured samples as dots, curves as lines."""
     figure = loop([*points, *curves], "stroke [mm]", y_title, height=480)
     for trace, line in zip(figure["data"][: len(points)], points, strict=True):
-        trace |= {"mode": "markers", "x": np.round(np.asarray(line.x), 4).tolist(), "y": np.round(np.asarray(line.y), 4).tolist()}
+        trace |= {
+            "mode": "markers",
+            "x": np.round(np.asarray(line.x), 4).tolist(),
+            "y": np.round(np.asarray(line.y), 4).tolist(),
+        }
         trace["marker"] |= {"size": 3, "opacity": 0.5}
     return figure

@@ -37,21 +37,26 @@ def report(
     missed = [g for g in goals if not g["held"]]
     page = Page(
         "Control strategies",
-        f"On a worn, hot, noisy engine with a dithering demand the VIGV is off by {number(errors[1]['mean_abs'])} deg on average "
-        f"under {best}, by {number(errors[0]['mean_abs'])} deg under the dual curves: {goals[0]['value']:.1f} times less, with "
-        f"{mine.travel / max(dual.travel, 1e-9):.2f} of the travel. "
+        f"On a worn, hot, noisy engine with a dithering demand the VIGV is off by {number(errors[1]['mean_abs'])} deg "
+        f"on average under {best}, by {number(errors[0]['mean_abs'])} deg under the dual curves: "
+        f"{goals[0]['value']:.1f} times less, with {mine.travel / max(dual.travel, 1e-9):.2f} of the travel. "
         + (f"{len(missed)} of {len(goals)} goals are missed." if missed else f"All {len(goals)} goals are held."),
         tone="bad" if missed else "good",
         subtitle="VIGV, VGV1, VGV2, closed loop of firmware and plant",
         command=words,
     )
-    page.tile("Mean VIGV error, all together", errors[1]["mean_abs"], "deg", f"{best}; dual {number(errors[0]['mean_abs'])}")
+    page.tile(
+        "Mean VIGV error, all together", errors[1]["mean_abs"], "deg", f"{best}; dual {number(errors[0]['mean_abs'])}"
+    )
     page.tile("Maximum", errors[1]["max_abs"], "deg", f"{best}; dual {number(errors[0]['max_abs'])}")
     page.tile("Travel of the actuator", mine.travel, "mm", f"{best}; dual {number(dual.travel)}")
     if failures:
         page.tile("Largest step when potentiometers fail", max(f.step for f, _ in failures), "deg", f"allowed {STEP}")
     roles = dict(zip(STRATEGIES, ("muted", "model", "target", "measured"), strict=True))
-    page.section("Error and cost", "Each group is one machine, each bar one strategy. Lower is better. Errors of the true angles.")
+    page.section(
+        "Error and cost",
+        "Each group is one machine, each bar one strategy. Lower is better. Errors of the true angles.",
+    )
     for title, value in (
         ("mean VIGV error [deg]", lambda o: o.figures["vigv"]["mean_abs"]),
         ("maximum VIGV error [deg]", lambda o: o.figures["vigv"]["max_abs"]),
@@ -64,15 +69,25 @@ def report(
     columns = ["machine", "strategy", *figures, "travel [mm]", "turns", "mA rms"]
     page.table(
         columns,
-        [[m, s, *(o.figures[v][k] for v in STAGES for k in FIGURES), o.travel, o.reversals, o.current] for (m, s), o in outcomes.items()],
+        [
+            [m, s, *(o.figures[v][k] for v in STAGES for k in FIGURES), o.travel, o.reversals, o.current]
+            for (m, s), o in outcomes.items()
+        ],
         "Errors in deg; 99-100 %: mean at these speeds; turns: reversals of the piston; mA rms: servo-valve current. "
         "The stroke is scheduled for the VIGV; VGV1 and VGV2 follow through their links, whose own error stays in.",
     )
-    page.section("The run, all together", f"Rotor speed, VIGV error under the dual curves and under {best}, and the stroke.")
+    page.section(
+        "The run, all together", f"Rotor speed, VIGV error under the dual curves and under {best}, and the stroke."
+    )
     page.plot(
         overlay(
             [
-                Panel("VIGV error [deg]", [Line(o.strategy, o.t, o.errors[:, 0], roles[o.strategy]) for o in both], zero=True, height=1.4),
+                Panel(
+                    "VIGV error [deg]",
+                    [Line(o.strategy, o.t, o.errors[:, 0], roles[o.strategy]) for o in both],
+                    zero=True,
+                    height=1.4,
+                ),
                 Panel("stroke demand [mm]", [Line(o.strategy, o.t, o.stroke_demand, roles[o.strategy]) for o in both]),
                 Panel("rotor speed [%]", [Line("rotor speed", mine.t, mine.n_r, "muted")]),
             ]
@@ -86,23 +101,42 @@ def report(
     page.plot(
         overlay(
             [
-                Panel("offset [deg]", [Line("true", t, growth, "muted"), Line("learned", t, adaptive.offset, "measured")]),
-                Panel("play beyond built [deg]", [Line("true", t, grown, "muted"), Line("learned", t, adaptive.width, "measured")]),
+                Panel(
+                    "offset [deg]", [Line("true", t, growth, "muted"), Line("learned", t, adaptive.offset, "measured")]
+                ),
+                Panel(
+                    "play beyond built [deg]",
+                    [Line("true", t, grown, "muted"), Line("learned", t, adaptive.width, "measured")],
+                ),
             ]
         )
     )
-    page.section("VIGV against speed, all together", "All rises and falls on top of each other; the closer to one line, the better.")
+    page.section(
+        "VIGV against speed, all together",
+        "All rises and falls on top of each other; the closer to one line, the better.",
+    )
     for o in both:
-        page.plot(loop([Line(o.strategy, o.n_r, o.vanes[:, 0], roles[o.strategy])], "rotor speed [%]", "VIGV [deg]"), half=True)
+        page.plot(
+            loop([Line(o.strategy, o.n_r, o.vanes[:, 0], roles[o.strategy])], "rotor speed [%]", "VIGV [deg]"),
+            half=True,
+        )
     if failures:
         page.section(
             "Potentiometers that fail",
-            "All three fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A drift slower than "
-            "what the casing may do cannot be told from growth: it is followed, slowly, up to the limit of the offset, and may leave "
-            "more error than dual has. Step: what the failure changes within 1 s.",
+            "All three fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A "
+            "drift slower than what the casing may do cannot be told from growth: it is followed, slowly, up to the "
+            "limit of the offset, and may leave more error than dual has. Step: what the failure changes within 1 s.",
         )
         page.table(
-            ["when", "failure", "step [deg]", "in 10 s [deg]", "crossings of the gap", "mean VIGV error since [deg]", "of dual [deg]"],
+            [
+                "when",
+                "failure",
+                "step [deg]",
+                "in 10 s [deg]",
+                "crossings of the gap",
+                "mean VIGV error since [deg]",
+                "of dual [deg]",
+            ],
             [[f.during, f.failure, f.step, f.departure, f.crossings, f.mean_abs, f.mean_abs_dual] for f, _ in failures],
         )
         page.plot(

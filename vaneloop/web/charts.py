@@ -1,7 +1,8 @@
-"""Curves and figures of the pages: long time curves thinned on the server for the view that is asked for, small figures from Plotly.
+"""Curves and figures of the pages: long time curves thinned on the server for the view that is asked for, small figures
+from Plotly.
 
-A view of n pixels gets about two points a pixel and line: the greatest and least of each stretch, chosen by tsdownsample's MinMax, so
-that no spike is lost at any zoom. The browser draws them with uPlot (chart.js).
+A view of n pixels gets about two points a pixel and line: the greatest and least of each stretch, chosen by
+tsdownsample's MinMax, so that no spike is lost at any zoom. The browser draws them with uPlot (chart.js).
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class Trace:
 
 @dataclass(frozen=True)
 class Panel:
-    """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero. least: smallest height of the y axis."""
+    """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero. least: smallest
+    height of the y axis.
+    """
 
     title: str
     unit: str
@@ -69,7 +72,17 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
         j = len(p.t) if end is None else min(len(p.t), int(np.searchsorted(p.t, end)) + 1)
         x, lines = _thin(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
         names = [{"name": t.name, "role": t.role, "width": t.width} for t in p.traces]
-        heads.append({"title": p.title, "unit": p.unit, "band": p.band, "height": p.height, "least": p.least, "n": len(x), "lines": names})
+        heads.append(
+            {
+                "title": p.title,
+                "unit": p.unit,
+                "band": p.band,
+                "height": p.height,
+                "least": p.least,
+                "n": len(x),
+                "lines": names,
+            }
+        )
         body += [np.ascontiguousarray(a, dtype="<f8").tobytes() for a in (x, *lines)]
     span = [low, high if high > low else low + 1.0] if np.isfinite(low) else [0.0, 1.0]
     head = json.dumps({"panels": heads, "span": span, "key": curves.key}).encode()
@@ -101,7 +114,9 @@ def of_log(channels: Mapping[str, tuple[str, Array, Array]], key: str) -> Curves
     panels = []
     for name, (unit, t, values) in channels.items():
         x, y = break_at_holes(t, values)
-        panels.append(Panel(f"{name} [{unit}]", unit, np.asarray(x), [Trace(name, np.asarray(y), "measured")], height=74))
+        panels.append(
+            Panel(f"{name} [{unit}]", unit, np.asarray(x), [Trace(name, np.asarray(y), "measured")], height=74)
+        )
     return Curves(panels, key)
 
 
@@ -132,7 +147,7 @@ class Figure(Element, component="figure.js"):
         self.classes("w-full")
 
 
-# ---- small figures ----------------------------------------------------------------------------------------------------------------------
+# ---- small figures ---------------------------------------------------------------------------------------------------
 
 
 def painted(x: Any, theme: Mapping[str, str]) -> Any:
@@ -152,7 +167,13 @@ def painted(x: Any, theme: Mapping[str, str]) -> Any:
 def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
     """Show a figure of vaneloop.pages.page in the page's theme."""
     c = THEMES["dark" if dark else "light"]
-    axis = {"gridcolor": c["grid"], "linecolor": c["muted"], "zerolinecolor": c["muted"], "tickcolor": c["muted"], "automargin": True}
+    axis = {
+        "gridcolor": c["grid"],
+        "linecolor": c["muted"],
+        "zerolinecolor": c["muted"],
+        "tickcolor": c["muted"],
+        "automargin": True,
+    }
     layout = painted(f["layout"], c)
     for key in [k for k in layout if k.startswith(("xaxis", "yaxis"))]:
         layout[key] = {**axis, **layout[key]}

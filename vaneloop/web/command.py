@@ -13,15 +13,16 @@ from vaneloop.web.guard import is_loopback
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Open the workbench: a page of this machine on which a log is dropped, the missing effect is found and switched on, vanes
-are scheduled, and the loop runs live.
+DESCRIPTION = """Open the workbench: a page of this machine on which a log is dropped, the missing effect is found and
+switched on, vanes are scheduled, and the loop runs live.
 
-It prints a link and opens it. Whoever asks must know the token in that link; a cookie then remembers it. Give your own token in the
-environment variable VANELOOP_WEB_TOKEN (16 characters or more), or one is made up. It listens on loopback only, or on another --host.
-There is no encryption: on a network that others listen to, use an SSH tunnel to loopback instead.
+It prints a link and opens it. Whoever asks must know the token in that link; a cookie then remembers it. Give your own
+token in the environment variable VANELOOP_WEB_TOKEN (16 characters or more), or one is made up. It listens on loopback
+only, or on another --host. There is no encryption: on a network that others listen to, use an SSH tunnel to loopback
+instead.
 
-Logs that are uploaded go into a private temporary folder. It is removed at the end, or after a kill at the next start. Python models are
-taken on the command line only.
+Logs that are uploaded go into a private temporary folder. It is removed at the end, or after a kill at the next start.
+Python models are taken on the command line only.
 
 examples:
   vaneloop web
@@ -36,10 +37,18 @@ LEAST_TOKEN = 16
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--host", metavar="A", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine only)")
-    parser.add_argument("--port", metavar="N", type=int, default=PORT, help=f"port to listen on; 0 takes a free one (default {PORT})")
-    parser.add_argument("--folder", metavar="D", default=".", help="folder whose logs are offered (default: the current one)")
-    parser.add_argument("--upload-limit", metavar="MB", type=int, default=512, help="largest file that may be uploaded (default 512)")
+    parser.add_argument(
+        "--host", metavar="A", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine only)"
+    )
+    parser.add_argument(
+        "--port", metavar="N", type=int, default=PORT, help=f"port to listen on; 0 takes a free one (default {PORT})"
+    )
+    parser.add_argument(
+        "--folder", metavar="D", default=".", help="folder whose logs are offered (default: the current one)"
+    )
+    parser.add_argument(
+        "--upload-limit", metavar="MB", type=int, default=512, help="largest file that may be uploaded (default 512)"
+    )
     parser.add_argument("--no-open", action="store_true", help="do not open a browser, only print the link")
     parser.add_argument("--quiet", action="store_true", help="say nothing but the link")
 
@@ -57,7 +66,10 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--folder {args.folder}: is not a folder")
     token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
     if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
-        raise InputError(f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} characters")
+        raise InputError(
+            f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} "
+            f"characters"
+        )
     try:
         import nicegui  # noqa: F401
         import tsdownsample  # noqa: F401
@@ -95,5 +107,7 @@ def _listen(host: str, port: int) -> socket.socket:
         sock.bind(where)
         sock.listen(128)
     except (OSError, UnicodeError) as e:
-        raise InputError(f"--host {host} --port {port}: cannot listen there ({getattr(e, 'strerror', None) or e})") from None
+        raise InputError(
+            f"--host {host} --port {port}: cannot listen there ({getattr(e, 'strerror', None) or e})"
+        ) from None
     return sock

@@ -50,7 +50,9 @@ def frame(session: Session, here: str) -> Iterator[None]:
             mode.value = session.dark
             session.touch("theme")
 
-        ui.button(icon="contrast", on_click=flip).props('flat round dense color=grey aria-label="light or dark"').tooltip("light or dark")
+        ui.button(icon="contrast", on_click=flip).props(
+            'flat round dense color=grey aria-label="light or dark"'
+        ).tooltip("light or dark")
 
     async def ask() -> None:
         try:
@@ -74,7 +76,8 @@ def dark(session: Session) -> bool:
 class Live:
     """Redraws parts of a page when what they show has changed: part -> sections of the session that it watches.
 
-    A click on an element that has meanwhile been drawn anew is lost, so nothing is drawn anew for progress, and buttons stay.
+    A click on an element that has meanwhile been drawn anew is lost, so nothing is drawn anew for progress, and buttons
+    stay.
     """
 
     def __init__(self, session: Session):
@@ -100,8 +103,12 @@ class Live:
         """Call ``draw`` when one of ``sections`` has changed, as long as the element that it is ``of`` is there."""
         self.parts.append((draw, sections, of))
 
-    def part(self, draw: Callable[[], None], *sections: str, shows: Callable[[], tuple[Any, ...]], classes: str = "stackc") -> None:
-        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``shows`` differs from before."""
+    def part(
+        self, draw: Callable[[], None], *sections: str, shows: Callable[[], tuple[Any, ...]], classes: str = "stackc"
+    ) -> None:
+        """Make a box here that ``draw`` fills, now and whenever one of ``sections`` has changed and ``shows`` differs
+        from before.
+        """
         box = ui.element("div").classes(classes)
         before = shows()
 
@@ -133,7 +140,9 @@ class Live:
         def draw() -> None:
             for text in shows():
                 if text:
-                    ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props('role="alert"')
+                    ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props(
+                        'role="alert"'
+                    )
 
         def shows() -> tuple[str, ...]:
             return tuple(self.session.errors.get(s, "") for s in sections)
@@ -146,9 +155,9 @@ class Live:
             with ui.element("div").classes("stackc").style("gap:3px"):
                 text = ui.label().classes("small soft")
                 bar = ui.linear_progress(0.0, show_value=False).props("rounded instant-feedback")
-            ui.button("Cancel", icon="close", on_click=lambda: self.session.stop(*names)).props("outline dense padding='2px 10px'").classes(
-                "cancel"
-            )
+            ui.button("Cancel", icon="close", on_click=lambda: self.session.stop(*names)).props(
+                "outline dense padding='2px 10px'"
+            ).classes("cancel")
 
         def show() -> None:
             job = self.session.busy(*names)
@@ -184,7 +193,9 @@ class Live:
 def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
     """Whether two answers of ``shows`` are one: plain values by value, anything else only as the same object."""
     plain = (str, int, float, tuple)
-    return len(a) == len(b) and all(x is y or (isinstance(x, plain) and isinstance(y, plain) and x == y) for x, y in zip(a, b, strict=True))
+    return len(a) == len(b) and all(
+        x is y or (isinstance(x, plain) and isinstance(y, plain) and x == y) for x, y in zip(a, b, strict=True)
+    )
 
 
 @contextmanager
@@ -217,15 +228,23 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequen
 
     head = "".join(f'<th class="{"num" if i in numbers else ""}">{html.escape(c)}</th>' for i, c in enumerate(columns))
     body = "".join(
-        "<tr>" + "".join(f'<td class="{"num" if i in numbers else ""}">{cell(v)}</td>' for i, v in enumerate(r)) + "</tr>" for r in rows
+        "<tr>"
+        + "".join(f'<td class="{"num" if i in numbers else ""}">{cell(v)}</td>' for i, v in enumerate(r))
+        + "</tr>"
+        for r in rows
     )
-    ui.html(f'<div class="scroll"><table class="vtable"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>', sanitize=False)
+    ui.html(
+        f'<div class="scroll"><table class="vtable"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>',
+        sanitize=False,
+    )
 
 
 def opened(session: Session, title: str, now: bool = False) -> ui.expansion:
     """A part that opens and closes, and stays as it is when it is drawn anew."""
     kept: dict[str, bool] = session.extra.setdefault("opened", {})
-    box = ui.expansion(title, value=now or kept.get(title, False), on_value_change=lambda e: kept.__setitem__(title, bool(e.value)))
+    box = ui.expansion(
+        title, value=now or kept.get(title, False), on_value_change=lambda e: kept.__setitem__(title, bool(e.value))
+    )
     return box.classes("w-full").props("dense")
 
 

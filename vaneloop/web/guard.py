@@ -1,10 +1,11 @@
 """What stands before the pages: who may ask, from where, and how much they may send.
 
-Every browser must know the token. The link that is printed carries it; a cookie remembers it, and a redirect takes it out of the address.
+Every browser must know the token. The link that is printed carries it; a cookie remembers it, and a redirect takes it
+out of the address.
 
 - On loopback only requests that name a loopback address or ``localhost`` are answered. This prevents DNS rebinding.
-- A request that a page of another site or of another port has caused is refused (Sec-Fetch-Site, Origin), websockets too. The cookie alone
-  cannot tell: to a browser all ports of a host are one site.
+- A request that a page of another site or of another port has caused is refused (Sec-Fetch-Site, Origin), websockets
+  too. The cookie alone cannot tell: to a browser all ports of a host are one site.
 - A page is given only to a browser that goes there: nothing else can begin a session.
 - A body larger than the limit is cut off while it arrives, whatever its header says.
 """
@@ -63,8 +64,8 @@ class _Refused(Exception):
 class Guard:
     """ASGI application around another.
 
-    ``port`` names the cookie: cookies of a host are shared by all its ports. ``loopback``: only loopback names are answered.
-    ``most``: bytes of a body. ``pages``: paths that only a browser's navigation gets.
+    ``port`` names the cookie: cookies of a host are shared by all its ports. ``loopback``: only loopback names are
+    answered. ``most``: bytes of a body. ``pages``: paths that only a browser's navigation gets.
     """
 
     def __init__(self, app: App, token: str, port: int, most: int, *, loopback: bool, pages: Collection[str] = ()):
@@ -73,7 +74,9 @@ class Guard:
         self._tickets: set[str] = set()
 
     def ticket(self) -> str:
-        """Return a word that does for the token once: the command line of a browser can be read by every user of the machine."""
+        """Return a word that does for the token once: the command line of a browser can be read by every user of the
+        machine.
+        """
         self._tickets.add(word := secrets.token_urlsafe(24))
         return word
 
@@ -92,8 +95,9 @@ class Guard:
             if not self._knows(headers):
                 raise _Refused(
                     403,
-                    "This workbench needs its token.\n\nOpen the link that `vaneloop web` printed where it was started: "
-                    f"http://{host}/?token=...\nCopy it into the address bar. If it is lost, end the program (Ctrl-C) and start it again.",
+                    "This workbench needs its token.\n\nOpen the link that `vaneloop web` printed where it was "
+                    f"started: http://{host}/?token=...\nCopy it into the address bar. If it is lost, end the program "
+                    "(Ctrl-C) and start it again.",
                 )
             if scope["type"] == "http" and scope["method"] == "GET" and scope["path"] in self.pages:
                 _only_a_navigation(headers)
@@ -132,7 +136,9 @@ class Guard:
         extra = [(b"set-cookie", cookie.encode()), (b"cache-control", b"no-store")]
         if headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
             await _write(send, 303, b"", [*extra, (b"location", where.encode())])
-        else:  # a link on another site: a redirect would still count as that site's, and the browser would keep the cookie back
+        else:
+            # a link on another site: a redirect would still count as that site's, and the browser would keep the
+            # cookie back
             page = f'<!doctype html><meta http-equiv="refresh" content="0;url={where}"><a href="{where}">VaneLoop</a>\n'
             await _write(send, 200, page.encode(), [*extra, (b"content-type", b"text/html; charset=utf-8")])
 
@@ -170,7 +176,9 @@ class Guard:
 
 
 def _headers(scope: Message) -> dict[str, str]:
-    """Headers by name in small letters. One that came twice is joined, so that it is none of the values allowed; cookies may come so."""
+    """Headers by name in small letters. One that came twice is joined, so that it is none of the values allowed;
+    cookies may come so.
+    """
     out: dict[str, str] = {}
     for k, v in scope["headers"]:
         name, value = k.decode("latin-1").lower(), v.decode("latin-1")
@@ -187,7 +195,11 @@ def _no_other_site(headers: dict[str, str], host: str) -> None:
         raise _Refused(403, f"a page of {origin[:80]!r} may not use this server")
     site = headers.get("sec-fetch-site", "none")  # absent: an older browser, or none at all
     if site not in ("none", "same-origin"):
-        raise _Refused(403, f"this request comes from another site's page ({site[:40]!r}): type or copy the address into the address bar")
+        raise _Refused(
+            403,
+            f"this request comes from another site's page ({site[:40]!r}): type or copy the address into the address "
+            f"bar",
+        )
 
 
 def _only_a_navigation(headers: dict[str, str]) -> None:
@@ -206,7 +218,9 @@ async def _answer(scope: Message, receive: Receive, send: Send, no: _Refused) ->
         await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
         return
     body = (no.text + "\n").encode("utf-8", "replace")
-    await _write(send, no.status, body, [(b"content-type", b"text/plain; charset=utf-8"), (b"cache-control", b"no-store")])
+    await _write(
+        send, no.status, body, [(b"content-type", b"text/plain; charset=utf-8"), (b"cache-control", b"no-store")]
+    )
 
 
 async def _write(send: Send, status: int, body: bytes, headers: list[tuple[bytes, bytes]]) -> None:

@@ -67,7 +67,9 @@ class Worker:
         ours, theirs = socket.socketpair()
         # -P: nothing is imported from the folder in which the server happens to run
         words = [sys.executable, "-P", "-m", self.module, str(theirs.fileno())]
-        self.process = subprocess.Popen(words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True)
+        self.process = subprocess.Popen(
+            words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+        )
         theirs.close()
         self._connection = Connection(ours.detach())
         loop = asyncio.get_running_loop()
@@ -151,4 +153,7 @@ class Worker:
         self.process, code = None, process.wait()
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
         for number in list(self.jobs):
-            self._end(number, WorkError(f"the process that did this has ended ({how}); the log may need more memory than there is"))
+            self._end(
+                number,
+                WorkError(f"the process that did this has ended ({how}); the log may need more memory than there is"),
+            )

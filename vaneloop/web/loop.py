@@ -1,7 +1,9 @@
-"""The loop live, in processes of its own: lockstep at a chosen speed, or nodes and a listener in real time. ``python -m vaneloop.web.loop FD``
+"""The loop live, in processes of its own: lockstep at a chosen speed, or nodes and a listener in real time. ``python -m
+vaneloop.web.loop FD``
 
-Lockstep is controller, ECU and wire in simulated time with everything of `hil.inject` on it; in real time each node is the loop that
-``vaneloop run`` and ``vaneloop ecu`` run, in a process of its own, and what is shown is what a third station hears on the bus.
+Lockstep is controller, ECU and wire in simulated time with everything of `hil.inject` on it; in real time each node is
+the loop that ``vaneloop run`` and ``vaneloop ecu`` run, in a process of its own, and what is shown is what a third
+station hears on the bus.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ class Heard:
 
         self.frames += 1
         ident = head & f.IDENT_MASK
-        ours = ident in f.NAMES and not head & (f.ERROR | f.EXTENDED | f.REMOTE | f.FD) and (head >> 32) & 0xFF == f.LENGTH
+        ours = (
+            ident in f.NAMES and not head & (f.ERROR | f.EXTENDED | f.REMOTE | f.FD) and (head >> 32) & 0xFF == f.LENGTH
+        )
         good = ours and f.crc(ident, data) == (data & 0xFF)
         values = f.decode(head, data) if ours else {}
         if ours and not good:
@@ -61,7 +65,12 @@ class Heard:
 
     def news(self) -> dict[str, Any]:
         """Everything since the last call."""
-        out = {"rows": np.array(self.rows).reshape(-1, len(COLUMNS)), "trace": self.trace, "frames": self.frames, "refused": self.refused}
+        out = {
+            "rows": np.array(self.rows).reshape(-1, len(COLUMNS)),
+            "trace": self.trace,
+            "frames": self.frames,
+            "refused": self.refused,
+        }
         self.rows, self.trace = [], []
         return out
 
@@ -143,7 +152,9 @@ def ready(progress: Progress) -> None:
     _compile()
 
 
-def lockstep(progress: Progress, demand: float, speed: float, record: str | None, seed: int | None, profile: str | None) -> dict[str, Any]:
+def lockstep(
+    progress: Progress, demand: float, speed: float, record: str | None, seed: int | None, profile: str | None
+) -> dict[str, Any]:
     """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop."""
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
@@ -226,7 +237,10 @@ def lockstep(progress: Progress, demand: float, speed: float, record: str | None
             took = time.perf_counter() - due + NEWS
             reached += 0.2 * ((k - first_k) / 1000.0 / max(took, 1e-9) - reached)
             injecting = max(0.0, min(injected.end, 1e6) - k * 1e-3)
-            progress(None, {**heard.news(), "speed": reached, "n_dem": typed.n_dem, "load": channel.load, "injecting": injecting})
+            progress(
+                None,
+                {**heard.news(), "speed": reached, "n_dem": typed.n_dem, "load": channel.load, "injecting": injecting},
+            )
     finally:
         if recorder is not None:
             recorder.close()
@@ -291,12 +305,15 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
 
     try:
         with undisturbed() as notes:
-            report = run_realtime(station, Port(bus), stop=stop, put=recorder.put if recorder is not None else None, live=live)
+            report = run_realtime(
+                station, Port(bus), stop=stop, put=recorder.put if recorder is not None else None, live=live
+            )
     finally:
         bus.shutdown()
         if recorder is not None:
             recorder.close()
-    return {"late": report.begin.figures(), "histogram": report.begin.shown(), "ticks": report.ticks, "missed": report.missed,
+    return {"late": report.begin.figures(), "histogram": report.begin.shown(), "ticks": report.ticks,
+        "missed": report.missed,
             "failed": report.failed, "notes": notes, "record": record}  # fmt: skip
 
 

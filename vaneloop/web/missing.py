@@ -37,11 +37,14 @@ def suffixes() -> str:
 
 
 async def receive(s: Session, e: events.UploadEventArguments, section: str) -> LogFile | None:
-    """Keep an uploaded file in the session's private folder; None, and a complaint, where it is of no kind that we know."""
+    """Keep an uploaded file in the session's private folder; None, and a complaint, where it is of no kind that we
+    know.
+    """
     name = safe_name(e.file.name)
     if not name.lower().endswith((*LOG_SUFFIXES, *OTHER_SUFFIXES)):
         s.errors[section] = (
-            f"{name}: suffix {name[name.rfind('.') :] if '.' in name else ''!r} is not a log's; allowed: {', '.join(LOG_SUFFIXES)}"
+            f"{name}: suffix {name[name.rfind('.') :] if '.' in name else ''!r} is not a log's; allowed: "
+            f"{', '.join(LOG_SUFFIXES)}"
         )
         s.touch(section)
         return None
@@ -90,12 +93,15 @@ class _Page:
             with ui.element("div").classes("two"):
                 with ui.element("div").classes("stackc"):
                     self.upload = ui.upload(
-                        label="drop a log here, or press +", auto_upload=True, max_file_size=self.most, on_upload=self._uploaded,
+                        label="drop a log here, or press +", auto_upload=True, max_file_size=self.most,
+                        on_upload=self._uploaded,
                         on_rejected=self._rejected,
                     )  # fmt: skip
                     self.upload.props(f'accept="{suffixes()}" flat')
                     s = self.s
-                    self.live.part(self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file))
+                    self.live.part(
+                        self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
+                    )
                     self.live.complaint("log")
                     self.live.progress("offers", "preview")
                     self.live.part(self._about, "log", shows=lambda: (s.preview,))
@@ -116,7 +122,9 @@ class _Page:
             if e.value is not None and s.files[e.value] != s.choice.file:
                 s.choose(s.files[e.value])
 
-        ui.select(options, value=at, label="or choose one", on_change=chosen).props("outlined dense options-dense").classes("w-full choose")
+        ui.select(options, value=at, label="or choose one", on_change=chosen).props(
+            "outlined dense options-dense"
+        ).classes("w-full choose")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
         file = await receive(self.s, e, "log")
@@ -126,7 +134,9 @@ class _Page:
 
     def _rejected(self) -> None:
         limit = f"{self.most / 2**20:.0f} MB"
-        self.s.errors["log"] = f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(LOG_SUFFIXES)})"
+        self.s.errors["log"] = (
+            f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(LOG_SUFFIXES)})"
+        )
         self.s.touch("log")
 
     def _about(self) -> None:
@@ -138,9 +148,10 @@ class _Page:
     def _channels(self) -> None:
         s = self.s
         if s.choice.file is None:
-            ui.label("Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model lacks.").classes(
-                "soft"
-            )
+            ui.label(
+                "Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model "
+                "lacks."
+            ).classes("soft")
             return
         if s.preview is None:
             return
@@ -159,7 +170,16 @@ class _Page:
 
     def _form_shows(self) -> tuple[Any, ...]:
         s, c = self.s, self.s.choice
-        return (c.file, c.dbc, c.model, tuple(s.offered), tuple(c.mapping.items()), tuple(c.units.items()), c.design_rpm, self._wrong())
+        return (
+            c.file,
+            c.dbc,
+            c.model,
+            tuple(s.offered),
+            tuple(c.mapping.items()),
+            tuple(c.units.items()),
+            c.design_rpm,
+            self._wrong(),
+        )
 
     def _form(self) -> None:
         s = self.s
@@ -168,7 +188,8 @@ class _Page:
         choice = s.choice
         with opened(s, "Names and units", self._wrong()).classes("names"):
             ui.label(
-                "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit that the log states."
+                "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit "
+                "that the log states."
             ).classes("soft small")
             names: dict[str, ui.select] = {}
             units: dict[str, ui.input] = {}
@@ -176,23 +197,29 @@ class _Page:
                 "display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"
             ):
                 for signal in ("t", *UNITS):
-                    with ui.element("div").style("display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:8px;align-items:center"):
+                    with ui.element("div").style(
+                        "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:8px;align-items:center"
+                    ):
                         ui.label(signal).classes("mono")
                         options = ["", *s.offered]
                         value = choice.mapping.get(signal, "")
-                        names[signal] = ui.select(options, value=value if value in options else "", with_input=True).props(
-                            f'outlined dense options-dense clearable aria-label="name of {signal} in the log"'
-                        )
+                        names[signal] = ui.select(
+                            options, value=value if value in options else "", with_input=True
+                        ).props(f'outlined dense options-dense clearable aria-label="name of {signal} in the log"')
                         hint = UNITS.get(signal, "s")
                         units[signal] = ui.input(value=choice.units.get(signal, ""), placeholder=hint).props(
                             f'outlined dense aria-label="unit of {signal} in the log"'
                         )
             with ui.element("div").classes("rowc"):
-                rpm = ui.input("design speed [rpm]", value=choice.design_rpm).props("outlined dense").style("width:170px")
-                beside = [f for f in (choice.dbc, choice.model) if f is not None]
-                ui.label("with " + " and ".join(f.name for f in beside) if beside else "a .dbc or a model .toml: drop it above").classes(
-                    "soft small"
+                rpm = (
+                    ui.input("design speed [rpm]", value=choice.design_rpm).props("outlined dense").style("width:170px")
                 )
+                beside = [f for f in (choice.dbc, choice.model) if f is not None]
+                ui.label(
+                    "with " + " and ".join(f.name for f in beside)
+                    if beside
+                    else "a .dbc or a model .toml: drop it above"
+                ).classes("soft small")
 
                 def apply() -> None:
                     choice.mapping = {k: str(v.value) for k, v in names.items() if v.value}
@@ -216,7 +243,9 @@ class _Page:
         with card("2  Where does the model fail?"):
             live.complaint("compare")
             live.progress("compare")
-            hint = ui.label("Choose a log: each stage of the machine is then driven by its own logged inputs and compared.").classes("soft")
+            hint = ui.label(
+                "Choose a log: each stage of the machine is then driven by its own logged inputs and compared."
+            ).classes("soft")
             live.shown(hint, lambda: s.choice.file is None, "compare", "log")
             live.part(self._compared, "compare", shows=lambda: (s.compared,))
 
@@ -235,7 +264,9 @@ class _Page:
                     with ui.element("div").classes("rowc"):
                         ui.label("Failure map of").classes("soft")
                         self._stage_toggle(stages, "padding='2px 10px'")
-                    self.live.part(self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s)))
+                    self.live.part(
+                        self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s))
+                    )
 
     def _figures(self, c: dict[str, Any]) -> None:
         s = self.s
@@ -243,11 +274,17 @@ class _Page:
         for f in c["figures"]:
             width = 100 * min(1.0, math.log10(max(f.ratio, 1.0)) / 2.2) + 2
             bar = f'<span class="bar {tone(f.ratio)}" style="width:{width:.0f}px"></span>'
-            rows.append([f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{f.ratio:.2f}", ("html", bar)])
+            rows.append(
+                [f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{f.ratio:.2f}", ("html", bar)]
+            )
         for name, why in c["not_observed"].items():
             rows.append([name, f"not observed: {why}", "", "", "", "", ""])
         table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
-        given = [f"{f.signal} {number(f.rms_as_given / f.noise_floor)}" for f in c["figures"] if f.rms_as_given > AGREES * f.noise_floor]
+        given = [
+            f"{f.signal} {number(f.rms_as_given / f.noise_floor)}"
+            for f in c["figures"]
+            if f.rms_as_given > AGREES * f.noise_floor
+        ]
         as_given = f" With the parameters as given, in noise floors: {', '.join(given)}." if given else ""
         ui.label(f"Nominal parameters are refitted within their tolerances.{as_given}").classes("note")
         if c["loop"]:
@@ -278,10 +315,19 @@ class _Page:
         mine = [r for r in hot if r.output == output][:9]
         width = max(len(r.ratio) for r in mine)
         cells = [
-            [float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * (width - len(r.ratio)) for r in mine
+            [float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)]
+            + [None] * (width - len(r.ratio))
+            for r in mine
         ]
         names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
-        f = heat(cells, [str(i + 1) for i in range(width)], names, "noise floors", "an eighth of the samples each, lowest to highest", "")
+        f = heat(
+            cells,
+            [str(i + 1) for i in range(width)],
+            names,
+            "noise floors",
+            "an eighth of the samples each, lowest to highest",
+            "",
+        )
         figure_of(f, dark(self.s), height=90 + 27 * max(3, len(names)))
         ui.label(f"Worst: {mine[0].worst()}.").classes("note")
 
@@ -291,9 +337,14 @@ class _Page:
         """The search, switches of effects, waterfall, curves, sliders."""
         s, live = self.s, self.live
         with card("3  What is missing?"):
-            words = "After the comparison: every effect of the library is fitted, and what earns its place on held-out data is named."
+            words = (
+                "After the comparison: every effect of the library is fitted, and what earns its place on "
+                "held-out data is named."
+            )
             live.shown(ui.label(words).classes("soft"), lambda: s.compared is None, "compare", "log")
-            start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props("unelevated size=md")
+            start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props(
+                "unelevated size=md"
+            )
             ready = lambda: s.compared is not None and s.diagnosis is None and not s.working["diagnose"]  # noqa: E731
             live.shown(start, ready, "compare", "log", "diagnosis", "diagnose", "jobs")
             live.progress("diagnose")
@@ -308,7 +359,14 @@ class _Page:
                     live.complaint("fit", "hand")
                     live.progress("refit")
                     with ui.element("div").classes("stackc") as box:
-                        live.part(self._fall, "fit", "diagnosis", "compare", "theme", shows=lambda: (s.diagnosis, s.shown_fit(), dark(s)))
+                        live.part(
+                            self._fall,
+                            "fit",
+                            "diagnosis",
+                            "compare",
+                            "theme",
+                            shows=lambda: (s.diagnosis, s.shown_fit(), dark(s)),
+                        )
 
                     def stale() -> None:
                         box.classes(**{"remove" if s.fitted() is s.shown_fit() else "add": "stale"})
@@ -325,7 +383,8 @@ class _Page:
     def _title(self) -> None:
         s = self.s
         text = (
-            f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors to each side."
+            f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors "
+            f"to each side."
             if s.stage
             else ""
         )
@@ -340,7 +399,9 @@ class _Page:
             tones = {"missing": "", "none": "good", "unknown": "bad"}
             ui.label(s.diagnosis["verdict"]).classes(f"verdict {tones[j['verdict']]}")
             for u in j["unknown"]:
-                near = f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
+                near = (
+                    f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
+                )
                 ui.label(f"What is left in the {u['stage']} stage: {u['shape']}.{near}").classes("note")
         command_line(s.command("diagnose"))
 
@@ -369,13 +430,23 @@ class _Page:
         on = s.chosen.get(s.stage, ())
         with ui.element("div").classes("effects"):
             for name in s.effects():
-                with ui.element("div").classes("effect" + (" on" if name in on else "")).props(f'data-effect="{name}"') as row:
-                    switch = ui.switch(value=name in on, on_change=lambda e, name=name: self._switch(name, bool(e.value)))
+                with (
+                    ui.element("div")
+                    .classes("effect" + (" on" if name in on else ""))
+                    .props(f'data-effect="{name}"') as row
+                ):
+                    switch = ui.switch(
+                        value=name in on, on_change=lambda e, name=name: self._switch(name, bool(e.value))
+                    )
                     switch.props(f'dense aria-label="{name}"')
                     self.switches[name] = switch, row
                     ui.label(name).classes("name")
                     c = gain.get(name)
-                    share = 0.0 if c is None or c.nats <= 0 or top <= 0 else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
+                    share = (
+                        0.0
+                        if c is None or c.nats <= 0 or top <= 0
+                        else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
+                    )
                     with (
                         ui.element("div")
                         .classes("gain")
@@ -393,10 +464,13 @@ class _Page:
         if name in found:
             f = found[name]
             parts = [
-                f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}" for n, p in f.parameters.items()
+                f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}"
+                for n, p in f.parameters.items()
             ]
             text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
-            return text + (f". As good: {', '.join(f.rivals)}" if f.rivals else "") + (f". {summary}" if summary else "")
+            return (
+                text + (f". As good: {', '.join(f.rivals)}" if f.rivals else "") + (f". {summary}" if summary else "")
+            )
         if name in named:
             return f"Rival of {named[name]}: this log cannot tell them apart. {summary}"
         if c is not None and c.reason:
@@ -424,7 +498,9 @@ class _Page:
                     f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
                 )
                 ui.label("noise floors, held out").classes("l")
-        figure_of(waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250)
+        figure_of(
+            waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250
+        )
 
     def _sliders(self) -> None:
         s = self.s
@@ -437,7 +513,9 @@ class _Page:
                 self.readout = ui.label().classes("mono hand-error")
                 ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
             now = s.values()
-            with ui.element("div").style("display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"):
+            with ui.element("div").style(
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"
+            ):
                 for e in f.result.effects:
                     for name, p in e.parameters.items():
                         self._slider(e.effect, name, float(p["value"]), str(p["unit"]), now[e.effect][name])
@@ -461,7 +539,9 @@ class _Page:
         low, high = max(p.low, min(p.neutral, fitted) - reach), min(p.high, max(p.neutral, fitted) + reach)
         with ui.element("div").classes("turn"):
             ui.label(f"{effect}: {name} [{unit}], fitted {number(fitted, 4)}").classes("what soft")
-            slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(f'dense aria-label="{effect} {name}"')
+            slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(
+                f'dense aria-label="{effect} {name}"'
+            )
             box = ui.label(f"{now:.5g}").classes("mono")
             self.sliders[effect, name] = slider, box
 
@@ -481,12 +561,21 @@ class _Page:
             with ui.element("div").classes("stackc"):
                 ui.html("<h3>The next experiment</h3>", sanitize=False)
                 live.part(self._rivals, "diagnosis", "log", shows=lambda: (s.diagnosis,))
-                ask = ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props("outline dense padding='4px 14px'")
+                ask = ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props(
+                    "outline dense padding='4px 14px'"
+                )
                 open_question = lambda: bool(self._pairs()) and not s.experiment_done and not s.working["experiment"]  # noqa: E731
                 live.shown(ask.classes("self-start"), open_question, "diagnosis", "experiment", "log", "jobs")
                 live.progress("experiment")
                 live.complaint("experiment")
-                live.part(self._experiment, "experiment", "diagnosis", "log", "theme", shows=lambda: (s.diagnosis, s.experiment, dark(s)))
+                live.part(
+                    self._experiment,
+                    "experiment",
+                    "diagnosis",
+                    "log",
+                    "theme",
+                    shows=lambda: (s.diagnosis, s.experiment, dark(s)),
+                )
             with ui.element("div").classes("stackc"):
                 ui.html("<h3>Save</h3>", sanitize=False)
                 hint = ui.label("The extended model (TOML, for --model), and the report (HTML).").classes("soft small")
@@ -494,8 +583,12 @@ class _Page:
                 live.complaint("save")
                 live.progress("report", "command")
                 with ui.element("div").classes("rowc"):
-                    report = ui.button("Report", icon="description", on_click=s.save_report).props("outline dense padding='4px 14px'")
-                    model = ui.button("Extended model", icon="save", on_click=s.save_model).props("outline dense padding='4px 14px'")
+                    report = ui.button("Report", icon="description", on_click=s.save_report).props(
+                        "outline dense padding='4px 14px'"
+                    )
+                    model = ui.button("Extended model", icon="save", on_click=s.save_model).props(
+                        "outline dense padding='4px 14px'"
+                    )
                 live.shown(report, lambda: s.diagnosis is not None, "diagnosis", "log")
                 live.shown(model, lambda: s.diagnosis is not None and bool(s.all_chosen()), "diagnosis", "log", "fit")
                 live.part(self._saved, "save", "diagnosis", "log", shows=lambda: (s.diagnosis, tuple(s.saved)))
@@ -508,7 +601,9 @@ class _Page:
 
     def _rivals(self) -> None:
         if self.s.diagnosis is None:
-            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes("soft small")
+            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes(
+                "soft small"
+            )
         elif self._pairs():
             ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in self._pairs())).classes("small")
         else:
@@ -531,15 +626,17 @@ class _Page:
         with ui.element("div").classes("rowc"):
             for key, name in links.items():
                 if key in s.saved:
-                    ui.link(f"download {name}", f"/saved/{key}").props(f'download="{name}"').classes(f"saved-{key}").style(
-                        "color:var(--measured)"
-                    )
+                    ui.link(f"download {name}", f"/saved/{key}").props(f'download="{name}"').classes(
+                        f"saved-{key}"
+                    ).style("color:var(--measured)")
             if "model" in s.saved:
 
                 def go_on() -> None:
                     s.choose(LogFile(s.saved["model"], "extended.toml", "extended.toml"))
 
-                ui.button("Go on with this model", icon="arrow_forward", on_click=go_on).props("flat dense padding='2px 10px'")
+                ui.button("Go on with this model", icon="arrow_forward", on_click=go_on).props(
+                    "flat dense padding='2px 10px'"
+                )
 
     def _commands(self) -> None:
         s = self.s

@@ -1,7 +1,7 @@
 """The server's private folder: its own while it runs, gone at the end, and after a kill gone at the next start.
 
-A folder is named ``vaneloop-web-PID-...``. Its process holds a lock (flock) on the file ``lock`` in it; the kernel frees the lock when the
-process ends, however it ends, so a number that another process has got since says nothing.
+A folder is named ``vaneloop-web-PID-...``. Its process holds a lock (flock) on the file ``lock`` in it; the kernel
+frees the lock when the process ends, however it ends, so a number that another process has got since says nothing.
 """
 
 from __future__ import annotations
@@ -24,13 +24,17 @@ LOCK = "lock"
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """Give a folder that only this user may enter (0700); it is removed at the end. Those of processes that are gone are removed first."""
+    """Give a folder that only this user may enter (0700); it is removed at the end. Those of processes that are gone
+    are removed first.
+    """
     sweep(Path(tempfile.gettempdir()))
     folder = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-"))
     held = os.open(folder / "locking", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)
-        (folder / "locking").rename(folder / LOCK)  # a file of this name has been locked: one that is free has lost its process
+        (folder / "locking").rename(
+            folder / LOCK
+        )  # a file of this name has been locked: one that is free has lost its process
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)

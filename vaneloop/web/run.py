@@ -1,4 +1,6 @@
-"""Page 3, Run: the loop live. Demand, strip charts, lamps, the bus's trace, faults on purpose, lateness, and a record for page 1."""
+"""Page 3, Run: the loop live. Demand, strip charts, lamps, the bus's trace, faults on purpose, lateness, and a record
+for page 1.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ LIT = 1.5  # s that a lamp stays lit once it is shown, so that what passes quick
 TRACE_LINES = 40
 TRACED = 2000  # frames kept for the trace
 TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
-STRIPS: tuple[tuple[str, str, float, tuple[tuple[str, str], ...]], ...] = (  # title, unit, least height of the axis, lines
+STRIPS: tuple[
+    tuple[str, str, float, tuple[tuple[str, str], ...]], ...
+] = (  # title, unit, least height of the axis, lines
     ("speed [%]", "%", 2.0, (("n_dem", "target"), ("n_r", "measured"))),
     ("stroke [mm]", "mm", 0.5, (("x_dem", "target"), ("x_lvdt", "measured"))),
     ("current [mA]", "mA", 2.0, (("i_cmd", "model"),)),
@@ -74,8 +78,21 @@ class Loop:
         record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
         profile = ["--profile", self.profile] if self.profile else []
         if self.bus == "lockstep":
-            own = "The slider, the pace and the buttons are the page's own. " if profile else "By slider: the page's own. "
-            words = ["run", "--bus", "lockstep", *(profile or ["--profile", "ramp"]), "--start-speed", f"{self.demand:g}", *seed, *record]
+            own = (
+                "The slider, the pace and the buttons are the page's own. "
+                if profile
+                else "By slider: the page's own. "
+            )
+            words = [
+                "run",
+                "--bus",
+                "lockstep",
+                *(profile or ["--profile", "ramp"]),
+                "--start-speed",
+                f"{self.demand:g}",
+                *seed,
+                *record,
+            ]
             return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
         return [("", ["run", "--bus", self.bus_name, *seed, *record]), ("", ["ecu", "--bus", self.bus_name, *profile])]
 
@@ -117,7 +134,13 @@ class Loop:
         record = self._record_path()
         try:
             await self._worker("loop").call(
-                "lockstep", "running", demand=self.demand, speed=self.speed, record=record, seed=self.seed, profile=self.profile
+                "lockstep",
+                "running",
+                demand=self.demand,
+                speed=self.speed,
+                record=record,
+                seed=self.seed,
+                profile=self.profile,
             )
         finally:
             self._ended(record)
@@ -239,7 +262,14 @@ class Loop:
         rows = rows[keep]
         t = rows[:, 0]
         panels = [
-            Panel(title, unit, t, [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines], height=120, least=least)
+            Panel(
+                title,
+                unit,
+                t,
+                [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines],
+                height=120,
+                least=least,
+            )
             for title, unit, least, lines in STRIPS
         ]
         self.session.curves["run"] = Curves(panels, "run")
@@ -266,7 +296,9 @@ class _Page:
         self.s, self.live = session, live
         self.loop: Loop = session.extra["loop"]
         self.traced: tuple[Any, str] = (None, "")
-        self.seen = {name: (n, time.monotonic() - LIT) for name, n in self.loop.lit.items()}  # lamp -> news counted, clock when shown
+        self.seen = {
+            name: (n, time.monotonic() - LIT) for name, n in self.loop.lit.items()
+        }  # lamp -> news counted, clock when shown
 
     # ---- start, stop, demand
 
@@ -319,7 +351,11 @@ class _Page:
             ui.button("Stop", icon="stop", on_click=lp.stop).props("unelevated color=negative padding='5px 18px'")
         else:
             ui.button("Start", icon="play_arrow", on_click=lp.start).props("unelevated padding='5px 18px'")
-        kinds = {"lockstep": "lockstep: simulated time", "local": "real time, embedded bus", "vcan0": "real time, vcan0"}
+        kinds = {
+            "lockstep": "lockstep: simulated time",
+            "local": "real time, embedded bus",
+            "vcan0": "real time, vcan0",
+        }
 
         def join(e: events.ValueChangeEventArguments) -> None:
             lp.bus = e.value
@@ -330,16 +366,25 @@ class _Page:
         if lp.running:
             bus.disable()
         if lp.bus == "lockstep":
-            speeds = {0.1: "0.1 x real time", 0.5: "0.5 x", 1.0: "1 x", 3.0: "3 x", 10.0: "10 x", 0.0: "as fast as it goes"}
+            speeds = {
+                0.1: "0.1 x real time",
+                0.5: "0.5 x",
+                1.0: "1 x",
+                3.0: "3 x",
+                10.0: "10 x",
+                0.0: "as fast as it goes",
+            }
 
             def speed(e: events.ValueChangeEventArguments) -> None:
                 lp.speed = float(e.value)
                 lp.tell(speed=lp.speed)
 
-            ui.select(speeds, value=lp.speed, on_change=speed).props("outlined dense options-dense").style("min-width:150px").classes(
-                "pace"
-            )
-        noisy = ui.checkbox("noisy sensors", value=lp.seed is not None, on_change=lambda e: self._set("seed", 1 if e.value else None))
+            ui.select(speeds, value=lp.speed, on_change=speed).props("outlined dense options-dense").style(
+                "min-width:150px"
+            ).classes("pace")
+        noisy = ui.checkbox(
+            "noisy sensors", value=lp.seed is not None, on_change=lambda e: self._set("seed", 1 if e.value else None)
+        )
         record = ui.checkbox("record", value=lp.record, on_change=lambda e: self._set("record", bool(e.value)))
         if lp.running:
             noisy.disable()
@@ -353,9 +398,9 @@ class _Page:
                 self.s.choose(lp.recorded)
                 ui.navigate.to("/")
 
-            ui.button("Open in missing physics", icon="arrow_forward", on_click=find).props("outline dense padding='4px 12px'").classes(
-                "open-record"
-            )
+            ui.button("Open in missing physics", icon="arrow_forward", on_click=find).props(
+                "outline dense padding='4px 12px'"
+            ).classes("open-record")
 
     def _set(self, name: str, value: Any) -> None:
         setattr(self.loop, name, value)
@@ -423,7 +468,11 @@ class _Page:
                 lamp.classes(replace=wanted)
                 lamp.shown = wanted  # type: ignore[attr-defined]
         for name, tile in self.tiles.items():
-            v = lp.status.get("speed", 1.0 if lp.bus != "lockstep" and lp.running else float("nan")) if name == "pace" else lp.latest(name)
+            v = (
+                lp.status.get("speed", 1.0 if lp.bus != "lockstep" and lp.running else float("nan"))
+                if name == "pace"
+                else lp.latest(name)
+            )
             tile.set_text("-" if v != v else f"{v:.1f}" if name in ("t", "pace") else f"{v:.2f}")
 
     # ---- injection
@@ -431,7 +480,11 @@ class _Page:
     def inject(self) -> None:
         """A button for every scenario of the library."""
         with card("3  A bad day, on purpose"):
-            find = ui.input(placeholder="find a scenario").props('outlined dense clearable aria-label="find a scenario"').classes("w-full")
+            find = (
+                ui.input(placeholder="find a scenario")
+                .props('outlined dense clearable aria-label="find a scenario"')
+                .classes("w-full")
+            )
             with ui.element("div").classes("effects").style("max-height:330px"):
                 boxes = []
                 for name in library():
@@ -511,7 +564,9 @@ class _Page:
                 with holder:
                     if not figures:
                         ui.label(
-                            "Lockstep is never late; start it in real time to see." if self.loop.bus == "lockstep" else "Not started yet."
+                            "Lockstep is never late; start it in real time to see."
+                            if self.loop.bus == "lockstep"
+                            else "Not started yet."
                         ).classes("soft")
                         return
                     ui.label(
@@ -530,7 +585,15 @@ class _Page:
 
 def _in_words(t: float, head: int, data: int, values: dict[str, float]) -> str:
     ident = head & IDENT_MASK
-    name = NAMES.get(ident, "?") if not head >> 29 & 7 else "error frame" if head >> 29 & 1 else "remote" if head >> 30 & 1 else "extended"
+    name = (
+        NAMES.get(ident, "?")
+        if not head >> 29 & 7
+        else "error frame"
+        if head >> 29 & 1
+        else "remote"
+        if head >> 30 & 1
+        else "extended"
+    )
     raw = (data & (1 << 64) - 1).to_bytes(8, "little")[: min((head >> 32) & 0xFF, 8)].hex(" ").upper()
     said = "  ".join(f"{k} {v:.6g}" for k, v in values.items()) or ("WRONG CRC" if name in NAMES.values() else "")
     return f"{t:10.3f}  {ident:03X}  {name:<11} {raw:<24} {said}"

@@ -1,4 +1,6 @@
-"""Page 2, Schedule: the paper's tool. Lengths, schedules and a hysteresis log in; one button a step; tables for the controller out."""
+"""Page 2, Schedule: the paper's tool. Lengths, schedules and a hysteresis log in; one button a step; tables for the
+controller out.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ class Plan:
     geometry_name: str = "geometry.toml"
     edited: bool = False
     log: LogFile | None = None
-    options: dict[str, Any] = field(default_factory=lambda: {"step": 0.5, "lb_range": 5.0, "lc_range": 5.0, "criterion": "rms"})
+    options: dict[str, Any] = field(
+        default_factory=lambda: {"step": 0.5, "lb_range": 5.0, "lc_range": 5.0, "criterion": "rms"}
+    )
     stage: str = "vigv"
     done: dict[str, Any] = field(default_factory=dict)
     loaded: int = 0  # times that a file has replaced numbers
@@ -106,14 +110,19 @@ class _Page:
         with (
             card(
                 "1  The engine",
-                "Lengths as built, the angles that each stage shall have, and a log of stroke and angle driven there and back.",
+                "Lengths as built, the angles that each stage shall have, and a log of stroke and angle driven there "
+                "and back.",
             ),
             ui.element("div").classes("two"),
         ):
             with ui.element("div").classes("stackc"):
-                self.live.part(self._lengths, "plan", shows=lambda: (self.plan, self.plan.loaded, self.plan.log, len(self.s.files)))
+                self.live.part(
+                    self._lengths, "plan", shows=lambda: (self.plan, self.plan.loaded, self.plan.log, len(self.s.files))
+                )
             with ui.element("div").classes("stackc"):
-                self.live.part(self._curve, "plan", "curve", shows=lambda: (self.plan, self.plan.loaded, self.plan.stage))
+                self.live.part(
+                    self._curve, "plan", "curve", shows=lambda: (self.plan, self.plan.loaded, self.plan.stage)
+                )
 
     def _number(self, section: str, key: str, label: str) -> None:
         q = getattr(getattr(self.plan.geometry, section), key)
@@ -123,7 +132,9 @@ class _Page:
                 return
             part = getattr(self.plan.geometry, section)
             new = part.model_copy(
-                update={key: q.model_copy(update={"value": float(box.value), "origin": "chosen: entered in the workbench"})}
+                update={
+                    key: q.model_copy(update={"value": float(box.value), "origin": "chosen: entered in the workbench"})
+                }
             )
             self.plan.geometry = self.plan.geometry.model_copy(update={section: new})
             self._edited()
@@ -156,7 +167,8 @@ class _Page:
                             self._number(section, key, key)
                         del q
         self.upload = ui.upload(
-            label="geometry.toml, schedules.toml or a log", auto_upload=True, max_file_size=self.most, on_upload=self._uploaded,
+            label="geometry.toml, schedules.toml or a log", auto_upload=True, max_file_size=self.most,
+            on_upload=self._uploaded,
             on_rejected=self._rejected,
         )  # fmt: skip
         self.upload.props(f'accept="{suffixes()}" flat')
@@ -168,9 +180,9 @@ class _Page:
             plan.done = {}
             s.touch("steps")
 
-        ui.select(options, value=at, label="hysteresis log", on_change=chosen).props("outlined dense options-dense").classes(
-            "w-full loop-log"
-        )
+        ui.select(options, value=at, label="hysteresis log", on_change=chosen).props(
+            "outlined dense options-dense"
+        ).classes("w-full loop-log")
 
         def shipped() -> None:
             s.extra["plan"] = Plan(load_geometry(), load_schedules())
@@ -199,7 +211,9 @@ class _Page:
         self.s.touch("plan")
 
     def _rejected(self) -> None:
-        self.s.errors["schedule"] = f"this file cannot be taken: it is larger than {self.most / 2**20:.0f} MB, or of another kind"
+        self.s.errors["schedule"] = (
+            f"this file cannot be taken: it is larger than {self.most / 2**20:.0f} MB, or of another kind"
+        )
         self.s.touch("steps")
 
     def _curve(self) -> None:
@@ -211,7 +225,9 @@ class _Page:
                 plan.stage = e.value
                 self.s.touch("curve")
 
-            ui.toggle({k: NAMES[k] for k in STAGES}, value=plan.stage, on_change=show).props("dense unelevated no-caps padding='2px 10px'")
+            ui.toggle({k: NAMES[k] for k in STAGES}, value=plan.stage, on_change=show).props(
+                "dense unelevated no-caps padding='2px 10px'"
+            )
             ui.label("drag a point, or give numbers").classes("soft small")
 
         def set_value(i: int, value: float) -> None:
@@ -221,7 +237,9 @@ class _Page:
                 return
             values[i] = value
             plan.schedules = plan.schedules.model_copy(
-                update={plan.stage: axis.model_copy(update={"values": values, "origin": "chosen: entered in the workbench"})}
+                update={
+                    plan.stage: axis.model_copy(update={"values": values, "origin": "chosen: entered in the workbench"})
+                }
             )
             self._edited()
             editor.put(values)
@@ -233,7 +251,9 @@ class _Page:
         with opened(self.s, "As numbers"), ui.element("div").classes("numbers"):
             for i, (n, v) in enumerate(zip(x, y, strict=True)):
                 box = ui.number(f"at {n:g} %", value=v, format="%.5g").props("outlined dense")
-                box.on("blur", lambda _, i=i, box=box: set_value(i, float(box.value)) if box.value is not None else None)
+                box.on(
+                    "blur", lambda _, i=i, box=box: set_value(i, float(box.value)) if box.value is not None else None
+                )
                 boxes.append(box)
 
     # ---- the steps
@@ -252,7 +272,12 @@ class _Page:
                 self._options()
             live.complaint("schedule")
             live.progress("schedule_step", "engine_part")
-            live.part(self._links_entered, "steps", "plan", shows=lambda: (self.plan.edited and "entered-geometry.toml" in s.saved,))
+            live.part(
+                self._links_entered,
+                "steps",
+                "plan",
+                shows=lambda: (self.plan.edited and "entered-geometry.toml" in s.saved,),
+            )
             live.part(self._command, "steps", "plan", shows=lambda: (" ".join(self.plan.words()),))
         for step, title in zip(STEPS, TITLES, strict=True):
             live.part(partial(self._result, step, title), "steps", "theme", shows=partial(self._shows, step))
@@ -263,7 +288,10 @@ class _Page:
 
     def _dress(self, button: ui.button, step: str) -> None:
         done = step in self.plan.done
-        button.props(add="outline icon-right=check" if done else "unelevated", remove="unelevated" if done else "outline icon-right")
+        button.props(
+            add="outline icon-right=check" if done else "unelevated",
+            remove="unelevated" if done else "outline icon-right",
+        )
         button.set_enabled(not self.s.working["schedule"] and (step != "loop" or self.plan.log is not None))
 
     def _options(self) -> None:
@@ -280,7 +308,8 @@ class _Page:
         option("lb_range", "largest change of Lb [mm]")
         option("lc_range", "largest change of Lc [mm]")
         ui.select(
-            {"rms": "best rms error", "max": "best largest error", "design": "best at 100 %"}, value=plan.options["criterion"],
+            {"rms": "best rms error", "max": "best largest error", "design": "best at 100 "
+                                                                             "%"}, value=plan.options["criterion"],
             on_change=lambda e: self._option("criterion", e.value),
         ).props("outlined dense options-dense").style("width:190px")  # fmt: skip
         assert {"rms", "max", "design"} == set(CRITERIA)
@@ -295,10 +324,14 @@ class _Page:
             with ui.element("div").classes("rowc"):
                 ui.label("the engine as entered:").classes("soft small")
                 for name in ("geometry.toml", "schedules.toml"):
-                    ui.link(f"download {name}", f"/saved/entered-{name}").props(f'download="{name}"').style("color:var(--measured)")
+                    ui.link(f"download {name}", f"/saved/entered-{name}").props(f'download="{name}"').style(
+                        "color:var(--measured)"
+                    )
 
     def _command(self) -> None:
-        command_line(shlex.join(["vaneloop", "schedule", *self.plan.words(), "--out", "engine/", "--report", "schedule.html"]))
+        command_line(
+            shlex.join(["vaneloop", "schedule", *self.plan.words(), "--out", "engine/", "--report", "schedule.html"])
+        )
 
     async def _run(self, step: str) -> None:
         s, plan = self.s, self.plan
@@ -324,8 +357,13 @@ class _Page:
         out = str(s.folder / "tables")
         asked = plan.geometry, plan.schedules, plan.log, dict(o)
         s.saved |= {f"entered-{n}.toml": folder / f"{n}.toml" for n in ("geometry", "schedules")}
-        answer = await s.bench.call("schedule_step", TITLES[STEPS.index(step)].lower(), step=step, words=words, out=out, command=command)
-        if any(a is not b for a, b in zip(asked[:3], (plan.geometry, plan.schedules, plan.log), strict=True)) or asked[3] != o:
+        answer = await s.bench.call(
+            "schedule_step", TITLES[STEPS.index(step)].lower(), step=step, words=words, out=out, command=command
+        )
+        if (
+            any(a is not b for a, b in zip(asked[:3], (plan.geometry, plan.schedules, plan.log), strict=True))
+            or asked[3] != o
+        ):
             return  # the engine has been changed meanwhile
         plan.done[step] = answer
         if step == "tables":
@@ -348,7 +386,11 @@ class _Page:
 
     def _stroke(self, r: dict[str, Any]) -> None:
         n, t = r["speed"], r["table"]
-        lines = [Line("extension", n, t[1], "measured"), Line("retraction", n, t[2], "model"), Line("mean", n, t[3], "target")]
+        lines = [
+            Line("extension", n, t[1], "measured"),
+            Line("retraction", n, t[2], "model"),
+            Line("mean", n, t[3], "target"),
+        ]
         figure_of(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]"), dark(self.s), 300)
         ui.label("Curves for the play entered: while it extends, the VIGV lags by half of it.").classes("note")
 
@@ -359,7 +401,13 @@ class _Page:
                 lb = {"initial": s.lb_initial, "built": s.lb_built, "adjusted": s.lb}[name]
                 lc = s.lc if name == "adjusted" else s.lc_built
                 rows.append(
-                    [NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))]
+                    [
+                        NAMES[s.stage],
+                        words,
+                        f"{lb:g}",
+                        f"{lc:g}",
+                        *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name])),
+                    ]
                 )
         with ui.element("div").classes("half"):
             table(["stage", "", "Lb, mm", "Lc, mm", "at 100 %, deg", "rms", "max"], rows, numbers=(2, 3, 4, 5, 6))
@@ -375,9 +423,20 @@ class _Page:
         rows = []
         for name, m in r.loops.items():
             rows.append(
-                [NAMES[name], f"{m.width:.3f} ± {m.width_sigma:.3f}", f"{m.offset:.3f}", f"{m.lb:.2f}", f"{m.lc:.2f}", f"{m.noise:.3f}"]
+                [
+                    NAMES[name],
+                    f"{m.width:.3f} ± {m.width_sigma:.3f}",
+                    f"{m.offset:.3f}",
+                    f"{m.lb:.2f}",
+                    f"{m.lc:.2f}",
+                    f"{m.noise:.3f}",
+                ]
             )
-        table(["loop", "width, deg", "offset, deg", "Lb equivalent, mm", "Lc equivalent, mm", "noise, deg"], rows, numbers=(1, 2, 3, 4, 5))
+        table(
+            ["loop", "width, deg", "offset, deg", "Lb equivalent, mm", "Lc equivalent, mm", "noise, deg"],
+            rows,
+            numbers=(1, 2, 3, 4, 5),
+        )
         m = r.loops["vigv"]
         x, y, side = m.samples
         pick = np.linspace(0, x.size - 1, min(x.size, 3000)).astype(int)
@@ -401,7 +460,10 @@ class _Page:
                         "x": np.round(np.asarray(line.x), 4).tolist(),
                         "y": np.round(np.asarray(line.y), 4).tolist(),
                     }
-                    trace |= {"x": np.round(np.asarray(line.x), 4).tolist(), "y": np.round(np.asarray(line.y), 4).tolist()}
+                    trace |= {
+                        "x": np.round(np.asarray(line.x), 4).tolist(),
+                        "y": np.round(np.asarray(line.y), 4).tolist(),
+                    }
                 trace["marker"] |= {"size": 3, "opacity": 0.45}
                 figure_of(f, dark(self.s), 380)
         for note in r.notes[:5]:
@@ -412,11 +474,20 @@ class _Page:
         with ui.element("div").classes("rowc"):
             for p in answer["files"]:
                 name = Path(p).name
-                ui.link(f"download {name}", f"/saved/schedule-{name}").props(f'download="{name}"').style("color:var(--measured)")
+                ui.link(f"download {name}", f"/saved/schedule-{name}").props(f'download="{name}"').style(
+                    "color:var(--measured)"
+                )
         pick = [i for i, n in enumerate(r.speed) if n % 5 == 0 or n >= 98]
-        rows = [[f"{r.speed[i]:g}", *(f"{v:.3f}" for v in r.table[1:, i]), *(f"{s.error[i]:.3f}" for s in r.links[1:])] for i in pick]
+        rows = [
+            [f"{r.speed[i]:g}", *(f"{v:.3f}" for v in r.table[1:, i]), *(f"{s.error[i]:.3f}" for s in r.links[1:])]
+            for i in pick
+        ]
         with ui.element("div").classes("half"):
-            table(["speed, %", "extension, mm", "retraction", "mean", "VGV1 error, deg", "VGV2 error"], rows, numbers=range(6))
+            table(
+                ["speed, %", "extension, mm", "retraction", "mean", "VGV1 error, deg", "VGV2 error"],
+                rows,
+                numbers=range(6),
+            )
             lines = [
                 Line(n, r.speed, r.table[k], role)
                 for k, n, role in ((1, "extension", "measured"), (2, "retraction", "model"), (3, "mean", "target"))

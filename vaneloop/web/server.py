@@ -48,7 +48,9 @@ class Sessions:
         self.used: dict[str, float] = {}
 
     def get(self, key: str, tab: Client) -> Session | None:
-        """Return the browser's session for one more tab; make it where there is none. None where others with open tabs take all places."""
+        """Return the browser's session for one more tab; make it where there is none. None where others with open tabs
+        take all places.
+        """
         if key not in self.of:
             if len(self.of) >= MOST_SESSIONS and not self._give_way():
                 return None
@@ -89,19 +91,26 @@ def logs_in(folder: Path) -> list[LogFile]:
         if place.is_dir():
             for f in sorted(place.iterdir())[:500]:
                 if f.suffix.lower() in LOG_SUFFIXES and f.is_file():
-                    out.append(LogFile(f, f.name if place != examples else f"example: {f.name}", os.path.relpath(f, folder)))
+                    out.append(
+                        LogFile(f, f.name if place != examples else f"example: {f.name}", os.path.relpath(f, folder))
+                    )
     return out
 
 
-def serve(sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C. ``sock`` listens already; ``most``: bytes of an upload; ``ready`` takes a word that does for the token once."""
+def serve(
+    sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None]
+) -> None:
+    """Serve until Ctrl-C. ``sock`` listens already; ``most``: bytes of an upload; ``ready`` takes a word that does for
+    the token once.
+    """
     with private_folder() as private:
         tempfile.tempdir = str(private)  # uploads on their way are private too
         _serve(sock, folder, token, most, loopback, ready, private)
 
 
 def _serve(
-    sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None], private: Path
+    sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None],
+    private: Path
 ) -> None:  # fmt: skip
     files = logs_in(folder)
 
@@ -127,7 +136,9 @@ def _serve(
             build(session, most)
             return None
 
-    for path, title, module in zip(PAGES, ("missing physics", "schedule", "run"), (missing, schedule, run), strict=True):
+    for path, title, module in zip(
+        PAGES, ("missing physics", "schedule", "run"), (missing, schedule, run), strict=True
+    ):
         page(path, title, module.build)
 
     @pages.get("/curves/{name}")
@@ -163,8 +174,10 @@ def _serve(
     pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
     pages.on_shutdown(sessions.close)
     ui.run_with(
-        api, title="VaneLoop", dark=None, tailwind=False, storage_secret=secrets.token_hex(32), show_welcome_message=False,
-        reconnect_timeout=RECONNECT, session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},
+        api, title="VaneLoop", dark=None, tailwind=False, storage_secret=secrets.token_hex(32),
+        show_welcome_message=False,
+        reconnect_timeout=RECONNECT,
+        session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},
     )  # fmt: skip
     guard = Guard(api, token, port, most, loopback=loopback, pages=PAGES)
     config = uvicorn.Config(  # h11 bounds the headers of a request

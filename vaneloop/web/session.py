@@ -1,7 +1,7 @@
 """One user's work, apart from any page that shows it: a reload, or a second tab, finds everything as it was.
 
-Every action calls what the command line calls, in a process beside the server (worker.py), and says which command does the same, where
-there is one (docs/workbench.md).
+Every action calls what the command line calls, in a process beside the server (worker.py), and says which command does
+the same, where there is one (docs/workbench.md).
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Choice:
     design_rpm: str = ""
 
     def words(self, real: bool) -> list[str]:
-        """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type them."""
+        """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type
+        them.
+        """
 
         def place(f: LogFile) -> str:
             return str(f.path) if real else f.word
@@ -197,7 +199,9 @@ class Session:
         """Read the log as the form says, then compare it with the model."""
         self.stop()
         self._clear_log()
-        self.errors = {k: v for k, v in self.errors.items() if k not in ("log", "compare", "diagnose", "fit", "experiment", "save")}
+        self.errors = {
+            k: v for k, v in self.errors.items() if k not in ("log", "compare", "diagnose", "fit", "experiment", "save")
+        }
         self.touch("log", "compare", "diagnosis", "fit", "experiment")
         self.do("log", self._read())
 
@@ -286,7 +290,9 @@ class Session:
         words = self.choice.words(real=True)
         d = self.diagnosis
         text = f"fitting {' + '.join(effects) or 'the nominal model'}"
-        answer = await worker.call("refit" if worker is self.bench else "ahead", text, words=words, stage=stage, effects=effects)
+        answer = await worker.call(
+            "refit" if worker is self.bench else "ahead", text, words=words, stage=stage, effects=effects
+        )
         if self.diagnosis is d:
             self.fits[stage, frozenset(effects)] = Fitted(**answer)
 
@@ -350,7 +356,13 @@ class Session:
             if f is None or not self.hand:
                 return
             answer = await self.bench.call(
-                "hand", "", words=self.choice.words(real=True), stage=stage, theta=f.theta, floor=f.floor, values=self.values()
+                "hand",
+                "",
+                words=self.choice.words(real=True),
+                stage=stage,
+                theta=f.theta,
+                floor=f.floor,
+                values=self.values(),
             )
             if self.hand and stage == self.stage and f is self.fitted():
                 self.hand_rms = answer["rms"]
@@ -392,7 +404,9 @@ class Session:
     async def _recommend(self) -> None:
         assert self.diagnosis is not None
         self.touch("experiment")
-        self.experiment = await self.search.call("experiment", "trying demand profiles", diagnosis=self.diagnosis["diagnosis"])
+        self.experiment = await self.search.call(
+            "experiment", "trying demand profiles", diagnosis=self.diagnosis["diagnosis"]
+        )
         self.experiment_done = True
         self.touch("experiment")
 
@@ -406,7 +420,8 @@ class Session:
         path = self.folder / "diagnosis.html"
         self.touch("save")
         await self.search.call(
-            "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"], path=str(path),
+            "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"],
+            path=str(path),
             command=self.command("diagnose", "--report", "diagnosis.html"), next_experiment=self.experiment,
         )  # fmt: skip
         self.saved["report"] = path
@@ -418,7 +433,12 @@ class Session:
 
     def extend_words(self) -> list[str]:
         """Options of ``vaneloop extend`` beyond the log's."""
-        return [w for e in self.all_chosen() for w in ("--effect", e)] + ["--out", "extended.toml", "--report", "extended.html"]
+        return [w for e in self.all_chosen() for w in ("--effect", e)] + [
+            "--out",
+            "extended.toml",
+            "--report",
+            "extended.html",
+        ]
 
     def save_model(self) -> None:
         """Run ``vaneloop extend`` with the effects that are switched on."""
@@ -435,7 +455,9 @@ class Session:
             self.saved.pop(key, None)
         self.touch("save")
         await self.bench.call("command", "extending the model", words=words)
-        self.saved |= {key: file for key, file in files.items() if file.exists()}  # nothing is written that is no better
+        self.saved |= {
+            key: file for key, file in files.items() if file.exists()
+        }  # nothing is written that is no better
         self.touch("save")
 
     def stop(self, *names: str) -> None:

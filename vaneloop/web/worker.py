@@ -1,7 +1,8 @@
-"""A process beside the server that does the long work: reads logs, searches, refits. ``python -m vaneloop.web.worker FD`` speaks over a socket.
+"""A process beside the server that does the long work: reads logs, searches, refits. ``python -m vaneloop.web.worker
+FD`` speaks over a socket.
 
-It calls what the command line calls. Its own process group holds whatever it starts, so that ending the group ends everything; when the
-server is gone it ends itself. Answers come one by one, in the order of the questions.
+It calls what the command line calls. Its own process group holds whatever it starts, so that ending the group ends
+everything; when the server is gone it ends itself. Answers come one by one, in the order of the questions.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ MOST_MEMORY = 0.75  # of the machine's
 LEAST_MEMORY = 4 << 30  # bytes; compiled code reserves address space of its own
 
 
-# ---- what is kept between questions ---------------------------------------------------------------------------------------------------
+# ---- what is kept between questions ----------------------------------------------------------------------------------
 
 _CHAIN: dict[tuple[str, ...], Any] = {}  # of the latest log only
 
@@ -71,7 +72,7 @@ def chain_for(words: list[str], progress: Progress) -> Any:
     return _CHAIN[key]
 
 
-# ---- tasks ----------------------------------------------------------------------------------------------------------------------------
+# ---- tasks -----------------------------------------------------------------------------------------------------------
 
 
 def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
@@ -112,19 +113,24 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     why = ""
     try:
         machine = build_plant(model=load_model(args.model)) if args.model else None
-        loop = replay(options.read_log_of(args), plant=machine, floors={f.signal: f.noise_floor for f in figures}).signals
+        loop = replay(
+            options.read_log_of(args), plant=machine, floors={f.signal: f.noise_floor for f in figures}
+        ).signals
     except InputError as e:
         why = str(e)
     progress(1.0, "")
     return {
-        "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located), "tone": located_tone(located),
+        "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located),
+        "tone": located_tone(located),
         "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes, "loop": loop, "loop_missing": why,
         "span": float(chain.t[-1]), "samples": len(chain.t),
     }  # fmt: skip
 
 
 def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
-    """Measured outputs of a stage and each model's error (in the output's unit), for plots. NaN where nothing counts."""
+    """Measured outputs of a stage and each model's error (in the output's unit), for plots. NaN where nothing
+    counts.
+    """
     import numpy as np
 
     stage = judge.stage
@@ -178,8 +184,12 @@ def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, 
     return {"result": r, "curves": curves_of(judge, models), "theta": r.final.theta, "floor": r.floor}
 
 
-def hand(progress: Progress, words: list[str], stage: str, theta: Any, floor: Any, values: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared unit."""
+def hand(
+    progress: Progress, words: list[str], stage: str, theta: Any, floor: Any, values: dict[str, dict[str, float]]
+) -> dict[str, Any]:
+    """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared
+    unit.
+    """
     import numpy as np
 
     from vaneloop.discrepancy.fit import Judge
@@ -205,7 +215,9 @@ def experiment(progress: Progress, diagnosis: Any) -> dict[str, Any] | None:
     return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"))
 
 
-def report(progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None) -> str:
+def report(
+    progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None
+) -> str:
     """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
     from vaneloop.pages.diagnosis import diagnosis_report
 
@@ -215,7 +227,9 @@ def report(progress: Progress, words: list[str], diagnosis: Any, path: str, comm
 
 
 def command(progress: Progress, words: list[str]) -> dict[str, Any]:
-    """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a defect of ours."""
+    """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a
+    defect of ours.
+    """
     from vaneloop.base import terminal
     from vaneloop.base.errors import InputError
     from vaneloop.cli.main import main
@@ -261,7 +275,14 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
     from plant.linkage import STAGES
     from plant.spatial import plane_joints
     from vaneloop.cli.schedule import log_of
-    from vaneloop.design.scheduling import STROKE_LIMITS, ScheduleOptions, schedule, stroke_tables, table_speeds, write_tables
+    from vaneloop.design.scheduling import (
+        STROKE_LIMITS,
+        ScheduleOptions,
+        schedule,
+        stroke_tables,
+        table_speeds,
+        write_tables,
+    )
     from vaneloop.pages.schedule import NAMES, schedule_page
 
     args = parsed("schedule", words)
@@ -275,7 +296,9 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
             joints = [list(plane_joints(geometry, name, x * 1e-3).values()) for x in strokes]
             places = [[[round(p.real * 1e3, 3), round(p.imag * 1e3, 3)] for p in j] for j in joints]
             radius = float(getattr(geometry, name).ld.value)
-            stages.append({"key": name, "name": NAMES[name], "joints": places, "radius": radius, "angles": angles[:, k].tolist()})
+            stages.append(
+                {"key": name, "name": NAMES[name], "joints": places, "radius": radius, "angles": angles[:, k].tolist()}
+            )
         return {"strokes": strokes.tolist(), "stages": stages}
     if step == "stroke":
         speed = table_speeds(schedules)
@@ -289,12 +312,27 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
 
 
 TASKS: dict[str, Callable[..., Any]] = {
-    **{f.__name__: f for f in (offers, preview, compare, diagnose, refit, hand, experiment, report, command, engine_part, schedule_step)},
+    **{
+        f.__name__: f
+        for f in (
+            offers,
+            preview,
+            compare,
+            diagnose,
+            refit,
+            hand,
+            experiment,
+            report,
+            command,
+            engine_part,
+            schedule_step,
+        )
+    },
     "ahead": refit,  # the same, before the user asks for it
 }
 
 
-# ---- the process ----------------------------------------------------------------------------------------------------------------------
+# ---- the process -----------------------------------------------------------------------------------------------------
 
 
 def _limit_memory() -> None:

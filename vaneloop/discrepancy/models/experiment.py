@@ -1,4 +1,6 @@
-"""Which demand profile would best tell the remaining rivals apart? Rivals are simulated and refitted on a bank of safe profiles."""
+"""Which demand profile would best tell the remaining rivals apart? Rivals are simulated and refitted on a bank of safe
+profiles.
+"""
 
 from __future__ import annotations
 
@@ -46,8 +48,11 @@ def _bank() -> dict[str, np.ndarray]:
         "small reversals about 80 %": _piecewise(small),
         "swept sine, 2 % about 82 %, 0.05 to 1.5 Hz": _sine(82.0, 2.0, 0.05, 1.5, 100.0),
         "swept sine, 6 % about 80 %, 0.02 to 0.5 Hz": _sine(80.0, 6.0, 0.02, 0.5, 100.0),
-        "dwells at 50, 80 and 99 %": _piecewise([(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99), (106, 50)]),
+        "dwells at 50, 80 and 99 %": _piecewise(
+            [(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99), (106, 50)]
+        ),
     }
+
 
 PROFILES = _bank()
 
@@ -61,7 +66,8 @@ def divergence(
     beside: tuple[str, ...] = (),
     seed: int = 1,
 ) -> tuple[float, float]:
-    """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this profile.
+    """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this
+    profile.
 
     truth   effects of the simulated machine with their parameters (border units)
     beside  other effects of the stage, refitted together with either
@@ -78,7 +84,9 @@ def divergence(
 
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
-    run = lockstep(Stimulus.of(profile, t_oil=warm), plant=build_plant(model=Model(effects=truth)), seed=seed, hashed=False)
+    run = lockstep(
+        Stimulus.of(profile, t_oil=warm), plant=build_plant(model=Model(effects=truth)), seed=seed, hashed=False
+    )
     log = Log("simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")})
     chain = build_chain(log)
     if all(s.name != stage for s in chain.stages):
@@ -134,7 +142,8 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():
-        # nats grow with the number of runs, spreads with its root; what decides in the diagnosis decides here, with a margin
+        # nats grow with the number of runs, spreads with its root; what decides in the diagnosis decides here, with a
+        # margin
         nats, spreads = min(n for n, _ in found), min(s for _, s in found)
         needed = max(MARGIN * NATS / max(nats, 1e-9), (MARGIN * RIVAL_SPREADS / max(spreads, 1e-9)) ** 2)
         by_pair = [[f.effect, r, n] for (_, f, r), (n, _) in zip(pairs, found, strict=True)]
@@ -149,11 +158,14 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     names = ", ".join(f"{f.effect} from {r}" for _, f, r in pairs)
     often = "" if repeats == 1 else f", {repeats} times over"
     gained = repeats * best["nats"]
-    text = f"To tell {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected gain {gained:.0f} nats for the closest pair."
+    text = (
+        f"To tell {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected gain {gained:.0f} nats "
+        f"for the closest pair."
+    )
     if not separated:
         text = (
-            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: "
-            f"they differ by {best['nats']:.1f} nats a run at best, {MARGIN * NATS:g} are wanted."
+            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: they differ by "
+            f"{best['nats']:.1f} nats a run at best, {MARGIN * NATS:g} are wanted."
         )
     return {
         "text": text, "profile": best["profile"], "score": gained, "separates": separated, "repeats": repeats,

@@ -67,7 +67,9 @@ class Answer:
         k = int(np.argmax(d.error_before / d.floor))
         size = float(np.sqrt(np.nanmean(self.bound.measured[k] ** 2)))
         share = 100 * d.error_after[k] / size
-        left = f"{d.outputs[k]} is left with an error of {d.error_after[k]:.4g} {d.units[k]} ({share:.2g} % of its RMS), "
+        left = (
+            f"{d.outputs[k]} is left with an error of {d.error_after[k]:.4g} {d.units[k]} ({share:.2g} % of its RMS), "
+        )
         left += f"{d.excess:.3g} times the noise of its samples"
         if d.verdict == "missing":
             names = [f.effect + (f" (or {', '.join(f.rivals)})" if f.rivals else "") for f in d.effects]
@@ -85,12 +87,19 @@ class Answer:
         stages = [
             {
                 "stage": d.stage, "verdict": d.verdict, "signal": d.outputs[k], "unit": d.units[k],
-                "error_before": float(d.error_before[k]), "error_after": float(d.error_after[k]), "noise_floor": float(d.floor[k]),
+                "error_before": float(d.error_before[k]), "error_after": float(d.error_after[k]),
+                "noise_floor": float(d.floor[k]),
             }
             for k in range(len(d.outputs))
         ]  # fmt: skip
         effects = [
-            {"effect": f.effect, "stage": d.stage, "probability": f.probability, "parameters": f.parameters, "rivals": f.rivals}
+            {
+                "effect": f.effect,
+                "stage": d.stage,
+                "probability": f.probability,
+                "parameters": f.parameters,
+                "rivals": f.rivals,
+            }
             for f in d.effects
         ]
         fitted = list(self.bound.logs)
@@ -107,7 +116,8 @@ class Answer:
             "waterfall": {d.stage: [{"step": n, "noise_floors": v} for n, v in d.steps]},
             "logs": [
                 {
-                    "log": log, "fitted": log in fitted, "signal": d.outputs[k], "unit": d.units[k], "step": step, "rms": float(rms[k]),
+                    "log": log, "fitted": log in fitted, "signal": d.outputs[k], "unit": d.units[k], "step": step,
+                    "rms": float(rms[k]),
                     "relative": float(rms[k] / self._size(log, k)),
                 }
                 for step, by in self.logs.items() for log, rms in by.items() for k in range(len(d.outputs))
@@ -124,11 +134,15 @@ class Answer:
             "elapsed_s": self.elapsed_s,
         }  # fmt: skip
         if self.shapes:
-            out["unknown"] = [{"stage": d.stage, "shape": "; ".join(s.text for s in self.shapes), "nearest_effects": []}]
+            out["unknown"] = [
+                {"stage": d.stage, "shape": "; ".join(s.text for s in self.shapes), "nearest_effects": []}
+            ]
         return out
 
     def together(self) -> dict[str, dict[str, Array]]:
-        """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test" -> RMS."""
+        """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test"
+        -> RMS.
+        """
         out: dict[str, dict[str, Array]] = {}
         for step, by in self.logs.items():
             out[step] = {}
@@ -146,7 +160,11 @@ class Answer:
 
     def _recalibrated(self) -> list[dict[str, object]]:
         free = {p.name for p in self.bound.system.parameters if np.isinf(p.tolerance)}
-        return [r for r in self.diagnosis.recalibrated if r["parameter"] not in free and not str(r["parameter"]).startswith("start_")]
+        return [
+            r
+            for r in self.diagnosis.recalibrated
+            if r["parameter"] not in free and not str(r["parameter"]).startswith("start_")
+        ]
 
     def parameters(self) -> list[dict[str, object]]:
         """The model's own parameters as fitted, with 90 % intervals."""
@@ -160,7 +178,9 @@ class Answer:
         return out
 
 
-def _bind(system: System, logs: Sequence[Record], test: Sequence[Record], model: Model | None) -> tuple[Bound, Bound | None]:
+def _bind(
+    system: System, logs: Sequence[Record], test: Sequence[Record], model: Model | None
+) -> tuple[Bound, Bound | None]:
     m = model or Model()
     bound = system.bind(list(logs), values=m.parameters, present=m.effects)
     return bound, system.bind(list(test), like=bound) if test else None
@@ -181,10 +201,14 @@ def _as_is(bound: Bound) -> StageDiagnosis:
     judge = Judge(bound.thinned, bound.noise())
     theta = bound.stage.neutral()
     fit = judge.fit((), theta, 0)
-    rms = np.sqrt(np.sum((judge.errors(theta[None])[0] * judge.floor[:, None]) ** 2, axis=1) / np.maximum(judge.valid.sum(axis=1), 1))
+    rms = np.sqrt(
+        np.sum((judge.errors(theta[None])[0] * judge.floor[:, None]) ** 2, axis=1)
+        / np.maximum(judge.valid.sum(axis=1), 1)
+    )
     excess = float(np.sqrt(np.sum(judge.errors(theta[None])[0] ** 2) / max(judge.n, 1)))
     return StageDiagnosis(
-        bound.stage.name, bound.stage.outputs, bound.stage.units, "none", judge.floor, fit, fit, rms, rms, [], [], [], 1.0,
+        bound.stage.name, bound.stage.outputs, bound.stage.units, "none", judge.floor, fit, fit, rms, rms, [], [], [],
+        1.0,
         [("model", excess)], excess,
     )  # fmt: skip
 
@@ -235,16 +259,27 @@ def diagnose(
     def on_test(theta: Array) -> float:
         assert other is not None
         by = other.figures(other.theta_from(bound, theta))
-        return float(np.mean([np.log(np.maximum(v, 1e-300) / bound.noise()).mean() for v in by.values() if np.isfinite(v).all()] or [0.0]))
+        return float(
+            np.mean(
+                [np.log(np.maximum(v, 1e-300) / bound.noise()).mean() for v in by.values() if np.isfinite(v).all()]
+                or [0.0]
+            )
+        )
 
-    d, decided = diagnose_system(bound.thinned, bound.noise(), tick, on_test if other is not None else None, bound.guess)
+    d, decided = diagnose_system(
+        bound.thinned, bound.noise(), tick, on_test if other is not None else None, bound.guess
+    )
     answer = _finish("diagnose", bound, other, d, started, model or Model())
     answer.notes += decided
     return answer
 
 
 def extend(
-    system: System, logs: Sequence[Record], effects: Sequence[str], test: Sequence[Record] = (), model: Model | None = None
+    system: System,
+    logs: Sequence[Record],
+    effects: Sequence[str],
+    test: Sequence[Record] = (),
+    model: Model | None = None,
 ) -> Answer:
     """Fit exactly these laws; ``answer.model`` is the model with them."""
     started = time.perf_counter()
@@ -278,7 +313,9 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
         named[" + ".join(part.effects)] = theta = part.theta
     if d.final.effects:
         named[" + ".join(d.final.effects)] = d.final.theta
-    answer = Answer(verb, bound, other, d, where(judge, d.base), logs=_steps(bound, other, named), notes=list(bound.notes))
+    answer = Answer(
+        verb, bound, other, d, where(judge, d.base), logs=_steps(bound, other, named), notes=list(bound.notes)
+    )
     last = list(answer.logs.values())[-1]
     if len(d.final.effects) > 1:
         for name in d.final.effects:
@@ -288,7 +325,9 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
             answer.ablation[name] = {log: float(np.exp(np.nanmean(np.log(last[log] / by[log])))) for log in by}
     elif d.final.effects:
         first = answer.logs["model"]
-        answer.ablation[d.final.effects[0]] = {log: float(np.exp(np.nanmean(np.log(last[log] / first[log])))) for log in first}
+        answer.ablation[d.final.effects[0]] = {
+            log: float(np.exp(np.nanmean(np.log(last[log] / first[log])))) for log in first
+        }
     for name, ratios in answer.ablation.items():
         for log, r in ratios.items():
             if r > NO_HELP:
@@ -298,7 +337,8 @@ def _finish(verb: str, bound: Bound, other: Bound | None, d: StageDiagnosis, sta
         i = bound.stage.parameters.index(p)
         if d.final.theta[i] == 0.0 and v0 != 0.0 and p.low == 0.0 and p.tolerance > 0:
             answer.notes.append(
-                f"{p.name}: not needed any more, set to 0 (it was {v0:.4g} {p.unit} while {', '.join(d.final.effects)} was missing)"
+                f"{p.name}: not needed any more, set to 0 (it was {v0:.4g} {p.unit} while {', '.join(d.final.effects)} "
+                "was missing)"
             )
     answer.notes += _loaded(bound, judge, d)
     if d.verdict != "none" and not agrees(d.excess, 1.0):
@@ -360,7 +400,10 @@ def write_model(path: str | Path, model: Model) -> None:
     def text(v: str) -> str:
         return '"' + v.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
-    lines = ["# Written by vaneloop extend: parameters and laws of a user's own model.", f"system = {text(model.system)}"]
+    lines = [
+        "# Written by vaneloop extend: parameters and laws of a user's own model.",
+        f"system = {text(model.system)}",
+    ]
     lines += ["history = [" + ", ".join(text(h) for h in model.history) + "]", "", "[parameters]"]
     lines += [f"{k} = {v!r}" for k, v in model.parameters.items()]
     for name, values in model.effects.items():
@@ -382,10 +425,17 @@ def load_model(path: str | Path, system: System) -> Model:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
         raise StageError(f"{path}: is not a model file ({e})") from None
     if data.get("system") != system.name:
-        raise StageError(f"{path}: is a model of {data.get('system', 'the vane chain')!r}; system {system.name!r} is asked for")
+        raise StageError(
+            f"{path}: is a model of {data.get('system', 'the vane chain')!r}; system {system.name!r} is asked for"
+        )
     parameters, effects = data.get("parameters", {}), data.get("effects", {})
     flat = {**parameters, **{f"{e}.{k}": v for e, by in effects.items() if isinstance(by, dict) for k, v in by.items()}}
     for k, v in flat.items():
         if not isinstance(v, int | float) or isinstance(v, bool) or not np.isfinite(v):
             raise StageError(f"{path}: {k} (={v!r}) must be a finite number")
-    return Model(system.name, dict(parameters), {k: dict(v) for k, v in effects.items()}, [str(h) for h in data.get("history", [])])
+    return Model(
+        system.name,
+        dict(parameters),
+        {k: dict(v) for k, v in effects.items()},
+        [str(h) for h in data.get("history", [])],
+    )

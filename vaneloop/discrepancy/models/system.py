@@ -1,10 +1,14 @@
-"""A user's own model: which channels it explains, how, and where laws may act. `System.bind` turns it, with logs, into a `Stage`.
+"""A user's own model: which channels it explains, how, and where laws may act. `System.bind` turns it, with logs, into
+a `Stage`.
 
 kind        the model is                                   scored
-----------  ---------------------------------------------  -------------------------------------------------------------------
+----------  ---------------------------------------------
+            -------------------------------------------------------------------
 static      y = model(u, p)                                at every sample
-force       force = model(u, p) from measured motion       at every sample (inverse dynamics); u has position, velocity, acceleration
-simulate    dx/dt = model(x, u, p)                         free run from the start, or in windows restarted from measured states
+force       force = model(u, p) from measured motion       at every sample (inverse dynamics); u has position, velocity,
+            acceleration
+simulate    dx/dt = model(x, u, p)                         free run from the start, or in windows restarted from
+            measured states
 closed_loop dx/dt = model(x, u, p), u = control(r, y, p)   free run with the loop closed
 
 docs/your_own_model.md says which to choose when.
@@ -47,7 +51,9 @@ EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differen
 
 
 def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: float = np.inf) -> Parameter:
-    """A parameter that the logs must tell: fitted from ``value``, which need be right within a factor of ten or so, within its bounds."""
+    """A parameter that the logs must tell: fitted from ``value``, which need be right within a factor of ten or so,
+    within its bounds.
+    """
     return Parameter(name, value, unit, low, high, np.inf)
 
 
@@ -65,25 +71,33 @@ class System:
     """A model and what is needed to hold it against logs.
 
     kind        static, force, simulate or closed_loop
-    model       see above; gets named tuples: u.pump, x.level, p.area. Plain Python on numbers (simulate, closed_loop: compiled
-                with numba where it can be) or on whole arrays (static, force)
-    outputs     measured channels that it explains, name -> unit, in the order in which the model (or ``output``) returns them
+    model       see above; gets named tuples: u.pump, x.level, p.area. Plain Python on numbers (simulate, closed_loop:
+                compiled with numba where it can be) or on whole arrays (static, force)
+    outputs     measured channels that it explains, name -> unit, in the order in which the model (or ``output``)
+                returns them
     inputs      measured channels that drive it, name -> unit
     parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
-    position, velocity   force: the channel of the displacement, and of its rate where it is measured too (else it is differentiated)
-    cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the measured force
-    start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force "measured" there
+    position, velocity   force: the channel of the displacement, and of its rate where it is measured too (else it is
+                         differentiated)
+    cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the
+                measured force
+    start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force
+    "measured" there
     states      simulate: name -> unit, in the order in which the model returns their derivatives
     rates       simulate: velocity -> displacement, for states that are these; laws of friction then act on the velocity
-    masses      simulate: velocity -> name of the parameter that divides forces there, so that laws there are in units of force
+    masses      simulate: velocity -> name of the parameter that divides forces there, so that laws there are in units
+                of force
     force_unit  unit of forces on states with a mass
     output      simulate: function output(x, u, p); default: the states that are named like the outputs
-    start       state -> value at the start of a log; others start at their measured value, or where they are not measured are fitted
+    start       state -> value at the start of a log; others start at their measured value, or where they are not
+                measured are fitted
     window      s: start anew from the measured states after each window of this length (for what integrates)
     between     "hold" or "line": what an input does between two samples
-    control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs after the
+    control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs
+                        after the
                 sensors' laws
-    places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default: everywhere
+    places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
+                everywhere
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
     """
 
@@ -125,12 +139,19 @@ class System:
             raise wrong(f"model (={self.model!r}) must be a function")
         if not self.outputs:
             raise wrong("outputs is empty; at least one measured channel must be explained")
-        for what, given in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states), ("commands", self.commands)):
+        for what, given in (
+            ("inputs", self.inputs),
+            ("outputs", self.outputs),
+            ("states", self.states),
+            ("commands", self.commands),
+        ):
             if not isinstance(given, dict):
                 raise wrong(f"{what} (={given!r}) must be a dict of name -> unit")
             for n in given:
                 if not (isinstance(n, str) and n.isidentifier() and not keyword.iskeyword(n) and not n.startswith("_")):
-                    raise wrong(f"{what}: {n!r} must be a Python name (letters, digits, _); --map renames a log's channel")
+                    raise wrong(
+                        f"{what}: {n!r} must be a Python name (letters, digits, _); --map renames a log's channel"
+                    )
         for p in self.parameters:
             if not isinstance(p, Parameter):
                 raise wrong(f"parameters: {p!r} is not a Parameter; write Parameter(...) or unknown(...)")
@@ -151,7 +172,10 @@ class System:
         if moves and not self.states:
             raise wrong(f"kind {self.kind!r} needs states=, name -> unit")
         if self.kind == "closed_loop" and not (self.control and self.commands):
-            raise wrong("kind 'closed_loop' needs control=, a function (r, y, p), and commands=, name -> unit of what it returns")
+            raise wrong(
+                "kind 'closed_loop' needs control=, a function (r, y, p), and commands=, name -> unit of what it "
+                "returns"
+            )
         for v, x in self.rates.items():
             for n in (v, x):
                 if n not in self.states:
@@ -168,7 +192,8 @@ class System:
             for o in self.outputs:
                 if o not in self.states and o not in self.commands:
                     raise wrong(
-                        f"output {o!r} is not a state; name it like one of {', '.join(self.states)}, or give output=, a function (x, u, p)"
+                        f"output {o!r} is not a state; name it like one of {', '.join(self.states)}, or give output=, "
+                        f"a function (x, u, p)"
                     )
         if self.between not in ("hold", "line"):
             raise wrong(f"between (={self.between!r}) must be 'hold' or 'line'")
@@ -280,7 +305,8 @@ class Bound:
                 close = difflib.get_close_matches(c, r.columns, 1)
                 hint = f"; close: {close[0]}" if close else ""
                 raise StageError(
-                    f"{r.name}: no channel {c!r}, which system {s.name!r} needs{hint}; the log has {', '.join(list(r.columns)[:12])}"
+                    f"{r.name}: no channel {c!r}, which system {s.name!r} needs{hint}; the log has "
+                    f"{', '.join(list(r.columns)[:12])}"
                 )
         t = np.asarray(r.t, dtype=float)
         if t.ndim != 1 or len(t) < 50:
@@ -295,7 +321,10 @@ class Bound:
             if c in (*s.inputs, s.position, s.velocity):
                 bad = ~np.isfinite(v)
                 if bad.mean() > 0.2:
-                    raise StageError(f"{r.name}: channel {c!r}: {bad.sum()} of {len(v)} samples are NaN; an input may lack 20 % at most")
+                    raise StageError(
+                        f"{r.name}: channel {c!r}: {bad.sum()} of {len(v)} samples are NaN; an input may lack 20 % at "
+                        f"most"
+                    )
                 if bad.any():
                     v = np.interp(t, t[~bad], v[~bad])
                     self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
@@ -355,7 +384,9 @@ class Bound:
                 best = max(best, float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))]))
         rate = 1.0 / float(np.median(np.diff(self.records[0].t)))
         self.cutoff = float(np.clip(best, 5.0 / self.records[0].t[-1], 0.2 * rate))
-        self.notes.append(f"motion differentiated, and forces compared, up to {self.cutoff:.3g} Hz (cutoff= sets another)")
+        self.notes.append(
+            f"motion differentiated, and forces compared, up to {self.cutoff:.3g} Hz (cutoff= sets another)"
+        )
 
     def _motion(self, r: Record) -> tuple[Array, Array, Array]:
         s = self.system
@@ -386,22 +417,35 @@ class Bound:
             raise
         except Exception as e:
             fields = getattr(getattr(e, "obj", None), "_fields", None)
-            why = f"no {e.name!r} among {', '.join(fields)}" if isinstance(e, AttributeError) and fields else f"{type(e).__name__}: {e}"
+            why = (
+                f"no {e.name!r} among {', '.join(fields)}"
+                if isinstance(e, AttributeError) and fields
+                else f"{type(e).__name__}: {e}"
+            )
             raise StageError(f"system {self.system.name!r}: {what} failed{_place(e)}: {why}") from None
 
     def _flat(self, what: str, value: Any, n: int, of: str) -> list[float]:
         values = list(value) if isinstance(value, tuple | list | np.ndarray) and np.ndim(value) else [value]
         if len(values) != n:
-            raise StageError(f"system {self.system.name!r}: {what} returned {len(values)} values; {n} are needed ({of})")
+            raise StageError(
+                f"system {self.system.name!r}: {what} returned {len(values)} values; {n} are needed ({of})"
+            )
         for name, v in zip(of.split(", "), values, strict=True):
             if np.ndim(v) != 0:
                 raise StageError(
-                    f"system {self.system.name!r}: {what} returned an array of shape {np.shape(v)} for {name}; a number is needed"
+                    f"system {self.system.name!r}: {what} returned an array of shape {np.shape(v)} for {name}; a "
+                    f"number is needed"
                 )
             if isinstance(v, str | complex | np.complexfloating) or v is None:
-                raise StageError(f"system {self.system.name!r}: {what} returned {v!r} for {name} at the first sample; a number is needed")
+                raise StageError(
+                    f"system {self.system.name!r}: {what} returned {v!r} for {name} at the first sample; a number is "
+                    f"needed"
+                )
             if not np.isfinite(v):
-                raise StageError(f"system {self.system.name!r}: {what} returned {v} for {name} at the first sample; it must be finite")
+                raise StageError(
+                    f"system {self.system.name!r}: {what} returned {v} for {name} at the first sample; it must be "
+                    f"finite"
+                )
         return [float(v) for v in values]
 
     def _compile(self) -> None:
@@ -456,7 +500,8 @@ class Bound:
 
         def build(jit: Callable[[Any], Any]) -> Callable[..., Any]:
             space: dict[str, Any] = {
-                "np": np, "jit": jit, "X": self.X, "U": self.U, "P": self.P, "Y": self.Y, "R": self.R, "model": jit(s.model),
+                "np": np, "jit": jit, "X": self.X, "U": self.U, "P": self.P, "Y": self.Y, "R": self.R,
+                "model": jit(s.model),
                 "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
                 "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": laws.transform, "MEMORY": MEMORY,
                 "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
@@ -472,8 +517,13 @@ class Bound:
         try:
             self._try(fast)
         except NumbaError as e:
-            why = next((line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line), "")[:100]
-            self.notes.append(f"system {s.name!r}: numba cannot compile the model ({why}); it runs as plain Python, some 100 times slower")
+            why = next((line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line), "")[
+                :100
+            ]
+            self.notes.append(
+                f"system {s.name!r}: numba cannot compile the model ({why}); it runs as plain Python, some 100 times "
+                f"slower"
+            )
             self._call("model", self._try, self.slow)
             return self.slow
         return fast
@@ -481,7 +531,11 @@ class Bound:
     def _output_source(self) -> str:
         s = self.system
         if s.output is not None:
-            call = "o = output(X(*xs), U(*us), P(*ps))".replace("X(*xs)", "X({x})").replace("U(*us)", "U({u})").replace("P(*ps)", "P({p})")
+            call = (
+                "o = output(X(*xs), U(*us), P(*ps))".replace("X(*xs)", "X({x})")
+                .replace("U(*us)", "U({u})")
+                .replace("P(*ps)", "P({p})")
+            )
             fill = {
                 "x": ", ".join(f"x[{i}]" for i in range(len(s.states))),
                 "u": ", ".join(f"u[{i}]" for i in range(len(self.U._fields))) if s.inputs or s.commands else "0.0",
@@ -492,7 +546,8 @@ class Bound:
         else:
             states, commands = list(s.states), list(s.commands)
             lines = [
-                f"y[{i}] = x[{states.index(o)}]" if o in states else f"y[{i}] = u[{commands.index(o)}]" for i, o in enumerate(s.outputs)
+                f"y[{i}] = x[{states.index(o)}]" if o in states else f"y[{i}] = u[{commands.index(o)}]"
+                for i, o in enumerate(s.outputs)
             ]
         return "\n    ".join(lines)
 
@@ -537,12 +592,18 @@ class Bound:
         if len(rows) != len(s.outputs) and np.ndim(values) == 2:
             rows = list(np.asarray(values))
         if len(rows) != len(s.outputs):
-            raise StageError(f"system {s.name!r}: model returned {len(rows)} values; {len(s.outputs)} are needed ({', '.join(s.outputs)})")
+            raise StageError(
+                f"system {s.name!r}: model returned {len(rows)} values; {len(s.outputs)} are needed "
+                f"({', '.join(s.outputs)})"
+            )
         out = np.empty((len(rows), n))
         for i, (name, row) in enumerate(zip(s.outputs, rows, strict=True)):
             row = np.asarray(row, dtype=float)
             if row.shape not in ((), (n,)):
-                raise StageError(f"system {s.name!r}: model returned shape {row.shape} for {name}; ({n},) is needed, one value a sample")
+                raise StageError(
+                    f"system {s.name!r}: model returned shape {row.shape} for {name}; ({n},) is needed, one value a "
+                    f"sample"
+                )
             if check and not np.all(np.isfinite(row)):
                 k = int(np.flatnonzero(~np.isfinite(np.broadcast_to(row, (n,))))[0])
                 raise StageError(
@@ -586,6 +647,7 @@ class Bound:
                         if which == log:
                             x0[m] = theta[n_p + k]
                     out[i, :, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
+
         if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
             with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
                 list(pool.map(one, range(len(thetas))))
@@ -622,7 +684,10 @@ class Bound:
             if not abs(held) > STARTS_LOADED * self.noise_of_force:
                 held = 0.0
             total = sum(row[1] for _, row in springs)
-            parts = [_forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, held * row[1] / total) for q, row in springs]
+            parts = [
+                _forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, held * row[1] / total)
+                for q, row in springs
+            ]
             y[0] += np.sum(parts, axis=0)
         if self.cutoff:
             y = np.array([_low_pass(t, row, self.cutoff) for row in y])
@@ -631,7 +696,9 @@ class Bound:
                 y[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
         return y
 
-    def _simulate(self, p: Array, x0: Array, log: int, active: list[tuple[_Placed, Array]], steps: int, upto: int | None = None) -> Array:
+    def _simulate(
+        self, p: Array, x0: Array, log: int, active: list[tuple[_Placed, Array]], steps: int, upto: int | None = None
+    ) -> Array:
         s = self.system
         t, u = self.records[log].t[:upto], self.u[log][:, :upto]
         loop = s.kind == "closed_loop"
@@ -664,8 +731,10 @@ class Bound:
         restart, at_restart = self._restarts(log, len(t))
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments = (
-            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory, rows, position, gap,
-            asymmetry, getattr(self, "smalls", np.zeros(n_states)), mass, steps, s.between == "line", loop, len(s.commands),
+            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
+            rows, position, gap,
+            asymmetry, getattr(self, "smalls", np.zeros(n_states)), mass, steps, s.between == "line", loop,
+            len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         try:
@@ -705,8 +774,9 @@ class Bound:
                     values[i] = np.gradient(_smoothed(r.t, r.columns[moving[name]]), r.t)
                 else:
                     raise StageError(
-                        f"system {s.name!r}: window= needs state {name!r} measured at every start; the log has {', '.join(r.columns)} "
-                        f"(name a channel like it, or declare it in rates= as the rate of a measured one)"
+                        f"system {s.name!r}: window= needs state {name!r} measured at every start; the log has "
+                        f"{', '.join(r.columns)} (name a channel like it, or declare it in rates= as the rate of a "
+                        "measured one)"
                     )
             first &= np.all(np.isfinite(values), axis=0)
             self._restart_cache[log] = first, values
@@ -741,7 +811,9 @@ class Bound:
         s = self.system
         out: list[_Placed] = []
 
-        def add(prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()) -> None:
+        def add(
+            prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()
+        ) -> None:
             for law in family.values():
                 if law.name in leave:
                     continue
@@ -785,7 +857,8 @@ class Bound:
                     m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                     force_unit = s.force_unit if name in s.masses else f"({unit})/s"
                     size = self._size(
-                        course, unit, force=max(float(np.sqrt(np.nanmean(rates**2))) * m, 1e-300), force_unit=force_unit,
+                        course, unit, force=max(float(np.sqrt(np.nanmean(rates**2))) * m, 1e-300),
+                        force_unit=force_unit,
                         speed=max(float(np.sqrt(np.nanmean(np.concatenate(course) ** 2))), 1e-300), speed_unit=unit,
                         travel=max(0.5 * float(np.ptp(np.concatenate(z))), 1e-300), travel_unit=s.states[s.rates[name]],
                     )  # fmt: skip
@@ -795,7 +868,11 @@ class Bound:
         signals = s.commands if s.kind == "closed_loop" else s.inputs
         for i, (name, unit) in enumerate(signals.items()):
             if self._allowed("input", name):
-                rows = self.nominal_commands[i] if s.kind == "closed_loop" else [u[i + (3 if s.kind == "force" else 0)] for u in self.u]
+                rows = (
+                    self.nominal_commands[i]
+                    if s.kind == "closed_loop"
+                    else [u[i + (3 if s.kind == "force" else 0)] for u in self.u]
+                )
                 add(name, "input", i + (3 if s.kind == "force" else 0), laws.SIGNAL_LAWS, self._size(rows, unit))
         for i, name in enumerate(outputs):
             if name in s.commands or not self._allowed("output", name):
@@ -805,7 +882,11 @@ class Bound:
                 rows = [np.zeros(len(y[i])) for y in self.y]
             # a constant force and a constant in the sensor of a force are the same; so are gains
             named = any(p in (s.places or ()) for p in ("output", name))
-            leave = tuple(x for x in laws.SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
+            leave = (
+                tuple(x for x in laws.SIGNAL_LAWS if x not in SENSOR_OF_FORCE)
+                if s.kind == "force" and not named
+                else ()
+            )
             prefix = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
             add(prefix, "output", i, laws.SIGNAL_LAWS, self._size(rows, s.outputs[name]), leave)
         return out
@@ -821,7 +902,12 @@ class Bound:
         self.loaded = s.start_force == "measured"
         self.noise_of_force = float(self.noise()[0]) if s.kind == "force" else 0.0
         if self.like is not None:
-            self.steps, self.effects, self.placed, self.small = self.like.steps, self.like.effects, self.like.placed, self.like.small
+            self.steps, self.effects, self.placed, self.small = (
+                self.like.steps,
+                self.like.effects,
+                self.like.placed,
+                self.like.small,
+            )
             if hasattr(self.like, "smalls"):
                 self.smalls = self.like.smalls
         starts: list[Parameter] = []
@@ -832,7 +918,9 @@ class Bound:
             known = [p.name for p in s.parameters]
             for name in self.values:
                 if name not in known and not name.startswith("start_"):
-                    raise StageError(f"model file: parameter {name!r} is not one of system {s.name!r}; allowed: {', '.join(known)}")
+                    raise StageError(
+                        f"model file: parameter {name!r} is not one of system {s.name!r}; allowed: {', '.join(known)}"
+                    )
             first = [
                 Parameter(p.name, float(np.clip(self.values[p.name], p.low, p.high)), p.unit, p.low, p.high, 0.0)
                 if p.name in self.values
@@ -870,15 +958,20 @@ class Bound:
                         raise StageError(f"model file: effect {e.name!r} needs a number for {w.name}")
                     v = float(np.clip(v, w.low, w.high))
                     size = w.scale or max(abs(v), 1e-300)
-                    parameters.append(Parameter(f"{e.name}.{w.name}", v, w.unit, w.low, w.high, WIDE * size, scale=0.1 * size))
+                    parameters.append(
+                        Parameter(f"{e.name}.{w.name}", v, w.unit, w.low, w.high, WIDE * size, scale=0.1 * size)
+                    )
             else:
                 searched.append(e)
-            placed.append(_Placed(q.effect, q.law, q.place, q.at, q.constant, slice(at, at + len(e.parameters)), q.neutral))
+            placed.append(
+                _Placed(q.effect, q.law, q.place, q.at, q.constant, slice(at, at + len(e.parameters)), q.neutral)
+            )
             at += len(e.parameters)
         self.placed = placed
         regimes, units = self._regimes()
         self.stage = Stage(
-            s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t, self.measured,
+            s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t,
+            self.measured,
             regimes=regimes, regime_units=units,
         )  # fmt: skip
         self.guess = self.stage.neutral()
@@ -928,7 +1021,12 @@ class Bound:
         e = self.run(theta[None])[0] - self.measured
         with np.errstate(invalid="ignore"):
             return {
-                name: np.array([np.sqrt(np.mean(row[np.isfinite(row)] ** 2)) if np.isfinite(row).any() else np.nan for row in e[:, at]])
+                name: np.array(
+                    [
+                        np.sqrt(np.mean(row[np.isfinite(row)] ** 2)) if np.isfinite(row).any() else np.nan
+                        for row in e[:, at]
+                    ]
+                )
                 for name, at in self.logs.items()
             }
 
@@ -979,9 +1077,9 @@ class Bound:
         if not np.all(np.abs(first) < self.far):
             k = np.unravel_index(int(np.argmax(~(np.abs(first) < self.far))), first.shape)
             raise StageError(
-                f"system {self.system.name!r}: the model leaves all bounds or turns NaN for {list(self.system.outputs)[k[0]]} at t = "
-                f"{self.t[k[1]]:g} s with its first parameters; other values of {', '.join(p.name for p in parameters) or 'the model'} "
-                f"are needed, or a window="
+                f"system {self.system.name!r}: the model leaves all bounds or turns NaN for "
+                f"{list(self.system.outputs)[k[0]]} at t = {self.t[k[1]]:g} s with its first parameters; other values "
+                f"of {', '.join(p.name for p in parameters) or 'the model'} are needed, or a window="
             )
         if self.system.kind in ("simulate", "closed_loop"):
             self._choose_steps(values)
@@ -1001,7 +1099,9 @@ class Bound:
             return np.where(use, e, 0.0)[:, ::stride].ravel()
 
         z0 = values[free] / size
-        result = least_squares(error, np.clip(z0, low / size, high / size), bounds=(low / size, high / size), diff_step=1e-4, max_nfev=60)
+        result = least_squares(
+            error, np.clip(z0, low / size, high / size), bounds=(low / size, high / size), diff_step=1e-4, max_nfev=60
+        )
         values[free] = result.x * size
         if self.system.kind in ("simulate", "closed_loop"):
             self._choose_steps(values)
@@ -1024,7 +1124,9 @@ class Bound:
         return min((abs(v) for v in (p.low, p.high) if np.isfinite(v) and v != 0.0), default=1.0)
 
     def _choose_steps(self, values: Array) -> None:
-        """Steps of the integration between two samples: doubled until the outputs no longer change by more than 1e-3 of their spread."""
+        """Steps of the integration between two samples: doubled until the outputs no longer change by more than 1e-3 of
+        their spread.
+        """
         scale = np.nanstd(self.measured, axis=1)
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
         before = self.run(values[None])[0]
@@ -1058,7 +1160,9 @@ class Bound:
             for i, name in enumerate(names):
                 if name in r.columns:
                     v = np.where(
-                        np.isfinite(r.columns[name]), r.columns[name], y[list(s.outputs).index(name), at] if name in s.outputs else 0.0
+                        np.isfinite(r.columns[name]),
+                        r.columns[name],
+                        y[list(s.outputs).index(name), at] if name in s.outputs else 0.0,
                     )
                 elif name in s.rates and s.rates[name] in r.columns:
                     v = np.gradient(_smoothed(r.t, r.columns[s.rates[name]]), r.t)
@@ -1133,7 +1237,8 @@ class Bound:
         return out, units
 
 
-# what stands for "rhs x k": the derivative k at x. Written out in place, since handing fifteen arrays to a function costs more
+# what stands for "rhs x k": the derivative k at x. Written out in place, since handing fifteen arrays to a function
+# costs more
 _RHS = """
 d = model(X({x}), U({u}), P({p}))
 {rates}
@@ -1166,7 +1271,8 @@ def controls(r, y, p, u):
 
 
 @jit
-def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps, line, loop,
+def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps,
+        line, loop,
         n_commands, e_code, e_at, e_out, e_rows, out):
     n, m = len(t), len(x0)
     x = x0.copy()
@@ -1221,7 +1327,8 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             for i in range(len(code)):
                 if memory[i] and code[i] <= 40:
                     w = where[i]
-                    f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w], remembered[i])
+                    f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
+                                 remembered[i])
                     held[w] += f / mass[w]
             first = False
             if line and not loop:
@@ -1256,8 +1363,12 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
 
 
 @laws._jit
-def _forces(code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float, held: float) -> Array:
-    """A law's force on a whole log; elements with a memory start with the force ``held``, in the middle of their gap where that is 0."""
+def _forces(
+    code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float, held: float
+) -> Array:
+    """A law's force on a whole log; elements with a memory start with the force ``held``, in the middle of their gap
+    where that is 0.
+    """
     s = np.zeros(laws.MEMORY)
     out = np.empty(len(v))
     for k in range(len(v)):
@@ -1310,7 +1421,9 @@ def load_system(path: str | Path) -> System:
     """
     path = Path(path)
     if not path.is_file():
-        raise StageError(f"{path}: no such file; --system wants a Python file with a System in it (docs/your_own_model.md)")
+        raise StageError(
+            f"{path}: no such file; --system wants a Python file with a System in it (docs/your_own_model.md)"
+        )
     name = f"_system_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -1335,5 +1448,7 @@ def load_system(path: str | Path) -> System:
             del sys.modules["discrepancy"]
     found = {id(v): v for v in vars(module).values() if isinstance(v, System)}
     if len(found) != 1:
-        raise StageError(f"{path}: {len(found)} objects of vaneloop.System; exactly one is needed, as in system = System(...)")
+        raise StageError(
+            f"{path}: {len(found)} objects of vaneloop.System; exactly one is needed, as in system = System(...)"
+        )
     return next(iter(found.values()))

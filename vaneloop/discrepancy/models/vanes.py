@@ -1,15 +1,22 @@
 """The vane chain as stages: the only module of the search that knows what a vane is.
 
-| stage    | driven by (logged)            | explains (logged)            | scored                                            |
+| stage    | driven by (logged)            | explains (logged)            | scored
+                |
 |----------|-------------------------------|------------------------------|---------------------------------------------------|
-| demand   | n_dem, n_r                    | x_dem                        | the firmware's own trend, tables and rate limits  |
-| servo    | x_dem, x_lvdt                 | i_cmd                        | windows, integral free                            |
-| engine   | n_dem                         | n_r                          | free run                                          |
-| actuator | i_cmd, n_r, p_s, t_oil        | x_lvdt                       | windows, stroke free                              |
-| linkage  | x_lvdt, n_r, t_oil            | vigv, vgv1, vgv2, jointly    | free run, play a state                            |
+| demand   | n_dem, n_r                    | x_dem                        | the firmware's own trend, tables and rate
+           limits  |
+| servo    | x_dem, x_lvdt                 | i_cmd                        | windows, integral free
+                |
+| engine   | n_dem                         | n_r                          | free run
+                |
+| actuator | i_cmd, n_r, p_s, t_oil        | x_lvdt                       | windows, stroke free
+                                                |
+| linkage  | x_lvdt, n_r, t_oil            | vigv, vgv1, vgv2, jointly    | free run, play a state
+                |
 
-All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are measured on the
-errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it causes is measured and added.
+All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are
+measured on the errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it
+causes is measured and added.
 """
 
 from __future__ import annotations
@@ -59,9 +66,16 @@ FREE = {  # nominal parameters that a stage refits within their tolerance
         *(f"linkage.{s}_{length}" for s in STAGES for length in STANDS_FOR),
     ),
 }
-LEAST_FLOOR = {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3}  # border units: nobody measures finer
+LEAST_FLOOR = {
+    "demand": 2e-3,
+    "servo": 1e-3,
+    "engine": 1e-4,
+    "actuator": 1e-4,
+    "linkage": 1e-3,
+}  # border units: nobody measures finer
 
-# mm: what a valve and piston without mass and oil spring leave of one that has them; logs of the rig without noise leave 0.0004
+# mm: what a valve and piston without mass and oil spring leave of one that has them; logs of the rig without noise
+# leave 0.0004
 QUASI_STATIC = 4e-4
 
 
@@ -87,7 +101,9 @@ class Chain:
         return next(s for s in self.stages if s.name == name)
 
 
-def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration | None = None, present: tuple[str, ...] = ()) -> Chain:
+def build_chain(
+    log: Log, plant: Plant | None = None, calibration: Calibration | None = None, present: tuple[str, ...] = ()
+) -> Chain:
     """Put ``log`` on one raster and make every stage that its channels allow.
 
     present  effects that the model already has: they are part of ``plant`` and not tried again
@@ -97,7 +113,8 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
     t, columns, fresh, lacking, notes = _raster(log)
     if len(t) < 500:
         raise LogError(
-            f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to search for missing physics"
+            f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
+            f"search for missing physics"
         )
     dt = float(t[1] - t[0])
     # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
@@ -117,7 +134,9 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
         machine_spell = spell if share >= 0.5 else stretch
         currents = law_holds if share >= 0.5 else usable  # between two rows they follow from the firmware's law
         if share < 0.5:
-            notes.append(f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes")
+            notes.append(
+                f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
+            )
     supply = machine.table.supply
     filled = {"p_s": supply.pressure.value, "t_oil": supply.temperature.value}
     have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
@@ -133,7 +152,10 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             law, off = _law(t, have, cal, smooth)
             what = _other_current(t, have, law, run, cal)
             if what:
-                notes.append(f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and demand")
+                notes.append(
+                    f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and "
+                    f"demand"
+                )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = _without_noise(t, have, machine)
                 law, off = _law(t, have, cal, smooth)
@@ -141,7 +163,9 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
             unknown = off.mean(axis=1) - off[:, -1] if sampled else None
             size = cal.k[fw.KP] * smooth.noise
-            have["ticks"], have["other_ticks"] = (_between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1))
+            have["ticks"], have["other_ticks"] = (
+                _between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
+            )
         have["stroke"] = smooth.stroke
     regimes, units = _regimes(t, columns)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
@@ -169,13 +193,15 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
             continue
         if dt > 1.5 * RASTER:
-            # a corner of an input between two rows costs about as much as the corners that the doubled raster loses besides
+            # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
+            # besides
             coarse = make(t[::2], _every_other(have), machine, cal, outputs, rows[::2], present)
             more = _rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]
         if name == "actuator":
-            # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's motion, may be quieter
+            # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's
+            # motion, may be quieter
             channel = noise_floor(t, stage.measured[0])
             freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
             stage.quiet = np.maximum([min(channel, freed)], least)
@@ -185,11 +211,13 @@ def build_chain(log: Log, plant: Plant | None = None, calibration: Calibration |
     return Chain(t, stages, absent, columns, machine, cal, notes)
 
 
-# ---- raster -------------------------------------------------------------------------------------------------------------------------
+# ---- raster ----------------------------------------------------------------------------------------------------------
 
 
 def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
-    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of its own; notes."""
+    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
+    its own; notes.
+    """
     channels = log.channels
     steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
     if not steps:
@@ -216,8 +244,11 @@ def _raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]
             edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
             count = np.maximum(np.diff(edge), 1)
             columns[name] = np.diff(total[edge]) / count
-        elif uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state") or _held(c, dt):
-            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames hold their value
+        elif (
+            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state") or _held(c, dt)
+        ):
+            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
+            # hold their value
             i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
             columns[name] = c.values[i]
         else:
@@ -236,7 +267,9 @@ def _held(c: Channel, dt: float) -> bool:
 
 
 def _to_frame(channels: Mapping[str, Channel], start: float, dt: float) -> float:
-    """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames show it; else 0."""
+    """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames
+    show it; else 0.
+    """
     for name in ("x_dem", "n_dem"):
         if name in channels and _held(channels[name], dt):
             c = channels[name]
@@ -266,7 +299,9 @@ def _rms(stage: Stage, difference: Array) -> Array:
 
 
 def _stretches(good: Array) -> Array:
-    """Number of the stretch of good rows that each row belongs to, from 0; a row that is not good belongs to the stretch before it."""
+    """Number of the stretch of good rows that each row belongs to, from 0; a row that is not good belongs to the
+    stretch before it.
+    """
     begins = good & ~np.concatenate([[False], good[:-1]])
     begins[0] = False
     return np.cumsum(begins)
@@ -308,7 +343,11 @@ def _regimes(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dic
                 sign, last = float(np.sign(v[i])), smooth[i]
             turns[i] = abs(smooth[i] - last)
         out["distance since reversal"], units["distance since reversal"] = turns, "mm"
-    for name, label, unit in (("n_r", "rotor speed", "%"), ("t_oil", "oil temperature", "degC"), ("p_s", "supply pressure", "MPa")):
+    for name, label, unit in (
+        ("n_r", "rotor speed", "%"),
+        ("t_oil", "oil temperature", "degC"),
+        ("p_s", "supply pressure", "MPa"),
+    ):
         if name in columns:
             out[label], units[label] = columns[name], unit
     if "i_cmd" in columns:
@@ -316,11 +355,15 @@ def _regimes(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dic
     return out, units
 
 
-# ---- parameters and effects ---------------------------------------------------------------------------------------------------------
+# ---- parameters and effects ------------------------------------------------------------------------------------------
 
 
-def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
-    """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors to SI."""
+def _declared(
+    stage: str, machine: Plant, present: tuple[str, ...]
+) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
+    """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors
+    to SI.
+    """
     known = {n.name: n for n in nominal(machine.table, machine.geometry)}
     parameters, rows, si = [], [], []
     for name in FREE[stage]:
@@ -343,7 +386,14 @@ def _declared(stage: str, machine: Plant, present: tuple[str, ...]) -> tuple[tup
             continue
         ps = tuple(
             Parameter(
-                p.name, p.neutral, p.unit, p.low, p.high, KNOWN.get(p.name, 0.0) * p.neutral, _vane(p.name), shape=p.name in SHAPES,
+                p.name,
+                p.neutral,
+                p.unit,
+                p.low,
+                p.high,
+                KNOWN.get(p.name, 0.0) * p.neutral,
+                _vane(p.name),
+                shape=p.name in SHAPES,
                 period=p.period,
             )
             for p in e.parameters
@@ -362,7 +412,9 @@ def _vane(name: str) -> str | None:
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
 FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
 SHAPES = (*FIXED_START, "phase", "roundness")
-KNOWN = {"drag": 0.5}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
+KNOWN = {
+    "drag": 0.5
+}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
 
@@ -370,7 +422,10 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
     """Sizes from which a fit of the effect starts: small to gross, both signs where the bounds allow."""
     if name == "valve_flow_saturation":
         # a sharp limit above all speeds of the log has no slope to follow, and one a tenth too low costs more than none
-        return (*((4.0 * 1.18**k, 0.0) for k in range(24)), *((v, 1.0) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0, 200.0)))
+        return (
+            *((4.0 * 1.18**k, 0.0) for k in range(24)),
+            *((v, 1.0) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0, 200.0)),
+        )
     if name in ("can_delay", "frame_hold"):
         return tuple((v,) for v in np.arange(0.01, 0.51, 0.01) if name != "frame_hold" or v > 0.015)
     if name == "trend_threshold_error":
@@ -396,7 +451,9 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
             if ok:
                 phases = (0.0, 90.0, 180.0, 270.0) if any(p.name == "phase" for p in ps) else (None,)
                 for phase in phases:
-                    out.append(tuple(phase if p.name == "phase" and phase is not None else start[i] for i, p in enumerate(ps)))
+                    out.append(
+                        tuple(phase if p.name == "phase" and phase is not None else start[i] for i, p in enumerate(ps))
+                    )
     return tuple(out)
 
 
@@ -408,7 +465,9 @@ def _lanes(machine: Plant, thetas: Array, rows: Array, si: Array) -> Array:
 
 
 def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int) -> Array:
-    """simulate(thetas), half of it in a second thread where there are more than ``least`` sets: compiled code needs no interpreter."""
+    """simulate(thetas), half of it in a second thread where there are more than ``least`` sets: compiled code needs no
+    interpreter.
+    """
     if len(thetas) <= least:
         return simulate(thetas)
     half = -(-len(thetas) // 2 // least) * least
@@ -418,11 +477,17 @@ def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int)
         return np.concatenate([first, second.result()])
 
 
-# ---- stages -------------------------------------------------------------------------------------------------------------------------
+# ---- stages ----------------------------------------------------------------------------------------------------------
 
 
 def _engine(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
 ) -> Stage:
     parameters, effects, rows, si = _declared("engine", machine, present)
     dt = float(t[1] - t[0])
@@ -441,19 +506,28 @@ def _engine(
         for piece in pieces:
             head = min(piece.start + second, piece.stop)
             start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
-            # at its rate limit the engine never forgets how it began: the speed at the start is what suits the first second
+            # at its rate limit the engine never forgets how it began: the speed at the start is what suits the first
+            # second
             for stop in (head, piece.stop):
                 inside = slice(piece.start * inner, stop * inner)
                 s[chain.N_R] = start
                 engine_run(n_dem[inside], dt / inner, p, s, out[inside])
-                start = start + np.mean(c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0)
+                start = start + np.mean(
+                    c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
+                )
         return out[::inner].T[:, None, :]
 
     return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])
 
 
 def _actuator(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
 ) -> Stage:
     parameters, effects, rows, si = _declared("actuator", machine, present)
     dt = float(t[1] - t[0])
@@ -477,7 +551,8 @@ def _actuator(
         out *= 1e3
         return out
 
-    # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no valve's curve tells
+    # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no
+    # valve's curve tells
     stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
     leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
     run = run & (leaning | ~_lately(leaning, WINDOW, dt))
@@ -502,7 +577,12 @@ def _actuator(
         for b in begins:  # the spool and the lags come from another time
             keep[b : b + window] = False
         part = _actuator(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.quiet, part.noise, part.raster_error = stage.floor, stage.quiet, stage.noise, stage.raster_error
+        part.floor, part.quiet, part.noise, part.raster_error = (
+            stage.floor,
+            stage.quiet,
+            stage.noise,
+            stage.raster_error,
+        )
         return part
 
     stage.excerpt = excerpt
@@ -510,7 +590,13 @@ def _actuator(
 
 
 def _linkage(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
 ) -> Stage:
     parameters, effects, rows, si = _declared("linkage", machine, present)
     dt = float(t[1] - t[0])
@@ -530,8 +616,8 @@ def _linkage(
         linkage_run(x, n_r, t_oil, t, dt, p, s, out)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
-    # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were left at full speed
-    # by a controller that had to catch up, which turns between two rows
+    # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
+    # left at full speed by a controller that had to catch up, which turns between two rows
     first_spell, settled = c["machine_spell"] == c["machine_spell"][0], _since(t, c["machine_spell"]) >= SETTLE
     known = np.zeros(len(t), dtype=bool)
     for piece in _pieces(c["machine_spell"]):
@@ -545,7 +631,10 @@ def _linkage(
     ageing, warming = _like_time(t, t_oil), _like_temperature(t, t_oil)
     stage.twins = {
         "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
-        **{name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("thermal_growth", "lvdt_thermal_drift")},
+        **{
+            name: ("time", lambda thetas: simulate(thetas, t_oil=ageing))
+            for name in ("thermal_growth", "lvdt_thermal_drift")
+        },
     }
 
     def excerpt(at: Array) -> Stage:
@@ -553,7 +642,12 @@ def _linkage(
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
         part = _linkage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.quiet, part.noise, part.raster_error = stage.floor, stage.quiet, stage.noise, stage.raster_error
+        part.floor, part.quiet, part.noise, part.raster_error = (
+            stage.floor,
+            stage.quiet,
+            stage.noise,
+            stage.raster_error,
+        )
         return part
 
     stage.excerpt = excerpt
@@ -569,7 +663,9 @@ def _like_time(t: Array, t_oil: Array) -> Array:
 
 
 def _like_temperature(t: Array, t_oil: Array) -> Array:
-    """A time (s) that goes with the oil's temperature, over the same span; time itself where the temperature is not known to change."""
+    """A time (s) that goes with the oil's temperature, over the same span; time itself where the temperature is not
+    known to change.
+    """
     return t if np.ptp(t_oil) == 0.0 else np.asarray(t[0] + np.ptp(t) * (t_oil - t_oil.min()) / np.ptp(t_oil))
 
 
@@ -584,7 +680,8 @@ BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the c
 
 
 class _Smooth(NamedTuple):
-    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as smoothing makes.
+    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as
+    smoothing makes.
 
     off: mm, the logged stroke less the fitted model's, whose motion is mostly gone.
     """
@@ -599,7 +696,8 @@ class _Smooth(NamedTuple):
 def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     """The logged stroke with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
 
-    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by leave-one-out errors.
+    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by
+    leave-one-out errors.
     """
     dt = float(t[1] - t[0])
     p = machine.p.copy()
@@ -631,16 +729,19 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     left = savgol_filter(noise * np.random.default_rng(1).standard_normal(len(t)), rows, SMOOTH_ORDER)
     distortion = smooth - savgol_filter(off, rows // 4 * 2 + 1, SMOOTH_ORDER)
     fast = np.abs(distortion) > 2.0 * noise  # rather noisy than wrong
-    return _Smooth(np.where(fast, c["x_lvdt"], model + smooth), noise, left, np.where(fast, off - smooth, distortion), off)
+    return _Smooth(
+        np.where(fast, c["x_lvdt"], model + smooth), noise, left, np.where(fast, off - smooth, distortion), off
+    )
 
 
 def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tuple[Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
-    At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off the stroke.
+    At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
+    the stroke.
 
-    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and a draw of how much
-    they are off because the stroke between two rows is not logged, of the same shape.
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and a draw
+    of how much they are off because the stroke between two rows is not logged, of the same shape.
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
@@ -660,25 +761,27 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
     def loop(e: Array) -> Array:
         return np.asarray(kp * e + ki * np.cumsum(e).reshape(e.shape) * chain.TICK)
 
-    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, and the way between them, which is known as well as a
-    # straight line and a cubic agree
+    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, and the way between them, which is
+    # known as well as a straight line and a cubic agree
     noise = smooth.noise * np.random.default_rng(0).standard_normal((len(t), 10))
     off = CubicSpline(t, smooth.left + smooth.distortion)(when) - noise + (stroke - straight)
     off[:, -1] = 0.0
     return loop(error) + kff * rate, loop(off)
 
 
-def _between_rows(c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, unknown: Array | None, seed: int) -> Array:
+def _between_rows(
+    c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, unknown: Array | None, seed: int
+) -> Array:
     """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
 
-    Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine ticks that nobody
-    logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap. Where the law does not hold (not in
-    mode RUN, at the current's limit) the current is the row's mean.
+    Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine
+    ticks that nobody logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap.
+    Where the law does not hold (not in mode RUN, at the current's limit) the current is the row's mean.
 
     law      of `_law`
     size     mA, RMS of the LVDT's noise in the current
-    unknown  mA, such an error as the law left in each row's mean, where that was worked out from its last tick; with the noise of about
-             one tick it is added for any ``seed`` but 0
+    unknown  mA, such an error as the law left in each row's mean, where that was worked out from its last tick; with
+             the noise of about one tick it is added for any ``seed`` but 0
     """
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
@@ -699,9 +802,11 @@ BEFORE = "the mean of the ten ticks before the row"
 
 
 def _other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> str:
-    """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that in its place.
+    """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that
+    in its place.
 
-    The firmware's ``law`` on the logged stroke says which it is instead (`SAMPLED`, `BEFORE`; "": neither), and what the other ticks added.
+    The firmware's ``law`` on the logged stroke says which it is instead (`SAMPLED`, `BEFORE`; "": neither), and what
+    the other ticks added.
     """
     width = int(round(WINDOW / RASTER))
     use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
@@ -721,7 +826,13 @@ def _other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: C
 
 
 def _servo(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
 ) -> Stage:
     parameters, effects, _, _ = _declared("servo", machine, present)
     mean, hidden = c["law"].mean(axis=1), c["law_error"]
@@ -735,7 +846,15 @@ def _servo(
     at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.k[fw.CURRENT_LIMIT], np.ones(5), "same") > 0.5
     near = _no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
     stage = Stage(
-        "servo", outputs, ("mA",), parameters, effects, simulate, t, np.where(run & near, c["i_cmd"], np.nan)[None], window=WINDOW
+        "servo",
+        outputs,
+        ("mA",),
+        parameters,
+        effects,
+        simulate,
+        t,
+        np.where(run & near, c["i_cmd"], np.nan)[None],
+        window=WINDOW,
     )
     # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
     seen = min(noise_floor(t, hidden), noise_floor(t, stage.measured[0] - mean))
@@ -746,7 +865,9 @@ def _servo(
 
 @compiled
 def _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, out):
-    """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every frame."""
+    """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every
+    frame.
+    """
     dt = t[1] - t[0]
     for i in range(first, last):
         at = t[i]
@@ -786,8 +907,8 @@ def _directions(n_dem, k, z, out):
 def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     """Rows at which the trend's direction does not turn on what the demand did before the first of them.
 
-    How far the demand had already come back then is not known: nothing, or nearly all that turns the direction. Where the two lead to
-    different directions, from either, the row does not count, nor those in which the curves blend.
+    How far the demand had already come back then is not known: nothing, or nearly all that turns the direction. Where
+    the two lead to different directions, from either, the row does not count, nor those in which the curves blend.
     """
     known = np.ones(len(n_dem), dtype=bool)
     for direction in (1.0, -1.0):
@@ -808,12 +929,22 @@ def _lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
 
 
 def _demand(
-    t: Array, c: dict[str, Array], machine: Plant, cal: Calibration, outputs: tuple[str, ...], run: Array, present: tuple[str, ...]
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
 ) -> Stage:
     _, effects, _, _ = _declared("demand", machine, present)
     n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
     pieces = _pieces(c["spell"])
-    run = run & np.concatenate([_direction_known(n_dem[piece], cal) for piece in pieces]) & ~_lately(c["missing"] > 0.0, 0.4)
+    run = (
+        run
+        & np.concatenate([_direction_known(n_dem[piece], cal) for piece in pieces])
+        & ~_lately(c["missing"] > 0.0, 0.4)
+    )
     measured = np.where(run, c["x_dem"], np.nan)
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
 
@@ -835,7 +966,10 @@ def _demand(
             delay = value(theta, "can_delay", float(machine.p[ROW["can_delay"], 0]))
             for piece in pieces:
                 first, last = piece.start, piece.stop
-                curves = [float(np.interp(n_r[first], table[0], table[row])) * 1e3 for row in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)]
+                curves = [
+                    float(np.interp(n_r[first], table[0], table[row])) * 1e3
+                    for row in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)
+                ]
                 rising = abs(curves[0] - c["x_dem"][first]) <= abs(curves[1] - c["x_dem"][first])
                 # at the start of a log the demand stands on a curve; later both directions are tried
                 for x, up in ((out[i, 0], rising), (other, not rising)) if first else ((out[i, 0], rising),):
