@@ -16,16 +16,16 @@ This file holds all compiled code of the controller on purpose: numba's cache lo
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from controller.calibration import Calibration
+
 import math
 
-from numba import njit
+import numpy as np
 
-# Nothing is allocated here, all arrays belong to the caller: counting references to them would take 115 of 148 ns a
-# tick.
-compiled = njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)  # type: ignore[call-overload]
-# The strategies inverse and adaptive are not inlined: that would double the time that compiling takes, for all
-# strategies.
-apart = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+from vaneloop.base.compiled import in_place, inlined
 
 # ---- inputs ----------------------------------------------------------------------------------------------------------
 INPUTS = ("n_dem", "n_r", "demand_fresh", "demand_rejected", "mode_request", "x_lvdt", "vigv", "vgv1", "vgv2", "pause")
@@ -397,8 +397,8 @@ KNOWN, WELL_KNOWN = 15.0, 30.0  # s of learning on a side
 SEEN_AGAIN = 0.6  # of well known: a side to which the stage comes back may have moved since
 
 
-@compiled
-def look_up(axis, row, table, v):
+@inlined
+def look_up(axis: int, row: int, table: np.ndarray, v: float) -> float:
     """Linear interpolation of ``table[row]`` over the increasing ``table[axis]``, held constant beyond both ends."""
     last = table.shape[1] - 1
     if not v > table[axis, 0]:
@@ -416,8 +416,8 @@ def look_up(axis, row, table, v):
     return table[row, lo] + w * (table[row, hi] - table[row, lo])
 
 
-@compiled
-def trend_step(z, k, n_dem):
+@inlined
+def trend_step(z: np.ndarray, k: np.ndarray, n_dem: float) -> None:
     """Is the demand rising or falling? One 10 ms step.
 
     The rate comes from a constant-rate Kalman filter in its steady-state form (alpha-beta)::
@@ -453,8 +453,8 @@ def trend_step(z, k, n_dem):
         z[TREND_TIMER] = 0.0
 
 
-@compiled
-def schedule_step(z, k, table):
+@inlined
+def schedule_step(z: np.ndarray, k: np.ndarray, table: np.ndarray) -> None:
     """Strategies `SINGLE` and `DUAL`: stroke demand from the speed by curves, one 10 ms step.
 
     The extension curve serves a rising demand, the retraction curve a falling one. Between them ``blend`` moves at a
@@ -473,8 +473,8 @@ def schedule_step(z, k, table):
     z[X_TARGET] = min(max(target, k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@apart
-def observe_speed(z, k):
+@in_place
+def observe_speed(z: np.ndarray, k: np.ndarray) -> None:
     """Rotor speed and its rate without the noise and the lag of a filter: one 10 ms step.
 
     ::
@@ -504,20 +504,20 @@ def observe_speed(z, k):
     z[SPEED] = min(max(z[SPEED], z[N_R] - k[OBSERVER_BAND]), z[N_R] + k[OBSERVER_BAND])
 
 
-@apart
-def angle_at(axis, row, angles, v):
+@in_place
+def angle_at(axis: int, row: int, angles: np.ndarray, v: float) -> float:
     """Look up ``angles``, see `look_up`."""
     return look_up(axis, row, angles, v)
 
 
-@apart
-def scheduled_angle(table, angles, n):
+@in_place
+def scheduled_angle(table: np.ndarray, angles: np.ndarray, n: float) -> float:
     """Target (rad) of the VIGV at speed ``n`` (%)."""
     return angle_at(ANGLE_STROKE, ANGLE_VIGV, angles, angle_at(ROW_SPEED, ROW_SINGLE, table, n))
 
 
-@apart
-def follow_play(z, stage, drive, width):
+@in_place
+def follow_play(z: np.ndarray, stage: int, drive: float, width: float) -> None:
     """Where in its gap is a stage? One step of the play operator, with the ``drive`` angle and total ``width`` (rad).
 
     The stage stands at ``farthest - engaged width / 2``: pushed there by the farthest drive on the engaged side, until
@@ -536,8 +536,8 @@ def follow_play(z, stage, drive, width):
         z[learned + stage] = min(z[learned + stage], SEEN_AGAIN * WELL_KNOWN)
 
 
-@apart
-def inverse_step(z, k, table, angles):
+@in_place
+def inverse_step(z: np.ndarray, k: np.ndarray, table: np.ndarray, angles: np.ndarray) -> None:
     """Strategies `INVERSE` and `ADAPTIVE`: the stroke demand that brings the VIGV to its target through the play, one
     10 ms step.
 
@@ -575,8 +575,8 @@ def inverse_step(z, k, table, angles):
     z[X_TARGET] = min(max(stroke, k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@apart
-def filter_pots(z, k, inputs):
+@in_place
+def filter_pots(z: np.ndarray, k: np.ndarray, inputs: np.ndarray) -> None:
     """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts
     against it.
     """
@@ -591,8 +591,8 @@ def filter_pots(z, k, inputs):
             z[SUSPECT + stage] += SUSPICION * TICK / SLOW_TICK
 
 
-@apart
-def _judge_pot(z, k, stage, expected, plausible):
+@in_place
+def _judge_pot(z: np.ndarray, k: np.ndarray, stage: int, expected: float, plausible: bool) -> None:
     """Is a potentiometer trusted? One 10 ms step.
 
     It is once its readings have followed the linkage over ``pot_trust`` without a doubt: one that is stuck may be right
@@ -618,8 +618,8 @@ def _judge_pot(z, k, stage, expected, plausible):
         z[LOWEST + stage] = z[HIGHEST + stage] = expected
 
 
-@apart
-def learn(z, k):
+@in_place
+def learn(z: np.ndarray, k: np.ndarray) -> None:
     """Learn offset and play of each stage from its potentiometer: one 10 ms step.
 
     With the stroke at rest, the reading less the angle expected, r, is put into the side on which the stage is
@@ -671,8 +671,8 @@ def learn(z, k):
     z[WIDTH_IN_USE] += min(max(z[WIDTH] - z[WIDTH_IN_USE], -step), step)
 
 
-@compiled
-def move_demand(z, k, target, rate):
+@inlined
+def move_demand(z: np.ndarray, k: np.ndarray, target: float, rate: float) -> None:
     """Let the stroke demand follow ``target`` (m) no faster than ``rate`` (m/s): one 10 ms step."""
     step = rate * SLOW_TICK
     z[X_FROM] = z[X_DEM]
@@ -680,8 +680,8 @@ def move_demand(z, k, target, rate):
     z[X_DEM] = min(max(z[X_DEM], k[STROKE_MIN]), k[STROKE_MAX])
 
 
-@compiled
-def servo_step(z, k, x_ref, dx_ref):
+@inlined
+def servo_step(z: np.ndarray, k: np.ndarray, x_ref: float, dx_ref: float) -> None:
     """Servo-valve current: PI on the stroke error with feed-forward of the demanded speed, one tick of 1 ms.
 
     ::
@@ -712,8 +712,8 @@ def servo_step(z, k, x_ref, dx_ref):
     z[I_CMD] = i
 
 
-@compiled
-def _debounce(z, timer, bad, bit, rise, heal):
+@inlined
+def _debounce(z: np.ndarray, timer: int, bad: bool, bit: int, rise: float, heal: float) -> None:
     """Set fault ``bit`` after ``rise`` seconds of bad ticks, clear it after ``heal`` seconds of good ones.
 
     The timer counts up to ``rise`` while bad; once the fault stands it counts down from 0 to -``heal`` while good.
@@ -731,8 +731,8 @@ def _debounce(z, timer, bad, bit, rise, heal):
             z[timer] = 0.0
 
 
-@compiled
-def _condition_lvdt(z, k, x, pause):
+@inlined
+def _condition_lvdt(z: np.ndarray, k: np.ndarray, x: float, pause: float) -> None:
     """Take a stroke sample if it is plausible (range, rate, not stuck); otherwise keep the last plausible one.
 
     A sample is plausible if the piston can have come there from the last plausible one at ``lvdt_rate``, however long
@@ -769,8 +769,8 @@ def _condition_lvdt(z, k, x, pause):
     _debounce(z, T_LVDT_STUCK, z[STUCK_TIMER] >= k[STUCK_TIME] - HALF_TICK, F_LVDT_STUCK, TICK, k[LVDT_HEAL])
 
 
-@compiled
-def _debounce_leaky(z, timer, bad, bit, rise, heal):
+@inlined
+def _debounce_leaky(z: np.ndarray, timer: int, bad: bool, bit: int, rise: float, heal: float) -> None:
     """Like `_debounce`, but good ticks only count the timer down: intermittent faults add up."""
     mask = int(z[FAULT_BITS])
     if mask & (1 << bit):
@@ -782,8 +782,8 @@ def _debounce_leaky(z, timer, bad, bit, rise, heal):
         z[timer] = 0.0
 
 
-@compiled
-def _monitor_demand(inputs, z, k, pause):
+@inlined
+def _monitor_demand(inputs: np.ndarray, z: np.ndarray, k: np.ndarray, pause: float) -> None:
     """Age, refusals and range of the ECU's demand; take the values of a good frame, its mode request too. It aged by
     ``pause`` (s), too.
     """
@@ -825,8 +825,8 @@ SERVO_MASK = (1 << F_TRACKING) | (1 << F_SATURATED)
 STOP_MASK = LVDT_MASK | (1 << F_PAUSED)  # FAIL_SAFE at once
 
 
-@compiled
-def _cause_present(z, mask):
+@inlined
+def _cause_present(z: np.ndarray, mask: int) -> bool:
     """Is the cause of any fault in ``mask`` there at this tick, rather than gone and the fault healing?"""
     faults = int(z[FAULT_BITS]) & mask
     present = False
@@ -835,8 +835,8 @@ def _cause_present(z, mask):
     return present
 
 
-@compiled
-def _choose_mode(z, k):
+@inlined
+def _choose_mode(z: np.ndarray, k: np.ndarray) -> None:
     """Next mode. The transitions that can happen are listed in docs/controller.md; this is all of them."""
     mode = int(z[MODE])
     faults = int(z[FAULT_BITS])
@@ -879,8 +879,8 @@ def _choose_mode(z, k):
     z[MODE] = float(mode)
 
 
-@compiled
-def tick(inputs, state, calibration):
+@inlined
+def tick(inputs: np.ndarray, state: np.ndarray, calibration: Calibration) -> None:
     """Run the controller for one servo tick of 1 ms.
 
     inputs       float64[N_INPUTS], see `INPUTS`; any value, NaN and infinity included, is safe

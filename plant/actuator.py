@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
+from vaneloop.base.compiled import compiled
 
 __all__ = ["speed_factor", "stroke_step"]
 
 
 @compiled
-def speed_factor(p_s, p_load, p_ref):
+def speed_factor(p_s: float, p_load: float, p_ref: float) -> float:
     """Return sqrt((p_s - p_load)/p_ref), 0 where the load exceeds the supply. Pressures in Pa, ``p_load`` against the
     motion.
     """
@@ -29,7 +29,7 @@ def speed_factor(p_s, p_load, p_ref):
 
 
 @compiled
-def stroke_step(x, v_before, v_after, stroke, dt):
+def stroke_step(x: float, v_before: float, v_after: float, stroke: float, dt: float) -> float:
     """Return the stroke (m) after ``dt`` (s) with the speed going straight from ``v_before`` to ``v_after`` (m/s),
     between the stops.
     """

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from plant.actuator import speed_factor, stroke_step
-from plant.compiled import in_place, inlined
 from plant.effect import T_REF
 from plant.effects import (
     N_STATE,
@@ -102,6 +103,7 @@ from plant.parameters import (
 from plant.play import play_step
 from plant.sensors import quantise
 from plant.valve import valve_step
+from vaneloop.base.compiled import in_place, inlined
 
 __all__ = [
     "N_STATE",
@@ -176,7 +178,7 @@ DRIVEN = BRISTLE + 3  # rad, three rings at the last tick, as friction saw them
 
 
 @in_place
-def rotor_step(s, p, j, n_dem, dt=TICK):
+def rotor_step(s: np.ndarray, p: np.ndarray, j: int, n_dem: float, dt: float = TICK) -> None:
     """Engine: one step ``dt`` (s) towards the demand ``n_dem`` (%)."""
     lag = rotor_lag_error.step(p[LAG, j], p[ROTOR_LAG_ERROR, j])
     acceleration = acceleration_limit_error.step(p[ACCELERATION, j], p[ACCELERATION_LIMIT_ERROR, j])
@@ -184,7 +186,17 @@ def rotor_step(s, p, j, n_dem, dt=TICK):
 
 
 @in_place
-def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
+def drive_step(
+    s: np.ndarray,
+    p: np.ndarray,
+    j: int,
+    i_cmd: float,
+    n_r: float,
+    p_s: float,
+    t_oil: float,
+    dt: float = TICK,
+    substeps: int = SUBSTEPS,
+) -> None:
     """Valve, actuator and LVDT: one step ``dt`` (s) under the current ``i_cmd`` (A), at ``n_r`` (%), ``p_s`` (Pa),
     ``t_oil`` (degC).
 
@@ -209,12 +221,15 @@ def drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt=TICK, substeps=SUBSTEPS):
 
 @inlined
 def drive_substep(
-    u, du, v, x, y, lagged, z, off, give, reading,
-    i, rated, share, a11, a12, a21, a22, overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, droop,
-    limit, roundness,
-    leakage, force, excess, stribeck, stiffness, compliance, drag, per_stroke, low, high, lvdt_factor, lvdt_share, dt,
-    loaded, lossy, sticky,
-):  # fmt: skip
+    u: float, du: float, v: float, x: float, y: float, lagged: float, z: float, off: float, give: float, reading: float,
+    i: float, rated: float, share: float, a11: float, a12: float, a21: float, a22: float, overlap: float,
+    extending: float, retracting: float, root: float, p_s: float, per_p_ref: float, per_area: float, load: float,
+    droop: float,
+    limit: float, roundness: float,
+    leakage: float, force: float, excess: float, stribeck: float, stiffness: float, compliance: float, drag: float,
+    per_stroke: float, low: float, high: float, lvdt_factor: float, lvdt_share: float, dt: float,
+    loaded: bool, lossy: bool, sticky: bool,
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
     """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
 
     loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
@@ -255,7 +270,9 @@ def drive_substep(
 
 
 @in_place
-def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
+def _drive_step(
+    s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, p_s: float, t_oil: float, dt: float, substeps: int
+) -> None:
     """`drive_step` with every effect: what changes within the step is in `drive_substep`."""
     i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
     y1, y2, y3, y4 = s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j]
@@ -288,7 +305,7 @@ def _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps):
 
 
 @in_place
-def wake(s, p, j, i_cmd):
+def wake(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float) -> None:
     """Set what only the effects remember to where it would be had they been followed: before ``p`` changes while the
     plant runs.
 
@@ -304,20 +321,20 @@ def wake(s, p, j, i_cmd):
 
 
 @in_place
-def measured_stroke(x, p, j, t_oil):
+def measured_stroke(x: float, p: np.ndarray, j: int, t_oil: float) -> float:
     """Return what the LVDT makes of a resting stroke ``x`` (m): its effects without its lags."""
     x = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j])
     return straight_reading(x, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
 
 
 @inlined
-def straight_reading(x, gain, drift, bias, t_oil):
+def straight_reading(x: float, gain: float, drift: float, bias: float, t_oil: float) -> float:
     """`measured_stroke` behind the windings' curve."""
     return lvdt_bias.step(lvdt_thermal_drift.step(lvdt_gain.step(x, gain), t_oil, drift), bias)
 
 
 @in_place
-def true_stroke(reading, p, j, t_oil):
+def true_stroke(reading: float, p: np.ndarray, j: int, t_oil: float) -> float:
     """Return the resting stroke (m) that the LVDT gives as ``reading`` (m): the inverse of `measured_stroke`, to 1e-9
     m.
     """
@@ -334,7 +351,7 @@ def true_stroke(reading, p, j, t_oil):
 
 
 @in_place
-def sample_lvdt(s, p, j, noise, t_oil=T_REF):
+def sample_lvdt(s: np.ndarray, p: np.ndarray, j: int, noise: float, t_oil: float = T_REF) -> float:
     """Return the LVDT's sample (m): lagged stroke plus ``noise`` (m), in steps of the converter."""
     x = s[X_LVDT, j]
     if p[DRIVE_EFFECTS, j] != 0.0:
@@ -343,7 +360,7 @@ def sample_lvdt(s, p, j, noise, t_oil=T_REF):
 
 
 @in_place
-def unloaded_ring_angle(p, j, k, c, d, n_r, t_oil):
+def unloaded_ring_angle(p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float) -> float:
     """Return the angle (rad) to which crank direction (c, d) drives the ring of stage ``k``, before its play."""
     o = GEOMETRY + N_CRANK + k * N_PER_STAGE
     lb = crank_length_error.step(p[o + G_LB, j], p[CRANK_LENGTH_ERROR + k, j])
@@ -355,7 +372,9 @@ def unloaded_ring_angle(p, j, k, c, d, n_r, t_oil):
 
 
 @in_place
-def stem_angle(s, p, j, k, c, d, n_r, t_oil, t):
+def stem_angle(
+    s: np.ndarray, p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float, t: float
+) -> float:
     """Turn ring ``k`` after the crank direction (c, d) at time ``t`` (s); return the angle (rad) for its potentiometer,
     bias included.
     """
@@ -377,7 +396,7 @@ def stem_angle(s, p, j, k, c, d, n_r, t_oil, t):
 
 
 @in_place
-def vane_step(s, p, j, n_r, t_oil, t=0.0):
+def vane_step(s: np.ndarray, p: np.ndarray, j: int, n_r: float, t_oil: float, t: float = 0.0) -> None:
     """Linkage, play and stem potentiometers: one step at the present stroke, at time ``t`` (s) from the start of the
     log.
 

@@ -10,12 +10,12 @@ its error is below 0.05 % of the change.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
+from vaneloop.base.compiled import compiled
 
 __all__ = ["engine_step"]
 
 
 @compiled
-def engine_step(n, n_dem, lag, acceleration, deceleration, dt):
+def engine_step(n: float, n_dem: float, lag: float, acceleration: float, deceleration: float, dt: float) -> float:
     """Return the rotor speed (%) after ``dt`` (s)."""
     return n + min(max((n_dem - n) / lag, -deceleration), acceleration) * dt

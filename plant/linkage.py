@@ -29,9 +29,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
 
 __all__ = [
@@ -102,8 +102,8 @@ N_GEOMETRY = N_CRANK + 3 * N_PER_STAGE
 # --- runtime form -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy")
-def crank(stroke, lx0, x1, y1, le):
+@compiled
+def crank(stroke: float, lx0: float, x1: float, y1: float, le: float) -> tuple[float, float]:
     """Direction (cos, sin) of the crank's upper arm, J1 to J2: the angle th0 + th1 of (6) and (7) without its angles.
 
     e = (x1 + i y1) (m + i sqrt(D^2 Le^2 - m^2)) / (D^2 Le),   D^2 = x1^2 + y1^2,   m = (D^2 + Le^2 - Lx^2) / 2
@@ -126,15 +126,15 @@ def crank(stroke, lx0, x1, y1, le):
     return (x1 * m - y1 * s) * f, (x1 * s + y1 * m) * f
 
 
-@njit(cache=True, error_model="numpy")
-def crank_angle(stroke, lx0, x1, y1, le):
+@compiled
+def crank_angle(stroke: float, lx0: float, x1: float, y1: float, le: float) -> float:
     """Angle th0 + th1 of the crank's upper arm against the actuator's base line, rad (equations 6 and 7)."""
     c, s = crank(stroke, lx0, x1, y1, le)
     return math.atan2(s, c)
 
 
-@njit(cache=True, error_model="numpy")
-def _ring_direction(c, s, ax, ay, lb, lc, ld):
+@compiled
+def _ring_direction(c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> tuple[float, float]:
     """Components (cos th5, sin th5) of the ring's rotation.
 
     Q = A + Lb e = Lc exp(i (th0 + th1 + th3)) + Ld w closes the loop J2 J3 J4 J5. With u = (|Q|^2 + Ld^2 - Lc^2) / (2
@@ -162,22 +162,22 @@ def _ring_direction(c, s, ax, ay, lb, lc, ld):
     return (qy * u - qx * v) * f, -(qx * u + qy * v) * f
 
 
-@njit(cache=True, error_model="numpy")
-def ring_angle(c, s, ax, ay, lb, lc, ld):
+@compiled
+def ring_angle(c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
     """Rotation th5 of the unison ring, rad, equation (15), from the crank's direction (c, s) of `crank`."""
     cos5, sin5 = _ring_direction(c, s, ax, ay, lb, lc, ld)
     return math.atan2(sin5, cos5)
 
 
-@njit(cache=True, error_model="numpy")
-def ring_tangent(c, s, ax, ay, lb, lc, ld):
+@compiled
+def ring_tangent(c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
     """tan th5 of the unison ring: what (16) needs, without a transcendental function."""
     cos5, sin5 = _ring_direction(c, s, ax, ay, lb, lc, ld)
     return sin5 / cos5
 
 
-@njit(cache=True, error_model="numpy")
-def vane_angle(theta5, ldp, l):  # noqa: E741
+@compiled
+def vane_angle(theta5: float, ldp: float, l: float) -> float:  # noqa: E741
     """Vane angle thl = asin(Ld' tan th5 / L), rad, equation (16). th5 in rad, Ld' and L in m; held at +-pi/2 beyond the
     lever's reach.
     """
@@ -189,20 +189,20 @@ def vane_angle(theta5, ldp, l):  # noqa: E741
     return math.asin(q)
 
 
-@njit(cache=True, error_model="numpy")
-def clevis_axial(theta5, ldp, l):  # noqa: E741
+@compiled
+def clevis_axial(theta5: float, ldp: float, l: float) -> float:  # noqa: E741
     """Axial motion of the clevis xa = L (1 - cos thl), m, equation (17); the planar model neglects it."""
     return l * (1.0 - math.cos(vane_angle(theta5, ldp, l)))
 
 
-@njit(cache=True, error_model="numpy")
-def ring_angle_of_vane(thetal, ldp, l):  # noqa: E741
+@compiled
+def ring_angle_of_vane(thetal: float, ldp: float, l: float) -> float:  # noqa: E741
     """Ring rotation th5 = atan(L sin thl / Ld'), rad: the inverse of (16) for |thl| <= pi/2."""
     return math.atan(l * math.sin(thetal) / ldp)
 
 
-@njit(cache=True, error_model="numpy")
-def vane_per_ring(theta5, ldp, l):  # noqa: E741
+@compiled
+def vane_per_ring(theta5: float, ldp: float, l: float) -> float:  # noqa: E741
     """Slope d thl / d th5 = Ld' (1 + tan^2 th5) / (L cos thl), rad/rad: turns a width at the ring into one at
     the vane.
     """
@@ -214,16 +214,16 @@ def vane_per_ring(theta5, ldp, l):  # noqa: E741
     return ldp * (1.0 + t * t) / (l * math.sqrt(r))
 
 
-@njit(cache=True, error_model="numpy")
-def stage_ring_angle(stroke, g, k):
+@compiled
+def stage_ring_angle(stroke: float, g: np.ndarray, k: int) -> float:
     """Ring rotation th5 of stage k, rad, from stroke in m and the flat geometry g."""
     c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
     o = N_CRANK + k * N_PER_STAGE
     return ring_angle(c, s, g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD])
 
 
-@njit(cache=True, error_model="numpy")
-def ring_angles(stroke, g):
+@compiled
+def ring_angles(stroke: float, g: np.ndarray) -> tuple[float, float, float]:
     """Ring rotations th5 of the three stages, rad: the crank is solved once for all of them."""
     c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
     o = N_CRANK
@@ -235,15 +235,15 @@ def ring_angles(stroke, g):
     return a, b, d
 
 
-@njit(cache=True, error_model="numpy")
-def stage_vane_angle(stroke, g, k):
+@compiled
+def stage_vane_angle(stroke: float, g: np.ndarray, k: int) -> float:
     """Vane angle thl of stage k, rad, from stroke in m: no play."""
     o = N_CRANK + k * N_PER_STAGE
     return vane_angle(stage_ring_angle(stroke, g, k), g[o + G_LDP], g[o + G_L])
 
 
-@njit(cache=True, error_model="numpy")
-def vane_slope(stroke, g, k):
+@compiled
+def vane_slope(stroke: float, g: np.ndarray, k: int) -> float:
     """Slope d thl / d stroke of stage k, rad/m: turns a width in stroke into one at the vane and back.
 
     d(th0 + th1)/dLx = Lx / sqrt(D^2 Le^2 - m^2)                      from the law of cosines at J2
@@ -273,8 +273,8 @@ def vane_slope(stroke, g, k):
     return dring * vane_per_ring(math.atan2(sin5, cos5), g[o + G_LDP], g[o + G_L])
 
 
-@njit(cache=True, error_model="numpy")
-def vane_angle_table(stroke, g, out):
+@compiled
+def vane_angle_table(stroke: np.ndarray, g: np.ndarray, out: np.ndarray) -> None:
     """Fill out (n, 3) with the vane angles, rad, of the strokes (n), m."""
     for i in range(stroke.shape[0]):
         a, b, d = ring_angles(stroke[i], g)
@@ -289,16 +289,16 @@ def vane_angle_table(stroke, g, out):
 # --- documentary form: equations (6) to (16) as printed ---------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy")
-def paper_theta1(lx, x1, y1, le):
+@compiled
+def paper_theta1(lx: float, x1: float, y1: float, le: float) -> float:
     """Equation (6): th1 = acos((x1^2 + y1^2 - Le^2 - Lx^2) / (2 Lx Le)), rad. The printed principal value is the branch
     used.
     """
     return math.acos((x1 * x1 + y1 * y1 - le * le - lx * lx) / (2.0 * lx * le))
 
 
-@njit(cache=True, error_model="numpy")
-def paper_theta0(lx, x1, y1, le, theta1):
+@compiled
+def paper_theta0(lx: float, x1: float, y1: float, le: float, theta1: float) -> float:
     """Equation (7): th0 = asin((y1 Le cos th1 + Lx y1 - x1 Le sin th1) / (x1^2 + y1^2)), rad.
 
     The principal value holds while the actuator points within 90 deg of its base line, cos th0 > 0.
@@ -306,8 +306,8 @@ def paper_theta0(lx, x1, y1, le, theta1):
     return math.asin((y1 * le * math.cos(theta1) + lx * y1 - x1 * le * math.sin(theta1)) / (x1 * x1 + y1 * y1))
 
 
-@njit(cache=True, error_model="numpy")
-def paper_ring(dx, dy, theta6, theta0, theta1):
+@compiled
+def paper_ring(dx: float, dy: float, theta6: float, theta0: float, theta1: float) -> tuple[float, float]:
     """Equations (11) and (12): ring centre (x5, y5) seen from J2 in the frame of the crank, m.
 
     x5 + i y5 = sqrt(dx^2 + dy^2) exp(i (3 pi/2 + th6 - th0 - th1)). As printed, J5 is straight below J2 (3 pi/2): the
@@ -318,8 +318,8 @@ def paper_ring(dx, dy, theta6, theta0, theta1):
     return la * math.cos(a), la * math.sin(a)
 
 
-@njit(cache=True, error_model="numpy")
-def paper_theta4(x5, y5, lb, lc, ld):
+@compiled
+def paper_theta4(x5: float, y5: float, lb: float, lc: float, ld: float) -> float:
     """Equation (13): cos th4 = ((x5 + Lb)^2 + y5^2 - Ld^2 - Lc^2) / (2 Ld Lc), rad, on the branch th4 = 2 pi -
     acos(...).
 
@@ -331,8 +331,8 @@ def paper_theta4(x5, y5, lb, lc, ld):
     return 2.0 * math.pi - math.acos((b * b + y5 * y5 - ld * ld - lc * lc) / (2.0 * ld * lc))
 
 
-@njit(cache=True, error_model="numpy")
-def paper_theta3(x5, y5, lb, lc, ld, theta4):
+@compiled
+def paper_theta3(x5: float, y5: float, lb: float, lc: float, ld: float, theta4: float) -> float:
     """Equation (14): sin th3 = (y5 Ld cos th4 + y5 Lc - (x5 + Lb) Ld sin th4) / ((x5 + Lb)^2 + y5^2), rad.
 
     The arcsine alone does not suffice: a link square to the lower arm has th3 = 90 deg. The linkage starts there at
@@ -347,8 +347,8 @@ def paper_theta3(x5, y5, lb, lc, ld, theta4):
     return math.atan2((y5 * p - b * q) / d2, (b * p + y5 * q) / d2)
 
 
-@njit(cache=True, error_model="numpy")
-def paper_theta5(theta0, theta1, theta3, theta4):
+@compiled
+def paper_theta5(theta0: float, theta1: float, theta3: float, theta4: float) -> float:
     """Equation (15): th5 = -810 deg + (th0 + th1 + th3 + th4), rad, brought to [-pi, pi] by whole turns.
 
     With the branches above the sum is near 450 deg, one turn below the 810 deg as printed.
@@ -357,15 +357,29 @@ def paper_theta5(theta0, theta1, theta3, theta4):
     return a - 2.0 * math.pi * math.floor(a / (2.0 * math.pi) + 0.5)
 
 
-@njit(cache=True, error_model="numpy")
-def paper_crank(stroke, lx0, x1, y1, le):
+@compiled
+def paper_crank(stroke: float, lx0: float, x1: float, y1: float, le: float) -> tuple[float, float]:
     """Angles (th0, th1) of actuator and upper arm, rad, by equations (7) and (6)."""
     theta1 = paper_theta1(lx0 + stroke, x1, y1, le)
     return paper_theta0(lx0 + stroke, x1, y1, le, theta1), theta1
 
 
-@njit(cache=True, error_model="numpy")
-def paper_vane(stroke, lx0, x1, y1, le, dx, dy, theta6, lb, lc, ld, ldp, l):  # noqa: E741
+@compiled
+def paper_vane(
+    stroke: float,
+    lx0: float,
+    x1: float,
+    y1: float,
+    le: float,
+    dx: float,
+    dy: float,
+    theta6: float,
+    lb: float,
+    lc: float,
+    ld: float,
+    ldp: float,
+    l: float,  # noqa: E741
+) -> tuple[float, float]:
     """Angles (th5, thl) of ring and vane, rad, by equations (6) to (16) one after the other. Lengths in m."""
     theta0, theta1 = paper_crank(stroke, lx0, x1, y1, le)
     x5, y5 = paper_ring(dx, dy, theta6, theta0, theta1)
@@ -380,8 +394,8 @@ def paper_vane(stroke, lx0, x1, y1, le, dx, dy, theta6, lb, lc, ld, ldp, l):  # 
 _OK, _CRANK, _RING, _TURN, _VANE, _FALLS = 0, 1, 2, 3, 4, 5
 
 
-@njit(cache=True, error_model="numpy")
-def _fault(stroke, g, k):
+@compiled
+def _fault(stroke: float, g: np.ndarray, k: int) -> tuple[int, float, float, float]:
     """Code of what keeps stage k from being assembled at a stroke (m), with the value and its limits: (code, value,
     low, high).
     """

@@ -11,13 +11,13 @@ Source: Krasnosel'skii and Pokrovskii, Systems with Hysteresis (1989), section 2
 
 from __future__ import annotations
 
-from plant.compiled import compiled
+from vaneloop.base.compiled import compiled
 
 __all__ = ["play_step"]
 
 
 @compiled
-def play_step(y, u, width):
+def play_step(y: float, u: float, width: float) -> float:
     """Return the new output (rad) of a play of total ``width`` (rad) whose output was ``y`` and whose input is
     ``u``.
     """

@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
-from plant.compiled import compiled
+from vaneloop.base.compiled import compiled
 
 __all__ = ["lag_factor", "quantise"]
 
 
 @compiled
-def lag_factor(tau, dt):
+def lag_factor(tau: float, dt: float) -> float:
     """Return 1 - exp(-dt/tau): the part of the remaining way a lag of ``tau`` (s) goes in ``dt`` (s); 1 for no lag."""
     if tau <= 0.0:
         return 1.0
@@ -24,7 +24,7 @@ def lag_factor(tau, dt):
 
 
 @compiled
-def quantise(v, step):
+def quantise(v: float, step: float) -> float:
     """Return ``v`` rounded to the nearest multiple of ``step``; ``v`` itself for step 0, NaN or infinite."""
     if step <= 0.0:
         return v

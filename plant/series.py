@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import inlined
+from vaneloop.base.compiled import inlined
 
 __all__ = ["arctangent", "tangent"]
 
@@ -17,7 +17,7 @@ QUARTER = 0.25 * math.pi
 
 
 @inlined
-def arctangent(sine, cosine):
+def arctangent(sine: float, cosine: float) -> float:
     """Return atan(sine / cosine), rad, for cosine > 0 (or 0 where sine is not)."""
     a = abs(sine)
     far, middle = a > 2.41421356237309504880 * cosine, a > 0.66 * cosine
@@ -33,7 +33,7 @@ def arctangent(sine, cosine):
 
 
 @inlined
-def tangent(x):
+def tangent(x: float) -> float:
     """Return tan(x), x in rad, held at +-1 beyond +-45 deg."""
     x = min(max(x, -QUARTER), QUARTER)
     z = x * x

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
-from numba import njit
 
 from plant import chain
 from plant.actuator import speed_factor
@@ -69,7 +70,6 @@ from plant.chain import (
     measured_stroke,
     true_stroke,
 )
-from plant.compiled import inlined
 from plant.effects import (
     EFFECTS,
     NEUTRAL,
@@ -125,6 +125,7 @@ from plant.parameters import (
 )
 from plant.play import play_step
 from plant.series import arctangent, tangent
+from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = ["actuator_run", "engine_run", "linkage_run", "step_currents"]
 
@@ -147,18 +148,17 @@ LINKAGE_BLOCKS = (
 )  # fmt: skip
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
-# makes its block's scratch array: of constant width, so that the compiler sees the strides
-_plain = njit(cache=True, nogil=True, error_model="numpy")
+# Each block makes its scratch array (so compiled_free, not in_place), of constant width: the compiler sees the strides.
 
 
-def engine_run(n_dem, dt, p, s, out):
+def engine_run(n_dem: np.ndarray, dt: float, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
     """Fill out[k, lane] with the rotor speed (%) at sample k; n_dem[k] (%) holds until sample k + 1. ``s`` is
     moved on.
     """
     _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
 
 
-def step_currents(i_cmd, dt, substeps, behind=chain.TICK):
+def step_currents(i_cmd: np.ndarray, dt: float, substeps: int, behind: float = chain.TICK) -> np.ndarray:
     """Return the current (A) of every step of `actuator_run`, float64[n, substeps]: [k, m] in step m after sample k -
     1.
 
@@ -176,7 +176,18 @@ def step_currents(i_cmd, dt, substeps, behind=chain.TICK):
     return out
 
 
-def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0):
+def actuator_run(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray | None = None,
+    window: int = 0,
+) -> None:
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
     current           A in every step, of `step_currents`
@@ -202,11 +213,13 @@ def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0)
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
     order = np.lexsort((p[VALVE_HYSTERESIS] != 0.0, p[PISTON_STICTION] != 0.0, lossy, p[DRIVE_LOADED] != 0.0, alone))
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
-    work = [(_actuator_blocks, order[j : min(j + W, wide)]) for j in range(0, wide, W)]
+    work: list[tuple[Callable[..., None], np.ndarray]] = [
+        (_actuator_blocks, order[j : min(j + W, wide)]) for j in range(0, wide, W)
+    ]
     if wide < p.shape[1]:
         work.append((_actuator_lanes, order[wide:]))
 
-    def run(part):
+    def run(part: Any) -> None:
         part[0](current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, part[1])
 
     if len(work) == 1:
@@ -216,7 +229,16 @@ def actuator_run(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt=None, window=0)
             list(threads.map(run, work[::-1]))
 
 
-def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
+def linkage_run(
+    x_lvdt: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+) -> None:
     """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise.
     ``s`` is moved on.
 
@@ -242,8 +264,8 @@ def linkage_run(x_lvdt, n_r, t_oil, t, dt, p, s, out):
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
 
 
-@_plain
-def _currents(mean, dt, substeps, behind):
+@compiled_free
+def _currents(mean: np.ndarray, dt: float, substeps: int, behind: float) -> np.ndarray:
     """Currents (n, substeps) between the samples, from the logged means: linear in each interval, of its mean, its
     slope the neighbours'.
 
@@ -266,7 +288,7 @@ def _currents(mean, dt, substeps, behind):
     return out
 
 
-def _late(parts, dt, substeps, behind):
+def _late(parts: np.ndarray, dt: float, substeps: int, behind: float) -> np.ndarray:
     """Currents (n, substeps) between the samples, from those of equal ``parts`` of the time between them that act
     ``behind`` later.
     """
@@ -277,13 +299,13 @@ def _late(parts, dt, substeps, behind):
     return np.diff(np.interp(at, edges, charge)).reshape(n, substeps) / (dt / substeps)
 
 
-def _in_blocks(lanes, width, few):
+def _in_blocks(lanes: int, width: int, few: int) -> int:
     """How many of the lanes run in blocks; the rest of at most ``few`` one by one."""
     rest = lanes % width
     return lanes - rest if rest <= few else lanes
 
 
-def _elsewhere(p, sites, called):
+def _elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:
     """Return bool[lane]: whether the lane has an effect of these ``sites`` that is not among the ``called`` ones."""
     rows = [
         ROW[e.name] + i
@@ -294,8 +316,8 @@ def _elsewhere(p, sites, called):
     return (p[rows] != np.array([[NEUTRAL[r - N_NOMINAL]] for r in rows]).reshape(-1, 1)).any(axis=0)
 
 
-@_plain
-def _rest(p, s, i, n_r):
+@compiled_free
+def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float) -> None:
     """Valve and oil at rest under the current ``i`` (A) at ``n_r`` (%)."""
     for j in range(p.shape[1]):
         current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
@@ -307,8 +329,8 @@ def _rest(p, s, i, n_r):
 # ---- engine ----------------------------------------------------------------------------------------------------------
 
 
-@_plain
-def _engine_run(n_dem, dt, steps, p, s, out):
+@compiled_free
+def _engine_run(n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
     lanes = p.shape[1]
     h = dt / steps
     b = np.empty((4, W))
@@ -335,13 +357,25 @@ def _engine_run(n_dem, dt, steps, p, s, out):
 
 
 @inlined
-def _between(a, k):
+def _between(a: np.ndarray, k: int) -> float:
     """Mean of a signal over the step to sample ``k``."""
     return 0.5 * (a[k - 1] + a[k])
 
 
-@_plain
-def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lanes):
+@compiled_free
+def _actuator_lanes(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray,
+    window: int,
+    lanes: np.ndarray,
+) -> None:
     """These ``lanes``, one after the other; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
@@ -376,8 +410,20 @@ def _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, lan
 (_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _ROUNDNESS, _N_ROWS) = range(47, 55)
 
 
-@_plain
-def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, order):
+@compiled_free
+def _actuator_blocks(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray,
+    window: int,
+    order: np.ndarray,
+) -> None:
     """The lanes of ``order``, eight at a time; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
@@ -525,7 +571,9 @@ def _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out, x_lvdt, window, or
 
 
 @inlined
-def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
+def _block_substep(
+    b: np.ndarray, i_cmd: float, p_s: float, h: float, loaded: bool, lossy: bool, sticky: bool, memory: bool
+) -> None:
     """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see
     `chain.drive_substep`.
     """
@@ -556,7 +604,7 @@ def _block_substep(b, i_cmd, p_s, h, loaded, lossy, sticky, memory):
 
 
 @inlined
-def _ramp_lag(tau, dt):
+def _ramp_lag(tau: float, dt: float) -> tuple[float, float]:
     """Return (e, b) of a first-order lag over ``dt`` for an input that goes straight from u0 to u1: y1 = e y0 + (b - e)
     u0 + (1 - b) u1.
     """
@@ -566,8 +614,19 @@ def _ramp_lag(tau, dt):
     return e, (1.0 - e) * tau / dt
 
 
-@_plain
-def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
+@compiled_free
+def _linkage_lanes(
+    x_lvdt: np.ndarray,
+    speed: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    lanes: np.ndarray,
+) -> None:
     """These ``lanes``, one after the other."""
     g = GEOMETRY
     before = np.empty(3)
@@ -610,8 +669,19 @@ def _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, lanes):
 (_LEVER, _GAIN, _OFFSET, _E, _B, _N_STAGE) = range(17, 23)
 
 
-@_plain
-def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
+@compiled_free
+def _linkage_blocks(
+    x_lvdt: np.ndarray,
+    speed: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    order: np.ndarray,
+) -> None:
     """The lanes of ``order``, `WIDE` at a time."""
     g = GEOMETRY
     b = np.empty((_N_LANE, WIDE))
@@ -705,7 +775,7 @@ def _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order):
 
 
 @inlined
-def _crank(stroke, lx0, x1, y1, le):
+def _crank(stroke: float, lx0: float, x1: float, y1: float, le: float) -> tuple[float, float]:
     """`plant.linkage.crank` without branches."""
     lx = lx0 + stroke
     d2 = x1 * x1 + y1 * y1
@@ -718,7 +788,7 @@ def _crank(stroke, lx0, x1, y1, le):
 
 
 @inlined
-def _ring(c, d, ax, ay, lb, lc, ld):
+def _ring(c: float, d: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
     """`plant.linkage.ring_angle` for angles within +-90 deg, without branches."""
     qx = ax + lb * c
     qy = ay + lb * d
@@ -731,7 +801,7 @@ def _ring(c, d, ax, ay, lb, lc, ld):
 
 
 @inlined
-def _vane(theta, lever):
+def _vane(theta: float, lever: float) -> float:
     """`plant.linkage.vane_angle` as an arctangent, asin q = atan(q / sqrt(1 - q^2)); ``lever`` = Ld'/L."""
     q = min(max(lever * tangent(theta), -1.0), 1.0)
     return arctangent(q, math.sqrt(1.0 - q * q))

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
+from vaneloop.base.compiled import compiled
 
 __all__ = ["valve_matrix", "valve_step"]
 
 
 @compiled
-def valve_matrix(bandwidth, damping, dt):
+def valve_matrix(bandwidth: float, damping: float, dt: float) -> tuple[float, float, float, float]:
     """Return (a11, a12, a21, a22) of the exact step of (u - i/i_rated, u') over ``dt`` (s).
 
     bandwidth: Hz, damping: in (0, 1).
@@ -35,7 +35,9 @@ def valve_matrix(bandwidth, damping, dt):
 
 
 @compiled
-def valve_step(u, du, target, a11, a12, a21, a22):
+def valve_step(
+    u: float, du: float, target: float, a11: float, a12: float, a21: float, a22: float
+) -> tuple[float, float]:
     """Return the spool (u, u') one step later, for the demand ``target`` = i / i_rated."""
     d = u - target
     u1 = target + a11 * d + a12 * du

@@ -311,10 +311,8 @@ def test_node_does_what_lockstep_does_bit_for_bit() -> None:
     out = np.empty((400, len(COLUMNS)))
     noise = np.random.Generator(np.random.PCG64(4)).standard_normal((4000, 5))
     advance(0, 4000, rows, noise, like, 10, out, np.empty((0, 0)))
-    assert np.array_equal(vgv.arrays.z, like.z)
-    assert np.array_equal(
-        np.delete(vgv.arrays.s, 0), np.delete(like.s, 0)
-    )  # the node's own rotor starts one frame later
+    assert np.array_equal(vgv.loop.z, like.z)
+    assert np.array_equal(np.delete(vgv.loop.s, 0), np.delete(like.s, 0))  # the node's own rotor starts one frame later
 
     status = [frames.decode(*f.tolist()) for f in (t[0] for t in sent if len(t))]
     servo = [frames.decode(*f.tolist()) for f in (t[1] for t in sent if len(t))]
@@ -346,7 +344,7 @@ def together(ticks: int, disturb: Any = None) -> tuple[Node, Ecu, list[np.ndarra
 def test_ecu_and_controller_run_and_hear_each_other() -> None:
     vgv, ecu, _, sent = together(3000)
     assert vgv.mode == "RUN" and vgv.faults == 0 and ecu.stale() == []
-    assert ecu.values["state"] == 2.0 and ecu.values["x_lvdt"] == pytest.approx(vgv.arrays.inputs[5] * 1e3, abs=0.2)
+    assert ecu.values["state"] == 2.0 and ecu.values["x_lvdt"] == pytest.approx(vgv.loop.inputs[5] * 1e3, abs=0.2)
     assert [len(s) for s in sent[:101]].count(4) == 2 and sum(len(s) for s in sent) == 3 * 300 + 30
 
 

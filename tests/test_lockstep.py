@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from hil.engine_test import engine_test, load_profile
 from hil.loop.lockstep import Stimulus, lockstep
 from tests.conftest import ROOT
-from vaneloop.cli.engine_test import engine_test, load_profile
 
 SHORT = """
 import numpy as np

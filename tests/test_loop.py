@@ -170,8 +170,8 @@ def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name
         [[frames.word0(ECU_DEMAND), frames.encode_demand(v, v, 1, k % 15)] for k, v in enumerate(demand)], np.int64
     )
     repeat(node, at, rows, ticks)
-    assert np.array_equal(node.arrays.z, loop.z)
-    assert np.array_equal(node.arrays.s, loop.s)
+    assert np.array_equal(node.loop.z, loop.z)
+    assert np.array_equal(node.loop.s, loop.s)
 
 
 @pytest.mark.parametrize("name", [n for n in EFFECTS if n not in LOADED])
@@ -181,28 +181,26 @@ def test_an_effect_injected_at_power_on_is_the_effect_in_the_machine(name: str) 
     engines = Ecu(made), Ecu()
     change = inject.MachineChange(Machine(effect=name, parameters=GROSS[name]), changed, engines[1])
     change.tick(0)
-    assert np.array_equal(changed.arrays.p, fixed.arrays.p) and np.array_equal(engines[1].arrays.p, engines[0].arrays.p)
+    assert np.array_equal(changed.loop.p, fixed.loop.p) and np.array_equal(engines[1].arrays.p, engines[0].arrays.p)
     for node in (fixed, changed):
-        node.arrays.s[:] = 0.0  # a machine that has the effect from the start may stand elsewhere
+        node.loop.s[:] = 0.0  # a machine that has the effect from the start may stand elsewhere
         repeat(node, np.empty(0), np.empty((0, 2)), 1)
-    assert np.array_equal(fixed.arrays.calibration.k, changed.arrays.calibration.k)
-    assert np.array_equal(fixed.arrays.calibration.table, changed.arrays.calibration.table)
+    assert np.array_equal(fixed.loop.calibration.k, changed.loop.calibration.k)
+    assert np.array_equal(fixed.loop.calibration.table, changed.loop.calibration.table)
     assert fixed.fingerprint() == changed.fingerprint()
 
 
 def test_an_effect_that_ends_leaves_the_calibration_as_it_was() -> None:
     node, ecu = Node(), Ecu()
-    before = node.arrays.calibration.k.copy(), node.arrays.calibration.table.copy()
+    before = node.loop.calibration.k.copy(), node.loop.calibration.table.copy()
     wrong = Machine(effect="schedule_error", parameters={"offset": 1.0}, duration=0.02)
     change, seen = inject.MachineChange(wrong, node, ecu), []
     for k in range(40):
         change.tick(k)
         node.tick(np.zeros((0, 2), np.int64))
-        seen.append(float(node.arrays.calibration.table[1, 0] - before[1][1, 0]))
+        seen.append(float(node.loop.calibration.table[1, 0] - before[1][1, 0]))
     assert seen == [pytest.approx(1e-3)] * 20 + [0.0] * 20
-    assert np.array_equal(node.arrays.calibration.k, before[0]) and np.array_equal(
-        node.arrays.calibration.table, before[1]
-    )
+    assert np.array_equal(node.loop.calibration.k, before[0]) and np.array_equal(node.loop.calibration.table, before[1])
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.states])
@@ -221,7 +219,7 @@ def test_an_effect_with_a_memory_that_begins_later_makes_no_jump(name: str) -> N
 def test_a_demand_arrives_with_the_age_that_delay_and_hold_give_it(delay: float, period: float) -> None:
     plant = Model(effects={"can_delay": {"delay": delay}, "frame_hold": {"period": period}}).plant()
     node = Node(plant)
-    a = node.arrays
+    a = node.loop
     for j in range(700):
         arrive(10 * j, a, j * 0.1, j * 0.05, 1.0)
         t = 0.01 * j
@@ -237,4 +235,4 @@ def test_a_late_demand_after_a_gap_is_the_last_that_came_before_it() -> None:
     came = [j for j in range(200) if not 40 <= j < 55 and j % 7]
     for j in came:
         arrive(10 * j + 3, node.arrays, float(j), float(j), 1.0)
-        assert node.arrays.inputs[IN_N_DEM] == max([i for i in came if i <= j - 10], default=came[0])
+        assert node.loop.inputs[IN_N_DEM] == max([i for i in came if i <= j - 10], default=came[0])

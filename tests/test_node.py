@@ -73,7 +73,7 @@ def test_servo_tells_the_mean_current_since_the_last_frame() -> None:
     currents: list[float] = []
     for k in range(100, 141):
         sent = vgv.tick(rows(demand(k // 10, 90.0, 89.0)) if k % 10 == 0 else NONE)
-        currents.append(vgv.arrays.z[I_CMD])
+        currents.append(vgv.loop.z[I_CMD])
         if k % 10 == 0 and k > 100:
             assert named(sent)[VGV_SERVO]["i_cmd"] == pytest.approx(1e3 * np.mean(currents[-10:]), abs=0.0011)
     assert np.ptp(currents) > 1e-3
@@ -81,11 +81,11 @@ def test_servo_tells_the_mean_current_since_the_last_frame() -> None:
 
 def test_frames_tell_the_sampled_sensors_in_the_units_of_the_dbc() -> None:
     vgv = started(seed=5)
-    at = vgv.arrays.s[
+    at = vgv.loop.s[
         chain.POT : chain.POT + 3, 0
     ].copy()  # what the tick samples: the machine as the tick before left it
     sent = named(vgv.tick(rows(demand(10))))
-    a = vgv.arrays
+    a = vgv.loop
     vane = np.rad2deg(at + a.sigma[1:4] * vgv._noise[0, 1:4])
     assert list(sent[VGV_ANGLES].values()) == pytest.approx(vane.tolist(), abs=0.0011)
     assert not np.allclose(vane, np.rad2deg(at), atol=0.01)  # its noise is in it
@@ -104,7 +104,7 @@ def test_supply_and_temperature_are_those_of_the_machine() -> None:
     for k in range(200):
         for vgv in (strong, weak):
             vgv.tick(rows(demand(k // 10, 95.0, 95.0)) if k % 10 == 0 else NONE)
-    assert strong.arrays.s[chain.X, 0] > weak.arrays.s[chain.X, 0] + 1e-3
+    assert strong.loop.s[chain.X, 0] > weak.loop.s[chain.X, 0] + 1e-3
 
 
 def test_faults_are_told_by_their_bits() -> None:
@@ -124,7 +124,7 @@ def test_the_last_good_frame_of_a_tick_counts_and_refused_ones_are_counted_in_it
     vgv = started()
     wrong = demand(11)[0], demand(11)[1] ^ 1 << 30
     vgv.tick(rows(demand(10, 61.0, 62.0), wrong, demand(11, 63.0, 64.0), wrong))
-    a = vgv.arrays
+    a = vgv.loop
     assert (a.inputs[IN_FRESH], a.inputs[IN_REJECTED]) == (1.0, 2.0)
     assert (a.z[N_DEM], a.z[N_R_RAW]) == (pytest.approx(63.0), pytest.approx(64.0))
     vgv.tick(NONE)
@@ -136,7 +136,7 @@ def test_the_last_good_frame_of_a_tick_counts_and_refused_ones_are_counted_in_it
 def test_only_the_first_n_rows_are_received() -> None:
     vgv = started()
     vgv.tick(rows(demand(10, 61.0), demand(11, 63.0)), 1)
-    assert vgv.arrays.z[N_DEM] == pytest.approx(61.0)
+    assert vgv.loop.z[N_DEM] == pytest.approx(61.0)
 
 
 def test_frames_of_others_are_counted_by_whose_they_seem_to_be() -> None:
@@ -174,15 +174,15 @@ def test_the_machine_runs_at_its_own_speed_until_a_demand_has_come_and_then_at_t
     vgv = Node(n_r=60.0)
     for _ in range(50):
         vgv.tick(NONE)
-    assert vgv.arrays.s[chain.N_R, 0] == pytest.approx(60.0)
+    assert vgv.loop.s[chain.N_R, 0] == pytest.approx(60.0)
     for k in range(50, 300):
         vgv.tick(rows(demand(k // 10, 70.0, 65.0)) if k % 10 == 0 else NONE)
-    assert 60.1 < vgv.arrays.s[chain.N_R, 0] < 70.0
+    assert 60.1 < vgv.loop.s[chain.N_R, 0] < 70.0
 
 
 def test_a_machine_starts_on_the_mean_curve_of_its_speed() -> None:
     for n_r in (50.0, 90.0):
-        a = Node(n_r=n_r).arrays
+        a = Node(n_r=n_r).loop
         assert a.s[chain.X, 0] == pytest.approx(np.interp(n_r, a.calibration.table[0], a.calibration.table[3]))
         assert a.s[chain.N_R, 0] == n_r
 
@@ -196,7 +196,7 @@ def test_a_load_of_the_air_acts_at_the_measured_speed() -> None:
     for n_r in (60.0, 110.0):
         for k in range(400):
             vgv.tick(rows(demand(vgv.k // 10, 60.0, n_r)) if k % 10 == 0 else NONE)
-        currents.append(vgv.arrays.s[chain.GIVE, 0])
+        currents.append(vgv.loop.s[chain.GIVE, 0])
     assert currents[1] == pytest.approx(currents[0] * (110.0 / 60.0) ** 2, rel=0.05)
 
 
@@ -206,7 +206,7 @@ def test_noise_is_drawn_once_for_each_hundred_ticks_and_used_row_by_row() -> Non
     for k in range(150):
         vgv.tick(NONE)
         assert np.array_equal(vgv._noise[k % 100], numbers[k])
-    assert not Node().arrays.sigma.any() and Node(seed=1).arrays.sigma.all()
+    assert not Node().loop.sigma.any() and Node(seed=1).loop.sigma.all()
 
 
 def test_the_fingerprint_is_of_everything() -> None:
@@ -264,9 +264,9 @@ def test_without_a_measured_speed_the_ecus_engine_gives_it_with_noise() -> None:
     plain, scattered = np.array(sent[0]), np.array(sent[1])
     assert 60.0 == plain[0] < plain[20] < plain[-1] < 70.0 and plain[20] - plain[10] < 0.8 + 0.02  # 8 %/s
     rms = np.std(scattered - plain)
-    assert 0.3 < rms / noisy.arrays.sigma[0] < 2.0
+    assert 0.3 < rms / noisy.loop.sigma[0] < 2.0
     numbers = np.random.Generator(np.random.PCG64(4)).standard_normal(40)
-    assert np.allclose(scattered - plain, noisy.arrays.sigma[0] * numbers, atol=0.0021)
+    assert np.allclose(scattered - plain, noisy.loop.sigma[0] * numbers, atol=0.0021)
 
 
 def test_the_ecu_keeps_the_last_good_values_of_each_frame() -> None:
@@ -315,13 +315,13 @@ def test_frames_that_are_late_by_five_periods_are_stale() -> None:
 
 def test_the_controller_gets_of_each_potentiometer_what_is_left_of_it() -> None:
     vgv = started()
-    at = vgv.arrays.s[chain.POT : chain.POT + 3, 0].copy()
+    at = vgv.loop.s[chain.POT : chain.POT + 3, 0].copy()
     vgv.tick(NONE)
-    assert np.allclose(vgv.arrays.inputs[6:9], at, atol=1e-12)  # all of it, at first
-    at = vgv.arrays.s[chain.POT : chain.POT + 3, 0].copy()
-    vgv.arrays.pots[0] = 0.5, 0.1, 1.0, 0.0, 0.0, np.nan
+    assert np.allclose(vgv.loop.inputs[6:9], at, atol=1e-12)  # all of it, at first
+    at = vgv.loop.s[chain.POT : chain.POT + 3, 0].copy()
+    vgv.loop.pots[0] = 0.5, 0.1, 1.0, 0.0, 0.0, np.nan
     vgv.tick(NONE)
-    assert np.allclose(vgv.arrays.inputs[6:9], [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
+    assert np.allclose(vgv.loop.inputs[6:9], [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
 
 
 def test_a_frame_with_counter_0_is_heard_like_any_other() -> None:
@@ -356,18 +356,18 @@ def test_a_pause_is_told_in_seconds_for_one_tick_and_is_no_frame() -> None:
     vgv = started()
     before = vgv.counts
     vgv.tick(rows((PAUSE, 30), (PAUSE, 12)))
-    assert vgv.arrays.inputs[IN_PAUSE] == pytest.approx(0.042)
+    assert vgv.loop.inputs[IN_PAUSE] == pytest.approx(0.042)
     assert {name: v - before[name] for name, v in vgv.counts.items() if v != before[name]} == {"stale": 1}
     vgv.tick(NONE)
-    assert vgv.arrays.inputs[IN_PAUSE] == 0.0
+    assert vgv.loop.inputs[IN_PAUSE] == 0.0
 
 
 def test_after_a_pause_the_first_frame_only_shows_where_the_counter_is() -> None:
     vgv = started()
     vgv.tick(rows((PAUSE, 20), demand(10)))
-    assert vgv.arrays.inputs[IN_FRESH] == 0.0 and vgv.counts["sync"] == 2
+    assert vgv.loop.inputs[IN_FRESH] == 0.0 and vgv.counts["sync"] == 2
     vgv.tick(rows(demand(11)))
-    assert vgv.arrays.inputs[IN_FRESH] == 1.0
+    assert vgv.loop.inputs[IN_FRESH] == 1.0
 
 
 def test_a_controller_that_stood_still_is_safe_first() -> None:
@@ -398,10 +398,10 @@ def test_the_machine_follows_only_demands_within_the_limits_of_the_calibration(
     n_dem: float, n_r: float, mode: int, plausible: bool
 ) -> None:
     vgv = started()
-    k = vgv.arrays.calibration.k
+    k = vgv.loop.calibration.k
     k[DEMAND_LOW], k[DEMAND_HIGH] = 50.0, 110.0
     vgv.tick(rows(demand(10, n_dem, n_r, mode)))
-    assert vgv.counts["good"] == 10 and vgv.arrays.inputs[IN_FRESH] == 1.0
+    assert vgv.counts["good"] == 10 and vgv.loop.inputs[IN_FRESH] == 1.0
     assert vgv.arrays.supply[2:].tolist() == pytest.approx([n_dem, n_r] if plausible else [70.0, 69.0])
 
 
@@ -409,4 +409,4 @@ def test_the_engine_of_the_machine_follows_the_demand_and_not_the_measured_speed
     vgv = Node(n_r=60.0)
     for k in range(300):
         vgv.tick(rows(demand(k // 10, 70.0, 50.0)) if k % 10 == 0 else NONE)
-    assert 61.0 < vgv.arrays.s[chain.N_R, 0] < 70.0
+    assert 61.0 < vgv.loop.s[chain.N_R, 0] < 70.0

@@ -484,7 +484,7 @@ def test_a_profile_of_any_length_is_refused(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text("t = [0, 1e9]\nn_dem = [60, 90]\n")
     with pytest.raises(InputError, match="spans 1e"):
         read_profile(tmp_path / "p.toml")
-    from vaneloop.cli.engine_test import load_profile
+    from hil.engine_test import load_profile
 
     text = tables.path("engine_test.toml").read_text()
     head, dwell = text.split("[dwell]")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from controller import load_calibration
+from hil.engine_test import engine_test, load_profile
 from hil.logs import Channel, Log, LogError, write_log
 from plant import Geometry, build_plant, load_geometry, load_schedules
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, STAGES, stage_ring_angle, vane_angle
@@ -19,7 +20,6 @@ from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, Manoeuvre, simulate
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
-from vaneloop.cli.engine_test import engine_test, load_profile
 from vaneloop.cli.main import main
 from vaneloop.design.scheduling import (
     LinkChange,

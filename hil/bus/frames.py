@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hil.logs.canlog import crc_table
-from plant.compiled import in_place
+from vaneloop.base.compiled import in_place
 
 if TYPE_CHECKING:
     import can
@@ -60,13 +60,13 @@ PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 
 
 @in_place
-def word0(ident):
+def word0(ident: int) -> int:
     """Return word 0 of a classic data frame of eight bytes."""
     return CLASSIC | ident
 
 
 @in_place
-def crc(ident, data):
+def crc(ident: int, data: int) -> int:
     """Return the E2E CRC of ``data`` (word 1) sent under ``ident``; byte 0 is the CRC's own place and does not
     count.
     """
@@ -78,26 +78,26 @@ def crc(ident, data):
 
 
 @in_place
-def protect(ident, data, counter):
+def protect(ident: int, data: int, counter: int) -> int:
     """Return ``data`` (word 1) with ``counter`` (0..14) and the CRC in their places."""
     data = (data & ~0xFFF) | (counter << 8)
     return data | crc(ident, data)
 
 
 @in_place
-def u16(data, at):
+def u16(data: int, at: int) -> int:
     """Return the unsigned 16-bit number that starts at bit ``at``."""
     return (data >> at) & 0xFFFF
 
 
 @in_place
-def s16(data, at):
+def s16(data: int, at: int) -> int:
     """Return the signed 16-bit number that starts at bit ``at``."""
     return ((data >> at) & 0xFFFF ^ 0x8000) - 0x8000
 
 
 @in_place
-def _raw(value, scale, offset, low, high, none):
+def _raw(value: float, scale: float, offset: float, low: float, high: float, none: int) -> int:
     """Return the nearest raw value of ``value`` held within ``low``..``high`` (physical); ``none`` for a NaN."""
     if value != value:
         return none
@@ -105,7 +105,7 @@ def _raw(value, scale, offset, low, high, none):
 
 
 @in_place
-def _at(raw, at):
+def _at(raw: int, at: int) -> int:
     """Return 16 bits at bit ``at`` of a word; at bit 48 the sign goes along, so that the word stays within an int64."""
     raw &= 0xFFFF
     if at == 48:
@@ -117,7 +117,7 @@ def _at(raw, at):
 
 
 @in_place
-def encode_demand(n_dem, n_r, mode_request, counter):
+def encode_demand(n_dem: float, n_r: float, mode_request: int, counter: int) -> int:
     """Return word 1 of ECU_DEMAND: speeds in %, ``mode_request`` 0 or 1."""
     data = (mode_request & 3) << 12
     data |= _at(_raw(n_dem, 0.002, 0.0, 0.0, 125.0, 65535), 16) | _at(_raw(n_r, 0.002, 0.0, 0.0, 125.0, 65535), 32)
@@ -125,13 +125,13 @@ def encode_demand(n_dem, n_r, mode_request, counter):
 
 
 @in_place
-def decode_demand(data):
+def decode_demand(data: int) -> tuple[float, float, int]:
     """Return n_dem (%), n_r (%) and mode_request of word 1 of ECU_DEMAND."""
     return u16(data, 16) * 0.002, u16(data, 32) * 0.002, (data >> 12) & 3
 
 
 @in_place
-def encode_status(x_dem, x_lvdt, state, counter):
+def encode_status(x_dem: float, x_lvdt: float, state: int, counter: int) -> int:
     """Return word 1 of VGV_STATUS: strokes in mm."""
     data = (state & 15) << 12
     data |= _at(_raw(x_dem, 0.001, -8.0, -5.0, 55.0, 65535), 16) | _at(_raw(x_lvdt, 0.001, -8.0, -5.0, 55.0, 65535), 32)
@@ -139,26 +139,26 @@ def encode_status(x_dem, x_lvdt, state, counter):
 
 
 @in_place
-def decode_status(data):
+def decode_status(data: int) -> tuple[float, float, int]:
     """Return x_dem (mm), x_lvdt (mm) and state of word 1 of VGV_STATUS."""
     return u16(data, 16) * 0.001 - 8.0, u16(data, 32) * 0.001 - 8.0, (data >> 12) & 15
 
 
 @in_place
-def encode_servo(i_cmd, faults, counter):
+def encode_servo(i_cmd: float, faults: int, counter: int) -> int:
     """Return word 1 of VGV_SERVO: mean current in mA, nine fault bits."""
     data = _at(_raw(i_cmd, 0.002, 0.0, -50.0, 50.0, -32768), 16) | ((faults & 0x1FF) << 32)
     return protect(VGV_SERVO, data, counter)
 
 
 @in_place
-def decode_servo(data):
+def decode_servo(data: int) -> tuple[float, int]:
     """Return i_cmd (mA) and the fault bits of word 1 of VGV_SERVO."""
     return s16(data, 16) * 0.002, (data >> 32) & 0x1FF
 
 
 @in_place
-def encode_angles(vigv, vgv1, vgv2, counter):
+def encode_angles(vigv: float, vgv1: float, vgv2: float, counter: int) -> int:
     """Return word 1 of VGV_ANGLES: degrees."""
     data = _at(_raw(vigv, 0.002, 0.0, -60.0, 60.0, -32768), 16)
     data |= _at(_raw(vgv1, 0.002, 0.0, -60.0, 60.0, -32768), 32)
@@ -167,13 +167,13 @@ def encode_angles(vigv, vgv1, vgv2, counter):
 
 
 @in_place
-def decode_angles(data):
+def decode_angles(data: int) -> tuple[float, float, float]:
     """Return vigv, vgv1, vgv2 (deg) of word 1 of VGV_ANGLES."""
     return s16(data, 16) * 0.002, s16(data, 32) * 0.002, s16(data, 48) * 0.002
 
 
 @in_place
-def encode_health(p_s, t_oil, lost, rejected, counter):
+def encode_health(p_s: float, t_oil: float, lost: int, rejected: int, counter: int) -> int:
     """Return word 1 of VGV_HEALTH: supply in MPa, oil in degC; the counts stay at 255."""
     data = _at(_raw(p_s, 0.001, 0.0, 0.0, 40.0, 65535), 16) | _at(_raw(t_oil, 0.01, 0.0, -60.0, 200.0, -32768), 32)
     data |= _at(min(lost, 255) | min(rejected, 255) << 8, 48)
@@ -181,7 +181,7 @@ def encode_health(p_s, t_oil, lost, rejected, counter):
 
 
 @in_place
-def decode_health(data):
+def decode_health(data: int) -> tuple[float, float, int, int]:
     """Return p_s (MPa), t_oil (degC), frames lost and frames rejected of word 1 of VGV_HEALTH."""
     return u16(data, 16) * 0.001, s16(data, 32) * 0.01, (data >> 48) & 0xFF, (data >> 56) & 0xFF
 
@@ -227,7 +227,7 @@ def new_receiver(ident: int) -> np.ndarray:
 
 
 @in_place
-def receive(r, head, data, now):
+def receive(r: np.ndarray, head: int, data: int, now: int) -> int:
     """Judge a frame that came at tick ``now`` (ms); return the verdict. Only after GOOD may its values be used.
 
     A counter that has gone on by 1..MAX_DELTA since the last good frame is good; what lies between is lost. After
@@ -274,7 +274,7 @@ def receive(r, head, data, now):
 
 
 @in_place
-def grow_old(r, now):
+def grow_old(r: np.ndarray, now: int) -> bool:
     """State a silence of MISSED periods at tick ``now``, after the frames of the tick; return True while it lasts. It
     loses nothing.
     """
@@ -290,7 +290,7 @@ def grow_old(r, now):
 
 
 @in_place
-def stand_still(r):
+def stand_still(r: np.ndarray) -> None:
     """Forget where the sender's counter was: its receiver stood still, and what came meanwhile is gone. Begins a
     silence.
     """
@@ -301,7 +301,7 @@ def stand_still(r):
 
 
 @in_place
-def refused(r):
+def refused(r: np.ndarray) -> int:
     """Return how many frames were refused since start."""
     return r[R_WRONG_CRC] + r[R_REPEATED] + r[R_WRONG_SEQUENCE] + r[R_WRONG_LENGTH] + r[R_WRONG_KIND]
 

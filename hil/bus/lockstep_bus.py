@@ -22,9 +22,9 @@ from can.broadcastmanager import CyclicSendTaskABC, ModifiableCyclicTaskABC, Res
 
 from hil.bus import wire as w
 from hil.bus.frames import from_message, to_message
-from hil.bus.wire import BIT_RATE, BITS_PER_TICK, new_wire, put, run_wire, take
-from hil.loop.node import MOST_SENT, Ecu, Node, ecu_tick, node_tick
-from plant.compiled import in_place
+from hil.bus.wire import BIT_RATE, BITS_PER_TICK, Wire, new_wire, put, run_wire, take
+from hil.loop.node import MOST_SENT, Ecu, EcuArrays, Node, NodeArrays, ecu_tick, node_tick
+from vaneloop.base.compiled import in_place
 
 __all__ = ["BusRun", "Channel", "LockstepBus", "channel_of", "run_lockstep"]
 
@@ -320,23 +320,23 @@ class _Task(ModifiableCyclicTaskABC, RestartableCyclicTaskABC):
 
 @in_place
 def run_loop(
-    k0,
-    ticks,
-    profile,
-    vgv,
-    vgv_noise,
-    vgv_row,
-    ecu,
-    ecu_noise,
-    wire,
-    at_vgv,
-    at_ecu,
-    received,
-    sent,
-    log,
-    logged,
-    states,
-):
+    k0: int,
+    ticks: int,
+    profile: np.ndarray,
+    vgv: NodeArrays,
+    vgv_noise: np.ndarray,
+    vgv_row: int,
+    ecu: EcuArrays,
+    ecu_noise: np.ndarray,
+    wire: Wire,
+    at_vgv: int,
+    at_ecu: int,
+    received: np.ndarray,
+    sent: np.ndarray,
+    log: np.ndarray,
+    logged: int,
+    states: np.ndarray,
+) -> int:
     """Run VGV node, ECU and wire for ``ticks`` ticks from tick ``k0``; return the number of rows written to ``log``.
 
     profile    float64[n, 3] what the ECU demands: n_dem, n_r (NaN = its engine), mode_request; a row every 10 ms, the
@@ -346,7 +346,8 @@ def run_loop(
     states     float64[ticks or 0, n] the firmware's and the plant's state after each tick
     """
     rows = 0
-    n_z, n_s = vgv.z.shape[0], vgv.s.shape[0]
+    z, s = vgv.loop.z, vgv.loop.s
+    n_z, n_s = z.shape[0], s.shape[0]
     for i in range(ticks):
         k = k0 + i
         frame = min(k // 10, profile.shape[0] - 1)
@@ -363,9 +364,9 @@ def run_loop(
             rows += take(wire, logged, log[rows:])
         if states.shape[0] > 0:
             for q in range(n_z):
-                states[i, q] = vgv.z[q]
+                states[i, q] = z[q]
             for q in range(n_s):
-                states[i, n_z + q] = vgv.s[q, 0]
+                states[i, n_z + q] = s[q, 0]
     return rows
 
 
@@ -436,7 +437,7 @@ def run_lockstep(
         noise, row = vgv.noise()
         n = min(len(noise) - row, ticks - vgv.k)
         some = np.empty((16 * n if keep else 0, 3), np.int64)
-        states = np.empty((n if hashed else 0, len(vgv.arrays.z) + len(vgv.arrays.s)))
+        states = np.empty((n if hashed else 0, len(vgv.loop.z) + len(vgv.loop.s)))
         m = run_loop(
             vgv.k,
             n,

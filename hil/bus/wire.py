@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, REMOTE
-from plant.compiled import in_place
+from vaneloop.base.compiled import in_place
 
 __all__ = [
     "ACTIVE", "BITS_PER_TICK", "BIT_RATE", "BUS_OFF", "OWN", "PASSIVE", "Wire", "frame_bits", "new_wire", "put",
@@ -120,7 +120,7 @@ def new_wire(
 
 
 @in_place
-def frame_bits(head, data, out):
+def frame_bits(head: int, data: int, out: np.ndarray) -> int:
     """Write a frame's bits from start of frame to CRC, stuff bits included, to ``out``; return their number."""
     extended = head & EXTENDED != 0
     remote = 1 if head & REMOTE else 0
@@ -166,7 +166,7 @@ def frame_bits(head, data, out):
 
 
 @in_place
-def _priority(head):
+def _priority(head: int) -> int:
     """Return the arbitration field as a number: the lowest wins."""
     ident = head & IDENT_MASK
     remote = 1 if head & REMOTE else 0
@@ -176,7 +176,7 @@ def _priority(head):
 
 
 @in_place
-def _random(clock):
+def _random(clock: np.ndarray) -> float:
     """Return the next random number in [0, 1): xorshift, 32 bits."""
     x = clock[RANDOM]
     x ^= (x << 13) & 0xFFFFFFFF
@@ -187,7 +187,7 @@ def _random(clock):
 
 
 @in_place
-def put(wire, j, head, data):
+def put(wire: Wire, j: int, head: int, data: int) -> bool:
     """Queue a frame of node ``j``, ready now; return False where it was refused: queue full, bus-off, or not a classic
     frame.
     """
@@ -203,7 +203,7 @@ def put(wire, j, head, data):
 
 
 @in_place
-def take(wire, j, rows):
+def take(wire: Wire, j: int, rows: np.ndarray) -> int:
     """Move what node ``j`` has received up to now into the first rows of ``rows`` (int64[n, 2 or 3]); return
     how many.
     """
@@ -219,7 +219,7 @@ def take(wire, j, rows):
 
 
 @in_place
-def _push(wire, j, head, data, at):
+def _push(wire: Wire, j: int, head: int, data: int, at: int) -> None:
     """Put a frame into the receive buffer of node ``j``; where there is no room, count it and say so once there is."""
     node = wire.node[j]
     room = wire.rx.shape[1] - node[RX_N]
@@ -245,14 +245,14 @@ def _push(wire, j, head, data, at):
 
 
 @in_place
-def _tell(wire, j, kind, detail, at):
+def _tell(wire: Wire, j: int, kind: int, detail: int, at: int) -> None:
     """Give node ``j`` an error frame of SocketCAN's class ``kind``, if it wants them."""
     if wire.node[j, WANTS_ERRORS]:
         _push(wire, j, ERROR | 8 << 32 | kind, detail << 8, at)
 
 
 @in_place
-def _judge(wire, j, at):
+def _judge(wire: Wire, j: int, at: int) -> None:
     """Set the mode of node ``j``, which is not bus-off, by its error counters."""
     node = wire.node[j]
     if node[TEC] > 255:
@@ -271,7 +271,7 @@ def _judge(wire, j, at):
 
 
 @in_place
-def _recess(wire, times):
+def _recess(wire: Wire, times: int) -> None:
     """Count ``times`` occurrences of 11 recessive bits for the nodes that are bus-off."""
     for j in range(wire.node.shape[0]):
         if wire.node[j, MODE] == BUS_OFF and wire.clock[RESTART]:
@@ -279,7 +279,7 @@ def _recess(wire, times):
 
 
 @in_place
-def run_wire(wire, until, watch):
+def run_wire(wire: Wire, until: int, watch: int) -> None:
     """Simulate up to bit ``until``; with ``watch`` >= 0 stop as soon as that node has something to take. Sets
     clock[NOW].
 
@@ -392,7 +392,7 @@ def run_wire(wire, until, watch):
 
 
 @in_place
-def _sends(wire, j, start, priority):
+def _sends(wire: Wire, j: int, start: int, priority: int) -> bool:
     """Is node ``j`` one of those that send at ``start`` with this arbitration field?"""
     node = wire.node[j]
     if not node[JOINED] or node[MODE] == BUS_OFF or node[TX_N] == 0:

@@ -58,8 +58,8 @@ from hil.bus.frames import (
     word0,
 )
 from hil.logs.canlog import e2e_crc
-from hil.loop.node import MOST_SENT, Node, node_tick
-from plant.compiled import in_place
+from hil.loop.node import MOST_SENT, Node, NodeArrays, node_tick
+from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
 
 __all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack"]
@@ -91,7 +91,19 @@ KINDS = ("noise", "payload", "insane", "mutated", "length", "wrong kind", "repla
 
 
 @in_place
-def _watched_ticks(k0, k_end, attack_end, at, received, noise, a, sent, limits, seen, ticks_in):
+def _watched_ticks(
+    k0: int,
+    k_end: int,
+    attack_end: int,
+    at: np.ndarray,
+    received: np.ndarray,
+    noise: np.ndarray,
+    a: NodeArrays,
+    sent: np.ndarray,
+    limits: np.ndarray,
+    seen: np.ndarray,
+    ticks_in: np.ndarray,
+) -> tuple[int, int, int]:
     """Run ticks ``k0``..``k_end`` on the frames and watch; return what failed, the tick, and how long RUN took after
     ``attack_end``.
 
@@ -103,20 +115,20 @@ def _watched_ticks(k0, k_end, attack_end, at, received, noise, a, sent, limits, 
         last = first
         while last < len(at) and at[last] <= k:
             last += 1
-        before = int(a.z[MODE])
+        before = int(a.loop.z[MODE])
         m = node_tick(k, received[first:last], last - first, noise, k % NOISE_ROWS, a, sent)
         first = last
-        mode = int(a.z[MODE])
+        mode = int(a.loop.z[MODE])
         ticks_in[mode] += 1
-        if not abs(a.z[I_CMD]) <= limits[0]:
+        if not abs(a.loop.z[I_CMD]) <= limits[0]:
             return CURRENT, k, 0
-        if not limits[1] <= a.z[X_DEM] <= limits[2]:
+        if not limits[1] <= a.loop.z[X_DEM] <= limits[2]:
             return STROKE, k, 0
         total = 0.0
-        for q in range(a.z.shape[0]):
-            total += a.z[q]
-        for q in range(a.s.shape[0]):
-            total += a.s[q, 0]
+        for q in range(a.loop.z.shape[0]):
+            total += a.loop.z[q]
+        for q in range(a.loop.s.shape[0]):
+            total += a.loop.s[q, 0]
         if not abs(total) < 1e12:
             return NOT_FINITE, k, 0
         if mode != before:
@@ -126,7 +138,7 @@ def _watched_ticks(k0, k_end, attack_end, at, received, noise, a, sent, limits, 
         for q in range(m):
             if crc(sent[q, 0] & IDENT_MASK, sent[q, 1]) != sent[q, 1] & 0xFF:
                 return SENT_CRC, k, 0
-        if mode != RUN or a.z[FAULT_BITS] != 0.0:
+        if mode != RUN or a.loop.z[FAULT_BITS] != 0.0:
             since = k + 1
     if since >= k_end:
         return NO_RECOVERY, k_end - 1, 0
@@ -313,7 +325,8 @@ class Bench:
 
     def _arrays(self) -> list[np.ndarray]:
         a = self.node.arrays
-        return [a.inputs, a.z, a.s, a.mean, a.sent, a.supply, a.receiver, a.counter]
+        loop = a.loop
+        return [loop.inputs, loop.z, loop.s, loop.mean, loop.sent, a.supply, a.receiver, a.counter]
 
     def _saved(self) -> list[np.ndarray]:
         return [x.copy() for x in self._arrays()]

@@ -86,12 +86,8 @@ class MachineChange:
     def __init__(self, action: Machine, node: Node, ecu: Ecu):
         from plant.effects import EFFECTS, ROW
 
-        self.arrays, self.engine, self.first, self.end = (
-            node.arrays,
-            ecu.arrays,
-            tick_of(action.start),
-            tick_of(action.end),
-        )
+        self.loop, self.fed, self.engine = node.loop, node.arrays.supply, ecu.arrays
+        self.first, self.end = tick_of(action.start), tick_of(action.end)
         self.new: dict[int, float] = {}
         if action.effect is not None:
             for i, q in enumerate(EFFECTS[action.effect].parameters):
@@ -105,10 +101,7 @@ class MachineChange:
     def tick(self, k: int) -> None:
         """Change the machine at the first tick, and back at the end."""
         if k == self.first:
-            self.old = (
-                {r: float(self.arrays.p[r, 0]) for r in self.new},
-                {i: float(self.arrays.supply[i]) for i in self.supply},
-            )
+            self.old = ({r: float(self.loop.p[r, 0]) for r in self.new}, {i: float(self.fed[i]) for i in self.supply})
             self._set(self.new, self.supply)
         elif k == self.end:
             self._set(*self.old)
@@ -119,10 +112,10 @@ class MachineChange:
         from plant.parameters import derive
 
         for i, v in supply.items():
-            self.arrays.supply[i] = v
+            self.fed[i] = v
         if rows:
-            chain.wake(self.arrays.s, self.arrays.p, 0, self.arrays.z[I_CMD])
-            for p in (self.arrays.p, self.engine.p):
+            chain.wake(self.loop.s, self.loop.p, 0, self.loop.z[I_CMD])
+            for p in (self.loop.p, self.engine.p):
                 for r, v in rows.items():
                     p[r, 0] = v
                 derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
@@ -213,7 +206,7 @@ def _lockstep(
     disturber = Disturber(of[OnBus], wire, places)
     rows = np.zeros((256, 2), np.int64)
 
-    z, s, a = node.arrays.z, node.arrays.s, node.arrays
+    z, s, receiver = node.loop.z, node.loop.s, node.arrays.receiver
     mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
     values = np.empty((ticks, 8))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
@@ -238,8 +231,8 @@ def _lockstep(
             s[chain.POT + 1, 0],
             s[chain.POT + 2, 0],
         )
-        counts[k, :8] = a.receiver[:8]
-        counts[k, 8] = frames.refused(a.receiver)
+        counts[k, :8] = receiver[:8]
+        counts[k, 8] = frames.refused(receiver)
         if k % 10 == 0:
             missed = ecu.stale()
             late[k : k + 10] = [n in missed for n in SENDER["VGV"]]
@@ -255,7 +248,7 @@ def _lockstep(
             recorded += [(k, head, data) for head, data in rows[: take(wire, ears, rows)].tolist()]
         if progress is not None and k % 1000 == 0:
             progress(k / ticks)
-    cal = a.calibration.k
+    cal = node.loop.calibration.k
     trace = Trace(
         np.arange(ticks) * TICK,
         mode,
@@ -335,7 +328,7 @@ LISTEN = 5.0  # s in which the controller must be heard in RUN
 
 def cannot(scenario: Scenario) -> str:
     """Return why an outsider cannot do what the scenario asks for; empty if it can."""
-    inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})  # type: ignore[attr-defined]
+    inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})
     return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
 
 

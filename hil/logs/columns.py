@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from plant.compiled import in_place, is_cached
+from vaneloop.base.compiled import in_place, is_cached
 
 __all__ = ["cut", "warm_up", "wrong_crc"]
 
@@ -18,7 +18,21 @@ def warm_up(say: Callable[[str], None]) -> None:
 
 
 @in_place
-def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none, out_rows, out):
+def cut(
+    words: np.ndarray,
+    rows: np.ndarray,
+    length: np.ndarray,
+    need: int,
+    big: bool,
+    shift: int,
+    bits: int,
+    signed: bool,
+    scale: float,
+    offset: float,
+    none: int,
+    out_rows: np.ndarray,
+    out: np.ndarray,
+) -> tuple[int, int]:
     """Cut one integer signal out of frames; return how many values there are and how many said "not available".
 
     words     uint64[n] the frames' bytes, the first lowest; rows int64[m] the frames to look at; length uint8[n] their
@@ -57,7 +71,7 @@ def cut(words, rows, length, need, big, shift, bits, signed, scale, offset, none
 
 
 @in_place
-def wrong_crc(words, rows, table, start, wrong):
+def wrong_crc(words: np.ndarray, rows: np.ndarray, table: np.ndarray, start: int, wrong: np.ndarray) -> None:
     """Mark in ``wrong`` (bool[m]) the frames whose first byte is not the CRC of the others; ``start`` is the CRC of the
     DataID.
     """

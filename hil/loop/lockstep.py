@@ -19,12 +19,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller import Calibration, load_calibration
 from controller.firmware import BLEND, DIRECTION, FAULT_BITS, IN_FRESH, IN_REJECTED, IN_X_LVDT, MODE, SLOW, X_DEM
-from hil.loop.tick import FRAME, arrive, control, mean_current, move, new_loop
+from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain
-from plant.compiled import compiled_free
+from vaneloop.base.compiled import compiled_free
 
 __all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
 
@@ -52,7 +53,14 @@ class Stimulus:
     rows: np.ndarray  # float64[n, N_STIMULUS]
 
     @classmethod
-    def of(cls, n_dem, n_r=None, p_s=21e6, t_oil=40.0, mode_request=1.0) -> Stimulus:
+    def of(
+        cls,
+        n_dem: ArrayLike,
+        n_r: ArrayLike | None = None,
+        p_s: ArrayLike = 21e6,
+        t_oil: ArrayLike = 40.0,
+        mode_request: ArrayLike = 1.0,
+    ) -> Stimulus:
         """Build from arrays or constants; all frames arrive and are good."""
         n_dem = np.atleast_1d(np.asarray(n_dem, dtype=np.float64))
         rows = np.empty((len(n_dem), N_STIMULUS))
@@ -85,7 +93,16 @@ class Run:
 
 
 @compiled_free
-def advance(k0, ticks, stimulus, noise, a, every, out, snapshots):
+def advance(
+    k0: int,
+    ticks: int,
+    stimulus: np.ndarray,
+    noise: np.ndarray,
+    a: Loop,
+    every: int,
+    out: np.ndarray,
+    snapshots: np.ndarray,
+) -> None:
     """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
 
     noise      float64[ticks or 1, 5] standard normal numbers (LVDT, three potentiometers, speed)
@@ -231,7 +248,7 @@ def warm_up(say: Callable[[str], None]) -> None:
     """Compile the loop once, telling the user before a wait of some seconds; silent when its compiled code is there
     already.
     """
-    from plant.compiled import is_cached
+    from vaneloop.base.compiled import is_cached
 
     if is_cached("lockstep.advance"):
         return

@@ -60,7 +60,7 @@ from hil.bus.frames import (
 )
 from hil.loop.tick import Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain
-from plant.compiled import in_place
+from vaneloop.base.compiled import in_place
 
 __all__ = ["Ecu", "EcuArrays", "Node", "NodeArrays", "ecu_tick", "node_tick", "replay", "run_ticks"]
 
@@ -75,7 +75,7 @@ DEGREES = 180.0 / np.pi
 class NodeArrays(NamedTuple):
     """All that the VGV node's tick works on, in place.
 
-    inputs .. sent  the loop's (`hil.loop.tick.Loop`)
+    loop        the closed loop's (`hil.loop.tick.Loop`)
     supply      float64[4] supply pressure (Pa), oil temperature (degC); demand and speed (%) of the machine: the last
                 plausible frame's
     receiver    int64, of ECU_DEMAND (`hil.bus.frames`)
@@ -83,25 +83,14 @@ class NodeArrays(NamedTuple):
                 error frames
     """
 
-    inputs: np.ndarray
-    z: np.ndarray
-    built: Calibration
-    calibration: Calibration
-    flash: np.ndarray
-    s: np.ndarray
-    p: np.ndarray
-    sigma: np.ndarray
-    mean: np.ndarray
-    angles: np.ndarray
-    pots: np.ndarray
-    sent: np.ndarray
+    loop: Loop
     supply: np.ndarray
     receiver: np.ndarray
     counter: np.ndarray
 
 
 @in_place
-def _take(a, received, n, k):
+def _take(a: NodeArrays, received: np.ndarray, n: int, k: int) -> None:
     """Judge the ``n`` received frames of tick ``k``, and the loop's word that it stood still; set the firmware's
     inputs.
     """
@@ -129,17 +118,19 @@ def _take(a, received, n, k):
                 a.counter[C_OTHER] += 1
     grow_old(a.receiver, k)
     if fresh == 1.0:
-        arrive(k, a, n_dem, n_r, float(request))
-        low, high = a.calibration.k[DEMAND_LOW], a.calibration.k[DEMAND_HIGH]
+        arrive(k, a.loop, n_dem, n_r, float(request))
+        k_of = a.loop.calibration.k
+        low, high = k_of[DEMAND_LOW], k_of[DEMAND_HIGH]
         if low <= n_dem <= high and low <= n_r <= high and request <= 1:
             a.supply[2], a.supply[3] = n_dem, n_r
-    a.inputs[IN_FRESH] = fresh
-    a.inputs[IN_PAUSE] = pause
-    a.inputs[IN_REJECTED] = float(refused(a.receiver) - before)
+    inputs = a.loop.inputs
+    inputs[IN_FRESH] = fresh
+    inputs[IN_PAUSE] = pause
+    inputs[IN_REJECTED] = float(refused(a.receiver) - before)
 
 
 @in_place
-def _next(counter, which):
+def _next(counter: np.ndarray, which: int) -> int:
     """Return the E2E counter for a frame to send, and count on."""
     now = counter[which]
     counter[which] = (now + 1) % 15
@@ -147,13 +138,15 @@ def _next(counter, which):
 
 
 @in_place
-def _put(sent, m, ident, data):
+def _put(sent: np.ndarray, m: int, ident: int, data: int) -> int:
     sent[m, 0], sent[m, 1] = frames.word0(ident), data
     return m + 1
 
 
 @in_place
-def node_tick(k, received, n, noise, row, a, sent):
+def node_tick(
+    k: int, received: np.ndarray, n: int, noise: np.ndarray, row: int, a: NodeArrays, sent: np.ndarray
+) -> int:
     """Run tick ``k`` of the VGV node on the first ``n`` rows of ``received``; write the frames to send and return their
     number.
 
@@ -163,8 +156,9 @@ def node_tick(k, received, n, noise, row, a, sent):
     sent      int64[4, 2]
     """
     _take(a, received, n, k)
-    z, p_s, t_oil = a.z, a.supply[0], a.supply[1]
-    control(k, a, noise, row, t_oil)
+    loop, p_s, t_oil = a.loop, a.supply[0], a.supply[1]
+    z = loop.z
+    control(k, loop, noise, row, t_oil)
     m = 0
     if k % SLOW == 0:
         c = a.counter
@@ -172,15 +166,15 @@ def node_tick(k, received, n, noise, row, a, sent):
             sent,
             m,
             VGV_STATUS,
-            encode_status(z[X_DEM] * 1e3, a.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)),
+            encode_status(z[X_DEM] * 1e3, loop.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)),
         )
-        m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(a) * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
-        vigv, vgv1, vgv2 = a.angles[0] * DEGREES, a.angles[1] * DEGREES, a.angles[2] * DEGREES
+        m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
+        vigv, vgv1, vgv2 = loop.angles[0] * DEGREES, loop.angles[1] * DEGREES, loop.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
         if k % (10 * SLOW) == 0:
             lost, rejected = a.receiver[frames.R_LOST], refused(a.receiver)
             m = _put(sent, m, VGV_HEALTH, encode_health(p_s * 1e-6, t_oil, lost, rejected, _next(c, C_HEALTH)))
-    move(k, a, a.supply[2], a.supply[3], p_s, t_oil)
+    move(k, loop, a.supply[2], a.supply[3], p_s, t_oil)
     return m
 
 
@@ -192,6 +186,7 @@ class Node:
     p_s, t_oil  supply pressure (Pa) and oil temperature (degC); change ``arrays.supply`` later
     seed     of the sensors' noise; None = noise-free
     k        the next tick (1 ms each)
+    loop     what its tick works on: the firmware's inputs, state and calibration, the plant's state and parameters
     """
 
     def __init__(
@@ -205,12 +200,11 @@ class Node:
         seed: int | None = None,
     ):
         machine, cal = plant or build_plant(), calibration or load_calibration()
-        loop = new_loop(
+        self.loop = new_loop(
             machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=np.array([[1.0, 0.0] * 3])
         )
-        assert NodeArrays._fields[: len(loop)] == Loop._fields
         self.arrays = NodeArrays(
-            *loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64)
+            self.loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64)
         )
         self.k = 0
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
@@ -238,12 +232,12 @@ class Node:
     @property
     def mode(self) -> str:
         """Mode of the controller."""
-        return MODES[int(self.arrays.z[MODE])]
+        return MODES[int(self.loop.z[MODE])]
 
     @property
     def faults(self) -> int:
         """Fault bits that stand now (`controller.FAULTS`)."""
-        return int(self.arrays.z[FAULT_BITS])
+        return int(self.loop.z[FAULT_BITS])
 
     @property
     def counts(self) -> dict[str, int]:
@@ -259,13 +253,25 @@ class Node:
         """Return the SHA-256 of the whole state: firmware, plant, receiver, counters."""
         digest = hashlib.sha256()
         a = self.arrays
-        for part in (a.z, a.s, a.mean, a.receiver, a.counter):
+        for part in (a.loop.z, a.loop.s, a.loop.mean, a.receiver, a.counter):
             digest.update(part.tobytes())
         return digest.hexdigest()
 
 
 @in_place
-def run_ticks(k0, ticks, at, received, first, noise, row, a, out, out_tick, scratch):
+def run_ticks(
+    k0: int,
+    ticks: int,
+    at: np.ndarray,
+    received: np.ndarray,
+    first: int,
+    noise: np.ndarray,
+    row: int,
+    a: NodeArrays,
+    out: np.ndarray,
+    out_tick: np.ndarray,
+    scratch: np.ndarray,
+) -> tuple[int, int]:
     """Run ``ticks`` ticks of the VGV node from tick ``k0`` on recorded frames.
 
     at, received   int64[n] tick of each frame, in order, and int64[n, 2] the frames; ``first`` is the first row not yet
@@ -353,7 +359,7 @@ ECU_VALUES = (
 
 
 @in_place
-def _listen(a, head, data, k):
+def _listen(a: EcuArrays, head: int, data: int, k: int) -> None:
     """Judge one frame of the controller; keep its values if it is good. After a pause of the ECU none is known to be
     new.
     """
@@ -379,7 +385,7 @@ def _listen(a, head, data, k):
 
 
 @in_place
-def ecu_tick(k, received, n, noise, a, sent):
+def ecu_tick(k: int, received: np.ndarray, n: int, noise: float, a: EcuArrays, sent: np.ndarray) -> int:
     """Run tick ``k`` of the ECU on the first ``n`` rows of ``received``: ECU_DEMAND every 10th tick. Returns the number
     of frames sent.
 

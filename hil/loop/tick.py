@@ -12,6 +12,11 @@ while the loop runs acts from the next tick on; `plant.parameters.derive` must f
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+
 import math
 from typing import NamedTuple
 
@@ -33,8 +38,8 @@ from controller.firmware import (
     TREND_RATE_ON,
 )
 from plant import Plant, chain
-from plant.compiled import in_place
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
+from vaneloop.base.compiled import in_place
 
 __all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "move", "new_loop"]
 
@@ -117,7 +122,7 @@ def flashed(calibration: Calibration, plant: Plant) -> Calibration:
 
 
 @in_place
-def _flash(built, cal, flash, p):
+def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarray) -> None:
     """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``."""
     flash[0], flash[1], flash[2] = (
         p[chain.SCHEDULE_ERROR, 0],
@@ -134,7 +139,7 @@ def _flash(built, cal, flash, p):
 
 
 @in_place
-def _last_by(sent, then, now):
+def _last_by(sent: np.ndarray, then: int, now: int) -> int:
     """Return the row of the last frame that came in the 10 ms ``then`` or before; of the first one kept if there is
     none.
     """
@@ -150,7 +155,7 @@ def _last_by(sent, then, now):
 
 
 @in_place
-def arrive(k, a, n_dem, n_r, mode_request):
+def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> None:
     """Give the controller what it gets of a good frame of the ECU that comes at tick ``k``: the content of this one or
     of an older one.
     """
@@ -166,7 +171,7 @@ def arrive(k, a, n_dem, n_r, mode_request):
 
 
 @in_place
-def control(k, a, noise, row, t_oil):
+def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     """Sample the sensors and run the firmware at tick ``k``.
 
     noise  float64[:, 5] standard normal numbers (LVDT, three potentiometers, speed), of this tick those in ``row``
@@ -192,7 +197,7 @@ def control(k, a, noise, row, t_oil):
 
 
 @in_place
-def mean_current(a):
+def mean_current(a: Loop) -> float:
     """Return the mean current (A) of the ticks since it was last asked for."""
     mean = a.mean[0] / a.mean[1]
     a.mean[0], a.mean[1] = 0.0, 0.0
@@ -200,7 +205,7 @@ def mean_current(a):
 
 
 @in_place
-def move(k, a, n_dem, n_r, p_s, t_oil):
+def move(k: int, a: Loop, n_dem: float, n_r: float, p_s: float, t_oil: float) -> None:
     """Let the machine move on from tick ``k`` to the next under the controller's current, at demand ``n_dem`` and speed
     ``n_r`` (%).
     """

@@ -13,8 +13,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(nominal, limit):
+def step(nominal: float, limit: float) -> float:
     """Return the acceleration limit (%/s)."""
     return max(nominal + limit, 1e-2)

@@ -14,8 +14,8 @@ Source: dynamic pressure; orifice equation under load, Merritt (1967), section 5
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(n_r, force):
+def step(n_r: float, force: float) -> float:
     """Return the load (N) against extension at the rotor speed ``n_r`` (%)."""
     r = 0.01 * n_r
     return force * (r * r)

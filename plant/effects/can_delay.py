@@ -16,8 +16,8 @@ Source: dead time of a sampled signal, Franklin, Powell, Workman, Digital Contro
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -33,6 +33,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(t, delay):
+def step(t: float, delay: float) -> float:
     """Return the time (s) of the content that a frame arriving at ``t`` (s) carries."""
     return t - delay

@@ -13,8 +13,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(gain, factor):
+def step(gain: float, factor: float) -> float:
     """Return the gain in use for the nominal ``gain``."""
     return gain * factor

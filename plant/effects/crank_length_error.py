@@ -13,8 +13,8 @@ Source: Kim & Ki 2020, equations (8) to (15), section 5 (arms adjusted by 1 and 
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(lb, error):
+def step(lb: float, error: float) -> float:
     """Return the lower arm's length (m)."""
     return lb + error

@@ -13,8 +13,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(stroke, shift):
+def step(stroke: float, shift: float) -> tuple[float, float]:
     """Return the lowest and the highest stroke (m)."""
     return max(0.0, shift), stroke + min(0.0, shift)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -33,7 +33,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(t, period):
+def step(t: float, period: float) -> float:
     """Return the time (s) of the content that a frame at ``t`` (s) carries."""
     if period <= 0.0:
         return t

@@ -15,8 +15,8 @@ Source: Merritt (1967), section 6-1, leakage coefficient.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -32,7 +32,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(v, p_load, resistance, coefficient):
+def step(v: float, p_load: float, resistance: float, coefficient: float) -> float:
     """Return the speed (m/s) left of ``v`` (m/s) at the load pressure ``p_load`` + ``resistance`` v (Pa, against
     extension).
     """

@@ -13,8 +13,8 @@ Source: Kim & Ki 2020, section 5: 1 mm of link is 1.6 deg.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(lc, error):
+def step(lc: float, error: float) -> float:
     """Return the vertical link's length (m)."""
     return lc + error

@@ -14,8 +14,8 @@ Source: play operator, see plant/play.py; Kim & Ki 2020, Figure 13, for the nomi
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(play, width, ratio):
+def step(play: float, width: float, ratio: float) -> float:
     """Return the total play (rad at the ring) for a ``width`` (rad at the vane) beyond the nominal ``play``; ``ratio``
     ring per vane.
     """

@@ -14,8 +14,8 @@ Source: Hooke's law; dynamic pressure.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(theta, n_r, compliance):
+def step(theta: float, n_r: float, compliance: float) -> float:
     """Return the ring angle (rad) at the rotor speed ``n_r`` (%)."""
     r = 0.01 * n_r
     return theta - compliance * (r * r)

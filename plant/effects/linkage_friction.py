@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "loop", "step"]
 
@@ -36,7 +36,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(y, travel, distance):
+def step(y: float, travel: float, distance: float) -> float:
     """Return the bristle's deflection (-1..1) after the ring has turned by ``travel`` (rad)."""
     if travel == 0.0:
         return y
@@ -45,7 +45,7 @@ def step(y, travel, distance):
 
 
 @compiled
-def loop(theta, y, width, ratio):
+def loop(theta: float, y: float, width: float, ratio: float) -> float:
     """Return the ring angle (rad) at the lever: ``theta`` held back by friction; ``width`` at the vane (rad), ``ratio``
     ring per vane.
     """

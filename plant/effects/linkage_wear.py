@@ -14,8 +14,8 @@ Source: Archard's law at constant conditions, J. Appl. Phys. 24 (1953) 981.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(play, rate, ratio, t):
+def step(play: float, rate: float, ratio: float, t: float) -> float:
     """Return the total play (rad at the ring) at time ``t`` (s) with a growth of ``rate`` (rad/s at the vane);
     ``ratio`` ring per vane.
     """

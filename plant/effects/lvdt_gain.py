@@ -13,8 +13,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(x, factor):
+def step(x: float, factor: float) -> float:
     """Return the reading (m) of the stroke ``x`` (m)."""
     return x * factor

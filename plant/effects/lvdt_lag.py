@@ -14,8 +14,8 @@ Source: first-order lag, Ogata, Modern Control Engineering (2010), section 5.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,6 +31,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(y, x, share):
+def step(y: float, x: float, share: float) -> float:
     """Return the lagged stroke (m) one step later; ``share`` = 1 - exp(-dt/tau), 1 for no lag."""
     return x if share >= 1.0 else y + share * (x - y)

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "slope", "step"]
 
@@ -41,7 +41,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(x, stroke, amplitude, cubic):
+def step(x: float, stroke: float, amplitude: float, cubic: float) -> float:
     """Return the reading (m) of the stroke ``x`` (m)."""
     y = x if amplitude == 0.0 else x - amplitude * math.sin(2.0 * math.pi * x / stroke)
     if cubic != 0.0:
@@ -51,7 +51,7 @@ def step(x, stroke, amplitude, cubic):
 
 
 @compiled
-def slope(x, stroke, amplitude, cubic):
+def slope(x: float, stroke: float, amplitude: float, cubic: float) -> float:
     """Return the derivative of the reading by the stroke, at ``x`` (m)."""
     r = 2.0 * x / stroke - 1.0
     sine = amplitude * (2.0 * math.pi / stroke) * math.cos(2.0 * math.pi * x / stroke)

@@ -12,8 +12,8 @@ Source: definition; 0.01 % of range per kelvin is a usual data-sheet figure.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import T_REF, Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -29,6 +29,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(x, t_oil, coefficient):
+def step(x: float, t_oil: float, coefficient: float) -> float:
     """Return the reading (m) of the stroke ``x`` (m) at the oil temperature ``t_oil`` (degC)."""
     return x if coefficient == 0.0 else x + coefficient * (t_oil - T_REF)

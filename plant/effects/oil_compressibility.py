@@ -17,8 +17,8 @@ Source: Merritt (1967), section 6-2, hydraulic stiffness 4 B A^2 / V.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["DEAD", "EFFECT", "NOMINAL", "step"]
 
@@ -40,7 +40,7 @@ NOMINAL = 0.048 * (1.0 + 2.0 * DEAD) / (4.0 * 1.6e9 * 1.2e-3)  # m/N, see the do
 
 
 @compiled
-def step(force, v, compliance, drag):
+def step(force: float, v: float, compliance: float, drag: float) -> float:
     """Return by how far (m) the piston stands off the pushed way, under ``force`` (N, against extension) at ``v``
     (m/s).
     """

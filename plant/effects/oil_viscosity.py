@@ -14,8 +14,8 @@ Source: Merritt (1967), ch. 3, discharge coefficient at low Reynolds number.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import T_REF, Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,6 +31,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(gain, t_oil, coefficient):
+def step(gain: float, t_oil: float, coefficient: float) -> float:
     """Return the flow gain (m/s) at the oil temperature ``t_oil`` (degC)."""
     return gain if coefficient == 0.0 else gain * max(1.0 + coefficient * (t_oil - T_REF), 0.05)

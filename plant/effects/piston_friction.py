@@ -21,9 +21,9 @@ Source: Coulomb friction on an elastic support (Prandtl), Armstrong-Helouvry, Du
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
 from plant.effects.oil_compressibility import DEAD
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "off_middle", "recentre", "step"]
 
@@ -39,7 +39,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(z, travel, level, stiffness):
+def step(z: float, travel: float, level: float, stiffness: float) -> float:
     """Return the friction force (N) after the oil has pushed by ``travel`` (m) from where it was ``z`` (N);
     ``stiffness`` 1/C (N/m).
     """
@@ -49,7 +49,7 @@ def step(z, travel, level, stiffness):
 
 
 @compiled
-def off_middle(x, per_stroke):
+def off_middle(x: float, per_stroke: float) -> float:
     """Return r, how unequal the columns of oil are at stroke ``x`` (m), 0 in the middle; ``per_stroke`` 1 over the full
     stroke (1/m).
     """
@@ -57,7 +57,7 @@ def off_middle(x, per_stroke):
 
 
 @compiled
-def recentre(off, jump, ways):
+def recentre(off: float, jump: float, ways: float) -> tuple[float, float]:
     """Return (off, back): the mean pressure's offset (N) after a ``jump`` of it and |ds| = ``ways`` of the way, and
     what of it went (N).
     """

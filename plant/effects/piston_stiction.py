@@ -18,8 +18,8 @@ and 3.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -38,7 +38,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(force, v, excess, speed):
+def step(force: float, v: float, excess: float, speed: float) -> float:
     """Return the greatest friction force (N) at the speed ``v`` (m/s)."""
     if excess == 0.0:
         return force

@@ -12,8 +12,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -29,6 +29,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(nominal, bias):
+def step(nominal: float, bias: float) -> float:
     """Return the total bias (rad) of a potentiometer whose nominal bias is ``nominal`` (rad)."""
     return nominal + bias

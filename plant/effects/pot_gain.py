@@ -12,8 +12,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -29,6 +29,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(vane, factor):
+def step(vane: float, factor: float) -> float:
     """Return the reading (rad) of the angle ``vane`` (rad)."""
     return vane * factor

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -37,6 +37,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(theta, amplitude, phase):
+def step(theta: float, amplitude: float, phase: float) -> float:
     """Return the ring angle (rad) for the angle ``theta`` (rad) of a centred ring."""
     return theta if amplitude == 0.0 else theta + amplitude * math.sin(theta + phase)

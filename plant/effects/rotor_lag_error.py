@@ -13,8 +13,8 @@ Source: first-order lag, Ogata, Modern Control Engineering (2010), section 5.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(nominal, lag):
+def step(nominal: float, lag: float) -> float:
     """Return the rotor's lag (s)."""
     return max(nominal + lag, 1e-2)

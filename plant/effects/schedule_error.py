@@ -13,8 +13,8 @@ Source: definition.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(x_table, offset):
+def step(x_table: float, offset: float) -> float:
     """Return the stroke (m) that the flashed table holds where the right one holds ``x_table`` (m)."""
     return x_table + offset

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -32,7 +32,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(v0, p, droop):
+def step(v0: float, p: float, droop: float) -> float:
     """Return the speed (m/s) under droop, for the speed ``v0`` without it and the pressure drop ``p`` (Pa)."""
     if droop == 0.0:
         return v0

@@ -13,8 +13,8 @@ Source: linear expansion; 0.5 mm/m for 40 K of steel.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import T_REF, Effect, per_vane_stage
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -30,6 +30,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(theta, t_oil, coefficient, ratio):
+def step(theta: float, t_oil: float, coefficient: float, ratio: float) -> float:
     """Return the ring angle (rad) at the oil temperature ``t_oil`` (degC); ``ratio`` ring per vane."""
     return theta if coefficient == 0.0 else theta + coefficient * ratio * (t_oil - T_REF)

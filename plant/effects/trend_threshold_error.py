@@ -16,8 +16,8 @@ Source: definition; Kim & Ki 2020, section 4, for the trend.
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -33,6 +33,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(threshold, factor):
+def step(threshold: float, factor: float) -> float:
     """Return the threshold in use for the nominal ``threshold`` (% or %/s)."""
     return threshold * factor

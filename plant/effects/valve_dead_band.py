@@ -15,8 +15,8 @@ Source: Merritt, Hydraulic Control Systems (1967), section 5-7, closed-centre va
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -32,6 +32,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(u, half):
+def step(u: float, half: float) -> float:
     """Return the opening (-) of the spool ``u`` (-) with an overlap of ``half`` (-)."""
     return u - min(max(u, -half), half)

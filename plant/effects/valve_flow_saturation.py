@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "corner", "step"]
 
@@ -40,13 +40,13 @@ OFF = 1.0  # m/s, the neutral limit
 
 
 @compiled
-def corner(v, limit):
+def corner(v: float, limit: float) -> float:
     """Return the speed (m/s) that a passage with a sharp corner lets through."""
     return v if limit >= OFF else min(max(v, -limit), limit)
 
 
 @compiled
-def step(v, limit, roundness):
+def step(v: float, limit: float, roundness: float) -> float:
     """Return the speed (m/s) that the passage lets through."""
     if limit >= OFF:
         return v

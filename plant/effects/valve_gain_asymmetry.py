@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -33,7 +33,7 @@ EFFECT = Effect(
 
 
 @compiled
-def step(gain, ratio):
+def step(gain: float, ratio: float) -> tuple[float, float]:
     """Return the flow gains (m/s at full spool) for extension and for retraction."""
     root = math.sqrt(ratio)
     return gain * root, gain / root

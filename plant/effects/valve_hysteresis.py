@@ -18,8 +18,8 @@ Hysteresis (1989), section 2; 2 to 4 % of rated current are usual (Moog type 30 
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "mean", "step"]
 
@@ -38,7 +38,9 @@ EFFECT = Effect(
 
 
 @compiled
-def step(y1, y2, y3, y4, i, width, spread):
+def step(
+    y1: float, y2: float, y3: float, y4: float, i: float, width: float, spread: float
+) -> tuple[float, float, float, float]:
     """Return the four plays' currents (A) for the command ``i`` (A); what counts is their `mean`."""
     half, far, near = 0.5 * width, 0.375 * width * spread, 0.125 * width * spread
     a, b, c, d = half - far, half - near, half + near, half + far
@@ -51,6 +53,6 @@ def step(y1, y2, y3, y4, i, width, spread):
 
 
 @compiled
-def mean(y1, y2, y3, y4):
+def mean(y1: float, y2: float, y3: float, y4: float) -> float:
     """Return the current (A) that moves the spool; of four equal numbers it is exactly that number."""
     return 0.25 * ((y1 + y2) + (y3 + y4))

@@ -14,8 +14,8 @@ Source: coil inductance and first stage, Merritt, Hydraulic Control Systems (196
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,6 +31,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(i, i_cmd, share):
+def step(i: float, i_cmd: float, share: float) -> float:
     """Return the lagged current (A) one step later; ``share`` = 1 - exp(-dt/tau), 1 for no lag."""
     return i_cmd if share >= 1.0 else i + share * (i_cmd - i)

@@ -14,8 +14,8 @@ Source: Moog, Electrohydraulic Valves: A Technical Look (null bias, null shift).
 
 from __future__ import annotations
 
-from plant.compiled import compiled
 from plant.effect import Effect, Parameter
+from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
 
@@ -31,6 +31,6 @@ EFFECT = Effect(
 
 
 @compiled
-def step(i, bias):
+def step(i: float, bias: float) -> float:
     """Return the current (A) that moves the spool."""
     return i + bias

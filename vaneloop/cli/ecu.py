@@ -99,7 +99,7 @@ def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
     if name == "engine-test" or (path.suffix.lower() == ".toml" and path.is_file() and "speed" in load_toml(path)):
         import numpy as np
 
-        from vaneloop.cli.engine_test import load_profile
+        from hil.engine_test import load_profile
 
         n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)

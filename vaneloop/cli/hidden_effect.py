@@ -144,7 +144,7 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
 
     import numpy as np
 
-    from vaneloop.cli.experiment import recommend
+    from vaneloop.discrepancy.models.experiment import recommend
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
     e = recommend(d)

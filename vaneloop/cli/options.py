@@ -41,7 +41,7 @@ def add_model_option(parser: argparse.ArgumentParser) -> None:
 
 def tell_search(say: Callable[[str], None]) -> None:
     """Tell the user that the first search compiles; silent when the compiled code is there already."""
-    from plant.compiled import is_cached
+    from vaneloop.base.compiled import is_cached
 
     if not is_cached("stages.actuator_run"):
         say("compiling the stages of the search for this machine (once, about 30 s) ...")

@@ -139,7 +139,7 @@ def _node_json(node: Any) -> dict[str, Any]:
     from controller.firmware import N_DEM
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
-    n_dem = float(node.arrays.z[N_DEM])
+    n_dem = float(node.loop.z[N_DEM])
     return {
         "mode": node.mode,
         "n_dem": n_dem,

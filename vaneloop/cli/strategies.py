@@ -11,11 +11,11 @@ from dataclasses import asdict
 from typing import Any
 
 from controller import STRATEGIES
+from hil.engine_test import load_profile
 from plant import build_plant
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.cli import options
-from vaneloop.cli.engine_test import load_profile
 from vaneloop.design.strategies import (
     FAILURES,
     FIGURES,

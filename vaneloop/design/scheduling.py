@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
@@ -47,6 +46,7 @@ from plant.linkage import (
     stage_vane_angle,
     vane_angle,
 )
+from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
 
 __all__ = [
@@ -325,8 +325,8 @@ def _axis(name: str, unit: str, origin: str, row: Array) -> list[str]:
 # ---------------------------------------------------------------- the measured loop
 
 
-@njit(cache=True)
-def _branches(x, width, tolerance):
+@compiled
+def _branches(x: Array, width: float, tolerance: float) -> NDArray[np.int8]:
     """Branch of each sample of the stroke x: 1 where a play of ``width`` is surely driven in extension, -1 in
     retraction, 0 else.
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from controller import SCALARS, STATE, STRATEGIES, Calibration
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, Plant, build_plant, chain
-from plant.compiled import compiled
 from plant.effect import T_REF
+from vaneloop.base.compiled import compiled
 
 __all__ = ["FAILURES", "Failure", "Outcome", "Scenario", "failing", "run", "scenarios"]
 
@@ -114,7 +114,7 @@ Outcomes = dict[tuple[str, str], Outcome]  # (scenario, strategy)
 
 
 @compiled
-def _motions(x, least, total, start):
+def _motions(x: np.ndarray, least: float, total: np.ndarray, start: np.ndarray) -> None:
     """Add travel and turning points of ``x`` to total = [travel, turns]; start = [turn, extreme, direction] goes on
     from call to call.
     """

@@ -22,8 +22,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy.stage import Array, Parameter
 
 __all__ = [
@@ -45,8 +45,6 @@ __all__ = [
 
 MEMORY = 4  # numbers that a law may remember
 PARAMETERS = 3  # most parameters of one law
-
-_jit = njit(cache=True, error_model="numpy", nogil=True)
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION
 PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME = range(11, 16)
 
 
-@_jit
+@compiled_free
 def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> float:
     """Law ``code`` on sample ``k`` of the signal ``u`` at times ``t`` (s), with parameters ``p`` and memory ``s``
     (changed in place).
@@ -206,7 +204,7 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
     return x
 
 
-@_jit
+@compiled_free
 def apply(code: int, t: Array, u: Array, p: Array) -> Array:
     """Law ``code`` on a whole signal: float64[samples] from float64[samples]."""
     s = np.zeros(MEMORY)
@@ -224,13 +222,13 @@ FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, 
 BACKLASH_GAP, FRICTION_ASYMMETRY = 30, 31
 
 
-@_jit
+@compiled_free
 def _slip(v: float, small: float) -> float:
     """Direction of motion; a straight line within ``small``, so that a simulation can come to rest."""
     return min(max(v / small, -1.0), 1.0) if small > 0.0 else (1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0)
 
 
-@_jit
+@compiled_free
 def force_of(
     code: int, v: float, x: float, first: bool, p: Array, gap: float, asymmetry: float, small: float, s: Array
 ) -> float:
@@ -313,7 +311,7 @@ def force_of(
     return 0.0
 
 
-@_jit
+@compiled_free
 def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: float, s: Array) -> float:
     """Set up the memory of a hysteretic law so that at displacement ``x`` it carries the force ``held``, or its
     friction; return that.
@@ -332,7 +330,7 @@ def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: floa
 STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT = range(41, 48)
 
 
-@_jit
+@compiled_free
 def state_rate(code: int, x: float, p: Array) -> float:
     """What law ``code`` takes off the derivative of the state ``x``. The two limits take nothing off; the simulation
     applies them.

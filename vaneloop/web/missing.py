@@ -71,7 +71,7 @@ class _Page:
         """Choose the stage shown; follows where it is chosen elsewhere."""
         s = self.s
 
-        def chosen(e: events.ValueChangeEventArguments) -> None:
+        def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
             if e.value and e.value != s.stage:
                 s.show(e.value)
 
@@ -118,7 +118,7 @@ class _Page:
         options = {i: f.name for i, f in enumerate(s.files)}
         at = next((i for i, f in enumerate(s.files) if f == s.choice.file), None)
 
-        def chosen(e: events.ValueChangeEventArguments) -> None:
+        def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
             if e.value is not None and s.files[e.value] != s.choice.file:
                 s.choose(s.files[e.value])
 

@@ -326,7 +326,7 @@ class _Page:
 
                 slider.on("update:model-value", turned, throttle=0.05)
 
-                def chosen(e: events.ValueChangeEventArguments) -> None:
+                def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
                     self._set("profile", e.value or None)
                     if e.value:
                         self.loop.tell(profile=e.value)
@@ -336,7 +336,7 @@ class _Page:
                     "outlined dense options-dense"
                 ).style("min-width:260px").classes("profile")
 
-                def ask(e: events.ValueChangeEventArguments) -> None:
+                def ask(e: events.ValueChangeEventArguments[Any]) -> None:
                     self.loop.tell(mode_request=int(e.value == "run"))
 
                 ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
@@ -357,7 +357,7 @@ class _Page:
             "vcan0": "real time, vcan0",
         }
 
-        def join(e: events.ValueChangeEventArguments) -> None:
+        def join(e: events.ValueChangeEventArguments[Any]) -> None:
             lp.bus = e.value
             self.s.touch("loop")
 
@@ -375,7 +375,7 @@ class _Page:
                 0.0: "as fast as it goes",
             }
 
-            def speed(e: events.ValueChangeEventArguments) -> None:
+            def speed(e: events.ValueChangeEventArguments[Any]) -> None:
                 lp.speed = float(e.value)
                 lp.tell(speed=lp.speed)
 
@@ -496,7 +496,7 @@ class _Page:
                         ui.label(title).classes("note").style("padding-left:6px;line-height:1.3")
                     boxes.append((box, f"{name} {title}".lower()))
 
-            def search(e: events.ValueChangeEventArguments) -> None:
+            def search(e: events.ValueChangeEventArguments[Any]) -> None:
                 for box, text in boxes:
                     box.set_visibility((e.value or "").lower() in text)
 

@@ -175,7 +175,7 @@ class _Page:
         options = {-1: "no log: the play entered above", **{i: f.name for i, f in enumerate(s.files)}}
         at = next((i for i, f in enumerate(s.files) if f == plan.log), -1)
 
-        def chosen(e: events.ValueChangeEventArguments) -> None:
+        def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
             plan.log = s.files[e.value] if e.value is not None and e.value >= 0 else None
             plan.done = {}
             s.touch("steps")
@@ -221,7 +221,7 @@ class _Page:
         with ui.element("div").classes("rowc"):
             ui.label("Schedule of").classes("soft")
 
-            def show(e: events.ValueChangeEventArguments) -> None:
+            def show(e: events.ValueChangeEventArguments[Any]) -> None:
                 plan.stage = e.value
                 self.s.touch("curve")
 
@@ -298,7 +298,7 @@ class _Page:
         plan = self.plan
 
         def option(key: str, label: str) -> None:
-            def changed(e: events.ValueChangeEventArguments) -> None:
+            def changed(e: events.ValueChangeEventArguments[Any]) -> None:
                 if e.value is not None and float(e.value) != self.plan.options[key]:
                     self._option(key, float(e.value))
 

@@ -210,7 +210,7 @@ def hand(
 
 def experiment(progress: Progress, diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
-    from vaneloop.cli.experiment import recommend
+    from vaneloop.discrepancy.models.experiment import recommend
 
     return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"))
 

@@ -33,6 +33,7 @@ import numba
 import numpy as np
 from numba.core.errors import NumbaError
 
+from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.laws import MEMORY, PARAMETERS, Law, Size
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError
@@ -233,7 +234,7 @@ class System:
 
 
 def _tuple_type(name: str, fields: Sequence[str]) -> Any:
-    return namedtuple(name, list(fields) or ["nothing"])  # type: ignore[misc]
+    return namedtuple(name, list(fields) or ["nothing"])
 
 
 @dataclass
@@ -507,7 +508,7 @@ class Bound:
                 "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             }  # fmt: skip
             exec(compile(source, f"<{s.name}>", "exec"), space)
-            return space["run"]  # type: ignore[no-any-return]
+            return space["run"]
 
         def compiled(f: Any) -> Any:
             return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
@@ -1362,7 +1363,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
 """
 
 
-@laws._jit
+@compiled_free
 def _forces(
     code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float, held: float
 ) -> Array:

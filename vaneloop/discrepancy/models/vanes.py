@@ -39,12 +39,12 @@ from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
 from hil.loop.tick import flashed
 from plant import Plant, build_plant, chain
-from plant.compiled import compiled
 from plant.effects import EFFECTS, ROW
 from plant.geometry import STANDS_FOR
 from plant.linkage import STAGES
 from plant.parameters import NAMES, derive, nominal
 from plant.stages import actuator_run, engine_run, linkage_run, step_currents
+from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, noise_of
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
@@ -864,7 +864,20 @@ def _servo(
 
 
 @compiled
-def _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, out):
+def _demand_run(
+    first: int,
+    last: int,
+    t: np.ndarray,
+    n_dem: np.ndarray,
+    n_r: np.ndarray,
+    delay: float,
+    hold: float,
+    phase: float,
+    k: np.ndarray,
+    table: np.ndarray,
+    z: np.ndarray,
+    out: np.ndarray,
+) -> None:
     """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every
     frame.
     """
@@ -897,7 +910,7 @@ def _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, out
 
 
 @compiled
-def _directions(n_dem, k, z, out):
+def _directions(n_dem: np.ndarray, k: np.ndarray, z: np.ndarray, out: np.ndarray) -> None:
     """Direction of the demand's trend at each row, from the trend's state ``z``."""
     for i in range(len(n_dem)):
         fw.trend_step(z, k, n_dem[i])
