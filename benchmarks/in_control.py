@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 
 from benchmarks.ours import OurLoop, Setup
-from controller import new_inputs, tick
-from controller.firmware import I_CMD, N_STATE, X_DEM
+from controller import STATE, flat, new_inputs, tick
+from controller.records import STATE_FIELDS, record
 from plant import chain
 
 __all__ = ["SIGNALS", "run"]
@@ -40,18 +40,18 @@ def run(setup: Setup) -> np.ndarray:
     import control
 
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
-    p_s, t_oil, run_request = rows[0, 2], rows[0, 3], 1.0
+    p_s, t_oil = rows[0, 2], rows[0, 3]
     inputs = new_inputs()
 
     def ticked(z, u):
-        inputs[:6] = u[0], u[1], u[2], 0.0, run_request, u[3]
-        z = z.copy()
-        tick(inputs, z, cal)
-        return z
+        inputs.n_dem, inputs.n_r, inputs.demand_fresh, inputs.x_lvdt = u
+        state = record(STATE_FIELDS, z.copy())
+        tick(inputs, state, cal)
+        return state
 
     def firmware_output(t, z, u, params):
         z = ticked(z, u)
-        return np.array([z[I_CMD], z[X_DEM]])
+        return np.array([z.i_cmd, z.x_dem])
 
     def machine_update(t, s, u, params):
         i_cmd, n_dem = u
@@ -65,12 +65,12 @@ def run(setup: Setup) -> np.ndarray:
         )
 
     firmware = control.NonlinearIOSystem(
-        lambda t, z, u, params: ticked(z, u),
+        lambda t, z, u, params: flat(ticked(z, u)),
         firmware_output,
         name="firmware",
         inputs=["n_dem", "n_r", "fresh", "x_lvdt"],
         outputs=["i_cmd", "x_dem"],
-        states=N_STATE,
+        states=len(STATE),
         dt=chain.TICK,
     )
     machine = control.NonlinearIOSystem(
@@ -91,6 +91,6 @@ def run(setup: Setup) -> np.ndarray:
     t = np.arange(setup.ticks) * chain.TICK
     fresh = (np.arange(setup.ticks) % 10 == 0).astype(float)
     start = OurLoop(setup)
-    x0 = np.concatenate([start.state, start.plant_state[:, 0]])
+    x0 = np.concatenate([flat(start.loop.z), start.loop.s[:, 0]])
     response = control.input_output_response(loop, t, np.array([np.repeat(rows[:, 0], 10), fresh]), x0)
     return response.outputs[:, ::10].T

@@ -15,7 +15,6 @@ from numba import njit
 from benchmarks.in_control import SIGNALS
 from benchmarks.ours import OurLoop, Setup
 from controller import new_inputs, tick
-from controller.firmware import I_CMD, X_DEM
 from plant import chain
 from plant import parameters as par
 
@@ -54,7 +53,7 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
 
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
     start = OurLoop(setup)
-    z, s = start.state, start.plant_state
+    z, s = start.loop.z, start.loop.s
     n_dem, inputs, ticks = rows[:, 0], new_inputs(), [0]
     gain = p[par.FLOW_GAIN, 0] * math.sqrt(rows[0, 2] / p[par.P_REF, 0])
     engine_values = [float(v) for v in p[[par.LAG, par.ACCELERATION, par.DECELERATION], 0]]
@@ -68,10 +67,10 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
 
     def firmware(demand, n_r, lvdt):
         lvdt = math.floor(lvdt / p[par.LVDT_STEP, 0] + 0.5) * p[par.LVDT_STEP, 0]
-        inputs[:6] = demand, n_r, float(ticks[0] % 10 == 0), 0.0, 1.0, lvdt
+        inputs.n_dem, inputs.n_r, inputs.demand_fresh, inputs.x_lvdt = demand, n_r, float(ticks[0] % 10 == 0), lvdt
         ticks[0] += 1
         tick(inputs, z, cal)
-        return z[I_CMD], z[X_DEM], lvdt
+        return z.i_cmd, z.x_dem, lvdt
 
     linkage_state = s.copy()
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from controller import Calibration, load_calibration
-from controller.firmware import FAULT_BITS
 from hil.loop.lockstep import COLUMNS, WARM_UP, Stimulus, advance
 from hil.loop.tick import new_loop
 from plant import Plant, build_plant
@@ -50,12 +49,12 @@ class OurLoop:
     def __init__(self, setup: Setup):
         self._setup = s = setup
         n_dem, t_oil = s.stimulus.rows[0, 0], s.stimulus.rows[0, 3]
-        self._loop = new_loop(s.plant, s.calibration, n_engine=n_dem, n_r=n_dem, t_oil=t_oil, noisy=s.noisy)
+        self.loop = new_loop(s.plant, s.calibration, n_engine=n_dem, n_r=n_dem, t_oil=t_oil, noisy=s.noisy)
         self._advance(-s.warm_up, s.warm_up, s.stimulus.rows[:1], _SILENT, np.empty((0, len(COLUMNS))))
-        self._loop.mean[:] = 0.0
+        self.loop.mean[:] = 0.0
 
     def _advance(self, k0: int, ticks: int, rows: np.ndarray, noise: np.ndarray, out: np.ndarray) -> None:
-        advance(k0, ticks, rows, noise, self._loop, self._setup.every, out, _NO_SNAPSHOTS)
+        advance(k0, ticks, rows, noise, self.loop, self._setup.every, out, _NO_SNAPSHOTS)
 
     def advance(self, out: np.ndarray, noise: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Run the stimulus from its start into ``out`` (SI, a row every 10 ticks)."""
@@ -66,7 +65,7 @@ class OurLoop:
     @property
     def faults(self) -> int:
         """Fault bits that stand now."""
-        return int(self._loop.z[FAULT_BITS])
+        return int(self.loop.outputs.faults)
 
 
 def profile(seconds: float) -> np.ndarray:

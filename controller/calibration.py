@@ -8,13 +8,22 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import model_validator
 
-from controller import firmware
+from controller.monitors import FAR
+from controller.records import (
+    INPUT_FIELDS,
+    OUTPUT_FIELDS,
+    SCALAR_FIELDS,
+    SCALARS,
+    STATE_FIELDS,
+    STRATEGIES,
+    Record,
+    record,
+)
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
 
-__all__ = ["STRATEGIES", "Calibration", "load_calibration", "new_inputs", "new_state"]
+__all__ = ["Calibration", "load_calibration", "new_inputs", "new_outputs", "new_state"]
 
-STRATEGIES = firmware.STRATEGIES
 _DEG = np.pi / 180.0
 _SI = {
     "mm": 1e-3,
@@ -28,12 +37,12 @@ _SI = {
 class Calibration(NamedTuple):
     """What `controller.tick` reads.
 
-    k       float64[N_SCALARS], SI, in the order of `firmware.SCALARS`
+    k       record of `records.SCALAR_FIELDS`, SI
     table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
     angles  float64[4, m]: stroke (m), then the angle (rad) of VIGV, VGV1, VGV2 at it in the middle of the play
     """
 
-    k: np.ndarray
+    k: Record
     table: np.ndarray
     angles: np.ndarray
 
@@ -305,7 +314,7 @@ def load_calibration(
             if isinstance(q, Quantity):
                 flat[key] = q.value * _SI.get(q.unit, 1.0)
     flat |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
-    k = np.array([flat[name] for name in firmware.SCALARS])
+    k = record(SCALAR_FIELDS, np.array([flat[name] for name in SCALARS]))
     table = np.array(
         [stroke.speed.values]
         + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]
@@ -317,18 +326,22 @@ def load_calibration(
     return Calibration(k, table, np.array(vanes))
 
 
-def new_inputs() -> np.ndarray:
+def new_inputs() -> Record:
     """Inputs of a controller to which nothing has come yet, without stem potentiometers; it is asked to run."""
-    inputs = np.zeros(firmware.N_INPUTS)
-    inputs[firmware.IN_MODE_REQUEST] = 1.0
-    inputs[firmware.IN_VIGV : firmware.IN_VGV2 + 1] = np.nan
+    inputs = record(INPUT_FIELDS)
+    inputs.mode_request = 1.0
+    inputs.pots[:] = np.nan
     return inputs
 
 
-def new_state() -> np.ndarray:
+def new_outputs() -> Record:
+    """Outputs of a controller that has not run yet: no current."""
+    return record(OUTPUT_FIELDS)
+
+
+def new_state() -> Record:
     """State of a controller that has just been switched on."""
-    z = np.zeros(firmware.N_STATE)
-    z[firmware.DIRECTION] = 1.0
-    z[firmware.BLEND] = 1.0
-    z[firmware.X_REACH] = firmware.FAR
+    z = record(STATE_FIELDS)
+    z.direction = z.blend = 1.0
+    z.x_reach = FAR
     return z

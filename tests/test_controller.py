@@ -19,9 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from controller import firmware as fw
-from controller import load_calibration, new_state, tick
-from controller.firmware import (
+from tests import columns as fw
+from tests.columns import (
     DEGRADED,
     FAIL_SAFE,
     INIT,
@@ -30,8 +29,11 @@ from controller.firmware import (
     N_STATE,
     RUN,
     STANDBY,
+    load_calibration,
     look_up,
+    new_state,
     servo_step,
+    tick,
     trend_step,
 )
 

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from controller import firmware as fw
 from controller import load_calibration, new_state
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.tick import flashed
@@ -69,6 +68,7 @@ from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
 from plant.series import arctangent, tangent
 from plant.stages import SOME, W, actuator_run, engine_run, linkage_run, step_currents
+from tests import columns as fw
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 

@@ -13,8 +13,9 @@ import random
 import numpy as np
 import pytest
 
-from controller import FAULTS, MODES, load_calibration, new_state, tick
-from controller import firmware as fw
+from controller import FAULTS, MODES
+from tests import columns as fw
+from tests.columns import load_calibration, new_state, tick
 from tests.reference_controller import Reference, clip, numbers
 
 COLUMNS = ("n_dem", "n_r", "fresh", "rejected", "request", "x", "follows", "strength", "vigv", "vgv1", "vgv2", "pause")
@@ -867,7 +868,7 @@ def test_readings_that_have_followed_just_6_degrees_are_trusted():
     k, z = CALS["adaptive"].k, new_state()
     z[fw.HIGHEST] = 6.0 * DEG
     assert k[fw.POT_TRUST] == 6.0 * DEG
-    fw._judge_pot(z, k, 0, 3.0 * DEG, True)
+    fw.judge_pot(z, k, 0, 3.0 * DEG, True)
     assert z[fw.TRUSTED] == 1.0
 
 

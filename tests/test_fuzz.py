@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.firmware import FAIL_SAFE, INIT, RUN, STANDBY
 from hil.bus.frames import ERROR, REMOTE
 from hil.inject import fuzz
 from hil.inject.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
+from tests.columns import FAIL_SAFE, INIT, RUN, STANDBY
 from tests.conftest import ROOT
 from vaneloop.cli.main import main
 

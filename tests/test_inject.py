@@ -16,8 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from controller import load_calibration
-from controller.firmware import DEMAND_TIMEOUT, MODES
+from controller import MODES, load_calibration
 from hil import inject
 from hil.bus import frames
 from hil.bus.frames import ECU_DEMAND, VERDICTS, new_receiver, receive
@@ -70,7 +69,7 @@ def test_the_same_scenario_gives_the_same_run_bit_for_bit() -> None:
 
 def test_a_controller_that_reacts_too_late_is_found_out() -> None:
     slow = load_calibration()
-    slow.k[DEMAND_TIMEOUT] = 0.1
+    slow.k.demand_timeout = 0.1
     outcome = inject.run("demand_stops", calibration=slow)
     assert not outcome.held
     broken = [c for c in outcome.checks if c.held is False]

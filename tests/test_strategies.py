@@ -10,12 +10,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from controller import firmware as fw
 from controller import load_calibration
 from controller.calibration import STRATEGIES
 from hil.engine_test import load_profile
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import build_plant
+from tests import columns as fw
 from vaneloop.cli.main import main
 from vaneloop.design import strategies as st
 

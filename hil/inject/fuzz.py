@@ -29,21 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from controller import load_calibration
-from controller.firmware import (
-    CURRENT_LIMIT,
-    DEGRADED,
-    FAIL_SAFE,
-    FAULT_BITS,
-    I_CMD,
-    INIT,
-    MODE,
-    RUN,
-    STANDBY,
-    STROKE_MAX,
-    STROKE_MIN,
-    X_DEM,
-)
+from controller import flat, load_calibration
+from controller.records import DEGRADED, FAIL_SAFE, INIT, RUN, STANDBY
 from hil.bus.frames import (
     ECU_DEMAND,
     ERROR,
@@ -115,18 +102,18 @@ def _watched_ticks(
         last = first
         while last < len(at) and at[last] <= k:
             last += 1
-        before = int(a.loop.z[MODE])
+        before = int(a.loop.outputs.mode)
         m = node_tick(k, received[first:last], last - first, noise, k % NOISE_ROWS, a, sent)
         first = last
-        mode = int(a.loop.z[MODE])
+        mode = int(a.loop.outputs.mode)
         ticks_in[mode] += 1
-        if not abs(a.loop.z[I_CMD]) <= limits[0]:
+        if not abs(a.loop.outputs.i_cmd) <= limits[0]:
             return CURRENT, k, 0
-        if not limits[1] <= a.loop.z[X_DEM] <= limits[2]:
+        if not limits[1] <= a.loop.outputs.x_dem <= limits[2]:
             return STROKE, k, 0
         total = 0.0
-        for q in range(a.loop.z.shape[0]):
-            total += a.loop.z[q]
+        for q in range(a.loop.numbers.shape[0]):
+            total += a.loop.numbers[q]
         for q in range(a.loop.s.shape[0]):
             total += a.loop.s[q, 0]
         if not abs(total) < 1e12:
@@ -138,7 +125,7 @@ def _watched_ticks(
         for q in range(m):
             if crc(sent[q, 0] & IDENT_MASK, sent[q, 1]) != sent[q, 1] & 0xFF:
                 return SENT_CRC, k, 0
-        if mode != RUN or a.loop.z[FAULT_BITS] != 0.0:
+        if mode != RUN or a.loop.outputs.faults != 0.0:
             since = k + 1
     if since >= k_end:
         return NO_RECOVERY, k_end - 1, 0
@@ -315,7 +302,7 @@ class Bench:
         self.node = Node(n_r=60.0, seed=0)
         self.recovery = recovery
         k = load_calibration().k
-        self.limits = np.array([k[CURRENT_LIMIT], k[STROKE_MIN], k[STROKE_MAX]]) if limits is None else limits
+        self.limits = np.array([k.current_limit, k.stroke_min, k.stroke_max]) if limits is None else limits
         self.noise = np.random.Generator(np.random.PCG64(0)).standard_normal((NOISE_ROWS, 5))
         self.transitions, self.ticks_in = np.zeros((5, 5), np.int64), np.zeros(5, np.int64)
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
@@ -326,7 +313,17 @@ class Bench:
     def _arrays(self) -> list[np.ndarray]:
         a = self.node.arrays
         loop = a.loop
-        return [loop.inputs, loop.z, loop.s, loop.mean, loop.sent, a.supply, a.receiver, a.counter]
+        return [
+            flat(loop.inputs),
+            flat(loop.outputs),
+            loop.numbers,
+            loop.s,
+            loop.mean,
+            loop.sent,
+            a.supply,
+            a.receiver,
+            a.counter,
+        ]
 
     def _saved(self) -> list[np.ndarray]:
         return [x.copy() for x in self._arrays()]

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller.firmware import MODES
+from controller import MODES
 from hil.bus import frames
 from hil.inject.scenario import (
     ACTIONS,
@@ -107,14 +107,13 @@ class MachineChange:
             self._set(*self.old)
 
     def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
-        from controller.firmware import I_CMD
         from plant import chain
         from plant.parameters import derive
 
         for i, v in supply.items():
             self.fed[i] = v
         if rows:
-            chain.wake(self.loop.s, self.loop.p, 0, self.loop.z[I_CMD])
+            chain.wake(self.loop.s, self.loop.p, 0, self.loop.outputs.i_cmd)
             for p in (self.loop.p, self.engine.p):
                 for r, v in rows.items():
                     p[r, 0] = v
@@ -166,18 +165,6 @@ def _lockstep(
     progress: Callable[[float], None] | None,
 ) -> Outcome:
     """Run a scenario in simulated time."""
-    from controller.firmware import (
-        CURRENT_LIMIT,
-        FAULT_BITS,
-        I_CMD,
-        MODE,
-        N_DEM,
-        N_R_RAW,
-        STROKE_MAX,
-        STROKE_MIN,
-        X_DEM,
-        X_MEAS,
-    )
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
     from hil.loop.node import Ecu, Node
@@ -220,13 +207,13 @@ def _lockstep(
         disturber.tick(k)
         from_ecu = ecu.tick(rows, take(wire, places["ECU"], rows)).tolist()
         from_vgv = node.tick(rows, take(wire, places["VGV"], rows)).tolist()
-        mode[k], faults[k] = z[MODE], z[FAULT_BITS]
+        mode[k], faults[k] = z.mode, z.faults
         values[k] = (
-            z[X_DEM],
-            z[X_MEAS],
-            z[I_CMD],
-            z[N_DEM],
-            z[N_R_RAW],
+            z.x_dem,
+            z.x_meas,
+            z.i_cmd,
+            z.n_dem,
+            z.n_r_raw,
             s[chain.POT, 0],
             s[chain.POT + 1, 0],
             s[chain.POT + 2, 0],
@@ -262,8 +249,8 @@ def _lockstep(
         ),
         dict(zip(COUNTS, counts.T, strict=True)),
         dict(zip(SENDER["VGV"], late.T, strict=True)),
-        (float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
-        float(cal[CURRENT_LIMIT]) * 1e3,
+        (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
+        float(cal.current_limit) * 1e3,
     )
     wall = time.perf_counter() - started
     return outcome_of(
@@ -307,7 +294,6 @@ class _Witness:
     def trace(self, begin: float) -> Trace:
         """Return the samples from ``begin`` s on, with times from there."""
         from controller import load_calibration
-        from controller.firmware import CURRENT_LIMIT, STROKE_MAX, STROKE_MIN
 
         table = np.array(self.rows)
         table = table[table[:, 0] >= begin]
@@ -317,8 +303,8 @@ class _Witness:
             table[:, 1].astype(int),
             table[:, 2].astype(np.int64),
             dict(zip(self.NAMES, table[:, 3:].T, strict=True)),
-            stroke=(float(cal[STROKE_MIN]) * 1e3, float(cal[STROKE_MAX]) * 1e3),
-            current=float(cal[CURRENT_LIMIT]) * 1e3,
+            stroke=(float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
+            current=float(cal.current_limit) * 1e3,
             exact=False,
         )
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from controller.firmware import FAULTS, MODES
+from controller import FAULTS, MODES
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Table, read
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.firmware import FAULTS, MODES
+from controller import FAULTS, MODES
 from hil.inject.scenario import Expect, Scenario
 
 __all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "judge", "outcome_of"]

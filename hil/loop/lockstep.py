@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller import Calibration, load_calibration
-from controller.firmware import BLEND, DIRECTION, FAULT_BITS, IN_FRESH, IN_REJECTED, IN_X_LVDT, MODE, SLOW, X_DEM
+from controller.records import SLOW
 from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain
 from vaneloop.base.compiled import compiled_free
@@ -109,7 +109,7 @@ def advance(
     out        float64[rows or 0, 13] in SI, a row every ``every`` ticks
     snapshots  float64[ticks or 0, n] copies of the whole state at each tick
     """
-    z, s, inputs = a.z, a.s, a.inputs
+    z, s, inputs, given = a.numbers, a.s, a.inputs, a.outputs
     noisy = noise.shape[0] > 1
     keep = snapshots.shape[0] > 0
     n_z, n_s = z.shape[0], s.shape[0]
@@ -124,13 +124,14 @@ def advance(
             n_r = stimulus[frame, S_N_R]
             if n_r != n_r:  # not logged: the plant's engine
                 n_r = s[chain.N_R, 0] + a.sigma[4] * noise[m, 4]
-            inputs[IN_FRESH] = stimulus[frame, S_FRESH]
-            inputs[IN_REJECTED] = stimulus[frame, S_REJECTED]
-            if inputs[IN_FRESH] > 0.5:
+            fresh = stimulus[frame, S_FRESH]
+            inputs.demand_fresh = fresh
+            inputs.demand_rejected = stimulus[frame, S_REJECTED]
+            if fresh > 0.5:
                 arrive(k, a, n_dem, n_r, stimulus[frame, S_MODE_REQUEST])
         else:
-            inputs[IN_FRESH] = 0.0
-            inputs[IN_REJECTED] = 0.0
+            inputs.demand_fresh = 0.0
+            inputs.demand_rejected = 0.0
         p_s, t_oil = stimulus[frame, S_P_S], stimulus[frame, S_T_OIL]
         control(k, a, noise, m, t_oil)
         if k % every == 0 and out.shape[0] > 0:
@@ -138,13 +139,13 @@ def advance(
             out[r, 0] = k * 1e-3
             out[r, 1] = n_dem
             out[r, 2] = n_r
-            out[r, 3] = z[X_DEM]
-            out[r, 4] = inputs[IN_X_LVDT]
+            out[r, 3] = given.x_dem
+            out[r, 4] = inputs.x_lvdt
             out[r, 5] = mean_current(a)
             out[r, 6] = p_s
             out[r, 7] = t_oil
             out[r, 8], out[r, 9], out[r, 10] = a.angles[0], a.angles[1], a.angles[2]
-            out[r, 11] = z[MODE]
+            out[r, 11] = given.mode
             out[r, 12] = s[chain.N_R, 0]
         if keep:
             for q in range(n_z):
@@ -204,7 +205,7 @@ def lockstep(
         pots=pots,
     )
     z, s = loop.z, loop.s
-    z[DIRECTION], z[BLEND] = _starting_curve(loop.calibration, n0, stroke_demand)
+    z.direction, z.blend = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
     silent = np.zeros((1, 5))
     advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
@@ -213,7 +214,7 @@ def lockstep(
         machine.place_rings(s, angles, n0, t_oil)
 
     out = np.empty((-(-ticks // every), len(COLUMNS)))
-    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(z) + len(s))) for _ in range(2)]
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.numbers) + len(s))) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()
     with ThreadPoolExecutor(1) as pool:
@@ -233,7 +234,7 @@ def lockstep(
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
     columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
-    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(z[FAULT_BITS]))
+    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.outputs.faults))
 
 
 def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:

@@ -19,20 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller import Calibration, load_calibration
-from controller.firmware import (
-    DEMAND_HIGH,
-    DEMAND_LOW,
-    FAULT_BITS,
-    IN_FRESH,
-    IN_PAUSE,
-    IN_REJECTED,
-    IN_X_LVDT,
-    MODE,
-    MODES,
-    SLOW,
-    X_DEM,
-)
+from controller import MODES, Calibration, load_calibration
+from controller.records import SLOW
 from hil.bus import frames
 from hil.bus.frames import (
     ECU_DEMAND,
@@ -120,13 +108,13 @@ def _take(a: NodeArrays, received: np.ndarray, n: int, k: int) -> None:
     if fresh == 1.0:
         arrive(k, a.loop, n_dem, n_r, float(request))
         k_of = a.loop.calibration.k
-        low, high = k_of[DEMAND_LOW], k_of[DEMAND_HIGH]
+        low, high = k_of.demand_low, k_of.demand_high
         if low <= n_dem <= high and low <= n_r <= high and request <= 1:
             a.supply[2], a.supply[3] = n_dem, n_r
     inputs = a.loop.inputs
-    inputs[IN_FRESH] = fresh
-    inputs[IN_PAUSE] = pause
-    inputs[IN_REJECTED] = float(refused(a.receiver) - before)
+    inputs.demand_fresh = fresh
+    inputs.pause = pause
+    inputs.demand_rejected = float(refused(a.receiver) - before)
 
 
 @in_place
@@ -157,7 +145,7 @@ def node_tick(
     """
     _take(a, received, n, k)
     loop, p_s, t_oil = a.loop, a.supply[0], a.supply[1]
-    z = loop.z
+    out = loop.outputs
     control(k, loop, noise, row, t_oil)
     m = 0
     if k % SLOW == 0:
@@ -166,9 +154,9 @@ def node_tick(
             sent,
             m,
             VGV_STATUS,
-            encode_status(z[X_DEM] * 1e3, loop.inputs[IN_X_LVDT] * 1e3, int(z[MODE]), _next(c, C_STATUS)),
+            encode_status(out.x_dem * 1e3, loop.inputs.x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS)),
         )
-        m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(z[FAULT_BITS]), _next(c, C_SERVO)))
+        m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(out.faults), _next(c, C_SERVO)))
         vigv, vgv1, vgv2 = loop.angles[0] * DEGREES, loop.angles[1] * DEGREES, loop.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
         if k % (10 * SLOW) == 0:
@@ -232,12 +220,12 @@ class Node:
     @property
     def mode(self) -> str:
         """Mode of the controller."""
-        return MODES[int(self.loop.z[MODE])]
+        return MODES[int(self.loop.outputs.mode)]
 
     @property
     def faults(self) -> int:
         """Fault bits that stand now (`controller.FAULTS`)."""
-        return int(self.loop.z[FAULT_BITS])
+        return int(self.loop.outputs.faults)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -253,7 +241,7 @@ class Node:
         """Return the SHA-256 of the whole state: firmware, plant, receiver, counters."""
         digest = hashlib.sha256()
         a = self.arrays
-        for part in (a.loop.z, a.loop.s, a.loop.mean, a.receiver, a.counter):
+        for part in (a.loop.numbers, a.loop.s, a.loop.mean, a.receiver, a.counter):
             digest.update(part.tobytes())
         return digest.hexdigest()
 

@@ -22,21 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller import Calibration, new_inputs, new_state, tick
-from controller.firmware import (
-    I_CMD,
-    IN_MODE_REQUEST,
-    IN_N_DEM,
-    IN_N_R,
-    IN_VIGV,
-    IN_X_LVDT,
-    KFF,
-    KI,
-    KP,
-    SLOW,
-    TREND_CHANGE,
-    TREND_RATE_ON,
-)
+from controller import Calibration, flat, give, new_inputs, new_outputs, new_state, tick
+from controller.records import SLOW, Record, copy
 from plant import Plant, chain
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place
@@ -55,7 +42,7 @@ CHANGED_BY = (
 class Loop(NamedTuple):
     """What the one tick works on.
 
-    inputs, z    the firmware's (`controller`)
+    inputs, outputs, z  the firmware's records (`controller.records`); numbers: z's memory as float64
     built        calibration as the tables have it
     calibration  the same as it is flashed: with the effects that change tables and gains
     flash        float64[3] those effects' parameters, as flashed
@@ -69,8 +56,10 @@ class Loop(NamedTuple):
                  mode_request
     """
 
-    inputs: np.ndarray
-    z: np.ndarray
+    inputs: Record
+    outputs: Record
+    z: Record
+    numbers: np.ndarray
     built: Calibration
     calibration: Calibration
     flash: np.ndarray
@@ -98,9 +87,12 @@ def new_loop(
     """
     cal = flashed(calibration, plant)
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
+    z = new_state()
     return Loop(
         new_inputs(),
-        new_state(),
+        new_outputs(),
+        z,
+        flat(z),
         calibration,
         cal,
         plant.p[list(CHANGED_BY), 0],
@@ -116,7 +108,7 @@ def new_loop(
 
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
-    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
+    cal = calibration._replace(k=copy(calibration.k), table=calibration.table.copy())
     _flash(calibration, cal, np.empty(3), plant.p)
     return cal
 
@@ -132,10 +124,11 @@ def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarra
     for row in range(1, built.table.shape[0]):
         for i in range(built.table.shape[1]):
             cal.table[row, i] = schedule_error.step(built.table[row, i], flash[0])
-    for row in (TREND_RATE_ON, TREND_CHANGE):
-        cal.k[row] = trend_threshold_error.step(built.k[row], flash[1])
-    for row in (KP, KI, KFF):
-        cal.k[row] = controller_gain_error.step(built.k[row], flash[2])
+    cal.k.trend_rate_on = trend_threshold_error.step(built.k.trend_rate_on, flash[1])
+    cal.k.trend_change = trend_threshold_error.step(built.k.trend_change, flash[1])
+    cal.k.kp = controller_gain_error.step(built.k.kp, flash[2])
+    cal.k.ki = controller_gain_error.step(built.k.ki, flash[2])
+    cal.k.kff = controller_gain_error.step(built.k.kff, flash[2])
 
 
 @in_place
@@ -167,7 +160,7 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
         content = can_delay.step(now * SLOW * chain.TICK, delay)
         content = frame_hold.step(content, period)
         at = _last_by(a.sent, int(math.floor(content / FRAME + 1e-6)), now)
-    a.inputs[IN_N_DEM], a.inputs[IN_N_R], a.inputs[IN_MODE_REQUEST] = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
+    a.inputs.n_dem, a.inputs.n_r, a.inputs.mode_request = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
 
 
 @in_place
@@ -183,16 +176,17 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         or p[chain.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
     ):
         _flash(a.built, a.calibration, a.flash, p)
-    inputs[IN_X_LVDT] = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
+    inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
     for q in range(3):
         a.angles[q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
-        inputs[IN_VIGV + q] = a.angles[q]
+        inputs.pots[q] = a.angles[q]
     if a.pots.shape[0] > 0:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
         for q in range(3):
-            inputs[IN_VIGV + q] = a.pots[r, 2 * q] * inputs[IN_VIGV + q] + a.pots[r, 2 * q + 1]
+            inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
     tick(inputs, a.z, a.calibration)
-    a.mean[0] += a.z[I_CMD]
+    give(a.z, a.outputs)
+    a.mean[0] += a.outputs.i_cmd
     a.mean[1] += 1.0
 
 
@@ -211,5 +205,5 @@ def move(k: int, a: Loop, n_dem: float, n_r: float, p_s: float, t_oil: float) ->
     """
     s, p = a.s, a.p
     chain.rotor_step(s, p, 0, n_dem, chain.TICK)
-    chain.drive_step(s, p, 0, a.z[I_CMD], n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
+    chain.drive_step(s, p, 0, a.outputs.i_cmd, n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
     chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)

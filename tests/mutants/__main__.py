@@ -17,10 +17,11 @@ from .campaign import Outcome, Target, run_target, sample
 from .mutate import Mutant
 
 ENOUGH = 0.95  # of the mutants that are not equivalent
+FIRMWARE = ("firmware", "modes", "monitors", "records", "schedule", "servo", "strategies", "trend")
 TARGETS = (
     Target(
         "firmware",
-        ("controller/firmware.py",),
+        tuple(f"controller/{part}.py" for part in FIRMWARE),
         (
             "tests/test_firmware_spec.py",
             "tests/test_controller.py::test_look_up_is_exact_at_its_breakpoints_and_its_ends",

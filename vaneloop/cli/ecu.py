@@ -112,7 +112,7 @@ def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from controller.firmware import FAULTS, MODES
+    from controller import FAULTS, MODES
     from hil.bus.port import Port
     from hil.loop.ecu import EcuStation, Typed
     from hil.loop.node import Ecu

@@ -22,8 +22,7 @@ the parameters were not fitted to, beside the noise floor that no model can unde
 
 examples:
   vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
-  vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml --report
-  extended.html
+  vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml
 
 exit codes: 0 each stage extended is at its noise floor (within 10 %), 1 an error remains, or the effects
 bring the model no nearer to the log (nothing is written then), 2 bad input"""

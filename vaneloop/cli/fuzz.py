@@ -9,7 +9,6 @@ import numba
 import numpy as np
 
 from controller import MODES, load_calibration
-from controller.firmware import CURRENT_LIMIT, STROKE_MAX, STROKE_MIN
 from hil.inject.fuzz import CLAIMS, HELD, KINDS, RECOVERY, Campaign, fuzz, read_attack, run_attack, write_attack
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -72,7 +71,7 @@ def command(args: argparse.Namespace) -> int:
     if not 0.01 <= args.recovery <= 3600:
         raise InputError(f"--recovery (={args.recovery:g}) must be 0.01 to 3600 s")
     k = load_calibration().k
-    limits = np.array([k[CURRENT_LIMIT], k[STROKE_MIN], k[STROKE_MAX]])
+    limits = np.array([k.current_limit, k.stroke_min, k.stroke_max])
     if args.current_limit is not None:
         if not 0 < args.current_limit <= 1000:
             raise InputError(f"--current-limit (={args.current_limit:g}) must be above 0, at most 1000 mA")

@@ -136,10 +136,9 @@ def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
 
 def _node_json(node: Any) -> dict[str, Any]:
     from controller import FAULTS
-    from controller.firmware import N_DEM
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
-    n_dem = float(node.loop.z[N_DEM])
+    n_dem = float(node.loop.z.n_dem)
     return {
         "mode": node.mode,
         "n_dem": n_dem,

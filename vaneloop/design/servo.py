@@ -547,7 +547,9 @@ def simulate(
                     come from below
     integral        A, integral part at t = 0
     """
-    from controller import firmware as fw
+    from controller import new_state
+    from controller.records import SCALAR_FIELDS, record
+    from controller.servo import servo_step
     from plant.actuator import speed_factor, stroke_step
     from plant.play import play_step
     from plant.sensors import lag_factor, quantise
@@ -555,9 +557,9 @@ def simulate(
 
     ref = np.asarray(x_ref, dtype=float)
     rate = np.zeros_like(ref) if dx_ref is None else np.asarray(dx_ref, dtype=float)
-    z, k = np.zeros(fw.N_STATE), np.zeros(fw.N_SCALARS)
-    k[[fw.KP, fw.KI, fw.KFF, fw.CURRENT_LIMIT]] = gains.kp, gains.ki, gains.kff, plant.current_limit
-    z[fw.INTEGRAL] = integral
+    z, k = new_state(), record(SCALAR_FIELDS)
+    k.kp, k.ki, k.kff, k.current_limit = gains.kp, gains.ki, gains.kff, plant.current_limit
+    z.integral = integral
     dt = plant.tick / substeps
     matrix = valve_matrix(plant.bandwidth, plant.damping, dt)
     lag = lag_factor(plant.lvdt_lag, dt)
@@ -573,16 +575,16 @@ def simulate(
     out: Array = np.empty((6, ref.size), dtype=np.float64)
     for n in range(ref.size):
         y = x_lvdt + noise[n]
-        z[fw.X_MEAS] = quantise(y, plant.lvdt_step) if quantised else y
-        fw.servo_step(z, k, ref[n], rate[n])
-        pending.append(float(z[fw.I_CMD]))
+        z.x_meas = quantise(y, plant.lvdt_step) if quantised else y
+        servo_step(z, k, ref[n], rate[n])
+        pending.append(float(z.i_cmd))
         i = pending.pop(0) + null_bias
         if site == "valve":
             spool_i = play_step(spool_i, i, gap)
             drive = spool_i
         else:
             drive = i
-        out[:, n] = x, z[fw.X_MEAS], vane, z[fw.I_CMD], x if site != "valve" else i, rod
+        out[:, n] = x, z.x_meas, vane, z.i_cmd, x if site != "valve" else i, rod
         for _ in range(substeps):
             before = u
             u, du = valve_step(u, du, drive / plant.rated_current, *matrix)

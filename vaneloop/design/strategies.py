@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller import SCALARS, STATE, STRATEGIES, Calibration
+from controller import STATE, STRATEGIES, Calibration
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, Plant, build_plant, chain
 from plant.effect import T_REF
@@ -216,10 +216,10 @@ def run(
     angle = 180.0 / np.pi
     offset, width, crossing = a[:, 5:8].T
     drive = np.interp(x_dem, calibration.angles[0], calibration.angles[1])
-    aim = drive + offset - 0.5 * crossing * (calibration.k[SCALARS.index("play_vigv")] + width)
+    aim = drive + offset - 0.5 * crossing * (calibration.k.play[0] + width)
     return Outcome(
         scenario.name,
-        STRATEGIES[int(calibration.k[0])],
+        STRATEGIES[int(calibration.k.strategy)],
         np.arange(len(a), dtype=np.float64) * (EVERY * 1e-3),
         n_r,
         errors,

@@ -6,7 +6,7 @@ Model, one step of T = 10 ms, n the demand (%), r its rate (%/s)::
 
 a is white with standard deviation sigma_a (%/s^2), v with sigma_v (%). The Kalman filter of this model settles to
 constant gains K = [alpha, beta/T], and then is the alpha-beta filter that the firmware runs
-(`controller.firmware.trend_step`)::
+(`controller.trend.trend_step`)::
 
     n- = n + T r,   e = y - n-,   n = n- + alpha e,   r = r + beta e / T
 
@@ -154,18 +154,20 @@ def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Ar
     """Demand, rate (%, %/s) and direction (+1, -1) as the firmware's `trend_step` finds them; one sample every
     10 ms.
     """
-    from controller import firmware as fw
+    from controller import new_state
+    from controller.records import SCALAR_FIELDS, record
+    from controller.trend import trend_step
 
     y = np.asarray(n_dem, dtype=float)
-    z, k = np.zeros(fw.N_STATE), np.zeros(fw.N_SCALARS)
-    k[[fw.TREND_ALPHA, fw.TREND_BETA]] = design.alpha, design.beta
-    k[[fw.TREND_RATE_ON, fw.TREND_CHANGE, fw.TREND_HOLD]] = design.rate_on, design.change, design.hold
-    z[fw.TREND_N] = z[fw.TREND_TURN] = z[fw.TREND_LAST] = y[0]
-    z[fw.DIRECTION] = 1.0
+    z, k = new_state(), record(SCALAR_FIELDS)
+    k.trend_alpha, k.trend_beta = design.alpha, design.beta
+    k.trend_rate_on, k.trend_change, k.trend_hold = design.rate_on, design.change, design.hold
+    z.trend_n = z.trend_turn = z.trend_last = y[0]
+    z.direction = 1.0
     out = np.empty((3, y.size))
     for i, v in enumerate(y):
-        fw.trend_step(z, k, v)
-        out[:, i] = z[fw.TREND_N], z[fw.TREND_RATE], z[fw.DIRECTION]
+        trend_step(z, k, v)
+        out[:, i] = z.trend_n, z.trend_rate, z.direction
     return out[0], out[1], out[2]
 
 

@@ -34,7 +34,9 @@ from scipy.ndimage import binary_propagation, uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
-from controller import firmware as fw
+from controller.records import RUN, SLOW_TICK, Record, copy
+from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
+from controller.trend import trend_step
 from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
 from hil.loop.tick import flashed
@@ -124,7 +126,7 @@ def build_chain(
     run = law_holds = machine_rows = currents = usable
     spell = machine_spell = stretch
     if "state" in columns:
-        running = np.round(columns["state"]) == fw.RUN
+        running = np.round(columns["state"]) == RUN
         run = usable & running
         spell = _stretches(fresh & running)  # nor is it known what a controller in another mode has made of the demand
         law_holds = run & (_since(t, spell) >= SETTLE)  # back in RUN, it first catches up
@@ -162,7 +164,7 @@ def build_chain(
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
             unknown = off.mean(axis=1) - off[:, -1] if sampled else None
-            size = cal.k[fw.KP] * smooth.noise
+            size = cal.k.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
                 _between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
@@ -744,7 +746,7 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
     of how much they are off because the stroke between two rows is not logged, of the same shape.
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
-    kp, ki, kff = (cal.k[i] for i in (fw.KP, fw.KI, fw.KFF))  # A/m = mA/mm
+    kp, ki, kff = (cal.k.kp, cal.k.ki, cal.k.kff)  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
     before[0], two[:2] = x_dem[0], x_dem[0]
@@ -790,7 +792,7 @@ def _between_rows(
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
     ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
-    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k[fw.CURRENT_LIMIT])
+    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k.current_limit)
     ticks[alone] = c["i_cmd"][alone, None]
     if unknown is not None and seed:
         ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
@@ -809,7 +811,7 @@ def _other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: C
     the other ticks added.
     """
     width = int(round(WINDOW / RASTER))
-    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k[fw.CURRENT_LIMIT])
+    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k.current_limit)
 
     def misfit(model: Array) -> float:
         e = np.where(use, c["i_cmd"] - model, np.nan)[: len(t) // width * width].reshape(-1, width)
@@ -843,7 +845,7 @@ def _servo(
         return i[:, None, :]
 
     # at the limit the integral stands still: its constant is another one before and after
-    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.k[fw.CURRENT_LIMIT], np.ones(5), "same") > 0.5
+    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.k.current_limit, np.ones(5), "same") > 0.5
     near = _no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
     stage = Stage(
         "servo",
@@ -873,9 +875,9 @@ def _demand_run(
     delay: float,
     hold: float,
     phase: float,
-    k: np.ndarray,
+    k: Record,
     table: np.ndarray,
-    z: np.ndarray,
+    z: Record,
     out: np.ndarray,
 ) -> None:
     """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every
@@ -895,26 +897,26 @@ def _demand_run(
             a = n_dem[j] + w * (n_dem[j + 1] - n_dem[j])
             b = n_r[j] + w * (n_r[j + 1] - n_r[j])
         if i == first:
-            z[fw.TREND_N] = a
-            z[fw.TREND_TURN] = a
-            z[fw.TREND_LAST] = a
-            z[fw.N_R] = b
-        z[fw.N_DEM] = a
-        z[fw.N_R] += (b - z[fw.N_R]) * fw.SLOW_TICK / (k[fw.SPEED_FILTER] + fw.SLOW_TICK)
-        fw.trend_step(z, k, a)
-        fw.schedule_step(z, k, table)
+            z.trend_n = a
+            z.trend_turn = a
+            z.trend_last = a
+            z.n_r = b
+        z.n_dem = a
+        z.n_r += (b - z.n_r) * SLOW_TICK / (k.speed_filter + SLOW_TICK)
+        trend_step(z, k, a)
+        schedule_step(z, k, table)
         if i == first:
-            z[fw.X_DEM] = z[fw.X_TARGET]
-        fw.move_demand(z, k, z[fw.X_TARGET], k[fw.STROKE_RATE])
-        out[i] = z[fw.X_DEM]
+            z.x_dem = z.x_target
+        move_demand(z, k, z.x_target, k.stroke_rate)
+        out[i] = z.x_dem
 
 
 @compiled
-def _directions(n_dem: np.ndarray, k: np.ndarray, z: np.ndarray, out: np.ndarray) -> None:
+def _directions(n_dem: np.ndarray, k: Record, z: Record, out: np.ndarray) -> None:
     """Direction of the demand's trend at each row, from the trend's state ``z``."""
     for i in range(len(n_dem)):
-        fw.trend_step(z, k, n_dem[i])
-        out[i] = z[fw.DIRECTION]
+        trend_step(z, k, n_dem[i])
+        out[i] = z.direction
 
 
 def _direction_known(n_dem: Array, cal: Calibration) -> Array:
@@ -926,13 +928,13 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     known = np.ones(len(n_dem), dtype=bool)
     for direction in (1.0, -1.0):
         out = np.empty((2, len(n_dem)))
-        for back, row in zip((0.0, 0.999 * cal.k[fw.TREND_CHANGE]), out, strict=True):
+        for back, row in zip((0.0, 0.999 * cal.k.trend_change), out, strict=True):
             z = new_state()
-            z[fw.TREND_N] = z[fw.TREND_LAST] = n_dem[0]
-            z[fw.TREND_TURN], z[fw.DIRECTION] = n_dem[0] + direction * back, direction
+            z.trend_n = z.trend_last = n_dem[0]
+            z.trend_turn, z.direction = n_dem[0] + direction * back, direction
             _directions(n_dem, cal.k, z, row)
         known &= out[0] == out[1]
-    return known & ~_lately(~known, cal.k[fw.BLEND_TIME] + 0.1)
+    return known & ~_lately(~known, cal.k.blend_time + 0.1)
 
 
 def _lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
@@ -968,10 +970,10 @@ def _demand(
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
         for i, theta in enumerate(thetas):
-            k, table = cal.k.copy(), cal.table.copy()
+            k, table = copy(cal.k), cal.table.copy()
             factor = value(theta, "trend_threshold_error", 1.0)
-            k[fw.TREND_RATE_ON] *= factor
-            k[fw.TREND_CHANGE] *= factor
+            k.trend_rate_on *= factor
+            k.trend_change *= factor
             offset = value(theta, "schedule_error", 0.0)
             table[1:] += offset * 1e-3
             hold = value(theta, "frame_hold", float(machine.p[ROW["frame_hold"], 0]))
@@ -980,15 +982,14 @@ def _demand(
             for piece in pieces:
                 first, last = piece.start, piece.stop
                 curves = [
-                    float(np.interp(n_r[first], table[0], table[row])) * 1e3
-                    for row in (fw.ROW_EXTENSION, fw.ROW_RETRACTION)
+                    float(np.interp(n_r[first], table[0], table[row])) * 1e3 for row in (ROW_EXTENSION, ROW_RETRACTION)
                 ]
                 rising = abs(curves[0] - c["x_dem"][first]) <= abs(curves[1] - c["x_dem"][first])
                 # at the start of a log the demand stands on a curve; later both directions are tried
                 for x, up in ((out[i, 0], rising), (other, not rising)) if first else ((out[i, 0], rising),):
                     z = new_state()
-                    z[fw.DEMAND_SEEN] = 1.0
-                    z[fw.DIRECTION], z[fw.BLEND] = (1.0, 1.0) if up else (-1.0, 0.0)
+                    z.demand_seen = 1.0
+                    z.direction, z.blend = (1.0, 1.0) if up else (-1.0, 0.0)
                     _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, x)
                 if first:
                     one, two = (np.nansum((x[piece] * 1e3 - measured[piece]) ** 2) for x in (out[i, 0], other))

@@ -1,0 +1,109 @@
+"""The firmware on rows of numbers, as tests like it: columns by name, and its parts as functions of float64 arrays.
+
+``log[:, MODE]`` of logged states, ``rows[:, IN_N_DEM]`` of inputs. `controller.records` has the order; this names it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+import controller
+from controller import firmware, monitors, records, schedule, servo, strategies, trend
+from controller.calibration import Calibration
+from controller.records import FAULTS, INPUTS, SCALARS, STATE
+from controller.schedule import look_up
+
+__all__ = [
+    "FAR", "FAULTS", "INPUTS", "SCALARS", "STATE", "filter_pots", "follow_play", "inverse_step", "judge_pot", "learn",
+    "load_calibration", "look_up", "move_demand", "new_state", "observe_speed", "schedule_step", "servo_step", "tick",
+    "trend_step",
+]  # fmt: skip
+
+SHORT = {"demand_fresh": "fresh", "demand_rejected": "rejected", "faults": "fault_bits"}
+FAR = monitors.FAR
+
+
+def named(prefix: str, names: tuple[str, ...]) -> dict[str, int]:
+    """Column of each number; of those that every vane stage has, that of the first stage, too."""
+    out: dict[str, int] = {}
+    for i, name in enumerate(names):
+        out[f"{prefix}{SHORT.get(name, name)}".upper()] = i
+        out.setdefault(f"{prefix}{name.removesuffix('_vigv')}".upper(), i)
+    return out
+
+
+for module in (records, schedule, strategies):
+    globals().update({n: v for n, v in vars(module).items() if n.isupper()})
+globals().update(named("", SCALARS) | named("IN_", INPUTS) | named("", STATE))
+N_INPUTS, N_SCALARS, N_STATE = len(INPUTS), len(SCALARS), len(STATE)
+
+
+def new_state() -> np.ndarray:
+    """State of a controller that has just been switched on."""
+    return records.flat(controller.new_state())
+
+
+def load_calibration(*args, **options) -> Calibration:
+    """The calibration with its scalars as a row of numbers."""
+    cal = controller.load_calibration(*args, **options)
+    return cal._replace(k=records.flat(cal.k))
+
+
+_I, _K, _Z = map(records.kind, (records.INPUT_FIELDS, records.SCALAR_FIELDS, records.STATE_FIELDS))
+on_rows = njit(error_model="numpy")
+
+
+@on_rows
+def tick(inputs, z, cal):  # noqa: D103
+    firmware.tick(inputs.view(_I)[0], z.view(_Z)[0], Calibration(cal.k.view(_K)[0], cal.table, cal.angles))
+
+
+@on_rows
+def trend_step(z, k, n_dem):  # noqa: D103
+    trend.trend_step(z.view(_Z)[0], k.view(_K)[0], n_dem)
+
+
+@on_rows
+def schedule_step(z, k, table):  # noqa: D103
+    schedule.schedule_step(z.view(_Z)[0], k.view(_K)[0], table)
+
+
+@on_rows
+def move_demand(z, k, target, rate):  # noqa: D103
+    schedule.move_demand(z.view(_Z)[0], k.view(_K)[0], target, rate)
+
+
+@on_rows
+def servo_step(z, k, x_ref, dx_ref):  # noqa: D103
+    servo.servo_step(z.view(_Z)[0], k.view(_K)[0], x_ref, dx_ref)
+
+
+@on_rows
+def observe_speed(z, k):  # noqa: D103
+    strategies.observe_speed(z.view(_Z)[0], k.view(_K)[0])
+
+
+@on_rows
+def follow_play(z, stage, drive, width):  # noqa: D103
+    strategies.follow_play(z.view(_Z)[0], stage, drive, width)
+
+
+@on_rows
+def inverse_step(z, k, table, angles):  # noqa: D103
+    strategies.inverse_step(z.view(_Z)[0], k.view(_K)[0], table, angles)
+
+
+@on_rows
+def learn(z, k):  # noqa: D103
+    strategies.learn(z.view(_Z)[0], k.view(_K)[0])
+
+
+@on_rows
+def judge_pot(z, k, stage, expected, plausible):  # noqa: D103
+    strategies._judge_pot(z.view(_Z)[0], k.view(_K)[0], stage, expected, plausible)
+
+
+@on_rows
+def filter_pots(z, k, inputs):  # noqa: D103
+    strategies.filter_pots(z.view(_Z)[0], k.view(_K)[0], inputs.view(_I)[0])
