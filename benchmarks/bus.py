@@ -60,23 +60,26 @@ def decoding() -> Iterator[Row]:
     import cantools
 
     from hil.bus.lockstep_bus import run_lockstep
-    from hil.logs import canlog
+    from hil.logs.candump import read_candump, write_candump
+    from hil.logs.dbc import load_dbc
+    from hil.logs.frames import Frames
+    from hil.logs.signals import cut_signal, select
 
     run = run_lockstep(profile(FRAMES / 410 + 1.0), seed=1)
     rows = run.rows[:FRAMES]
     ident = (rows[:, 0] & 0x7FF).astype(np.uint32)
     data = np.ascontiguousarray(rows[:, 1]).view(np.uint8).reshape(-1, 8)
     n = len(rows)
-    log = canlog.Frames(run.t[:n], ident, np.zeros(n, np.int32), np.full(n, 8, np.uint8), data)
-    messages = canlog.load_dbc(tables.path("vgv.dbc"))[0]
+    log = Frames(run.t[:n], ident, np.zeros(n, np.int32), np.full(n, 8, np.uint8), data)
+    messages = load_dbc(tables.path("vgv.dbc"))[0]
     db: Any = cantools.database.load_file(tables.path("vgv.dbc"))
 
-    def ours(frames: canlog.Frames) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
+    def ours(frames: Frames) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
         out = {}
         for message in messages:
-            which, _ = canlog.select(frames, message)
+            which, _ = select(frames, message)
             for signal in message.layout.signals:
-                out[message.ident, signal.name] = canlog.cut_signal(frames, which, message, signal)[:2]
+                out[message.ident, signal.name] = cut_signal(frames, which, message, signal)[:2]
         return out
 
     def theirs(start: int) -> list[dict[str, Any]]:
@@ -112,11 +115,11 @@ def decoding() -> Iterator[Row]:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "long.log")
-        canlog.write_candump(path, log)
+        write_candump(path, log)
         mine = other = float("inf")
         for _ in range(3):
             started = time.process_time()
-            ours(canlog.read_candump(path))
+            ours(read_candump(path))
             mine = min(mine, time.process_time() - started)
         part = Path(folder, "part.log")
         with path.open("rb") as whole:

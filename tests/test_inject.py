@@ -23,7 +23,8 @@ from hil.bus.frames import ECU_DEMAND, VERDICTS, new_receiver, receive
 from hil.inject import Expect, Outcome, Scenario, Trace, judge
 from hil.inject.scenario import OnFrame, library, load_scenario
 from hil.inject.tamper import Gateway, Intruder
-from hil.logs import canlog
+from hil.logs.candump import write_candump
+from hil.logs.frames import Frames
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
@@ -275,8 +276,8 @@ def test_old_frames_of_a_log_come_again_with_their_spacing(tmp_path: Path) -> No
     """A recorded run's demand, sent again by a third station beside the live ECU."""
     t = np.arange(50) * 0.01
     data = np.array([[*int(demand(10 * i)[1] & (2**64 - 1)).to_bytes(8, "little")] for i in range(50)], np.uint8)
-    log = canlog.Frames(t, np.full(50, ECU_DEMAND, np.uint32), np.zeros(50, np.int32), np.full(50, 8, np.uint8), data)
-    canlog.write_candump(tmp_path / "old.log", log)
+    log = Frames(t, np.full(50, ECU_DEMAND, np.uint32), np.zeros(50, np.int32), np.full(50, 8, np.uint8), data)
+    write_candump(tmp_path / "old.log", log)
     again = sent_by(inject.Replay(log=str(tmp_path / "old.log"), loop=False), 2000)
     assert [(k, h, d) for k, h, d in again] == [(10 * i, *demand(10 * i)) for i in range(50)]
     scenario = tmp_path / "again.toml"

@@ -17,9 +17,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hil.logs import Channel, Log, LogError, canlog, read_log, write_log
+from hil.logs import Channel, Log, LogError, read_log, write_log
 from hil.logs import log as logs
-from hil.logs.canlog import Frames, Message
+from hil.logs.asc import read_asc
+from hil.logs.blf import read_blf
+from hil.logs.candump import read_candump
+from hil.logs.dbc import Message, load_dbc
+from hil.logs.frames import EXTENDED, Frames
+from hil.logs.signals import cut_signal, e2e_crc, encode, select
+from hil.logs.trc import read_trc
 from vaneloop.base import tables
 from vaneloop.base.signals import UNITS
 
@@ -164,14 +170,14 @@ def test_dbc_round_trip_loses_at_most_half_a_resolution(db: Any, seed: int) -> N
 @given(seed=st.integers(0, 2**32))
 def test_frames_are_those_of_cantools_and_the_e2e_library(db: Any, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    for message in canlog.load_dbc(DBC)[0]:
+    for message in load_dbc(DBC)[0]:
         m, n = message.layout, 33
         values = {
             s.name: np.round(rng.uniform(s.minimum, s.maximum, n) / s.scale) * s.scale
             for s in m.signals
             if s.name not in ("crc", "counter")
         }
-        ours = canlog.encode(message, values, n)
+        ours = encode(message, values, n)
         theirs = bytearray(8)
         for k in range(n):
             counter = theirs[1] & 15
@@ -184,7 +190,7 @@ def test_frames_are_those_of_cantools_and_the_e2e_library(db: Any, seed: int) ->
         wrong = ours.copy()
         bit = rng.integers(0, 64, n)
         wrong[np.arange(n), bit // 8] ^= (1 << bit % 8).astype(np.uint8)
-        assert (canlog.e2e_crc(wrong, message.e2e) != wrong[:, 0]).all()
+        assert (e2e_crc(wrong, message.e2e) != wrong[:, 0]).all()
 
 
 # --- signals cut out of columns ---------------------------------------------------------------------------------------
@@ -223,7 +229,7 @@ def test_column_decode_equals_cantools(draw: st.DataObject) -> None:
     )
     for s in signals:
         layout = CanMessage(0x123, "M", size, [s], strict=False)
-        _, ours, _ = canlog.cut_signal(frames, np.arange(n), Message(layout, 0x123, None, False, {}), s)
+        _, ours, _ = cut_signal(frames, np.arange(n), Message(layout, 0x123, None, False, {}), s)
         theirs = [layout.decode(row.tobytes(), decode_choices=False)[s.name] for row in block]
         np.testing.assert_allclose(ours, np.array(theirs, float), rtol=1e-15, atol=0)
 
@@ -252,8 +258,8 @@ def test_a_multiplexed_signal_is_read_where_its_selector_says_so(tmp_path: Path)
 
 
 def test_every_format_has_a_test() -> None:
-    assert set(logs._FORMATS) == {*TABLES, *BUSES, ".mf4"}
-    assert sorted(logs.__all__) == ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
+    assert set(logs.FORMATS) == {*TABLES, *BUSES, ".mf4"}
+    assert set(logs.__all__) == {"Channel", "FORMATS", "Format", "Log", "LogError", "offered", "read_log", "write_log"}
 
 
 @pytest.mark.parametrize("suffix", [*TABLES, ".mf4"])
@@ -327,12 +333,10 @@ def test_frames_are_those_that_python_can_reads(tmp_path: Path, suffix: str, wri
             else:
                 out.on_message_received(can.Message(**who, is_error_frame=True, channel=0))
     theirs = [m for m in can.LogReader(path) if not m.is_error_frame and not m.is_remote_frame]
-    ours = {".log": canlog.read_candump, ".asc": canlog.read_asc, ".blf": canlog.read_blf, ".trc": canlog.read_trc}[
-        suffix
-    ](path)
+    ours = {".log": read_candump, ".asc": read_asc, ".blf": read_blf, ".trc": read_trc}[suffix](path)
     assert len(theirs) == ours.t.size
     for k, m in enumerate(theirs):
-        assert m.arbitration_id | (canlog.EXTENDED if m.is_extended_id else 0) == ours.ident[k]
+        assert m.arbitration_id | (EXTENDED if m.is_extended_id else 0) == ours.ident[k]
         assert bytes(m.data) == ours.data[k, : ours.length[k]].tobytes()
         assert abs(m.timestamp - theirs[0].timestamp - ours.t[k]) < 2e-6
 
@@ -374,9 +378,7 @@ def test_current_on_the_bus_is_the_mean_since_the_last_frame(tmp_path: Path) -> 
 
 
 def test_candump_variants_are_understood(tmp_path: Path) -> None:
-    frame = canlog.encode(
-        canlog.load_dbc(DBC)[0][0], {"n_dem": np.array([10.0, 20.0, 30.0, 40.0]), "n_r": np.full(4, 9.0)}, 4
-    )
+    frame = encode(load_dbc(DBC)[0][0], {"n_dem": np.array([10.0, 20.0, 30.0, 40.0]), "n_r": np.full(4, 9.0)}, 4)
     hexes = [f.tobytes().hex() for f in frame]
     text = [
         f"(1735329625.000000) can0 0A0#{hexes[0].upper()}",
@@ -388,8 +390,8 @@ def test_candump_variants_are_understood(tmp_path: Path) -> None:
         "(1735329625.027000) can0 1ABCDEF0#0102", "", "# comment", "(1735329625.03",
     ]  # fmt: skip
     (tmp_path / "a.log").write_text("\n".join(text))
-    frames = canlog.read_candump(tmp_path / "a.log")
-    assert frames.ident.tolist() == [0x0A0] * 4 + [0x1ABCDEF0 | canlog.EXTENDED]
+    frames = read_candump(tmp_path / "a.log")
+    assert frames.ident.tolist() == [0x0A0] * 4 + [0x1ABCDEF0 | EXTENDED]
     assert frames.notes == ["1 lines are not candump lines: left out", "3 remote or error frames: left out"]
     assert frames.data[3, :8].tobytes().hex() == hexes[3]
     log = read_log(tmp_path / "a.log")
@@ -404,7 +406,7 @@ def test_many_layouts_and_much_noise_between_lose_no_frame(tmp_path: Path) -> No
         lines.append(f"({1000 + k * 0.01:.6f}) can{k % 40} 0A0#{rng.bytes(8).hex().upper()}")
         lines.append("(" + "".join(rng.choice(list("abcxyz ."), 40)))
     (tmp_path / "a.log").write_text("\n".join(lines))
-    frames = canlog.read_candump(tmp_path / "a.log")
+    frames = read_candump(tmp_path / "a.log")
     assert frames.t.size == 3000 and np.unique(frames.bus).size == 40
     np.testing.assert_allclose(frames.t, np.arange(3000) * 0.01, atol=1e-9)
 
@@ -457,7 +459,7 @@ def test_asc_times_relative_to_the_event_before_add_up(tmp_path: Path) -> None:
         text += "   0.004000 1  Statistic: D 1 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
         text += "   0.006000 1  123             Rx   d 2 01 02  Length = 1 ID = 291\n"
     (tmp_path / "a.asc").write_text(text)
-    np.testing.assert_allclose(canlog.read_asc(tmp_path / "a.asc").t, np.arange(5) * 0.01, atol=1e-9)
+    np.testing.assert_allclose(read_asc(tmp_path / "a.asc").t, np.arange(5) * 0.01, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -477,7 +479,7 @@ def test_every_version_of_trc_is_read(tmp_path: Path, head: str, line: str) -> N
         for k in range(120)
     ]
     (tmp_path / "a.trc").write_text(head + "; comment\n" + "\n".join(rows))
-    frames = canlog.read_trc(tmp_path / "a.trc")
+    frames = read_trc(tmp_path / "a.trc")
     np.testing.assert_allclose(frames.t, np.arange(120) * 0.01, atol=1e-9)
     assert np.array_equal(frames.data[:, 0], np.arange(120)) and frames.ident.tolist() == [0xA0, 0xA1] * 60
 
@@ -786,8 +788,8 @@ def test_real_frames_decode_as_cantools_does() -> None:
     import can
 
     folder = data("can_honda")
-    messages = {m.ident: m for m in canlog.load_dbc(folder / "honda_pilot_2017.dbc")[0]}
-    frames = canlog.read_candump(folder / "revlog.log")
+    messages = {m.ident: m for m in load_dbc(folder / "honda_pilot_2017.dbc")[0]}
+    frames = read_candump(folder / "revlog.log")
     theirs: dict[tuple[int, str], list[float]] = {}
     for k, f in enumerate(can.CanutilsLogReader(folder / "revlog.log")):
         assert f.arbitration_id == frames.ident[k] and bytes(f.data) == frames.data[k, : len(f.data)].tobytes()
@@ -798,9 +800,9 @@ def test_real_frames_decode_as_cantools_does() -> None:
     assert theirs
     for (ident, name), values in theirs.items():
         m = messages[ident]
-        rows, _ = canlog.select(frames, m)
+        rows, _ = select(frames, m)
         np.testing.assert_allclose(
-            canlog.cut_signal(frames, rows, m, m.layout.get_signal_by_name(name))[1], values, rtol=1e-15
+            cut_signal(frames, rows, m, m.layout.get_signal_by_name(name))[1], values, rtol=1e-15
         )
 
 

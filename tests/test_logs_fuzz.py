@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import hil.logs.mdf
-from hil.logs import LogError, canlog, read_log, write_log
+from hil.logs import LogError, dbc, read_log, write_log
 from hil.logs import log as logs
 from tests.test_logs import check, run
 from vaneloop.base import tables
@@ -152,7 +152,7 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
     reply.unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("suffix", list(logs._FORMATS))
+@pytest.mark.parametrize("suffix", list(logs.FORMATS))
 def test_no_damage_takes_the_reader_down(
     tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,7 +168,7 @@ def test_no_damage_takes_the_reader_of_bus_mdf_down(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", list(logs._FORMATS))
+@pytest.mark.parametrize("suffix", list(logs.FORMATS))
 def test_long_campaign(
     tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,15 +211,15 @@ def test_no_damage_to_a_database_takes_the_reader_down(tmp_path: Path) -> None:
             check(read_log(tmp_path / "a.log", dbc=bad))
         except LogError as e:
             assert "\n" not in str(e)
-    canlog._load_dbc.cache_clear()
+    dbc._load_dbc.cache_clear()
 
 
 def test_a_suffix_that_lies_is_refused(tmp_path: Path) -> None:
     good = {}
-    for suffix in logs._FORMATS:
+    for suffix in logs.FORMATS:
         write_log(tmp_path / f"a{suffix}", run(60))
         good[suffix] = (tmp_path / f"a{suffix}").read_bytes()
-    for suffix in logs._FORMATS:
+    for suffix in logs.FORMATS:
         for other, raw in good.items():
             if other != suffix:
                 (tmp_path / f"b{suffix}").write_bytes(raw)
@@ -229,7 +229,7 @@ def test_a_suffix_that_lies_is_refused(tmp_path: Path) -> None:
     for name in ("folder.csv", "none.log", "a", "a.txt"):
         with pytest.raises(LogError):
             read_log(tmp_path / name)
-    for suffix in logs._FORMATS:
+    for suffix in logs.FORMATS:
         (tmp_path / f"c{suffix}").write_bytes(b"")
         with pytest.raises(LogError, match="empty"):
             read_log(tmp_path / f"c{suffix}")

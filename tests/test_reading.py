@@ -19,8 +19,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hil.logs.mdf
-from hil.logs import Channel, Log, LogError, canlog, offered, plausible, read_log, write_log
-from hil.logs.canlog import Frames
+from hil.logs import Channel, Log, LogError, offered, plausible, read_log, write_log
+from hil.logs.candump import write_candump
+from hil.logs.dbc import load_dbc
+from hil.logs.frames import Frames
+from hil.logs.signals import encode
 from hil.loop.ecu import read_profile
 from tests.conftest import ROOT
 from tests.test_logs import check, refused
@@ -281,8 +284,8 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
     if suffix == ".mf4" and not file.name.startswith("bus"):
         hil.logs.mdf.write_groups(file, [(t, {"n_dem": (n_dem, "%")})])
         return
-    message = next(m for m in canlog.load_dbc(tables.path("vgv.dbc"))[0] if m.layout.name == "ECU_DEMAND")
-    data = canlog.encode(message, {"n_dem": n_dem, "n_r": n_dem}, t.size)
+    message = next(m for m in load_dbc(tables.path("vgv.dbc"))[0] if m.layout.name == "ECU_DEMAND")
+    data = encode(message, {"n_dem": n_dem, "n_r": n_dem}, t.size)
     frames = Frames(
         t, np.full(t.size, message.ident, np.uint32), np.zeros(t.size, np.int32), np.full(t.size, 8, np.uint8), data
     )
@@ -296,7 +299,7 @@ def raw_writer(file: Path, frames: Frames) -> None:
     """Frames with their stamps as they are: python-can's writers mend them."""
     rows = list(zip(frames.t.tolist(), frames.ident.tolist(), frames.data, strict=True))
     if file.suffix == ".log":
-        canlog.write_candump(file, frames)
+        write_candump(file, frames)
     elif file.suffix == ".asc":
         head = "date Fri Jan 1 10:00:00.000 am 2021\nbase hex  timestamps absolute\n"
         file.write_text(head + "".join(f"{t:.6f} 1  {i:X}  Rx  d 8 {d.tobytes().hex(' ')}\n" for t, i, d in rows))

@@ -16,8 +16,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from hil.logs import canlog, read_log
-from hil.logs.recorder import ERROR, EXTENDED, FD, FRAME, REMOTE, Recorder, RecorderProcess, read_record
+from hil.logs import read_log
+from hil.logs.dbc import load_dbc
+from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, REMOTE
+from hil.logs.recorder import Recorder, RecorderProcess, read_record
+from hil.logs.signals import encode
 from tests.conftest import ROOT
 from tests.test_bus import broker_of
 from vaneloop.base.errors import InputError
@@ -39,11 +42,11 @@ def some_frames(n: int, first: int = 0) -> np.ndarray:
     """Frames ``first`` to ``first + n``, a millisecond apart: VGV_STATUS with the number in x_dem, every other one
     sent.
     """
-    status = next(m for m in canlog.load_dbc(path("vgv.dbc"))[0] if m.layout.name == "VGV_STATUS")
+    status = next(m for m in load_dbc(path("vgv.dbc"))[0] if m.layout.name == "VGV_STATUS")
     k = first + np.arange(n)
     out = np.zeros(n, FRAME)
     out["ns"], out["ident"], out["length"], out["tx"] = START + k * 10**6, 0x0B0, 8, k % 2
-    out["data"][:, :8] = canlog.encode(
+    out["data"][:, :8] = encode(
         status, {"x_dem": k % 40000 * 0.001, "x_lvdt": np.zeros(n), "state": np.full(n, 2.0)}, n
     )
     return out

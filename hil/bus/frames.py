@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hil.logs.canlog import crc_table
+from hil.logs.signals import crc_table
 from vaneloop.base.compiled import in_place
 
 if TYPE_CHECKING:

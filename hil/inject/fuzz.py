@@ -44,7 +44,7 @@ from hil.bus.frames import (
     to_message,
     word0,
 )
-from hil.logs.canlog import e2e_crc
+from hil.logs.signals import e2e_crc
 from hil.loop.node import MOST_SENT, Node, NodeArrays, node_tick
 from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError

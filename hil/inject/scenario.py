@@ -42,7 +42,7 @@ COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_leng
 @lru_cache(maxsize=1)
 def layouts() -> dict[str, Any]:
     """Return the messages of ``vgv.dbc`` by name."""
-    from hil.logs.canlog import load_dbc
+    from hil.logs.dbc import load_dbc
     from vaneloop.base.tables import path
 
     return {m.layout.name: m for m in load_dbc(path("vgv.dbc"))[0]}

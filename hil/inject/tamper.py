@@ -227,10 +227,10 @@ class Intruder:
 
 def _old_frames(action: Replay) -> tuple[dict[int, list[Words]], int]:
     """Return the frames of a CAN log by ms from its first, and the log's length in ms."""
-    from hil.logs import canlog
+    from hil.logs.log import FORMATS
 
     path = Path(str(action.log))
-    readers = {".log": canlog.read_candump, ".asc": canlog.read_asc, ".blf": canlog.read_blf, ".trc": canlog.read_trc}
+    readers = {suffix: f.frames for suffix, f in FORMATS.items() if f.frames is not None}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: suffix {path.suffix!r} holds no frames to replay; allowed: {', '.join(readers)}")
     log = readers[path.suffix.lower()](path)

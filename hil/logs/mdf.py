@@ -21,9 +21,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from hil.logs.canlog import EXTENDED, Frames, LogError, check_file, in_order, read_bytes
+from hil.logs.bus_log import encode_channels, open_bus_log
+from hil.logs.frames import EXTENDED, Frames, in_order
+from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
+from vaneloop.base.signals import UNITS
 
-__all__ = ["read_mdf", "write_bus", "write_groups"]
+__all__ = ["Groups", "open_mdf", "read_mdf", "write_bus", "write_groups", "write_mdf"]
 
 _MEMORY = 1 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
 _TIME = 20.0, 1e6  # s, and bytes of file per further second
@@ -36,6 +39,45 @@ _FRAMES = (
     "LIN_",
     "FLX_",
 )  # kept by the standard for bus events
+
+
+class Groups:
+    """Channel groups of an MDF4 file: `CHANNEL`, or `GROUP.CHANNEL` where several groups have it."""
+
+    kind = "channel"
+    sorted = False
+
+    def __init__(self, content: dict[str, Any]):
+        self.notes: list[str] = []
+        self.names = {key: tuple(names) for key, names in content["names"].items()}
+        self._series, self._why = content["series"], content["why"]
+
+    def has(self) -> str:
+        return names_held(self.kind, self.names)
+
+    def absent(self, name: str) -> str:
+        return ""
+
+    def series(self, key: str) -> Series:
+        if key not in self._series:
+            self.notes.append(f"{key}: {self._why.get(key, 'has no samples')}")
+            return Series(np.empty(0), np.empty(0))
+        t, values, unit = self._series[key]
+        return Series(t, values, unit)
+
+
+def open_mdf(path: Path, options: Options) -> Source:
+    """MDF4: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is
+    asked for.
+    """
+    wanted = [*UNITS, *options.mapping]
+    content, frames = read_mdf(path, wanted)
+    groups = Groups(content)
+    if frames is not None and (
+        options.dbc is not None or not any(find(groups, n, n in options.mapping) for n in wanted)
+    ):
+        return open_bus_log(frames, options)
+    return groups
 
 
 def read_mdf(path: Path, wanted: list[str]) -> tuple[dict[str, Any], Frames | None]:
@@ -211,6 +253,17 @@ def _bus_columns(mdf: Any, g: int, names: list[str]) -> list[np.ndarray]:
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_mdf(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    """Channel groups, one per raster; bus logging where a DBC is given."""
+    if dbc is not None:
+        write_bus(path, encode_channels(channels, dbc, path))
+        return
+    rasters: dict[bytes, tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]] = {}
+    for name, c in channels.items():
+        rasters.setdefault(c.t.tobytes(), (c.t, {}))[1][name] = c.values, UNITS[name].replace("-", "")
+    write_groups(path, list(rasters.values()))
 
 
 def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:

@@ -313,7 +313,7 @@ class Report:
     work: Lateness = field(default_factory=Lateness)
 
 
-_pack = struct.Struct("<qqq56x").pack  # hil.logs.recorder.FRAME of a frame in two words
+_pack = struct.Struct("<qqq56x").pack  # hil.logs.record_formats.FRAME of a frame in two words
 _TX = 1 << 48
 
 

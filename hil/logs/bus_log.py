@@ -1,0 +1,168 @@
+"""A CAN log seen through a database: its signals read from frames, and channels written as the frames that a bus would
+carry.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.logs.dbc import Message, load_dbc
+from hil.logs.frames import Frames
+from hil.logs.signals import cut_signal, encode, pgn, select
+from hil.logs.source import Channel, LogError, Options, Series, Source, names_held
+from vaneloop.base import tables
+
+__all__ = ["Bus", "bus_reader", "bus_writer", "encode_channels", "open_bus_log"]
+
+_MOST_FRAMES = 20_000_000  # of one message; 55 h at 10 ms
+_HOLD = 3  # frame periods a value is repeated on the bus before its channel counts as silent
+
+
+class Bus:
+    """A CAN log seen through a database: `MESSAGE.SIGNAL`, or `SIGNAL` where one message has it."""
+
+    kind = "signal"
+    sorted = True
+
+    def __init__(self, frames: Frames, messages: list[Message], notes: list[str], dbc: Path):
+        self.frames, self.dbc = frames, dbc
+        self.notes = notes + frames.notes
+        self.names: dict[str, tuple[str, ...]] = {}
+        self._of: dict[str, tuple[Message, Any]] = {}
+        self._silent: dict[str, str] = {}
+        self._rows: dict[int, np.ndarray] = {}
+        seen = np.unique(frames.ident)
+        groups = pgn(seen[seen >> 31 == 1])
+        for m in messages:
+            here = m.ident in seen or (m.ident >> 31 and pgn(m.ident & 0x1FFFFFFF) in groups)
+            for s in m.layout.signals:
+                key = f"{m.layout.name}.{s.name}"
+                if here:
+                    self.names[key] = (key, s.name)
+                    self._of[key] = m, s
+                else:
+                    why = (
+                        f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no "
+                        f"such frame"
+                    )
+                    self._silent[s.name] = self._silent[key] = why
+
+    def has(self) -> str:
+        if self.names:
+            return names_held(self.kind, self.names)
+        ident, count = np.unique(self.frames.ident & 0x1FFFFFFF, return_counts=True)
+        most = ", ".join(f"0x{i:X}" for i in ident[np.argsort(-count)][:8]) + (", ..." if ident.size > 8 else "")
+        return f"; {self.dbc.name} has no message for the log's {ident.size} identifiers ({most}): --dbc F"
+
+    def absent(self, name: str) -> str:
+        return self._silent.get(name, "")
+
+    def series(self, key: str) -> Series:
+        m, signal = self._of[key]
+        if m.ident not in self._rows:
+            self._rows[m.ident], notes = select(self.frames, m)
+            self.notes += notes
+        rows, values, missing = cut_signal(self.frames, self._rows[m.ident], m, signal)
+        if missing and not rows.size:
+            self._silent[key] = self._silent[str(signal.name)] = f"all {missing} frames say not available"
+        elif missing:
+            self.notes.append(f"{key}: {missing} frames say not available: left out")
+        return Series(self.frames.t[rows], values, str(signal.unit or ""))
+
+
+def bus_reader(read: Callable[[Path], Frames]) -> Callable[[Path, Options], Source]:
+    """Reader of a CAN log format: its frames, seen through the database."""
+
+    def open_bus(path: Path, options: Options) -> Source:
+        return open_bus_log(read(path), options)
+
+    return open_bus
+
+
+def open_bus_log(frames: Frames, options: Options) -> Bus:
+    """Frames seen through the database that the user named, or the product's own."""
+    dbc = options.dbc or tables.path("vgv.dbc")
+    messages, notes = load_dbc(dbc)
+    return Bus(frames, messages, list(notes), dbc)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def bus_writer(write: Callable[[Path, Frames], None]) -> Callable[[Path, dict[str, Channel], Path | None], None]:
+    """Writer of a CAN log format: channels to the frames of the database, then these to the file."""
+
+    def write_bus(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+        write(path, encode_channels(channels, dbc or tables.path("vgv.dbc"), path))
+
+    return write_bus
+
+
+def encode_channels(channels: dict[str, Channel], dbc: Path, path: Path) -> Frames:
+    """Frames as the nodes would send them: each message at its period, with the value then valid.
+
+    A value is repeated until its channel's next sample, but no longer than `_HOLD` frame periods or steps of the
+    channel: after that the signal says "not available", and a message without any value is not sent. i_cmd is the mean
+    since the last frame.
+    """
+    messages, _ = load_dbc(dbc)
+    start = min(float(c.t[0]) for c in channels.values())
+    parts = []
+    left = set(channels)
+    for m in messages:
+        names = [s.name for s in m.layout.signals if s.name in channels]
+        if not names:
+            continue
+        left -= set(names)
+        period = (m.layout.cycle_time or 10) / 1000
+        first = min(float(channels[n].t[0]) for n in names)
+        last = max(float(channels[n].t[-1]) for n in names)
+        if (last - first) / period > _MOST_FRAMES:
+            raise LogError(f"{path}: {last - first:.3g} s are too long for a CAN log with a frame every {period:g} s")
+        k = np.arange(math.ceil((first - start) / period - 1e-6), math.floor((last - start) / period + 1e-6) + 1)
+        t = start + k * period
+        values = {n: _sample(channels[n], t, period, n == "i_cmd") for n in names}
+        sent = ~np.logical_and.reduce([np.isnan(v) for v in values.values()])
+        t, values = t[sent], {n: v[sent] for n, v in values.items()}
+        if "mode_request" in m.missing:
+            values["mode_request"] = np.ones(t.size)
+        try:
+            data = encode(m, values, t.size)
+        except LogError as e:
+            raise LogError(f"{path}: {e}") from None
+        parts.append((t - start, np.full(t.size, m.ident, np.uint32), data))
+    if left:
+        raise LogError(f"{path}: {dbc.name} has no signal for {', '.join(sorted(left))}")
+    t = np.concatenate([p[0] for p in parts])
+    ident = np.concatenate([p[1] for p in parts])
+    width = max(8, *(p[2].shape[1] for p in parts))
+    data = np.zeros((t.size, width), np.uint8)
+    length = np.concatenate([np.full(len(p[2]), p[2].shape[1], np.uint8) for p in parts])
+    at = 0
+    for p in parts:
+        data[at : at + len(p[2]), : p[2].shape[1]] = p[2]
+        at += len(p[2])
+    order = np.lexsort((ident & 0x1FFFFFFF, np.rint(t * 1e6)))  # the lower identifier wins arbitration
+    return Frames(t[order], ident[order], np.zeros(t.size, np.int32), length[order], data[order])
+
+
+def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:
+    """The channel's value valid at each ``t``: its latest sample, or the mean since the sample before; NaN where it is
+    silent.
+    """
+    now = np.searchsorted(c.t, t + 1e-6, side="right")
+    age = t - c.t[np.maximum(now - 1, 0)]
+    step = float(np.median(np.diff(c.t))) if c.t.size > 1 else 0.0
+    there = (now > 0) & (age <= _HOLD * max(period, step))
+    values = c.values[np.maximum(now - 1, 0)].copy()
+    if mean and t.size:
+        before = np.searchsorted(c.t, t - period + 1e-6, side="right")
+        total = np.concatenate(([0.0], np.cumsum(c.values)))
+        several = now - before > 1
+        values[several] = (total[now] - total[before])[several] / (now - before)[several]
+    return np.where(there, values, np.nan)

@@ -1,0 +1,129 @@
+"""CSV: text with a header line, read and written through polars."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.logs.source import ABSENT, Channel, LogError, Options, Source, read_bytes
+from hil.logs.table import Table, polars_table, split_unit, time_column
+from vaneloop.base.signals import UNITS
+
+__all__ = ["open_csv", "write_csv"]
+
+_NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
+_MOST_COLUMNS = 10_000
+
+
+def open_csv(path: Path, options: Options) -> Source:
+    """CSV with one header line; separator , ; or tab, decimal comma with ; allowed; empty cell = no sample there."""
+    raw = read_bytes(path)
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raw = raw.decode("utf-16", errors="replace").encode()
+    if b"\0" in raw:
+        raise LogError(f"{path}: is not a CSV (binary bytes in it)")
+    try:
+        raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raw = raw.decode("cp1252", errors="replace").encode()
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    first = 2  # row of the first sample, as an editor counts
+    head, _, rest = raw.partition(b"\n")
+    while rest and (head.startswith(b"#") or not head.strip()):
+        head, _, rest = rest.partition(b"\n")
+        first += 1
+    line = head.decode().strip("\r")
+    separator = max(",;\t", key=line.count)
+    try:
+        headers = [h.strip() for h in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error as e:
+        raise LogError(f"{path}: header line cannot be read ({e}): {line[:80]!r}") from None
+    if len(headers) > _MOST_COLUMNS:
+        raise LogError(f"{path}: {len(headers)} columns; allowed: {_MOST_COLUMNS}")
+    again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
+    if again is not None:
+        raise LogError(f"{path}: column {again!r} is there more than once")
+    comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
+
+    time = time_column(path, headers, options.mapping)
+    known = {*UNITS, *options.mapping, time}
+    table = _Csv(
+        path, rest, headers, [h for h in headers if h in known or split_unit(h)[0] in known], separator, comma, first
+    )
+    return Table([h for h in headers if h], table.column, first, time)
+
+
+class _Csv:
+    """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
+
+    def __init__(
+        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int
+    ):
+        self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
+        self.separator, self.comma, self.first = separator, comma, first
+        self.ready: dict[str, np.ndarray] | None = None
+
+    def column(self, header: str) -> np.ndarray:
+        import polars as pl
+
+        if not self.rows.strip():
+            return np.empty(0)
+        if self.ready is None:
+            try:
+                frame = self._read(self.wanted, pl.Float64)
+                self.ready = {h: _numbers(frame[h]) for h in self.wanted}
+            except pl.exceptions.PolarsError:
+                self.ready = {}  # a cell that is no number: column by column
+        if header not in self.ready:
+            self.ready[header] = self._numbers(header)
+        return self.ready[header]
+
+    def _read(self, columns: list[str], kind: Any) -> Any:
+        """The columns of ``columns`` as ``kind``."""
+        import polars as pl
+
+        places = [f"c{self.headers.index(h)}" for h in columns]  # names of our own: the file's may be empty
+        head = self.separator.join(f"c{i}" for i in range(len(self.headers))).encode() + b"\n"
+        frame = pl.read_csv(
+            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0,
+            schema_overrides=dict.fromkeys(places, kind),
+            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String,
+            null_values=["", *_NO_SAMPLE],
+        )  # fmt: skip
+        return frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
+
+    def _numbers(self, header: str) -> np.ndarray:
+        """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
+        named.
+        """
+        import polars as pl
+
+        try:
+            text = self._read([header], pl.String)[header].str.strip_chars()
+        except pl.exceptions.PolarsError as e:
+            raise LogError(f"{self.path}: column {header!r}: {str(e)[:160]}") from None
+        text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
+        number = (text.str.replace(",", ".", literal=True) if self.comma else text).cast(pl.Float64, strict=False)
+        bad = (number.is_null() & text.is_not_null()).arg_true()
+        if bad.len():
+            raise LogError(
+                f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number"
+            )
+        return _numbers(number)
+
+
+def _numbers(column: Any) -> np.ndarray:
+    """float64 of a polars column; no sample becomes `ABSENT`."""
+    values = column.to_numpy().astype(np.float64, copy=True)
+    values[column.is_null().to_numpy()] = ABSENT
+    return values
+
+
+def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    """Write a CSV: t, then a column a channel on all times of all; an empty cell where a channel has no sample."""
+    polars_table(channels).write_csv(path)

@@ -1,0 +1,95 @@
+"""Databases of CAN messages, read through cantools.
+
+What it stumbles over is left out of the file, as long as no signal's layout needs it.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.logs.frames import EXTENDED
+from hil.logs.source import LogError, check_file, read_bytes
+
+__all__ = ["Message", "load_dbc"]
+
+MAX_DBC = 32 << 20  # bytes; the largest of whole vehicles have some ten MB
+# What a DBC can lose without losing a signal's layout, least needed first.
+_DROP = (("VAL_",), ("CM_",),
+    ("BA_", "BA_DEF_", "BA_DEF_DEF_", "BA_REL_", "BA_DEF_REL_", "BA_DEF_DEF_REL_", "SIG_GROUP_", "EV_",
+         "BO_TX_BU_", "VAL_TABLE_"))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message of the database, with what the product needs beyond its layout.
+
+    e2e         DataID of AUTOSAR E2E profile 1, None where the message has none
+    j1939       raw values with 0xFE or 0xFF on top mean error or not available (J1939-71)
+    missing     signal -> raw value that means not available (attribute NotAvailable of vgv.dbc)
+    """
+
+    layout: Any  # cantools.database.can.Message
+    ident: int
+    e2e: int | None
+    j1939: bool
+    missing: dict[str, int]
+
+
+def load_dbc(path: Path) -> tuple[list[Message], list[str]]:
+    """Messages of a database file and notes on what had to be left out of it."""
+    if (size := check_file(path)) > MAX_DBC:
+        raise LogError(f"{path}: {size:,} bytes; a database may have {MAX_DBC:,}")
+    return _load_dbc(str(path), read_bytes(path))
+
+
+@functools.lru_cache(maxsize=8)
+def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
+    import cantools
+
+    kind = Path(path).suffix.lower().lstrip(".")
+    text = raw.decode("utf-8-sig" if raw.startswith(b"\xef\xbb\xbf") else "cp1252", errors="replace")
+    if kind in ("arxml", "kcd", "sym"):
+        tries = [(text, False, "")]
+    else:
+        kind = "dbc"
+        if "BO_ " not in text:
+            raise LogError(f"{path}: is not a DBC (it defines no message, BO_)")
+        tries = [(text, True, ""), (text, False, "")]
+        for k in range(1, len(_DROP) + 1):
+            gone = [word for words in _DROP[:k] for word in words]
+            shorter = re.sub(rf'^[ \t]*(?:{"|".join(gone)})[ \t](?:[^;"]|"(?:[^"\\]|\\.)*")*;', "", text, flags=re.M)
+            tries.append((shorter, False, "without its lines " + ", ".join(gone)))
+    reason = ""
+    for content, strict, lost in tries:
+        try:
+            db: Any = cantools.database.load_string(content, database_format=kind, strict=strict)
+            messages = [_message(m) for m in db.messages]
+        except Exception as e:  # cantools raises whatever its grammar meets
+            reason = reason or " ".join(str(e).split())[:120]
+            continue
+        return messages, [f"{path}: read {lost} ({reason})"] if lost else []
+    raise LogError(f"{path}: is not a database that cantools reads ({reason})")
+
+
+def _message(m: Any) -> Message:
+    """Read the attributes of a cantools message."""
+    attributes = m.dbc.attributes if m.dbc is not None else {}
+
+    def number(of: Any, key: str) -> int | None:
+        attribute = of.get(key)
+        return None if attribute is None else attribute.value
+
+    missing = {}
+    for s in m.signals:
+        value = number(s.dbc.attributes if s.dbc is not None else {}, "NotAvailable")
+        if isinstance(value, int):
+            missing[s.name] = value
+    e2e = number(attributes, "DataID") if number(attributes, "E2EProfile") in (1, "P01") else None
+    frame_format = attributes.get("VFrameFormat")
+    j1939 = m.protocol == "j1939" or (frame_format is not None and frame_format.value in (3, "J1939PG"))
+    ident = m.frame_id | (EXTENDED if m.is_extended_frame else 0)
+    return Message(m, ident, e2e, j1939 and m.is_extended_frame, missing)

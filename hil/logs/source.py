@@ -1,0 +1,145 @@
+"""What a format of logs gives and takes: it opens a file as a `Source`, which offers `Series` under names, and writes
+`Channel`s.
+
+A source says what stands in the file. `hil.logs.log` brings it to the product's names and units.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from vaneloop.base.errors import InputError
+
+__all__ = [
+    "ABSENT", "Channel", "LogError", "Options", "Series", "Source", "check_file", "close_names", "find", "is_absent",
+    "names_held", "read_bytes",
+]  # fmt: skip
+
+MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
+
+
+class LogError(InputError):
+    """A log cannot be used. One line: file, channel, reason."""
+
+    def __init__(self, text: str):
+        # names and cells of a damaged file end up in messages: keep them on one printable line
+        line = "".join(c if c.isprintable() else " " for c in text)
+        super().__init__(" ".join(line.split())[:1000])
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Samples of one signal: t in s, strictly increasing; values in the signal's unit, finite."""
+
+    t: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Series:
+    """Samples as they stand in the file; sample k is called "``word`` ``first`` + k" (row 17)."""
+
+    t: np.ndarray
+    values: np.ndarray
+    unit: str = ""
+    t_unit: str = ""
+    word: str = "sample"
+    first: int = 1
+
+
+class Source(Protocol):
+    """A file that has been opened: ``names`` maps what it offers to the names it may be asked by."""
+
+    kind: str
+    names: dict[str, tuple[str, ...]]
+    notes: list[str]
+    sorted: bool
+
+    def series(self, key: str) -> Series: ...
+
+    def has(self) -> str: ...
+
+    def absent(self, name: str) -> str: ...
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a reader may need beyond the path."""
+
+    dbc: Path | None
+    mapping: Mapping[str, str]
+
+
+# A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.
+ABSENT = np.array([0x7FF8_0000_0000_0A0B], np.uint64).view(np.float64)[0]
+
+
+def is_absent(values: np.ndarray) -> np.ndarray:
+    """Which values are `ABSENT`: bool[n]."""
+    return values.view(np.uint64) == np.uint64(0x7FF8_0000_0000_0A0B)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def check_file(path: Path) -> int:
+    """Size of the file, or a LogError for one that is missing, a folder, empty, or too long."""
+    try:
+        folder, size = path.is_dir(), path.stat().st_size
+    except (OSError, ValueError) as e:
+        raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    if folder or not path.is_file():
+        raise LogError(f"{path}: is {'a folder' if folder else 'not a file'}, not a log")
+    if size > MAX_FILE:
+        raise LogError(f"{path}: {size} bytes; allowed: up to {MAX_FILE}")
+    if not size:
+        raise LogError(f"{path}: is empty")
+    return size
+
+
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The file's bytes, or its first ``most``; LogError where it cannot be read."""
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(most)
+    except (OSError, MemoryError) as e:
+        raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def find(source: Source, name: str, mapped: bool) -> list[str]:
+    """What the file offers under ``name``: full name before short; in any case of letters only where the user gave the
+    name.
+    """
+    if name in source.names:
+        return [name]
+    for fold in (str, str.casefold) if mapped else (str,):
+        hits = [k for k, aliases in source.names.items() if any(fold(name) == fold(a) for a in aliases)]
+        if hits:
+            return hits
+    return []
+
+
+def close_names(name: str, have: Iterable[str]) -> str:
+    """Suggestions for a misspelt name."""
+    back = {h.casefold(): h for h in have}
+    near = difflib.get_close_matches(name.casefold(), back, 4, 0.6)
+    return "; close: " + ", ".join(back[n][:60] for n in near) if near else ""
+
+
+def names_held(kind: str, have: Iterable[str]) -> str:
+    """What the file offers, shortened."""
+    names = [str(h)[:60] for h in have]
+    if not names:
+        return f"; the file has no {kind}"
+    more = f" and {len(names) - 12} more" if len(names) > 12 else ""
+    return f"; the file has {len(names)} {kind}{'s' * (len(names) != 1)}: {', '.join(names[:12])}{more}"

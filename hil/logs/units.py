@@ -1,0 +1,121 @@
+"""Samples to the unit of their signal: units as files and users write them, through pint."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.logs.source import LogError
+from vaneloop.base.signals import UNITS
+
+__all__ = ["Units"]
+
+_SPEED = ("n_dem", "n_r")
+_ALIASES = {
+    "%": "percent", "pct": "percent", "per cent": "percent", "1": "", "ratio": "",
+    "°": "degree", "deg": "degree", "°c": "degC", "c": "degC", "celsius": "degC", "deg c": "degC",
+    "°f": "degF", "degf": "degF", "f": "degF", "k": "kelvin", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm", "min^-1": "rpm", "rps": "turn/second", "rev/s": "turn/second", "1/s": "turn/second",
+    "hz": "turn/second",
+    "khz": "kiloturn/second", "sec": "second", "s": "second",
+    "ms": "millisecond", "us": "microsecond", "µs": "microsecond", "ns": "nanosecond", "min": "minute",
+}  # fmt: skip
+# A unit text comes from a file: 9**9**9 would keep pint busy for hours.
+_UNIT = re.compile(r"[A-Za-z%°µμΩ_/*^.0-9 ()-]*")
+_POWER_TOWER = re.compile(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}")
+
+
+@functools.lru_cache(maxsize=1)
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+
+
+@functools.lru_cache(maxsize=256)
+def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
+    """(a, b) with value_in_into = a * value_in_unit + b; None where ``unit`` is no unit, its name where it cannot be
+    converted.
+
+    Frequencies are turns: 1 Hz of a rotor is 60 rpm (pint alone would take it for 1 rad/s).
+    """
+    import pint
+
+    text = unit.strip()
+    text = _ALIASES.get(text.casefold(), text)
+    if len(text) > 32 or not _UNIT.fullmatch(text) or _POWER_TOWER.search(text):
+        return None
+    registry = _registry()
+    into = _ALIASES.get(into.casefold(), into)
+    try:
+        parsed = registry.parse_units(text)
+    except (
+        pint.errors.PintError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        SyntaxError,
+        RecursionError,
+        ArithmeticError,
+    ):
+        return None
+    except Exception as e:  # the tokenizer of pint's grammar has error types of its own
+        if type(e).__module__ in ("tokenize", "builtins"):
+            return None
+        raise
+    try:
+        a, b = (float(registry.Quantity(v, parsed).to(into).magnitude) for v in (0.0, 1.0))
+    except (pint.errors.PintError, ValueError, TypeError, ArithmeticError):
+        return text
+    if not (math.isfinite(a) and math.isfinite(b)) or a == b:
+        return None
+    return b - a, a
+
+
+_NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
+
+
+@dataclass(frozen=True)
+class Units:
+    """How to bring a signal's samples to its own unit; ``stated`` are the units that the user named, signal -> unit."""
+
+    path: Path
+    stated: Mapping[str, str]
+    design_rpm: float | None
+    notes: list[str]
+    signals: Mapping[str, str] = field(default_factory=lambda: UNITS)
+
+    def convert(self, signal: str, key: str, values: np.ndarray, unit: str) -> np.ndarray:
+        own = self.signals.get(signal, "s")
+        stated = signal in self.stated
+        unit = self.stated.get(signal, unit).strip()
+        if signal == "state" or unit == own or unit.casefold() in _NO_UNIT or (unit == "1" and not stated):
+            return values
+        factor = _factor(unit, own)
+        if isinstance(factor, tuple):
+            return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
+        if factor is None and not stated:
+            self.notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
+            return values
+        allowed = f"{own} or what converts to it"
+        if signal in _SPEED:
+            allowed = "%, or rpm, Hz, rad/s with the design speed"
+            speed = _factor(unit, "rpm")
+            if isinstance(speed, tuple):
+                if self.design_rpm is None:
+                    way = f"--design-rpm R gives the design speed, --unit {signal}=% says that it is % already"
+                    raise LogError(
+                        f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}"
+                    )
+                return values * (speed[0] * 100.0 / self.design_rpm)
+        what = "unit is not known" if factor is None else "unit does not convert"
+        raise LogError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed} (--unit {signal}=...)")
