@@ -10,28 +10,40 @@ import numpy as np
 import pytest
 
 from vaneloop.base.errors import InputError
-from vaneloop.design import servo as d
 from vaneloop.design import trend as tf
+from vaneloop.design.limit_cycles import LimitCycle, Play, limit_cycles, play_describing_function
+from vaneloop.design.servo import (
+    Gains,
+    ServoPlant,
+    continuous_loop,
+    continuous_response,
+    default_gains,
+    frequency_response,
+    margins,
+    sampled_loop,
+)
+from vaneloop.design.servo_design import MIDDLE, DesignResult, design, evaluate, summary
+from vaneloop.design.servo_simulation import ramp_demand, simulate, steady_cycle
 from vaneloop.pages.design import design_page
 
-PLANT = d.ServoPlant()
-GAINS = d.Gains(16.0, 100.0, 0.2667)
+PLANT = ServoPlant()
+GAINS = Gains(16.0, 100.0, 0.2667)
 
 
 @pytest.fixture(scope="module")
-def result() -> d.DesignResult:
-    return d.design(GAINS, PLANT)
+def result() -> DesignResult:
+    return design(GAINS, PLANT)
 
 
 # ---------------------------------------------------------------- linear loop
 
 
-def dense_margins(gains: d.Gains, plant: d.ServoPlant) -> tuple[float, float, float, float]:
+def dense_margins(gains: Gains, plant: ServoPlant) -> tuple[float, float, float, float]:
     """Crossover (Hz), gain margin (dB), phase margin (deg), disk margin of the continuous loop with its exact delay, on
     a dense grid.
     """
     w = np.geomspace(0.5, 1500.0, 400_000)
-    loop = d.continuous_response(gains, plant, w)
+    loop = continuous_response(gains, plant, w)
     cross = int(np.argmax(np.abs(loop) < 1.0))
     phase = np.unwrap(np.angle(loop))
     back = int(np.argmax(phase < -math.pi))
@@ -44,10 +56,10 @@ def dense_margins(gains: d.Gains, plant: d.ServoPlant) -> tuple[float, float, fl
 
 
 @pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("gains", [GAINS, d.Gains(8.0, 20.0, 0.0), d.Gains(25.0, 400.0, 0.2)])
-def test_margins_of_the_sampled_loop_are_those_of_the_closed_form(gains: d.Gains, delay: int) -> None:
+@pytest.mark.parametrize("gains", [GAINS, Gains(8.0, 20.0, 0.0), Gains(25.0, 400.0, 0.2)])
+def test_margins_of_the_sampled_loop_are_those_of_the_closed_form(gains: Gains, delay: int) -> None:
     plant = replace(PLANT, delay=delay)
-    m = d.margins(gains, plant)
+    m = margins(gains, plant)
     # the firmware's integral counts this tick's error already: T z/(z - 1) is the trapezoid's 1/s and half a tick's
     # proportional part
     equal = replace(gains, kp=gains.kp + 0.5 * gains.ki * plant.tick)
@@ -59,7 +71,7 @@ def test_margins_of_the_sampled_loop_are_those_of_the_closed_form(gains: d.Gains
     assert m.disk_margin == pytest.approx(disk, abs=0.01)
 
 
-def test_sampled_response_is_numpys_own(result: d.DesignResult) -> None:
+def test_sampled_response_is_numpys_own(result: DesignResult) -> None:
     """Zero-order hold by the matrix exponential and PI by its difference equation, in plain numpy."""
     from scipy.linalg import expm
 
@@ -85,14 +97,14 @@ def test_disk_margin_of_the_published_example() -> None:
     assert 10 ** (gain / 20) == pytest.approx(1.59, abs=0.01)
 
 
-def test_a_gain_raised_by_the_gain_margin_is_at_the_edge(result: d.DesignResult) -> None:
+def test_a_gain_raised_by_the_gain_margin_is_at_the_edge(result: DesignResult) -> None:
     edge = GAINS.kp * 10 ** (result.nominal.gain_margin_db / 20)
     ratio = GAINS.ki / GAINS.kp
-    assert d.margins(d.Gains(0.99 * edge, 0.99 * edge * ratio, 0.0), PLANT).stable
-    assert not d.margins(d.Gains(1.01 * edge, 1.01 * edge * ratio, 0.0), PLANT).stable
+    assert margins(Gains(0.99 * edge, 0.99 * edge * ratio, 0.0), PLANT).stable
+    assert not margins(Gains(1.01 * edge, 1.01 * edge * ratio, 0.0), PLANT).stable
 
 
-def test_stated_limits_hold_at_every_corner(result: d.DesignResult) -> None:
+def test_stated_limits_hold_at_every_corner(result: DesignResult) -> None:
     assert [c.name for c in result.checks if not c.ok] == []
     assert len(result.corners) == 32
     for c in result.corners:
@@ -104,29 +116,29 @@ def test_stated_limits_hold_at_every_corner(result: d.DesignResult) -> None:
 
 
 def test_the_calibrated_gains_are_the_designed_ones() -> None:
-    assert d.default_gains() == GAINS
-    assert d.ServoPlant.from_tables() == PLANT
+    assert default_gains() == GAINS
+    assert ServoPlant.from_tables() == PLANT
 
 
-def test_linear_simulation_follows_controls_step(result: d.DesignResult) -> None:
+def test_linear_simulation_follows_controls_step(result: DesignResult) -> None:
     """A step too small to saturate anything, through the firmware's servo step and the plant's own steps."""
     n = 300
-    run = d.simulate(replace(GAINS, kff=0.0), PLANT, np.full(n, d.MIDDLE + 1e-4), start=d.MIDDLE, substeps=80)
-    np.testing.assert_allclose((run.x_lvdt - d.MIDDLE) / 1e-4, result.curves["step_linear"][:n], atol=1e-3)
+    run = simulate(replace(GAINS, kff=0.0), PLANT, np.full(n, MIDDLE + 1e-4), start=MIDDLE, substeps=80)
+    np.testing.assert_allclose((run.x_lvdt - MIDDLE) / 1e-4, result.curves["step_linear"][:n], atol=1e-3)
 
 
-def test_noise_current_is_what_the_simulation_shows(result: d.DesignResult) -> None:
+def test_noise_current_is_what_the_simulation_shows(result: DesignResult) -> None:
     assert result.noise_current_ma == pytest.approx(result.rest["noisy_current_ma_rms"], rel=0.05)
 
 
-def test_anti_windup_keeps_a_saturating_step_from_overshooting(result: d.DesignResult) -> None:
+def test_anti_windup_keeps_a_saturating_step_from_overshooting(result: DesignResult) -> None:
     assert result.step["bare_10mm_saturated_ms"] > 30.0
     assert result.step["bare_10mm_overshoot_mm"] < 0.2  # an integral wound up over these 50 ms would give 1 mm and more
 
 
 def test_halving_the_plants_step_changes_nothing_that_matters() -> None:
-    reference = d.ramp_demand(d.MIDDLE + 0.05 * np.clip(np.arange(50) * 0.01 - 0.1, 0.0, 0.2), PLANT)
-    a, b = (d.simulate(GAINS, PLANT, *reference, substeps=n).x for n in (10, 20))
+    reference = ramp_demand(MIDDLE + 0.05 * np.clip(np.arange(50) * 0.01 - 0.1, 0.0, 0.2), PLANT)
+    a, b = (simulate(GAINS, PLANT, *reference, substeps=n).x for n in (10, 20))
     assert np.abs(a - b).max() < 0.5 * PLANT.lvdt_noise  # 1.5 um: at 50 mm/s, 0.03 ms of the LVDT's lag
 
 
@@ -134,10 +146,10 @@ def test_simulation_is_the_products_plant() -> None:
     """The chain that lockstep runs, tick by tick with the same current, goes the same way."""
     from plant import build_plant, chain
 
-    x_ref, dx_ref = d.ramp_demand(d.MIDDLE + 0.05 * np.clip(np.arange(50) * 0.01 - 0.1, 0.0, 0.2), PLANT)
-    run = d.simulate(GAINS, PLANT, x_ref, dx_ref)
+    x_ref, dx_ref = ramp_demand(MIDDLE + 0.05 * np.clip(np.arange(50) * 0.01 - 0.1, 0.0, 0.2), PLANT)
+    run = simulate(GAINS, PLANT, x_ref, dx_ref)
     machine = build_plant()
-    s = machine.start(d.MIDDLE, 80.0)
+    s = machine.start(MIDDLE, 80.0)
     x, x_lvdt = np.empty(run.t.size), np.empty(run.t.size)
     for n, i in enumerate(run.i):
         x[n], x_lvdt[n] = s[chain.X, 0], s[chain.X_LVDT, 0]
@@ -160,8 +172,8 @@ def test_the_gap_is_total_not_half() -> None:
         y = min(max(y, u - gap / 2), u + gap / 2)
         out[k] = y
     fundamental = 2j * np.mean(out[n:] * np.exp(-1j * turn[n:])) / amplitude
-    assert d.play_describing_function(amplitude, gap) == pytest.approx(fundamental, abs=1e-3)
-    assert d.play_describing_function(0.5, gap) == 0.0
+    assert play_describing_function(amplitude, gap) == pytest.approx(fundamental, abs=1e-3)
+    assert play_describing_function(0.5, gap) == 0.0
 
 
 def test_textbook_servo_with_backlash() -> None:
@@ -179,27 +191,27 @@ def test_textbook_servo_with_backlash() -> None:
         x += h * v
         y = min(max(y, x - 0.2), x + 0.2)
         out[n] = x
-    seen = d.steady_cycle(t, out, 0.01)
+    seen = steady_cycle(t, out, 0.01)
     assert seen is not None
     assert (seen.amplitude, seen.omega) == (pytest.approx(0.33, abs=0.01), pytest.approx(2 * math.pi / 5.0, rel=0.04))
 
-    (cycle,) = d.limit_cycles(lambda w: 4.0 / (1j * w * (1j * w + 1.0)), 0.4, 0.1, 20.0)
+    (cycle,) = limit_cycles(lambda w: 4.0 / (1j * w * (1j * w + 1.0)), 0.4, 0.1, 20.0)
     assert cycle.amplitude == pytest.approx(0.33, abs=0.01)
     assert cycle.omega == pytest.approx(1.24, rel=0.02)
     assert (cycle.amplitude, cycle.omega) == (
         pytest.approx(seen.amplitude, rel=0.03),
         pytest.approx(seen.omega, rel=0.01),
     )
-    assert d.limit_cycles(lambda w: 0.25 / (1j * w * (1j * w + 1.0)), 0.4, 0.01, 20.0) == []  # K = 1/4: none
+    assert limit_cycles(lambda w: 0.25 / (1j * w * (1j * w + 1.0)), 0.4, 0.01, 20.0) == []  # K = 1/4: none
 
 
 def test_controls_own_search_finds_the_same_crossing() -> None:
     import control as ct
 
-    gains = d.Gains(10.0, 400.0, 0.0)
-    (cycle,) = d.limit_cycles(lambda w: d.continuous_response(gains, PLANT, w), 1.0, 1.0, 500.0)
+    gains = Gains(10.0, 400.0, 0.0)
+    (cycle,) = limit_cycles(lambda w: continuous_response(gains, PLANT, w), 1.0, 1.0, 500.0)
     found = ct.describing_function_response(
-        d.continuous_loop(gains, PLANT),
+        continuous_loop(gains, PLANT),
         ct.friction_backlash_nonlinearity(1.0),
         np.linspace(0.8, 2.0, 60),
         np.geomspace(10.0, 200.0, 400),
@@ -208,20 +220,20 @@ def test_controls_own_search_finds_the_same_crossing() -> None:
     assert found[0] == pytest.approx((cycle.amplitude, cycle.omega), rel=2e-3)
 
 
-def oscillate(gains: d.Gains, gap: float, seconds: float = 12.0, site: str = "lvdt") -> d.LimitCycle | None:
+def oscillate(gains: Gains, gap: float, seconds: float = 12.0, site: str = "lvdt") -> LimitCycle | None:
     n = round(seconds / PLANT.tick)
-    start = d.MIDDLE + gap if site == "lvdt" else d.MIDDLE
-    run = d.simulate(
-        gains, PLANT, np.full(n, d.MIDDLE), play=d.Play(site, gap), start=start, integral=0.0 if site == "lvdt" else gap
+    start = MIDDLE + gap if site == "lvdt" else MIDDLE
+    run = simulate(
+        gains, PLANT, np.full(n, MIDDLE), play=Play(site, gap), start=start, integral=0.0 if site == "lvdt" else gap
     )
-    return d.steady_cycle(run.t, run.play_in, 0.02 * gap)
+    return steady_cycle(run.t, run.play_in, 0.02 * gap)
 
 
 @pytest.mark.parametrize(("kp", "ki"), [(10.0, 400.0), (16.0, 800.0), (8.0, 500.0)])
 def test_play_inside_the_loop_oscillates_as_predicted(kp: float, ki: float) -> None:
     """Strong integral, motion well beyond the gap: the describing function holds within 12 %."""
-    gains, gap = d.Gains(kp, ki, 0.0), 0.1e-3
-    (cycle,) = d.limit_cycles(lambda w: d._response(d.sampled_loop(gains, PLANT), w), gap, 1.0, 2000.0)
+    gains, gap = Gains(kp, ki, 0.0), 0.1e-3
+    (cycle,) = limit_cycles(lambda w: frequency_response(sampled_loop(gains, PLANT), w), gap, 1.0, 2000.0)
     seen = oscillate(gains, gap)
     assert seen is not None
     assert seen.amplitude == pytest.approx(cycle.amplitude, rel=0.12)
@@ -229,7 +241,7 @@ def test_play_inside_the_loop_oscillates_as_predicted(kp: float, ki: float) -> N
 
 
 @pytest.mark.parametrize("site", ["lvdt", "valve"])
-def test_with_harmonics_the_prediction_holds_where_the_piston_grazes_the_gap(result: d.DesignResult, site: str) -> None:
+def test_with_harmonics_the_prediction_holds_where_the_piston_grazes_the_gap(result: DesignResult, site: str) -> None:
     p = next(p for p in result.play if p.site == site)
     assert p.grazing
     assert p.simulated_amplitude is not None and p.simulated_hz is not None
@@ -240,19 +252,19 @@ def test_with_harmonics_the_prediction_holds_where_the_piston_grazes_the_gap(res
 
 
 def test_the_limit_cycle_grows_with_the_gap_and_keeps_its_frequency() -> None:
-    gains = d.Gains(10.0, 400.0, 0.0)
+    gains = Gains(10.0, 400.0, 0.0)
     small, large = oscillate(gains, 0.05e-3), oscillate(gains, 0.2e-3)
     assert small is not None and large is not None
     assert large.amplitude == pytest.approx(4.0 * small.amplitude, rel=0.01)
     assert large.omega == pytest.approx(small.omega, rel=0.01)
 
 
-def test_without_integral_play_does_not_oscillate(result: d.DesignResult) -> None:
+def test_without_integral_play_does_not_oscillate(result: DesignResult) -> None:
     assert all(p.without_integral is None for p in result.play)
-    assert oscillate(d.Gains(16.0, 0.0, 0.0), 0.1e-3, 4.0) is None
+    assert oscillate(Gains(16.0, 0.0, 0.0), 0.1e-3, 4.0) is None
 
 
-def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: d.DesignResult) -> None:
+def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: DesignResult) -> None:
     outside = next(p for p in result.play if p.site == "vanes")
     assert outside.predicted_amplitude is None and outside.simulated_amplitude is None
     run = result.curves["play"]["vanes"]
@@ -260,8 +272,8 @@ def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: d.Des
     assert run.x_vane[-1] == pytest.approx(run.x[run.t > 0.4].min() + outside.gap * 0.5e-3, abs=1e-9)
     assert run.x_vane[-1] - run.x[-1] > 0.4e-3 * outside.gap
     # the loop does not know: the same run without play has the same piston, bit for bit
-    points = d.MIDDLE + np.interp(np.arange(100) * 10e-3, [0.1, 0.3, 0.5], [0.0, 4e-3, 2e-3])
-    free = d.simulate(GAINS, PLANT, *d.ramp_demand(points, PLANT))
+    points = MIDDLE + np.interp(np.arange(100) * 10e-3, [0.1, 0.3, 0.5], [0.0, 4e-3, 2e-3])
+    free = simulate(GAINS, PLANT, *ramp_demand(points, PLANT))
     assert np.array_equal(free.x, run.x[: free.x.size])
 
 
@@ -269,28 +281,28 @@ def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: d.Des
 
 
 def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -> None:
-    result, code = d.evaluate()
+    result, code = evaluate()
     design_page(result, tmp_path / "design.html")
     assert code == 0 and result.ok
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False))["nominal"]["gain_margin_db"] > 8.0
     assert (tmp_path / "design.html").stat().st_size > 100_000
-    assert any("gain margin" in line for line in d.summary(result))
-    result, code = d.evaluate(kp=60.0)
+    assert any("gain margin" in line for line in summary(result))
+    result, code = evaluate(kp=60.0)
     assert code == 1 and not result.ok
     json.dumps(result.to_dict(), allow_nan=False)
 
 
 def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
-    result, code = d.evaluate(kp=200.0)
+    result, code = evaluate(kp=200.0)
     design_page(result, tmp_path / "unstable.html")
     assert code == 1 and "stable" in result.checks[0].name
     json.dumps(result.to_dict(), allow_nan=False)
-    assert d.summary(result)
+    assert summary(result)
 
 
 @pytest.mark.parametrize("gap_mm", [0.0, 0.3])
 def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
-    result, code = d.evaluate(backlash_inside=gap_mm)
+    result, code = evaluate(backlash_inside=gap_mm)
     assert result.play[0].gap == pytest.approx(gap_mm)
     assert code == (0 if gap_mm == 0.0 else 1)  # 0.3 mm hunts with 0.16 mm, beyond 0.05 mm
     assert (result.play[0].predicted_amplitude is None) == (gap_mm == 0.0)
@@ -301,7 +313,7 @@ def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
 )
 def test_a_gain_out_of_range_is_named(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
-        d.evaluate(**bad)
+        evaluate(**bad)
 
 
 # ---------------------------------------------------------------- trend filter

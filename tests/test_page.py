@@ -18,24 +18,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.figures import error_figures
+from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
-from vaneloop.pages import page as page_module
-from vaneloop.pages.page import (
-    THEMES,
-    Line,
-    Page,
-    Panel,
-    bars,
-    decimate,
-    heat,
-    histogram,
-    loop,
-    number,
-    overlay,
-    ranking,
-    waterfall,
-)
-from vaneloop.pages.replay import PAPER_TABLE_5, engine_test_report, replay_report
+from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
+from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
+from vaneloop.pages.page import Page
+from vaneloop.pages.replay import replay_report
+from vaneloop.pages.series import MAX_POINTS, decimate
+from vaneloop.pages.style import THEMES, number
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'\u2028"
 
@@ -107,7 +97,8 @@ def test_the_page_needs_no_network_and_forbids_it():
     assert loads == []
     policy = next(v for k, v in elements.attributes if k == "content" and "default-src" in v)
     assert "default-src 'none'" in policy and "http" not in policy
-    assert "sendChartToCloud" not in page_module._SCRIPT and "modeBarButtons:" in page_module._SCRIPT
+    script = (ROOT / "vaneloop" / "pages" / "page.js").read_text(encoding="utf-8")
+    assert "sendChartToCloud" not in script and "modeBarButtons:" in script
 
 
 def test_plotly_is_inlined_once_and_the_charset_is_declared():
@@ -272,7 +263,7 @@ def test_a_thinned_loop_stays_on_the_path_and_covers_it():
     x, y = np.cos(angle), 2 * np.sin(angle)
     trace = loop([Line("a", x, y)], "x", "y")["data"][0]
     u, v = unpack(trace["x"]), unpack(trace["y"])
-    assert u.size <= page_module.MAX_POINTS
+    assert u.size <= MAX_POINTS
     drawn = np.isfinite(u)
     assert np.abs(u[drawn] ** 2 + (v[drawn] / 2) ** 2 - 1).max() < 1e-5
     around = np.unwrap(np.sort(np.arctan2(v[drawn] / 2, u[drawn])))

@@ -21,16 +21,11 @@ from tests.rig import Hidden, Manoeuvre, simulate
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.cli.main import main
-from vaneloop.design.scheduling import (
-    LinkChange,
-    MeasuredLoop,
-    ScheduleOptions,
-    geometry_with,
-    measure_loop,
-    schedule,
-    table_speeds,
-    write_tables,
-)
+from vaneloop.design.links import LinkChange, ScheduleOptions, geometry_with
+from vaneloop.design.measured_loop import MeasuredLoop, measure_loop
+from vaneloop.design.schedule_files import write_tables
+from vaneloop.design.scheduling import schedule
+from vaneloop.design.stroke_tables import table_speeds
 
 GEOMETRY = load_geometry()
 SCHEDULES = load_schedules()

@@ -29,8 +29,8 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.cli.main import main
 from vaneloop.design.clearance import FITS, clearance_study
+from vaneloop.design.links import geometry_with
 from vaneloop.design.multibody import multibody_angles
-from vaneloop.design.scheduling import geometry_with
 
 GEOMETRY = load_geometry()
 STROKE = np.linspace(0.0, 48.0, 25)

@@ -24,7 +24,8 @@ from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
 from plant.parameters import PlantTable, load_plant
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Quantity, path, read
-from vaneloop.design.scheduling import stroke_tables, vane_angle_table, write_stroke_tables, write_vane_angles
+from vaneloop.design.schedule_files import write_stroke_tables, write_vane_angles
+from vaneloop.design.stroke_tables import stroke_tables, vane_angle_table
 
 MODELS = {
     "calibration.toml": CalibrationTable,

@@ -6,7 +6,7 @@ import argparse
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
-from vaneloop.design.servo import evaluate, summary
+from vaneloop.design.servo_design import evaluate, summary
 from vaneloop.pages.design import design_page
 
 __all__ = ["DESCRIPTION", "add_options", "command"]

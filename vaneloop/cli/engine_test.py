@@ -13,7 +13,7 @@ from hil.replay import STATISTICS, ReplayResult, replay_json
 from plant import build_plant
 from vaneloop.base import terminal
 from vaneloop.cli import options
-from vaneloop.pages.replay import PAPER_TABLE_5
+from vaneloop.pages.engine_test import PAPER_TABLE_5
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -66,7 +66,7 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from hil.loop.lockstep import warm_up
     from vaneloop.base.errors import InputError
-    from vaneloop.pages.replay import engine_test_report
+    from vaneloop.pages.engine_test import engine_test_report
 
     if args.hysteresis is not None and not 0.0 <= args.hysteresis <= 10.0:
         raise InputError(f"--hysteresis (={args.hysteresis:g} deg) must be in [0, 10]")

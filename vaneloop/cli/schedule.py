@@ -94,7 +94,9 @@ def log_of(args: argparse.Namespace) -> Any:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import load_geometry, load_schedules
-    from vaneloop.design.scheduling import ScheduleOptions, result_json, schedule, write_tables
+    from vaneloop.design.links import ScheduleOptions
+    from vaneloop.design.schedule_files import result_json, write_tables
+    from vaneloop.design.scheduling import schedule
 
     adjust = () if args.adjust == "none" else tuple(a.strip() for a in args.adjust.split(","))
     options = ScheduleOptions(args.step, args.lb_range, args.lc_range, adjust, args.criterion, args.limit)

@@ -13,7 +13,9 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located, bins_of, locate
 from vaneloop.discrepancy.models.vanes import Chain
 from vaneloop.discrepancy.workflow import Diagnosis
-from vaneloop.pages.page import TONE_OF, Line, Page, Panel, heat, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.figures import Line, Panel, heat, loop, overlay, ranking, waterfall
+from vaneloop.pages.page import Page
+from vaneloop.pages.style import TONE_OF, number
 
 __all__ = ["compare_report", "diagnosis_report", "located_sentence", "located_tone", "verdict_sentence"]
 

@@ -12,7 +12,8 @@ __all__ = ["clearance_page", "spatial_page"]
 
 def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane: float) -> Any:
     """Write the page of `vaneloop clearance`; return its path."""
-    from vaneloop.pages.page import Line, Page, Panel, bars, overlay
+    from vaneloop.pages.figures import Line, Panel, bars, overlay
+    from vaneloop.pages.page import Page
 
     names = [s.stage.upper() for s in studies]
     ring = ", ".join(f"{n} {s.clearances.ring:.2f} mm" for n, s in zip(names, studies, strict=True))
@@ -81,7 +82,8 @@ def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
     import numpy as np
 
     from plant.linkage import STAGES
-    from vaneloop.pages.page import Line, Page, Panel, overlay
+    from vaneloop.pages.figures import Line, Panel, overlay
+    from vaneloop.pages.page import Page
 
     by = "Exudyn, a general multibody library" if check.multibody else "Newton's method on the constraint equations"
     worst = {s: float(np.max(np.abs(check.difference(s)))) for s in STAGES}

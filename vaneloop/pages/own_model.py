@@ -9,7 +9,9 @@ import numpy as np
 
 from vaneloop.discrepancy.locate import bins_of
 from vaneloop.discrepancy.models.own_model import NO_HELP, Answer
-from vaneloop.pages.page import TONE_OF, Line, Page, Panel, Tone, bars, heat, loop, number, overlay, ranking, waterfall
+from vaneloop.pages.figures import Line, Panel, bars, heat, loop, overlay, ranking, waterfall
+from vaneloop.pages.page import Page
+from vaneloop.pages.style import TONE_OF, Tone, number
 
 __all__ = ["own_report", "short_names"]
 

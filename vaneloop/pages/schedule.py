@@ -13,8 +13,10 @@ from plant import Geometry
 from plant.geometry import vane_angles
 from plant.linkage import STAGES
 from plant.spatial import plane_joints
-from vaneloop.design.scheduling import DESIGN_SPEED, STROKE_LIMITS, ScheduleResult
-from vaneloop.pages.page import Line, Page, Panel, bars, loop, overlay
+from vaneloop.design.scheduling import ScheduleResult
+from vaneloop.design.stroke_tables import DESIGN_SPEED, STROKE_LIMITS
+from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
+from vaneloop.pages.page import Page
 
 __all__ = ["mechanism_figure", "schedule_page"]
 

@@ -29,7 +29,9 @@ def report(
     words: str = "",
 ) -> Path:
     """Write the page; return its path."""
-    from vaneloop.pages.page import Line, Page, Panel, bars, loop, number, overlay
+    from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
+    from vaneloop.pages.page import Page
+    from vaneloop.pages.style import number
 
     last = rows[-1]
     both = dual, mine = outcomes[last.name, "dual"], outcomes[last.name, best]

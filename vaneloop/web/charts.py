@@ -18,7 +18,8 @@ from nicegui.element import Element
 from nicegui.elements import plotly as bundled
 from tsdownsample import MinMaxDownsampler
 
-from vaneloop.pages.page import THEMES, break_at_holes
+from vaneloop.pages.series import break_at_holes
+from vaneloop.pages.style import THEMES
 
 __all__ = ["Chart", "Curves", "Figure", "Panel", "Trace", "figure", "of_log", "painted", "view"]
 
@@ -28,7 +29,7 @@ MOST_POINTS = 4000  # a line and view, whatever the browser asks for
 
 @dataclass(frozen=True)
 class Trace:
-    """One line of a panel; its colour by role (`vaneloop.pages.page.THEMES`)."""
+    """One line of a panel; its colour by role (`vaneloop.pages.style.THEMES`)."""
 
     name: str
     y: Array
@@ -151,7 +152,7 @@ class Figure(Element, component="figure.js"):
 
 
 def painted(x: Any, theme: Mapping[str, str]) -> Any:
-    """``@role`` of vaneloop.pages.page's figures as this theme's colour."""
+    """``@role`` of vaneloop.pages.figures as this theme's colour."""
     if isinstance(x, str) and x.startswith("@"):
         role, _, alpha = x[1:].partition("/")
         if role not in theme:
@@ -165,7 +166,7 @@ def painted(x: Any, theme: Mapping[str, str]) -> Any:
 
 
 def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
-    """Show a figure of vaneloop.pages.page in the page's theme."""
+    """Show a figure of vaneloop.pages.figures in the page's theme."""
     c = THEMES["dark" if dark else "light"]
     axis = {
         "gridcolor": c["grid"],

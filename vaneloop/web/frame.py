@@ -14,7 +14,7 @@ from nicegui import ui
 from nicegui.element import Element
 
 from vaneloop.discrepancy.locate import agrees
-from vaneloop.pages.page import THEMES
+from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
 from vaneloop.web.session import Session
 
@@ -26,7 +26,7 @@ OFTEN = 0.05  # s between two looks at what has changed
 
 
 def styles() -> str:
-    """The pages' style sheet, in the colours of vaneloop.pages.page's reports."""
+    """The pages' style sheet, in the colours of vaneloop.pages."""
     more = {"light": "--page:#f3f5f8;--lift:#eef2f6", "dark": "--page:#0f1419;--lift:#1d252e"}
     themes = [f"body.body--{n}{{{''.join(f'--{k}:{v};' for k, v in c.items())}{more[n]}}}" for n, c in THEMES.items()]
     return "\n".join([*themes, (Path(__file__).parent / "style.css").read_text(encoding="utf-8")])

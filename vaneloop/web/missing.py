@@ -10,9 +10,10 @@ from nicegui import events, ui
 from plant.effects import EFFECTS
 from vaneloop.base.signals import UNITS
 from vaneloop.discrepancy.locate import AGREES, Located
-from vaneloop.pages.page import Line as PageLine
-from vaneloop.pages.page import Panel as PagePanel
-from vaneloop.pages.page import heat, number, overlay, waterfall
+from vaneloop.pages.figures import Line as PageLine
+from vaneloop.pages.figures import Panel as PagePanel
+from vaneloop.pages.figures import heat, overlay, waterfall
+from vaneloop.pages.style import number
 from vaneloop.web.charts import Chart
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
 from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name

@@ -19,7 +19,7 @@ from controller import FAULTS, MODES
 from hil.bus.frames import IDENT_MASK, NAMES
 from hil.inject.scenario import library, load_scenario
 from hil.loop.ecu import BUILTIN
-from vaneloop.pages.page import bars
+from vaneloop.pages.figures import bars
 from vaneloop.web.charts import Chart, Curves, Panel, Trace
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame
 from vaneloop.web.jobs import Cancelled, Worker, WorkError

@@ -16,8 +16,10 @@ from nicegui.element import Element
 
 from plant import Geometry, Schedules, load_geometry, load_schedules
 from plant.linkage import STAGES
-from vaneloop.design.scheduling import CRITERIA, STROKE_LIMITS, write_geometry, write_schedules
-from vaneloop.pages.page import Line, Panel, loop, overlay
+from vaneloop.design.links import CRITERIA
+from vaneloop.design.schedule_files import write_geometry, write_schedules
+from vaneloop.design.stroke_tables import STROKE_LIMITS
+from vaneloop.pages.figures import Line, Panel, loop, overlay
 from vaneloop.pages.schedule import NAMES, ROLES
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table
 from vaneloop.web.missing import receive, suffixes

@@ -275,14 +275,10 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
     from plant.linkage import STAGES
     from plant.spatial import plane_joints
     from vaneloop.cli.schedule import log_of
-    from vaneloop.design.scheduling import (
-        STROKE_LIMITS,
-        ScheduleOptions,
-        schedule,
-        stroke_tables,
-        table_speeds,
-        write_tables,
-    )
+    from vaneloop.design.links import ScheduleOptions
+    from vaneloop.design.schedule_files import write_tables
+    from vaneloop.design.scheduling import schedule
+    from vaneloop.design.stroke_tables import STROKE_LIMITS, stroke_tables, table_speeds
     from vaneloop.pages.schedule import NAMES, schedule_page
 
     args = parsed("schedule", words)

@@ -1,0 +1,429 @@
+"""Figures of a page: curves over a common axis, loops, bars, histograms, maps.
+
+    overlay([Panel("vigv [deg]", [Line("measured", t, y, "measured")])])
+
+A figure is a plain dictionary in Plotly's JSON form. Colours are names of roles (``@measured``, ``@model``,
+``@target``, ``@error``, ...), which the page resolves for the reader's light or dark scheme.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vaneloop.pages.series import decimate, packed, thin_path
+from vaneloop.pages.style import THEMES, number
+
+__all__ = ["Figure", "Line", "Panel", "bars", "heat", "histogram", "loop", "overlay", "ranking", "waterfall"]
+
+Figure = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve: its name in the legend, its points and the role that gives it its colour."""
+
+    name: str
+    x: ArrayLike
+    y: ArrayLike
+    role: str = "model"
+    width: float = 1.4
+    dash: str = "solid"
+    opacity: float = 1.0
+    shown: bool = True  # False: hidden until the reader clicks its name
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot of a stack over a common axis.
+
+    title   what the vertical axis shows, with its unit
+    band    half-width of a grey band about zero, for example three times the noise floor
+    height  relative to the other panels
+    zero    draw the line of zero
+    """
+
+    title: str
+    lines: Sequence[Line]
+    band: float | None = None
+    height: float = 1.0
+    zero: bool = False
+    log: bool = False
+    marks: Mapping[str, float] = field(default_factory=dict)  # name -> level of a dashed horizontal line
+
+
+def overlay(panels: Sequence[Panel], x_title: str = "time [s]", height: int | None = None) -> Figure:
+    """Curves in stacked panels over one common axis: zoom in one and all follow."""
+    total = sum(p.height for p in panels)
+    space = 0.055 if len(panels) > 1 else 0.0
+    usable = 1.0 - space * (len(panels) - 1)
+    data: list[Figure] = []
+    layout: Figure = {
+        "height": height or int(110 + 215 * total),
+        "hovermode": "x unified",
+        "hoversubplots": "axis",
+        "xaxis": {"title": {"text": _label(x_title)}, "anchor": "y" + _nth(len(panels)), "showspikes": True},
+        "shapes": [],
+        "annotations": [],
+    }
+    top, seen = 1.0, set()
+    for k, panel in enumerate(panels, start=1):
+        bottom = max(0.0, top - usable * panel.height / total)
+        layout["yaxis" + _nth(k)] = {
+            "title": {"text": _label(panel.title)},
+            "domain": [bottom, top],
+            "zeroline": panel.zero,
+            "type": "log" if panel.log else "linear",
+        }
+        top = bottom - space
+        _band_and_marks(layout, panel, "y" + _nth(k))
+        for line in panel.lines:
+            x, y = decimate(line.x, line.y)
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": _label(line.name),
+                    "legendgroup": _label(line.name),
+                    "showlegend": line.name not in seen,
+                    "visible": True if line.shown else "legendonly",
+                    "xaxis": "x",
+                    "yaxis": "y" + _nth(k),
+                    "x": packed(x),
+                    "y": packed(y),
+                    "opacity": line.opacity,
+                    "line": {"color": _role(line.role), "width": line.width, "dash": line.dash},
+                    "connectgaps": False,
+                    "hovertemplate": "%{y:.4g}",
+                }
+            )
+            seen.add(line.name)
+    return {"data": data, "layout": layout}
+
+
+def _band_and_marks(layout: Figure, panel: Panel, axis: str) -> None:
+    """Draw the grey band and the level marks of one panel."""
+    across = {"xref": "x domain", "x0": 0, "x1": 1, "yref": axis, "layer": "below"}
+    if panel.band:
+        rect = {
+            "type": "rect",
+            "y0": -panel.band,
+            "y1": panel.band,
+            "fillcolor": "@noise",
+            "opacity": 0.22,
+            "line": {"width": 0},
+        }
+        layout["shapes"].append(across | rect)
+        edge = {"type": "line", "line": {"color": "@text", "width": 1, "dash": "dot"}, "opacity": 0.7, "layer": "above"}
+        layout["shapes"] += [across | edge | {"y0": level, "y1": level} for level in (-panel.band, panel.band)]
+    for name, level in panel.marks.items():
+        layout["shapes"].append(
+            across | {"type": "line", "y0": level, "y1": level, "line": {"color": "@soft", "width": 1, "dash": "dot"}}
+        )
+        layout["annotations"].append(
+            {
+                "xref": "x domain",
+                "x": 1,
+                "xanchor": "right",
+                "yref": axis,
+                "y": level,
+                "yanchor": "bottom",
+                "text": _label(name),
+                "showarrow": False,
+                "font": {"size": 11, "color": "@soft"},
+            }
+        )
+
+
+def histogram(
+    errors: Mapping[str, ArrayLike],
+    x_title: str,
+    roles: Mapping[str, str] | None = None,
+    noise: float | None = None,
+    bins: int = 81,
+) -> Figure:
+    """Share of the samples at each size of error. Outermost bins hold what lies beyond the 99.8 % range.
+
+    noise: RMS of the measurement noise; a dotted line shows what a perfect model would leave.
+    """
+    series = {name: (a := np.asarray(e, dtype=float))[np.isfinite(a)] for name, e in errors.items()}
+    series = {name: e for name, e in series.items() if e.size}
+    reach = max((float(np.quantile(np.abs(e), 0.998)) for e in series.values()), default=0.0)
+    reach = max(reach, 4 * (noise or 0.0)) or 1.0
+    edges = np.linspace(-reach, reach, bins + 1)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    colours = dict(zip(series, ["error", "measured", "model", "target", "other"], strict=False)) | dict(roles or {})
+    data: list[Figure] = []
+    highest = 0.0
+    for name, e in series.items():
+        share = 100.0 * np.histogram(np.clip(e, -reach, reach), edges)[0] / e.size
+        highest = max(highest, float(share.max()))
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": _label(name),
+                "x": packed(middle),
+                "y": packed(share),
+                "line": {"shape": "hvh", "color": _role(colours.get(name, "other")), "width": 1.5},
+                "fill": "tozeroy",
+                "fillcolor": _role(colours.get(name, "other")) + "/0.25",
+                "hovertemplate": "%{x:.3g}: %{y:.2f} %",
+            }
+        )
+    if noise:
+        step = edges[1] - edges[0]
+        # share of a Gaussian in one bin; narrower than the bin it would exceed the plot, so it is clipped there
+        bell = 100.0 * step / (noise * math.sqrt(2 * math.pi)) * np.exp(-0.5 * (middle / noise) ** 2)
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": "measurement noise alone",
+                "x": packed(middle),
+                "y": packed(bell),
+                "line": {"color": "@soft", "width": 1.3, "dash": "dot"},
+                "hoverinfo": "skip",
+            }
+        )
+    layout = {
+        "height": 340,
+        "xaxis": {"title": {"text": _label(x_title)}, "range": [-reach * 1.02, reach * 1.02]},
+        "yaxis": {"title": {"text": "share of samples [%]"}, "range": [0, 1.12 * highest or 1.0]},
+    }
+    return {"data": data, "layout": layout}
+
+
+def loop(lines: Sequence[Line], x_title: str, y_title: str, height: int = 440, markers: bool = False) -> Figure:
+    """One quantity against another; a loop that stays open is hysteresis."""
+    data, reach = [], []
+    for line in lines:
+        x, y = thin_path(np.asarray(line.x, dtype=float), np.asarray(line.y, dtype=float))
+        colour = _role(line.role)
+        reach += [float(np.nanmin(y)), float(np.nanmax(y))] if np.isfinite(y).any() and line.shown else []
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers" if markers else "lines",
+                "name": _label(line.name),
+                "x": packed(x),
+                "y": packed(y),
+                "line": {"color": colour, "width": line.width, "dash": line.dash},
+                "marker": {"color": colour, "size": 3},
+                "visible": True if line.shown else "legendonly",
+                "hovertemplate": "%{x:.4g}, %{y:.4g}",
+            }
+        )
+    layout: Figure = {
+        "height": height,
+        "hovermode": "closest",
+        "xaxis": {"title": {"text": _label(x_title)}},
+        "yaxis": {"title": {"text": _label(y_title)}},
+    }
+    if reach and max(reach) > min(reach):
+        margin = 0.06 * (max(reach) - min(reach))
+        layout["yaxis"]["range"] = [min(reach) - margin, max(reach) + margin]
+    return {"data": data, "layout": layout}
+
+
+def bars(
+    groups: Sequence[str],
+    series: Mapping[str, Sequence[float | None]],
+    y_title: str,
+    roles: Mapping[str, str] | None = None,
+    marks: Mapping[str, float] | None = None,
+    height: int = 360,
+) -> Figure:
+    """Grouped bars with their values above them; ``marks`` are named dashed levels."""
+    colours = dict(zip(series, ["measured", "model", "target", "error", "other"], strict=False)) | dict(roles or {})
+    data = [
+        {
+            "type": "bar",
+            "name": _label(name),
+            "x": [_label(g) for g in groups],
+            "y": [None if v is None or not math.isfinite(v) else float(v) for v in values],
+            "text": [number(v) if v is not None else "none" for v in values],
+            "textposition": "outside",
+            "cliponaxis": False,
+            "marker": {"color": _role(colours.get(name, "other"))},
+            "hovertemplate": "%{x}: %{text}",
+        }
+        for name, values in series.items()
+    ]
+    layout: Figure = {
+        "height": height,
+        "barmode": "group",
+        "bargap": 0.28,
+        "bargroupgap": 0.06,
+        "xaxis": {"type": "category", "showgrid": False},
+        "yaxis": {"title": {"text": _label(y_title)}, "rangemode": "tozero"},
+        "shapes": [],
+        "annotations": [],
+    }
+    _band_and_marks(layout, Panel("", [], marks=marks or {}), "y")
+    return {"data": data, "layout": layout}
+
+
+def waterfall(
+    steps: Sequence[tuple[str, float]], y_title: str, floor: float | None = None, height: int = 400
+) -> Figure:
+    """How an error falls step by step: the level after each step, the fall hanging from the level before.
+
+    steps  (name, level reached); the first is where it starts, the last where it ends
+    floor  level that cannot be undercut, drawn as a line
+    """
+    names = [_label(s[0]) for s in steps]
+    levels = [float(s[1]) for s in steps]
+    base, size, colours, text = [], [], [], []
+    for i, level in enumerate(levels):
+        if i in (0, len(levels) - 1):
+            base.append(0.0)
+            size.append(level)
+            colours.append("@error" if i == 0 else "@measured")
+            text.append(number(level))
+        else:
+            base.append(min(level, levels[i - 1]))
+            size.append(abs(level - levels[i - 1]))
+            colours.append("@good" if level <= levels[i - 1] else "@bad")
+            text.append(f"{level - levels[i - 1]:+.3g}".replace("-", "−"))
+    thin = {"color": "@muted", "width": 1, "dash": "dot"}
+    connectors = [
+        {"type": "line", "xref": "x", "yref": "y", "x0": i, "x1": i + 1, "y0": levels[i], "y1": levels[i], "line": thin}
+        for i in range(len(levels) - 1)
+    ]
+    layout: Figure = {
+        "height": height,
+        "showlegend": False,
+        "bargap": 0.35,
+        "xaxis": {"type": "category", "showgrid": False},
+        "yaxis": {"title": {"text": _label(y_title)}, "rangemode": "tozero"},
+        "shapes": connectors,
+        "annotations": [],
+    }
+    _band_and_marks(layout, Panel("", [], marks={} if floor is None else {f"noise floor {number(floor)}": floor}), "y")
+    bar = {
+        "type": "bar",
+        "x": names,
+        "y": size,
+        "base": base,
+        "text": text,
+        "textposition": "outside",
+        "cliponaxis": False,
+        "marker": {"color": colours},
+        "hovertemplate": "%{x}: %{text}",
+    }
+    return {"data": [bar], "layout": layout}
+
+
+def ranking(
+    names: Sequence[str],
+    values: Sequence[float],
+    x_title: str,
+    notes: Sequence[str] | None = None,
+    highlight: Sequence[str] = (),
+    low: Sequence[float] | None = None,
+    high: Sequence[float] | None = None,
+) -> Figure:
+    """Horizontal bars, greatest on top, for example candidate effects by probability; ``highlight`` ones stand out."""
+    order = sorted(range(len(names)), key=lambda i: values[i])
+    bar: Figure = {
+        "type": "bar",
+        "orientation": "h",
+        "y": [_label(names[i]) for i in order],
+        "x": [float(values[i]) for i in order],
+        "text": [number(values[i]) + (f"  {_label(notes[i])}" if notes else "") for i in order],
+        "textposition": "outside",
+        "cliponaxis": False,
+        "marker": {"color": ["@model" if names[i] in highlight else "@muted" for i in order]},
+        "hovertemplate": "%{y}: %{text}",
+    }
+    if low is not None and high is not None:
+        bar["error_x"] = {
+            "type": "data",
+            "symmetric": False,
+            "array": [high[i] - values[i] for i in order],
+            "arrayminus": [values[i] - low[i] for i in order],
+            "color": "@soft",
+        }
+    top = max([*values, *(high or [])], default=1.0) or 1.0
+    layout = {
+        "height": 90 + 26 * max(3, len(names)),
+        "bargap": 0.3,
+        "showlegend": False,
+        "xaxis": {"title": {"text": _label(x_title)}, "range": [0, 1.25 * top]},
+        "yaxis": {"type": "category", "showgrid": False, "automargin": True},
+    }
+    return {"data": [bar], "layout": layout}
+
+
+def heat(
+    values: Sequence[Sequence[float | None]] | ArrayLike,
+    columns: Sequence[str],
+    rows: Sequence[str],
+    unit: str,
+    x_title: str = "",
+    y_title: str = "",
+    signed: bool = False,
+) -> Figure:
+    """Map of a figure over two conditions (rows, columns); an empty cell was never visited.
+
+    signed: colours diverge about zero (bias); otherwise they grow from zero (size of an error).
+    """
+    z = np.array(
+        [[math.nan if v is None else float(v) for v in row] for row in np.asarray(values, dtype=object)], dtype=float
+    )
+    text = [["" if not math.isfinite(v) else number(v, 2) for v in row] for row in z]
+    reach = float(np.nanmax(np.abs(z))) if np.isfinite(z).any() else 1.0
+    scale = (
+        [[0, "@cold"], [0.5, "@heat0"], [1, "@heat2"]] if signed else [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]]
+    )
+    trace = {
+        "type": "heatmap",
+        "z": [[None if not math.isfinite(v) else float(v) for v in row] for row in z],
+        "x": [_label(c) for c in columns],
+        "y": [_label(r) for r in rows],
+        "text": text,
+        "texttemplate": "%{text}",
+        "colorscale": scale,
+        "zmin": -reach if signed else 0.0,
+        "zmax": reach or 1.0,
+        "xgap": 2,
+        "ygap": 2,
+        "showlegend": False,
+        "colorbar": {"title": {"text": _label(unit)}, "thickness": 12, "outlinewidth": 0},
+        "hovertemplate": f"%{{y}}, %{{x}}: %{{z:.3g}} {_label(unit)}<extra></extra>",
+    }
+    return {
+        "data": [trace],
+        "layout": {
+            "height": 120 + 38 * max(3, len(rows)),
+            "xaxis": {"type": "category", "title": {"text": _label(x_title)}, "showgrid": False},
+            "yaxis": {
+                "type": "category",
+                "title": {"text": _label(y_title)},
+                "autorange": "reversed",
+                "showgrid": False,
+            },
+        },
+    }
+
+
+def _label(text: object) -> str:
+    """Text for the inside of a plot, where Plotly reads tags."""
+    return html.escape(str(text), quote=False)
+
+
+def _role(role: str) -> str:
+    """Colour of a role as the page's own name for it; any other colour passes."""
+    return "@" + role if role in THEMES["light"] else role
+
+
+def _nth(k: int) -> str:
+    """Plotly's suffix of the k-th axis: none, 2, 3, ..."""
+    return "" if k == 1 else str(k)
