@@ -23,7 +23,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
-from vaneloop.pages.replay import replay_report
+from vaneloop.pages.replay import replay_page
 from vaneloop.pages.series import MAX_POINTS, decimate
 from vaneloop.pages.style import THEMES, number
 
@@ -132,12 +132,12 @@ def test_any_text_leaves_the_structure_of_the_page(name):
 
 @pytest.mark.parametrize("index", range(7))
 def test_plotly_accepts_every_kind_of_plot(index):
-    go.Figure(painted(full_page()._figures[index]))
+    go.Figure(painted(full_page().figures[index]))
 
 
 def test_every_colour_role_exists_in_both_schemes():
     assert THEMES["light"].keys() == THEMES["dark"].keys()
-    used = set(re.findall(r'"@([a-z0-9]+)', json.dumps(full_page()._figures)))
+    used = set(re.findall(r'"@([a-z0-9]+)', json.dumps(full_page().figures)))
     assert used <= THEMES["light"].keys() and {"measured", "noise", "error"} <= used
 
 
@@ -360,27 +360,27 @@ def verdict(file):
 
 
 def test_a_model_that_fits_is_said_to_fit(tmp_path):
-    tone, text = verdict(replay_report(result(), tmp_path / "r.html", "vaneloop replay run.csv"))
+    tone, text = verdict(replay_page(result(), "vaneloop replay run.csv").write(tmp_path / "r.html"))
     assert tone == "good" and "within the sensors" in text
 
 
 def test_a_model_that_misses_hysteresis_is_said_to_miss_it_in_the_vane_angle(tmp_path):
-    tone, text = verdict(replay_report(result(width=2.6), tmp_path / "r.html"))
+    tone, text = verdict(replay_page(result(width=2.6)).write(tmp_path / "r.html"))
     assert tone == "bad" and "VIGV angle" in text and "times what sensor noise explains" in text
 
 
 def test_a_log_with_a_demand_alone_makes_a_page(tmp_path):
-    _, text = verdict(replay_report(result(channels=()), tmp_path / "r.html"))
+    _, text = verdict(replay_page(result(channels=())).write(tmp_path / "r.html"))
     assert "no signal to hold the model against" in text
 
 
 def test_a_log_with_a_hostile_name_makes_a_safe_page(tmp_path):
-    source = replay_report(result(log="/tmp/<img src=x onerror=alert(1)>.csv"), tmp_path / "r.html").read_text()
+    source = replay_page(result(log="/tmp/<img src=x onerror=alert(1)>.csv")).write(tmp_path / "r.html").read_text()
     assert "img" not in Elements(source).tags
 
 
 def test_a_run_of_three_thousand_seconds_stays_below_eight_megabytes(tmp_path):
-    file = replay_report(result(3000.0, 100.0), tmp_path / "r.html")
+    file = replay_page(result(3000.0, 100.0)).write(tmp_path / "r.html")
     assert file.stat().st_size < 8e6
 
 

@@ -3,8 +3,14 @@
 The names below are the public interface, for notebooks and tests of your own; each is imported when it is first used::
 
     import vaneloop
-    log = vaneloop.read_log("run.mf4")
-    result = vaneloop.replay(log)
+    log = vaneloop.read_log("examples/hidden_effect.parquet")
+    answer = vaneloop.diagnose(log)  # Machine(...) or a System of your own as second argument
+    print(answer)  # one sentence; in a notebook the cell shows the page
+    answer.to_dict()["effects"], answer.plot(), answer.report("diagnosis.html")
+    better = vaneloop.extend(log, answer.effects)
+    better.write("better.toml")
+
+Every verb (`replay`, `compare`, `locate`, `diagnose`, `extend`, `experiment`) returns such an answer.
 """
 
 from __future__ import annotations
@@ -16,23 +22,31 @@ if TYPE_CHECKING:
     from hil.bus.port import open_bus
     from hil.inject.scenario import Scenario
     from hil.logs import Channel, Log, read_log, write_log
-    from hil.replay import replay
     from vaneloop.base.errors import InputError
     from vaneloop.discrepancy.models.system import Record, System, load_system, unknown
     from vaneloop.discrepancy.stage import Parameter
+    from vaneloop.verbs.machine import Machine
+    from vaneloop.verbs.replay import replay
+    from vaneloop.verbs.search import compare, diagnose, experiment, extend, locate
 
 _HOME = {
     "Channel": "hil.logs",
     "InputError": "vaneloop.base.errors",
     "Log": "hil.logs",
+    "Machine": "vaneloop.verbs.machine",
     "Parameter": "vaneloop.discrepancy.stage",
     "Record": "vaneloop.discrepancy.models.system",
     "Scenario": "hil.inject.scenario",
     "System": "vaneloop.discrepancy.models.system",
+    "compare": "vaneloop.verbs.search",
+    "diagnose": "vaneloop.verbs.search",
+    "experiment": "vaneloop.verbs.search",
+    "extend": "vaneloop.verbs.search",
     "load_system": "vaneloop.discrepancy.models.system",
+    "locate": "vaneloop.verbs.search",
     "open_bus": "hil.bus.port",
     "read_log": "hil.logs",
-    "replay": "hil.replay",
+    "replay": "vaneloop.verbs.replay",
     "unknown": "vaneloop.discrepancy.models.system",
     "write_log": "hil.logs",
 }
@@ -41,11 +55,17 @@ __all__ = [
     "Channel",
     "InputError",
     "Log",
+    "Machine",
     "Parameter",
     "Record",
     "Scenario",
     "System",
+    "compare",
+    "diagnose",
+    "experiment",
+    "extend",
     "load_system",
+    "locate",
     "open_bus",
     "read_log",
     "replay",

@@ -5,14 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
 
 from vaneloop.base import terminal
-from vaneloop.pages.mechanism import clearance_page
-
-if TYPE_CHECKING:
-    pass
 from vaneloop.design.clearance import FITS, WORDS, clearance_study, study_rows
+from vaneloop.pages.mechanism import clearance_page
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 

@@ -36,7 +36,7 @@ def command(args: argparse.Namespace) -> int:
         return own_model.command(args, "compare")
     from hil.logs import LogError
     from vaneloop.discrepancy.workflow import locate_stages
-    from vaneloop.pages.diagnosis import compare_report, located_sentence
+    from vaneloop.verbs.search import Stages
 
     extra: dict[str, object] = {}
     report, args.report = args.report, None
@@ -48,7 +48,8 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, f"note: no stage by stage comparison: {e}")
         extra["not_observed"] = {"all": str(e)}
     else:
-        located = locate_stages(chain.stages)
+        answer = Stages(chain, locate_stages(chain.stages), args.log)
+        located = answer.located
         figures = [f for x in located for f in x.signals]
         stages = [f.json() for f in figures]
         floors = {f.signal: f.noise_floor for f in figures}
@@ -67,12 +68,12 @@ def command(args: argparse.Namespace) -> int:
             columns,
             rows,
         )
-        terminal.say(args, located_sentence(located))
+        terminal.say(args, answer.sentence())
         extra["not_observed"] = chain.not_observed
-        extra["verdict"] = "fails" if any(x.fails for x in located) else "agrees"
+        extra["verdict"] = "fails" if answer.fails else "agrees"
         if report:
             words = " ".join(["vaneloop compare", *sys.argv[2:]])
-            terminal.say(args, f"page: {compare_report(located, chain, report, words, args.log)}")
+            terminal.say(args, f"page: {answer.report(report, words)}")
             report = None
     args.report = report
     return replay.command(args, {"stages": stages, **extra}, floors)

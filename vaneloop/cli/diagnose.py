@@ -41,28 +41,24 @@ def command(args: argparse.Namespace) -> int:
     if own_model.asked(args):
         return own_model.command(args, "diagnose")
     from vaneloop.base.errors import InputError
-    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+    from vaneloop.verbs.search import diagnosed
 
     if not 1 <= args.workers <= 64:
         raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
     chain = chain_of(args)
     with terminal.progress_bar(args, "searching the library of effects") as progress:
-        d = diagnose(chain.stages, chain.not_observed, progress, args.workers)
-    d.notes = list(chain.notes)
-    show(args, d)
-    terminal.write_json(args, diagnosis_json(d, args.log))
+        answer = diagnosed(chain, args.log, args.workers, progress)
+    show(args, answer)
+    terminal.write_json(args, answer.to_dict())
     if args.report:
-        from vaneloop.pages.diagnosis import diagnosis_report
-
         words = " ".join(["vaneloop diagnose", *sys.argv[2:]])
-        terminal.say(args, f"page: {diagnosis_report(d, chain, args.report, words, args.log)}")
-    return 0 if d.verdict == "none" else 1
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    return 0 if answer.verdict == "none" else 1
 
 
-def show(args: argparse.Namespace, d: Any) -> None:
+def show(args: argparse.Namespace, answer: Any) -> None:
     """Print the verdict, the stages and the effects."""
-    from vaneloop.pages.diagnosis import verdict_sentence
-
+    d = answer.diagnosis
     rows = []
     for s in d.stages:
         for k in range(len(s.floor)):
@@ -88,4 +84,4 @@ def show(args: argparse.Namespace, d: Any) -> None:
             terminal.say(
                 args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}"
             )
-    terminal.say(args, verdict_sentence(d))
+    terminal.say(args, answer.sentence())

@@ -75,7 +75,10 @@ def command(args: argparse.Namespace) -> int:
     n_dem = load_profile(args.profile)
     files = options.tables_of(args, tell=True)
     machine = build_plant(files["plant"], args.geometry or files["geometry"], files["schedules"])
-    calibrations = {strategy: options.calibration_of(args, strategy) for strategy in ("single", "dual", *args.strategy)}
+    calibrations = {
+        strategy: options.machine_of(args, strategy=strategy).calibration
+        for strategy in ("single", "dual", *args.strategy)
+    }
     warm_up(lambda text: terminal.say(args, text))
     results: dict[str, ReplayResult] = {}
     for strategy in calibrations:

@@ -9,7 +9,6 @@ from pathlib import Path
 from vaneloop.base import terminal
 from vaneloop.cli import options
 from vaneloop.cli.options import add_model_option, chain_of
-from vaneloop.discrepancy.models.experiment import recommend
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -35,36 +34,28 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from hil.logs import Channel, write_log
-    from vaneloop.discrepancy.workflow import diagnose
+    from vaneloop.verbs.search import diagnosed
+    from vaneloop.verbs.search import experiment as recommend
 
     chain = chain_of(args)
     with terminal.progress_bar(args, "searching the library of effects") as progress:
-        d = diagnose(chain.stages, chain.not_observed, progress)
+        found = diagnosed(chain, args.log, progress=progress)
     with terminal.progress_bar(args, "trying profiles") as progress:
-        e = recommend(d, progress)
+        answer = recommend(None, found, progress=progress)
+    e = answer.recommended
     if e is None:
         terminal.say(args, "nothing to separate: the log leaves no rivals")
-        terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": None, "profiles": []})
     else:
         rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
         terminal.print_table(
             args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows
         )
-        terminal.say(args, e["text"])
-        best = {
-            "profile": e["profile"],
-            "nats": e["score"],
-            "repeats": e["repeats"],
-            "separates": e["separates"],
-            "text": e["text"],
-        }
-        terminal.write_json(args, {"schema": 1, "log": args.log, "recommended": best, "profiles": e["table"]})
-        if args.out:
-            write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
-            terminal.say(args, f"profile: {args.out}")
+        terminal.say(args, answer.sentence())
+    terminal.write_json(args, answer.to_dict())
+    if e is not None and args.out:
+        write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
+        terminal.say(args, f"profile: {args.out}")
     if args.report:
-        from vaneloop.pages.diagnosis import diagnosis_report
-
         words = " ".join(["vaneloop experiment", *sys.argv[2:]])
-        terminal.say(args, f"page: {diagnosis_report(d, chain, args.report, words, args.log, e)}")
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
     return 1 if e is not None and not e["separates"] else 0

@@ -36,18 +36,14 @@ def command(args: argparse.Namespace) -> int:
     if own_model.asked(args):
         return own_model.command(args, "locate")
     from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.verbs.search import Stages
 
     chain = chain_of(args)
-    located = locate_stages(chain.stages)
-    for x in located:
+    answer = Stages(chain, locate_stages(chain.stages), args.log)
+    for x in answer.located:
         say_located(args, x)
-    stages = [x.json() for x in located]
-    terminal.write_json(
-        args, {"schema": 1, "log": args.log, "stages": stages, "not_observed": chain.not_observed, "notes": chain.notes}
-    )
+    terminal.write_json(args, answer.to_dict())
     if args.report:
-        from vaneloop.pages.diagnosis import compare_report
-
         words = " ".join(["vaneloop locate", *sys.argv[2:]])
-        terminal.say(args, f"page: {compare_report(located, chain, args.report, words, args.log)}")
-    return 1 if any(x.fails for x in located) else 0
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    return 1 if answer.fails else 0

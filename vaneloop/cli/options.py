@@ -11,15 +11,14 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
     "CAN_SUFFIXES",
-    "TABLES",
     "add_log_options",
     "add_model_option",
     "add_reading_options",
     "add_tables_option",
-    "calibration_of",
     "chain_of",
     "log_options",
     "machine_of",
@@ -51,22 +50,15 @@ def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
     """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``)
     describes.
     """
-    from hil.logs import LogError
     from hil.loop.lockstep import warm_up
-    from plant import load_model
-    from vaneloop.discrepancy.models.vanes import build_chain
 
-    if model is None and args.model:
-        model = load_model(args.model, machine_of(args))
+    machine = machine_of(args, model)
     log = read_log_of(args, require=())
     warm_up(lambda text: terminal.say(args, text))
     tell_search(lambda text: terminal.say(args, text))
-    chain = build_chain(log, machine_of(args, model), present=tuple(model.effects) if model is not None else ())
+    chain = machine.bind(log)
     for note in chain.notes:
         terminal.say(args, f"note: {note}")
-    if not chain.stages:
-        why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
-        raise LogError(f"{args.log}: no stage can be judged ({why})")
     return chain
 
 
@@ -103,9 +95,6 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     )
 
 
-TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
-
-
 def add_tables_option(group: Any) -> None:
     """Declare ``--tables``."""
     group.add_argument(
@@ -117,37 +106,21 @@ def add_tables_option(group: Any) -> None:
 
 
 def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
-    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell``
-    says which.
+    """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says
+    which.
     """
-    files = {name: f"{name}.toml" for name in TABLES}
-    if getattr(args, "tables", None) is None:
-        return files
-    folder = Path(args.tables)
-    if not folder.is_dir():
-        raise InputError(f"--tables {folder}: is not a folder")
-    found = {name: str(folder / file) for name, file in files.items() if (folder / file).is_file()}
-    if not found:
-        raise InputError(f"--tables {folder}: holds none of {', '.join(files.values())}")
-    if tell:
-        terminal.say(args, f"tables from {folder}: {', '.join(found)}")
-    return {**files, **found}
+    tables = getattr(args, "tables", None)
+    files = files_of(tables)
+    if tell and tables is not None:
+        own = [name for name, file in files.items() if file != f"{name}.toml"]
+        terminal.say(args, f"tables from {Path(tables)}: {', '.join(own)}")
+    return files
 
 
-def machine_of(args: argparse.Namespace, model: Any = None) -> Any:
-    """The plant that ``--tables`` describes, with what ``model`` adds."""
-    from plant import build_plant
-
-    files = tables_of(args)
-    return build_plant(files["plant"], files["geometry"], files["schedules"], model)
-
-
-def calibration_of(args: argparse.Namespace, strategy: str | None = None) -> Any:
-    """The controller's calibration that ``--tables`` describes."""
-    from controller import load_calibration
-
-    files = tables_of(args)
-    return load_calibration(files["calibration"], files["stroke_tables"], strategy, files["vane_angles"])
+def machine_of(args: argparse.Namespace, model: Any = None, strategy: str | None = None) -> Machine:
+    """The machine that ``--tables`` and ``model`` (default: ``--model``) describe."""
+    named = getattr(args, "model", None) or None
+    return Machine(getattr(args, "tables", None), named if model is None else model, strategy)
 
 
 def _mapping(options: list[str]) -> dict[str, str]:

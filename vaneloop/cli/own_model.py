@@ -49,52 +49,12 @@ def asked(args: argparse.Namespace) -> bool:
 
 def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
     """One log as the system wants it: by its own reader, or by ours."""
-    import numpy as np
+    from vaneloop.verbs.search import read_record
 
-    from vaneloop.discrepancy import Record, StageError
-
-    name = Path(path).name
-    if system.read is not None:
-        if not Path(path).is_file():
-            raise StageError(f"{path}: no such file")
-        try:
-            data = dict(system.read(path))
-        except Exception as e:
-            raise StageError(
-                f"{path}: read() of system {system.name!r} failed: {type(e).__name__}: {' '.join(str(e).split())}"
-            ) from None
-        if "t" not in data:
-            raise StageError(
-                f"{path}: read() of system {system.name!r} returned {', '.join(map(str, data)) or 'nothing'}; a time "
-                f"'t' is needed"
-            )
-        try:
-            columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
-        except (TypeError, ValueError) as e:
-            raise StageError(f"{path}: read() of system {system.name!r}: not numbers ({e})") from None
-        return Record(name, columns.pop("t"), columns)
-    from hil.logs import read_log
-
-    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
-        c: "" for c in (system.velocity,) if c
-    }
-    signals = {**motion, **system.inputs, **system.outputs}
-    log = read_log(
-        path, **options.log_options(args), require=[c for c in signals if c not in system.optional()], signals=signals,
-    )  # fmt: skip
-    for note in log.notes:
-        terminal.say(args, f"note: {name}: {note}")
-    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
-    t = reference.t
-    columns = {}
-    for c, channel in log.channels.items():
-        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
-        v = np.interp(t, channel.t, channel.values)
-        if c in system.outputs:  # outputs are never made up: far from a sample there is none
-            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
-            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
-        columns[c] = v
-    return Record(name, t, columns)
+    record, notes = read_record(path, system, **({} if system.read else options.log_options(args)))
+    for note in notes:
+        terminal.say(args, f"note: {note}")
+    return record
 
 
 def command(args: argparse.Namespace, verb: str) -> int:
@@ -114,6 +74,7 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
     from vaneloop.discrepancy.locate import agrees
     from vaneloop.discrepancy.models import own_model
     from vaneloop.discrepancy.workflow import no_better
+    from vaneloop.verbs.search import OwnAnswer
 
     wanted: list[str] = []
     if verb == "extend":
@@ -143,21 +104,17 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
         print(f"vaneloop extend: {args.log}: {text}; {args.out} is not written", file=sys.stderr)
         return 1
     _show(args, verb, answer)
-    data = answer.json()
-    data["log"] = args.log
-    if verb in ("compare", "locate"):
-        data |= _older(answer)
+    more: dict[str, Any] = {}
     words = " ".join([f"vaneloop {verb}", *sys.argv[2:]])
     if verb == "extend":
         answer.model.history.append(words)
         own_model.write_model(args.out, answer.model)
         terminal.say(args, f"model: {args.out}")
-        data["model"] = args.out
-    terminal.write_json(args, data)
+        more = {"model": args.out}
+    shown = OwnAnswer(answer, args.log, more)
+    terminal.write_json(args, shown.to_dict())
     if args.report:
-        from vaneloop.pages.own_model import own_report
-
-        terminal.say(args, f"page: {own_report(answer, args.report, words, args.log)}")
+        terminal.say(args, f"page: {shown.report(args.report, words)}")
     if verb == "compare":
         return 0
     if verb == "locate":
@@ -166,22 +123,6 @@ def _command(args: argparse.Namespace, verb: str, system: Any) -> int:
     if verb == "extend":
         return 0 if all(map(agrees, d.error_after, d.floor)) else 1
     return 0 if d.verdict == "none" else 1
-
-
-def _older(answer: Any) -> dict[str, Any]:
-    """What compare and locate give for the vane chain too."""
-    d = answer.diagnosis
-    signals = [
-        {
-            "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured",
-            "rms": d.error_before[k],
-            "noise_floor": d.floor[k], "samples": int((answer.bound.measured[k] == answer.bound.measured[k]).sum()),
-        }
-        for k in range(len(d.outputs))
-    ]  # fmt: skip
-    if answer.verb == "locate":
-        return {"stages": [answer.located.json()]}
-    return {"signals": signals}
 
 
 def _show(args: argparse.Namespace, verb: str, answer: Any) -> None:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from hil.replay import STAGE
+from hil.replay import STAGE, STATISTICS, ReplayResult
 from vaneloop.base import terminal
 from vaneloop.cli import options
-
-if TYPE_CHECKING:
-    pass
-from hil.replay import STATISTICS, ReplayResult, replay, replay_json
+from vaneloop.verbs.replay import replay
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -71,20 +69,14 @@ def command(
 
     limits = _limits(args.tolerance)
     options.tables_of(args, tell=True)
-    calibration = options.calibration_of(args, args.strategy)  # refuse a wrong name or table before reading a long log
-    model = None
-    if args.model is not None:
-        from plant import load_model
-
-        model = load_model(args.model, options.machine_of(args))
-    machine = options.machine_of(args, model)
+    machine = options.machine_of(args, strategy=args.strategy)  # refuse a wrong name or table before reading a long log
     log = options.read_log_of(args)
     from hil.loop.lockstep import warm_up
 
     warm_up(lambda text: terminal.say(args, text))
     with terminal.progress_bar(args, f"replaying {Path(args.log).name}") as progress:
-        result = replay(log, plant=machine, calibration=calibration, progress=progress, floors=floors)
-    exceeded = _exceeded(result, limits)
+        answer = replay(log, machine, progress=progress, floors=floors)
+    result, exceeded = answer.result, _exceeded(answer.result, limits)
     rows = [
         [
             s.signal,
@@ -104,12 +96,11 @@ def command(
         terminal.say(args, f"note: {note}")
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
-    terminal.write_json(args, {**replay_json(result), "exceeded": exceeded, **(extra or {})})
+    answer = dataclasses.replace(answer, exceeded=exceeded, more=extra or {})
+    terminal.write_json(args, answer.to_dict())
     if args.report:
-        from vaneloop.pages.replay import replay_report
-
         words = " ".join(["vaneloop replay", args.log, *(a for a in sys.argv[2:] if a != args.log)])
-        terminal.say(args, f"page: {replay_report(result, args.report, command=words)}")
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
     if args.out:
         channels = {k: Channel(result.t, v) for k, v in result.model.items()}
         try:

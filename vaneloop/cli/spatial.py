@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING
 
 from vaneloop.base import terminal
-from vaneloop.pages.mechanism import spatial_page
-
-if TYPE_CHECKING:
-    pass
 from vaneloop.design.spatial import spatial_check
+from vaneloop.pages.mechanism import spatial_page
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 

@@ -90,7 +90,7 @@ def command(args: argparse.Namespace) -> int:
     _checked(args)
     files = options.tables_of(args)
     plant = build_plant(files["plant"], files["geometry"], files["schedules"])
-    calibrations = {s: options.calibration_of(args, s) for s in STRATEGIES}
+    calibrations = {s: options.machine_of(args, strategy=s).calibration for s in STRATEGIES}
     n_dem = load_profile(args.profile, args.dwell)
     rows = scenarios(args.play, args.growth, args.noise, args.dither)
     warm_up(lambda text: terminal.say(args, text))

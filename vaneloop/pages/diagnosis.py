@@ -17,7 +17,7 @@ from vaneloop.pages.figures import Line, Panel, heat, loop, overlay, ranking, wa
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import TONE_OF, number
 
-__all__ = ["compare_report", "diagnosis_report", "located_sentence", "located_tone", "verdict_sentence"]
+__all__ = ["compare_page", "diagnosis_page", "located_sentence", "located_tone", "verdict_sentence"]
 
 
 def verdict_sentence(d: Diagnosis) -> str:
@@ -56,8 +56,8 @@ def located_tone(located: Sequence[Located]) -> Literal["good", "neutral", "bad"
     return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
 
 
-def compare_report(located: Sequence[Located], chain: Chain, path: str | Path, command: str, log: str) -> Path:
-    """Write the page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
+def compare_page(located: Sequence[Located], chain: Chain, command: str, log: str) -> Page:
+    """The page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
     page = Page(
         f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
     )
@@ -81,13 +81,13 @@ def compare_report(located: Sequence[Located], chain: Chain, path: str | Path, c
         judge = Judge(chain.stage(x.stage), x.floor)
         _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
         _failure_map(page, x)
-    return page.write(path)
+    return page
 
 
-def diagnosis_report(
-    d: Diagnosis, chain: Chain, path: str | Path, command: str, log: str, experiment: dict[str, Any] | None = None
-) -> Path:
-    """Write the page of ``vaneloop diagnose`` or ``extend``."""
+def diagnosis_page(
+    d: Diagnosis, chain: Chain, command: str, log: str, experiment: dict[str, Any] | None = None
+) -> Page:
+    """The page of ``vaneloop diagnose`` or ``extend``."""
     title = f"Diagnosis of {Path(log).name}"
     page = Page(title, verdict_sentence(d), tone=TONE_OF[d.verdict], command=command, log=log)
     for s in d.stages:
@@ -162,7 +162,7 @@ def diagnosis_report(
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
         page.table(["effect", "stage", "what would excite it"], unseen)
-    return page.write(path)
+    return page
 
 
 def _stage_story(page: Page, s: StageDiagnosis, chain: Chain) -> None:

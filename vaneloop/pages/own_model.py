@@ -13,11 +13,11 @@ from vaneloop.pages.figures import Line, Panel, bars, heat, loop, overlay, ranki
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import TONE_OF, Tone, number
 
-__all__ = ["own_report", "short_names"]
+__all__ = ["own_page", "short_names"]
 
 
-def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path:
-    """Write the page of ``vaneloop compare|locate|diagnose|extend --system``."""
+def own_page(answer: Answer, command: str, log: str) -> Page:
+    """The page of ``vaneloop compare|locate|diagnose|extend --system``."""
     d, b = answer.diagnosis, answer.bound
     looks = answer.verb in ("compare", "locate")
     k = int(np.argmax(d.error_before / d.floor))
@@ -145,7 +145,7 @@ def own_report(answer: Answer, path: str | Path, command: str, log: str) -> Path
         page.section("Notes")
         for n in answer.notes:
             page.text(n[0].upper() + n[1:] + ".")
-    return page.write(path)
+    return page
 
 
 def short_names(names: Sequence[str], width: int = 28) -> dict[str, str]:

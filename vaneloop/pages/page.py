@@ -58,7 +58,7 @@ class Page:
         self._tiles: list[str] = []
         self._body: list[str] = []
         self._sections: list[str] = []
-        self._figures: list[Figure] = []
+        self.figures: list[Figure] = []
         self._grid = False
 
     def tile(self, label: str, value: object, unit: str = "", note: str = "", tone: Tone = "neutral") -> None:
@@ -96,9 +96,9 @@ class Page:
         height = int(figure.get("layout", {}).get("height") or 400)
         note = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
         self._body.append(
-            f'<figure><div class="plot" id="p{len(self._figures)}" style="height:{height}px"></div>{note}</figure>'
+            f'<figure><div class="plot" id="p{len(self.figures)}" style="height:{height}px"></div>{note}</figure>'
         )
-        self._figures.append(figure)
+        self.figures.append(figure)
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "") -> None:
         """Add a table; numbers are rounded to three digits and set flush right."""
@@ -139,7 +139,7 @@ class Page:
             *self._body,
             f"<footer><dl>{facts}</dl></footer>",
             "</main>",
-            f'<script type="application/json" id="figures">{_json(self._figures)}</script>',
+            f'<script type="application/json" id="figures">{_json(self.figures)}</script>',
             f'<script type="application/json" id="themes">{_json(THEMES)}</script>',
             f"<script>{get_plotlyjs()}</script>",
             f"<script>\n{_beside('page.js')}</script>",

@@ -16,7 +16,7 @@ from vaneloop.pages.run import ZOOM, Result, against_speed, axis_title, loops, s
 from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import Tone, number
 
-__all__ = ["replay_report"]
+__all__ = ["replay_page"]
 
 Array = NDArray[np.float64]
 
@@ -24,8 +24,8 @@ DETAIL = 40.0  # s around the worst moment: a whole rise or fall of the engine
 VANES = ("vigv", "vgv1", "vgv2")
 
 
-def replay_report(result: Result, path: str | Path, command: str = "", title: str | None = None) -> Path:
-    """Write the page of one replay; return its path."""
+def replay_page(result: Result, command: str = "", title: str | None = None) -> Page:
+    """The page of one replay."""
     measured = [s for s in result.signals if s.reference == "measured"]
     schedule = [s for s in result.signals if s.reference == "schedule"]
     sentence, tone = _replay_verdict(result, measured, schedule)
@@ -93,7 +93,7 @@ def replay_report(result: Result, path: str | Path, command: str = "", title: st
         for v in vanes:
             if v in result.target:
                 page.plot(against_speed(result, v), half=len(vanes) > 1)
-    return page.write(path)
+    return page
 
 
 # ---------------------------------------------------------------- sentences and figures

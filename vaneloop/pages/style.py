@@ -5,11 +5,11 @@ reader.
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["THEMES", "TONE_OF", "Tone", "number"]
+__all__ = ["THEMES", "TONE_OF", "Tone", "number", "painted"]
 
 Tone = Literal["neutral", "good", "bad"]
 TONE_OF: dict[str, Tone] = {"none": "good", "missing": "neutral", "unknown": "bad"}  # verdict of a diagnosis
@@ -80,3 +80,16 @@ def number(value: object, digits: int = 3) -> str:
             decimals -= 1
         return f"{v:,.{decimals}f}"
     return str(value)
+
+
+def painted(figure: Any, theme: str = "light") -> Any:
+    """A figure with the colours of ``theme`` in place of the roles: ``@role`` and ``@role/opacity``."""
+    if isinstance(figure, dict):
+        return figure if "bdata" in figure else {k: painted(v, theme) for k, v in figure.items()}
+    if isinstance(figure, list | tuple):
+        return [painted(v, theme) for v in figure]
+    if isinstance(figure, str) and figure.startswith("@"):
+        role, _, opacity = figure[1:].partition("/")
+        colour = THEMES[theme].get(role, figure)
+        return f"{colour}{round(255 * float(opacity)):02x}" if opacity else colour
+    return figure

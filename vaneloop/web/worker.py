@@ -219,11 +219,11 @@ def report(
     progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None
 ) -> str:
     """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
-    from vaneloop.pages.diagnosis import diagnosis_report
+    from vaneloop.pages.diagnosis import diagnosis_page
 
     chain = chain_for(words, progress)
     progress(None, "writing the page")
-    return str(diagnosis_report(diagnosis, chain, path, command, words[0], next_experiment))
+    return str(diagnosis_page(diagnosis, chain, command, words[0], next_experiment).write(path))
 
 
 def command(progress: Progress, words: list[str]) -> dict[str, Any]:

@@ -1,0 +1,100 @@
+"""The machine that logs are held against: its tables, what a model file adds, its control strategy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vaneloop.base.errors import InputError
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from hil.logs import Log
+    from plant import Model, Plant
+    from vaneloop.discrepancy.models.vanes import Chain
+
+__all__ = ["TABLES", "Machine", "files_of"]
+
+TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
+
+
+def files_of(tables: str | Path | None) -> dict[str, str]:
+    """File of each table, by name without suffix: from the folder ``tables`` or the shipped one."""
+    shipped = {name: f"{name}.toml" for name in TABLES}
+    if tables is None:
+        return shipped
+    folder = Path(tables)
+    if not folder.is_dir():
+        raise InputError(f"--tables {folder}: is not a folder")
+    found = {name: str(folder / file) for name, file in shipped.items() if (folder / file).is_file()}
+    if not found:
+        raise InputError(f"--tables {folder}: holds none of {', '.join(shipped.values())}")
+    return {**shipped, **found}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Controller and vanes as tables describe them.
+
+    tables    folder whose TOML files replace the shipped ones; None: the shipped ones
+    model     model file (or `plant.Model`) with recalibrated parameters and effects beyond the nominal machine
+    strategy  control strategy, one of `controller.STRATEGIES`; None: the calibration's
+
+    A wrong folder, table or model raises InputError when the machine is made.
+    """
+
+    tables: str | Path | None = None
+    model: str | Path | Model | None = None
+    strategy: str | None = None
+
+    def __post_init__(self) -> None:
+        """Read what is named, so that a wrong name is refused here."""
+        self.plant, self.calibration  # noqa: B018
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """File of each table, by name without suffix."""
+        return files_of(self.tables)
+
+    @cached_property
+    def added(self) -> Model:
+        """What the model file adds to the nominal machine."""
+        from plant import Model, load_model
+
+        if self.model is None:
+            return Model()
+        return self.model if isinstance(self.model, Model) else load_model(self.model, self._built(None))
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The vanes, their actuator and their sensors."""
+        return self._built(None if self.model is None else self.added)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What the controller is flashed with."""
+        from controller import load_calibration
+
+        f = self.files
+        return load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"])
+
+    def _built(self, model: Model | None) -> Plant:
+        from plant import build_plant
+
+        return build_plant(self.files["plant"], self.files["geometry"], self.files["schedules"], model)
+
+    def bind(self, log: Log) -> Chain:
+        """Put a log into the stages of this machine, each to be driven by its own logged inputs.
+
+        Raises LogError for a log that shows none of them.
+        """
+        from hil.logs import LogError
+        from vaneloop.discrepancy.models.vanes import build_chain
+
+        chain = build_chain(log, self.plant, self.calibration, present=tuple(self.added.effects))
+        if not chain.stages:
+            why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
+            raise LogError(f"{log.path}: no stage can be judged ({why})")
+        return chain

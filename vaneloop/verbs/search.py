@@ -1,0 +1,406 @@
+"""Compare, locate, diagnose, extend, experiment: where a model fails, what it lacks, and what to measure next.
+
+Each verb takes one log of the vane machine (`Machine`), or records of a user's own machine (`System`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from vaneloop.base.errors import InputError
+from vaneloop.discrepancy import Record, StageError, System
+from vaneloop.discrepancy.locate import Located, agrees
+from vaneloop.discrepancy.models import own_model
+from vaneloop.discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage, locate_stages, no_better
+from vaneloop.discrepancy.workflow import diagnose as search
+from vaneloop.verbs.answer import Answer
+from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.replay import log_of
+
+if TYPE_CHECKING:
+    from hil.logs import Log
+    from plant import Model
+    from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.pages.page import Page
+
+__all__ = [
+    "Diagnosed", "Experiment", "Extended", "OwnAnswer", "Stages", "compare", "diagnose", "experiment", "extend",
+    "locate", "read_record",
+]  # fmt: skip
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Stages(Answer):
+    """Every stage on its own logged inputs, nothing added: how large its error is, where it fails, since when."""
+
+    chain: Chain
+    located: list[Located]
+    log: str = ""
+
+    @property
+    def fails(self) -> bool:
+        """Whether any stage's error is more than noise."""
+        return any(x.fails for x in self.located)
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        from vaneloop.pages.diagnosis import located_sentence
+
+        return located_sentence(self.located)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as the JSON of ``vaneloop locate``."""
+        stages = [x.json() for x in self.located]
+        lacks = {"not_observed": self.chain.not_observed, "notes": self.chain.notes}
+        return {"schema": 1, "log": self.log, "stages": stages, **lacks}
+
+    def page(self, command: str = "") -> Page:
+        """The answer as a page."""
+        from vaneloop.pages.diagnosis import compare_page
+
+        return compare_page(self.located, self.chain, command, self.log)
+
+
+@dataclass(frozen=True)
+class Diagnosed(Answer):
+    """What each stage lacks: effects with probability, parameters and rivals, or "unknown" with its shape."""
+
+    chain: Chain
+    diagnosis: Diagnosis
+    log: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """Missing, none or unknown."""
+        return self.diagnosis.verdict
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the effects named as missing, the most probable first."""
+        return [str(e["effect"]) for e in self.to_dict()["effects"]]
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        from vaneloop.pages.diagnosis import verdict_sentence
+
+        return verdict_sentence(self.diagnosis)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as the JSON of ``vaneloop diagnose``."""
+        return diagnosis_json(self.diagnosis, self.log)
+
+    def page(self, command: str = "") -> Page:
+        """The answer as a page."""
+        from vaneloop.pages.diagnosis import diagnosis_page
+
+        return diagnosis_page(self.diagnosis, self.chain, command, self.log)
+
+
+@dataclass(frozen=True)
+class Extended(Diagnosed):
+    """The model with effects added and fitted.
+
+    model    `plant.Model`: recalibrated parameters and all effects
+    refused  why the model is no better with them; "": it is
+    path     where the model file was written; "": nowhere
+    """
+
+    model: Model | None = None
+    refused: str = ""
+    path: str = ""
+
+    @property
+    def reached(self) -> bool:
+        """Whether each stage extended stands at its noise floor."""
+        stages = self.diagnosis.stages
+        return all(agrees(e, f) for r in stages for e, f in zip(r.error_after, r.floor, strict=True))
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        if self.refused:
+            return f"The model is no better with it: {self.refused}."
+        falls = (f"{r.stage} from {r.steps[0][1]:.3g} to {r.excess:.3g}" for r in self.diagnosis.stages)
+        return f"Error in noise floors, held out: {', '.join(falls)}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as the JSON of ``vaneloop extend``."""
+        waterfall = {r.stage: [{"step": n, "noise_floors": v} for n, v in r.steps] for r in self.diagnosis.stages}
+        return {**super().to_dict(), "model": self.path, "waterfall": waterfall}
+
+    def write(self, path: str | Path) -> Path:
+        """Write the model file that every command takes with ``--model``; return its path."""
+        from plant import write_model
+
+        assert self.model is not None
+        write_model(str(path), self.model)
+        return Path(path)
+
+
+@dataclass(frozen=True)
+class Experiment(Answer):
+    """Which demand profile would best tell the rivals of a diagnosis apart; ``recommended`` None: there are none."""
+
+    diagnosed: Diagnosed
+    recommended: dict[str, Any] | None
+    log: str = ""
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        return self.recommended["text"] if self.recommended else "Nothing to separate: the log leaves no rivals."
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as the JSON of ``vaneloop experiment``."""
+        e = self.recommended
+        if e is None:
+            return {"schema": 1, "log": self.log, "recommended": None, "profiles": []}
+        best = {"nats": e["score"], **{k: e[k] for k in ("profile", "repeats", "separates", "text")}}
+        return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"]}
+
+    def page(self, command: str = "") -> Page:
+        """The answer as a page."""
+        from vaneloop.pages.diagnosis import diagnosis_page
+
+        return diagnosis_page(self.diagnosed.diagnosis, self.diagnosed.chain, command, self.log, self.recommended)
+
+
+@dataclass(frozen=True)
+class OwnAnswer(Answer):
+    """What a verb found on a user's own model (`vaneloop.discrepancy.models.own_model.Answer`)."""
+
+    answer: own_model.Answer
+    log: str = ""
+    more: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """Missing, none or unknown."""
+        return self.answer.diagnosis.verdict
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the laws named as missing."""
+        return [f.effect for f in self.answer.diagnosis.effects]
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        return self.answer.sentence()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as the commands' JSON."""
+        out = self.answer.json()
+        if self.answer.verb == "locate":
+            out["stages"] = [self.answer.located.json()]
+        if self.answer.verb == "compare":
+            out["signals"] = self._signals()
+        return {**out, "log": self.log or out["log"], **self.more}
+
+    def _signals(self) -> list[dict[str, Any]]:
+        d, measured = self.answer.diagnosis, self.answer.bound.measured
+        return [
+            {
+                "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured",
+                "rms": d.error_before[k], "noise_floor": d.floor[k],
+                "samples": int((measured[k] == measured[k]).sum()),
+            }
+            for k in range(len(d.outputs))
+        ]  # fmt: skip
+
+    def page(self, command: str = "") -> Page:
+        """The answer as a page."""
+        from vaneloop.pages.own_model import own_page
+
+        return own_page(self.answer, command, self.log)
+
+
+# ---- the verbs -------------------------------------------------------------------------------------------------------
+
+
+def _chain(log: Log | str | Path, machine: Machine) -> tuple[Chain, str]:
+    read = log_of(log, require=())
+    return machine.bind(read), read.path
+
+
+def _records(logs: Any, system: System) -> list[Record]:
+    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
+
+
+def _own(verb: str, logs: Any, system: System, test: Any, **options: Any) -> OwnAnswer:
+    records = _records(logs, system)
+    try:
+        answer = getattr(own_model, verb)(system, records, test=_records(test, system), **options)
+    except StageError as e:
+        raise InputError(str(e)) from None
+    return OwnAnswer(answer, records[0].name)
+
+
+def compare(
+    log: Any, model: Machine | System | None = None, *, test: Any = (), progress: Progress | None = None
+) -> Stages | OwnAnswer:
+    """By how much does the model miss? Each stage driven by its own logged inputs, so that none hides behind another.
+
+    log    a log of the vane machine (`Log` or a file's name); of a `System`, one or several `Record` or files' names
+    model  the machine that the log is held against; default: the shipped tables
+    test   records that nothing is fitted to, of a `System`
+    """
+    if isinstance(model, System):
+        return _own("compare", log, model, test)
+    chain, name = _chain(log, model or Machine())
+    return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
+
+
+def locate(
+    log: Any, model: Machine | System | None = None, *, test: Any = (), progress: Progress | None = None
+) -> Stages | OwnAnswer:
+    """Which stage fails, under which conditions, since when? Arguments as of `compare`."""
+    return _own("locate", log, model, test) if isinstance(model, System) else compare(log, model, progress=progress)
+
+
+def diagnose(
+    log: Any,
+    model: Machine | System | None = None,
+    *,
+    test: Any = (),
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Diagnosed | OwnAnswer:
+    """Which physical effects does the model lack? Arguments as of `compare`; ``workers``: stages searched at a time."""
+    if isinstance(model, System):
+        return _own("diagnose", log, model, test, progress=progress)
+    chain, name = _chain(log, model or Machine())
+    return diagnosed(chain, name, workers, progress)
+
+
+def diagnosed(chain: Chain, log: str, workers: int = 2, progress: Progress | None = None) -> Diagnosed:
+    """`diagnose` of a log that has been put into stages."""
+    d = search(chain.stages, chain.not_observed, progress, workers)
+    d.notes = list(chain.notes)
+    return Diagnosed(chain, d, log)
+
+
+def extend(
+    log: Any, effects: Sequence[str], model: Machine | System | None = None, *, test: Any = ()
+) -> Extended | OwnAnswer:
+    """Add effects to the model and fit them, together with those it has. Other arguments as of `compare`.
+
+    Raises InputError for an effect that is not in the library, or whose stage the log does not show.
+    """
+    if isinstance(model, System):
+        return _own("extend", log, model, test, effects=effects)
+    machine = model or Machine()
+    known(effects)
+    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy))
+    return extended(chain, effects, machine.added, name)
+
+
+def known(effects: Sequence[str]) -> None:
+    """Refuse an effect that is not in the library."""
+    import difflib
+
+    from plant.effects import EFFECTS
+
+    for name in effects:
+        if name not in EFFECTS:
+            close = difflib.get_close_matches(name, EFFECTS, 1)
+            hint = f"; probably {close[0]!r} is meant" if close else ""
+            raise InputError(f"--effect {name!r} is not in the library{hint}; docs/effects.md lists it")
+
+
+def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:
+    """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
+    from plant import Model
+    from plant.effects import EFFECTS
+
+    started = time.perf_counter()
+    by_stage: dict[str, list[str]] = {}
+    effects: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys([*before.effects, *wanted]):
+        stage = next((s for s in EFFECTS[name].stages if any(s == c.name for c in chain.stages)), None)
+        if stage is not None:
+            by_stage.setdefault(stage, []).append(name)
+        elif name in wanted:
+            why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in EFFECTS[name].stages)
+            raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
+        else:
+            effects[name] = before.effects[name]
+    results = [extend_stage(chain.stage(s), tuple(names)) for s, names in by_stage.items()]
+    parameters: dict[str, Any] = dict(before.parameters)
+    for r in results:
+        parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
+        for f in r.effects:
+            own = [p.name for p in EFFECTS[f.effect].parameters]
+            effects[f.effect] = {k: float(cast(float, v["value"])) for k, v in f.parameters.items() if k in own}
+    model = Model(parameters=parameters, effects=effects, meta=before.meta)
+    seconds = time.perf_counter() - started
+    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, list(chain.notes))
+    return Extended(chain, d, log, model, next(filter(None, map(no_better, results)), ""))
+
+
+def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None) -> Experiment:
+    """Which demand profile would best tell apart the rivals that a log leaves?
+
+    model  the machine, or the diagnosis of this log where that has been made
+    """
+    from vaneloop.discrepancy.models.experiment import recommend
+
+    if not isinstance(model, Diagnosed):
+        chain, name = _chain(log, model or Machine())
+        model = diagnosed(chain, name)
+    return Experiment(model, recommend(model.diagnosis, progress), model.log)
+
+
+def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:
+    """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
+
+    reading  arguments of `hil.logs.read_log`: dbc, mapping, units, design_rpm
+    """
+    import numpy as np
+
+    name = Path(path).name
+    if system.read is not None:
+        return Record(name, *_by_its_own_reader(str(path), system)), []
+    from hil.logs import read_log
+
+    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
+        c: "" for c in (system.velocity,) if c
+    }
+    signals = {**motion, **system.inputs, **system.outputs}
+    log = read_log(path, **reading, require=[c for c in signals if c not in system.optional()], signals=signals)
+    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
+    t = reference.t
+    columns = {}
+    for c, channel in log.channels.items():
+        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
+        v = np.interp(t, channel.t, channel.values)
+        if c in system.outputs:  # outputs are never made up: far from a sample there is none
+            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
+            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
+        columns[c] = v
+    return Record(name, t, columns), [f"{name}: {note}" for note in log.notes]
+
+
+def _by_its_own_reader(path: str, system: System) -> tuple[Any, dict[str, Any]]:
+    """Time and channels from the system's ``read``."""
+    import numpy as np
+
+    assert system.read is not None
+    if not Path(path).is_file():
+        raise StageError(f"{path}: no such file")
+    said = f"{path}: read() of system {system.name!r}"
+    try:
+        data = dict(system.read(path))
+    except Exception as e:
+        raise StageError(f"{said} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
+    if "t" not in data:
+        raise StageError(f"{said} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed")
+    try:
+        columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
+    except (TypeError, ValueError) as e:
+        raise StageError(f"{said}: not numbers ({e})") from None
+    return columns.pop("t"), columns
