@@ -13,7 +13,7 @@ from numba import njit
 
 from benchmarks.ours import OurLoop, Setup
 from controller import STATE, flat, new_inputs, tick
-from controller.records import STATE_FIELDS, record
+from controller.records import STATE_FIELDS, as_inputs, record
 from plant import chain
 
 __all__ = ["SIGNALS", "run"]
@@ -41,7 +41,7 @@ def run(setup: Setup) -> np.ndarray:
 
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
     p_s, t_oil = rows[0, 2], rows[0, 3]
-    inputs = new_inputs()
+    inputs = as_inputs(new_inputs())
 
     def ticked(z, u):
         inputs.n_dem, inputs.n_r, inputs.demand_fresh, inputs.x_lvdt = u

@@ -15,6 +15,7 @@ from numba import njit
 from benchmarks.in_control import SIGNALS
 from benchmarks.ours import OurLoop, Setup
 from controller import new_inputs, tick
+from controller.records import as_inputs
 from plant import chain
 from plant import parameters as par
 
@@ -54,7 +55,7 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
     start = OurLoop(setup)
     z, s = start.loop.z, start.loop.s
-    n_dem, inputs, ticks = rows[:, 0], new_inputs(), [0]
+    n_dem, inputs, ticks = rows[:, 0], as_inputs(new_inputs()), [0]
     gain = p[par.FLOW_GAIN, 0] * math.sqrt(rows[0, 2] / p[par.P_REF, 0])
     engine_values = [float(v) for v in p[[par.LAG, par.ACCELERATION, par.DECELERATION], 0]]
     drive_values = [

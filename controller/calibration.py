@@ -11,12 +11,13 @@ from pydantic import model_validator
 from controller.monitors import FAR
 from controller.records import (
     INPUT_FIELDS,
-    OUTPUT_FIELDS,
+    OUTPUTS,
     SCALAR_FIELDS,
     SCALARS,
     STATE_FIELDS,
     STRATEGIES,
     Record,
+    flat,
     record,
 )
 from vaneloop.base.errors import InputError
@@ -305,16 +306,16 @@ def load_calibration(
     angle = read(angles, AngleTable)
     if strategy is not None and strategy not in STRATEGIES:
         raise InputError(f"strategy (={strategy!r}) must be one of {', '.join(STRATEGIES)}")
-    flat = {
+    values = {
         "strategy": float(STRATEGIES.index(strategy or cal.schedule.strategy)),
         "table_input": 0.0 if cal.schedule.table_input == "n_r" else 1.0,
     }
     for section in cal.__class__.model_fields:
         for key, q in getattr(cal, section):
             if isinstance(q, Quantity):
-                flat[key] = q.value * _SI.get(q.unit, 1.0)
-    flat |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
-    k = record(SCALAR_FIELDS, np.array([flat[name] for name in SCALARS]))
+                values[key] = q.value * _SI.get(q.unit, 1.0)
+    values |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
+    k = record(SCALAR_FIELDS, np.array([values[name] for name in SCALARS]))
     table = np.array(
         [stroke.speed.values]
         + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]
@@ -326,22 +327,24 @@ def load_calibration(
     return Calibration(k, table, np.array(vanes))
 
 
-def new_inputs() -> Record:
-    """Inputs of a controller to which nothing has come yet, without stem potentiometers; it is asked to run."""
+def new_inputs() -> np.ndarray:
+    """Inputs (float64[n] of `INPUTS`) of a controller to which nothing has come yet, without stem potentiometers; it is
+    asked to run.
+    """
     inputs = record(INPUT_FIELDS)
     inputs.mode_request = 1.0
     inputs.pots[:] = np.nan
-    return inputs
+    return flat(inputs)
 
 
-def new_outputs() -> Record:
-    """Outputs of a controller that has not run yet: no current."""
-    return record(OUTPUT_FIELDS)
+def new_outputs() -> np.ndarray:
+    """Outputs (float64[n] of `OUTPUTS`) of a controller that has not run yet: no current."""
+    return np.zeros(len(OUTPUTS))
 
 
-def new_state() -> Record:
-    """State of a controller that has just been switched on."""
+def new_state() -> np.ndarray:
+    """State (float64[n] of `STATE`) of a controller that has just been switched on."""
     z = record(STATE_FIELDS)
     z.direction = z.blend = 1.0
     z.x_reach = FAR
-    return z
+    return flat(z)

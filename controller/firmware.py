@@ -36,6 +36,10 @@ from controller.records import (
     SLOW_TICK,
     TICK,
     Record,
+    as_inputs,
+    as_outputs,
+    as_scalars,
+    as_state,
 )
 from controller.schedule import move_demand, schedule_step
 from controller.servo import servo_step
@@ -53,14 +57,14 @@ __all__ = ["give", "tick"]
 def tick(inputs: Record, state: Record, calibration: Calibration) -> None:
     """Run the controller for one servo tick of 1 ms.
 
-    inputs       record of `INPUT_FIELDS`; any value, NaN and infinity included, is safe
-    state        record of `STATE_FIELDS`, changed in place; start from `controller.new_state()`
+    inputs       float64[n] of `INPUTS`, or their record; any value, NaN and infinity included, is safe
+    state        float64[n] of `STATE`, or their record, changed in place; start from `controller.new_state()`
     calibration  `controller.Calibration` (scalars ``k``, stroke ``table``, vane ``angles``)
 
     Invariants: ``state.i_cmd`` within +-current_limit, ``state.x_dem`` within [stroke_min, stroke_max], mode one of
     `MODES`.
     """
-    z, k = state, calibration.k
+    inputs, z, k = as_inputs(inputs), as_state(state), as_scalars(calibration.k)
     pause = min(inputs.pause, 1e6) if inputs.pause > 0.0 else 0.0  # not NaN
     condition_lvdt(z, k, inputs.x_lvdt, pause)
     monitor_demand(inputs, z, k, pause)
@@ -114,5 +118,6 @@ def tick(inputs: Record, state: Record, calibration: Calibration) -> None:
 
 @inlined
 def give(state: Record, outputs: Record) -> None:
-    """Fill ``outputs`` (record of `OUTPUT_FIELDS`) with what leaves the firmware after a tick."""
-    outputs.i_cmd, outputs.x_dem, outputs.mode, outputs.faults = state.i_cmd, state.x_dem, state.mode, state.faults
+    """Fill ``outputs`` (float64[n] of `OUTPUTS`, or their record) with what leaves the firmware after a tick."""
+    z, out = as_state(state), as_outputs(outputs)
+    out.i_cmd, out.x_dem, out.mode, out.faults = z.i_cmd, z.x_dem, z.mode, z.faults

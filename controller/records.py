@@ -1,19 +1,23 @@
 """What the firmware works on, declared once: inputs, outputs, state, calibration scalars.
 
-Every record is a row of float64 in the order below, so its memory is also a C struct of doubles. In compiled code and
-in Python its fields are attributes: ``state.x_dem``, ``state.width[stage]``, ``calibration.k.kp``. `flat` shows the
-same memory as numbers. Units are SI, speeds %.
+Every record is a row of float64 in the order below, so its memory is also a C struct of doubles. As a `record` its
+fields are attributes, in compiled code and in Python: ``state.x_dem``, ``state.width[stage]``, ``calibration.k.kp``.
+`flat` shows the same memory as numbers; the firmware takes either. Units are SI, speeds %.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
 __all__ = [
     "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OUTPUTS", "OUTPUT_FIELDS", "SCALARS", "SCALAR_FIELDS",
-    "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "copy", "flat", "flat_names", "kind", "record",
+    "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs", "as_scalars", "as_state",
+    "copy", "flat", "flat_names", "kind", "record",
 ]  # fmt: skip
 
 Record = Any  # a numpy.record: its fields are attributes, which the types of numpy do not know
@@ -232,3 +236,26 @@ def flat(of: Record) -> np.ndarray:
 def copy(of: Record) -> Record:
     """A record of its own with the same numbers."""
     return flat(of).copy().view(of.dtype)[0]
+
+
+def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
+    """Function, compiled too, that shows a row of numbers as the record of ``fields``, and a record as it is."""
+    layout = kind(fields)
+
+    def view(row: Any) -> Record:
+        return row if isinstance(row, np.void) else row.view(layout)[0]
+
+    def numbers(row: Any) -> Any:
+        return row.view(layout)[0]
+
+    def named(row: Any) -> Any:
+        return row
+
+    @overload(view)
+    def _compiled(row: Any) -> Any:
+        return numbers if isinstance(row, types.Array) else named
+
+    return view
+
+
+as_inputs, as_outputs, as_scalars, as_state = map(_viewer, (INPUT_FIELDS, OUTPUT_FIELDS, SCALAR_FIELDS, STATE_FIELDS))

@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit
 
 import controller
-from controller import firmware, monitors, records, schedule, servo, strategies, trend
+from controller import monitors, new_state, records, schedule, servo, strategies, tick, trend
 from controller.calibration import Calibration
 from controller.records import FAULTS, INPUTS, SCALARS, STATE
 from controller.schedule import look_up
@@ -39,71 +38,60 @@ globals().update(named("", SCALARS) | named("IN_", INPUTS) | named("", STATE))
 N_INPUTS, N_SCALARS, N_STATE = len(INPUTS), len(SCALARS), len(STATE)
 
 
-def new_state() -> np.ndarray:
-    """State of a controller that has just been switched on."""
-    return records.flat(controller.new_state())
-
-
 def load_calibration(*args, **options) -> Calibration:
     """The calibration with its scalars as a row of numbers."""
     cal = controller.load_calibration(*args, **options)
     return cal._replace(k=records.flat(cal.k))
 
 
-_I, _K, _Z = map(records.kind, (records.INPUT_FIELDS, records.SCALAR_FIELDS, records.STATE_FIELDS))
 on_rows = njit(error_model="numpy")
 
 
 @on_rows
-def tick(inputs, z, cal):  # noqa: D103
-    firmware.tick(inputs.view(_I)[0], z.view(_Z)[0], Calibration(cal.k.view(_K)[0], cal.table, cal.angles))
-
-
-@on_rows
 def trend_step(z, k, n_dem):  # noqa: D103
-    trend.trend_step(z.view(_Z)[0], k.view(_K)[0], n_dem)
+    trend.trend_step(records.as_state(z), records.as_scalars(k), n_dem)
 
 
 @on_rows
 def schedule_step(z, k, table):  # noqa: D103
-    schedule.schedule_step(z.view(_Z)[0], k.view(_K)[0], table)
+    schedule.schedule_step(records.as_state(z), records.as_scalars(k), table)
 
 
 @on_rows
 def move_demand(z, k, target, rate):  # noqa: D103
-    schedule.move_demand(z.view(_Z)[0], k.view(_K)[0], target, rate)
+    schedule.move_demand(records.as_state(z), records.as_scalars(k), target, rate)
 
 
 @on_rows
 def servo_step(z, k, x_ref, dx_ref):  # noqa: D103
-    servo.servo_step(z.view(_Z)[0], k.view(_K)[0], x_ref, dx_ref)
+    servo.servo_step(records.as_state(z), records.as_scalars(k), x_ref, dx_ref)
 
 
 @on_rows
 def observe_speed(z, k):  # noqa: D103
-    strategies.observe_speed(z.view(_Z)[0], k.view(_K)[0])
+    strategies.observe_speed(records.as_state(z), records.as_scalars(k))
 
 
 @on_rows
 def follow_play(z, stage, drive, width):  # noqa: D103
-    strategies.follow_play(z.view(_Z)[0], stage, drive, width)
+    strategies.follow_play(records.as_state(z), stage, drive, width)
 
 
 @on_rows
 def inverse_step(z, k, table, angles):  # noqa: D103
-    strategies.inverse_step(z.view(_Z)[0], k.view(_K)[0], table, angles)
+    strategies.inverse_step(records.as_state(z), records.as_scalars(k), table, angles)
 
 
 @on_rows
 def learn(z, k):  # noqa: D103
-    strategies.learn(z.view(_Z)[0], k.view(_K)[0])
+    strategies.learn(records.as_state(z), records.as_scalars(k))
 
 
 @on_rows
 def judge_pot(z, k, stage, expected, plausible):  # noqa: D103
-    strategies._judge_pot(z.view(_Z)[0], k.view(_K)[0], stage, expected, plausible)
+    strategies._judge_pot(records.as_state(z), records.as_scalars(k), stage, expected, plausible)
 
 
 @on_rows
 def filter_pots(z, k, inputs):  # noqa: D103
-    strategies.filter_pots(z.view(_Z)[0], k.view(_K)[0], inputs.view(_I)[0])
+    strategies.filter_pots(records.as_state(z), records.as_scalars(k), records.as_inputs(inputs))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from numba import njit
-
-from controller import Calibration, flat, load_calibration, new_inputs, new_state, tick
-from controller.records import INPUT_FIELDS, STATE_FIELDS, copy, kind
+from controller import Calibration, load_calibration, new_inputs, new_state, tick
+from controller.records import copy
 from tests.columns import (
     I_CMD,
     IN_FRESH,
@@ -26,20 +24,11 @@ from tests.rig import Compiled
 __all__ = ["firmware"]
 
 
-_INPUTS, _STATE = kind(INPUT_FIELDS), kind(STATE_FIELDS)
-
-
-@njit(error_model="numpy")
-def tick_on_rows(inputs, state, calibration):
-    """The firmware's tick on rows of numbers, which is what the rig has."""
-    tick(inputs.view(_INPUTS)[0], state.view(_STATE)[0], calibration)
-
-
 def firmware(calibration: Calibration | None = None) -> Compiled:
     """Return the controller as the rig takes it; controller errors are put into its calibration."""
     cal = calibration or load_calibration()
     out = Compiled(
-        tick=tick_on_rows, inputs=flat(new_inputs()), state=flat(new_state()), calibration=cal,
+        tick=tick, inputs=new_inputs(), state=new_state(), calibration=cal,
         n_dem=IN_N_DEM, n_r=IN_N_R, x_lvdt=IN_X_LVDT, fresh=IN_FRESH,
         i_cmd=I_CMD, x_dem=X_DEM, mode=MODE, mode_request=IN_MODE_REQUEST,
     )  # fmt: skip

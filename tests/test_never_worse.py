@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from vaneloop.cli import extend
-from vaneloop.discrepancy import workflow
 from vaneloop.discrepancy.diagnose import Search
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.vanes import Chain
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 from vaneloop.discrepancy.workflow import extend_stage, no_better
+from vaneloop.verbs import search as verbs
 
 N = 1200
 
@@ -82,7 +82,7 @@ def test_extend_writes_no_model_that_is_no_better(after, written, monkeypatch, t
     )
     chain = Chain(stage.t, [stage], {}, {}, None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(extend, "chain_of", lambda args, model: chain)
-    monkeypatch.setattr(workflow, "extend_stage", lambda stage, effects: ended)
+    monkeypatch.setattr(verbs, "extend_stage", lambda stage, effects: ended)
     parser = argparse.ArgumentParser()
     extend.add_options(parser)
     out = tmp_path / "m.toml"

@@ -511,7 +511,7 @@ def test_a_spell_in_another_mode_is_the_firmwares(kind):
     """The controller leaves RUN and comes back by itself; the machine moves as it says; the rows before are
     untouched.
     """
-    firmware = pytest.importorskip("controller.firmware")
+    firmware = pytest.importorskip("controller.records")
     from tests.firmware_on_rig import firmware as controller_of_the_product
     from tests.rig import Spell
 

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller import Calibration, flat, give, new_inputs, new_outputs, new_state, tick
-from controller.records import SLOW, Record, copy
+from controller import Calibration, give, new_inputs, new_outputs, new_state, tick
+from controller.records import SLOW, Record, as_inputs, as_outputs, as_state, copy
 from plant import Plant, chain
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place
@@ -89,10 +89,10 @@ def new_loop(
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
     z = new_state()
     return Loop(
-        new_inputs(),
-        new_outputs(),
+        as_inputs(new_inputs()),
+        as_outputs(new_outputs()),
+        as_state(z),
         z,
-        flat(z),
         calibration,
         cal,
         plant.p[list(CHANGED_BY), 0],

@@ -70,7 +70,7 @@ def simulate(
     integral        A, integral part at t = 0
     """
     from controller import new_state
-    from controller.records import SCALAR_FIELDS, record
+    from controller.records import SCALAR_FIELDS, as_state, record
     from controller.servo import servo_step
     from plant.actuator import speed_factor, stroke_step
     from plant.play import play_step
@@ -79,7 +79,7 @@ def simulate(
 
     ref = np.asarray(x_ref, dtype=float)
     rate = np.zeros_like(ref) if dx_ref is None else np.asarray(dx_ref, dtype=float)
-    z, k = new_state(), record(SCALAR_FIELDS)
+    z, k = as_state(new_state()), record(SCALAR_FIELDS)
     k.kp, k.ki, k.kff, k.current_limit = gains.kp, gains.ki, gains.kff, plant.current_limit
     z.integral = integral
     dt = plant.tick / substeps

@@ -155,11 +155,11 @@ def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Ar
     10 ms.
     """
     from controller import new_state
-    from controller.records import SCALAR_FIELDS, record
+    from controller.records import SCALAR_FIELDS, as_state, record
     from controller.trend import trend_step
 
     y = np.asarray(n_dem, dtype=float)
-    z, k = new_state(), record(SCALAR_FIELDS)
+    z, k = as_state(new_state()), record(SCALAR_FIELDS)
     k.trend_alpha, k.trend_beta = design.alpha, design.beta
     k.trend_rate_on, k.trend_change, k.trend_hold = design.rate_on, design.change, design.hold
     z.trend_n = z.trend_turn = z.trend_last = y[0]

@@ -34,7 +34,7 @@ from scipy.ndimage import binary_propagation, uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
-from controller.records import RUN, SLOW_TICK, Record, copy
+from controller.records import RUN, SLOW_TICK, Record, as_state, copy
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
 from hil.figures import noise_floor
@@ -929,7 +929,7 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     for direction in (1.0, -1.0):
         out = np.empty((2, len(n_dem)))
         for back, row in zip((0.0, 0.999 * cal.k.trend_change), out, strict=True):
-            z = new_state()
+            z = as_state(new_state())
             z.trend_n = z.trend_last = n_dem[0]
             z.trend_turn, z.direction = n_dem[0] + direction * back, direction
             _directions(n_dem, cal.k, z, row)
@@ -987,7 +987,7 @@ def _demand(
                 rising = abs(curves[0] - c["x_dem"][first]) <= abs(curves[1] - c["x_dem"][first])
                 # at the start of a log the demand stands on a curve; later both directions are tried
                 for x, up in ((out[i, 0], rising), (other, not rising)) if first else ((out[i, 0], rising),):
-                    z = new_state()
+                    z = as_state(new_state())
                     z.demand_seen = 1.0
                     z.direction, z.blend = (1.0, 1.0) if up else (-1.0, 0.0)
                     _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, x)
