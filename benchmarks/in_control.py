@@ -14,7 +14,7 @@ from numba import njit
 from benchmarks.ours import OurLoop, Setup
 from controller import STATE, flat, new_inputs, tick
 from controller.records import STATE_FIELDS, as_inputs, record
-from plant import chain
+from plant import chain, places
 
 __all__ = ["SIGNALS", "run"]
 
@@ -61,7 +61,7 @@ def run(setup: Setup) -> np.ndarray:
 
     def machine_output(t, s, u, params):
         return np.array(
-            [s[chain.N_R], lvdt_sample(s.reshape(-1, 1), p), s[chain.POT], s[chain.POT + 1], s[chain.POT + 2]]
+            [s[places.N_R], lvdt_sample(s.reshape(-1, 1), p), s[places.POT], s[places.POT + 1], s[places.POT + 2]]
         )
 
     firmware = control.NonlinearIOSystem(

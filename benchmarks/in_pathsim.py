@@ -16,7 +16,7 @@ from benchmarks.in_control import SIGNALS
 from benchmarks.ours import OurLoop, Setup
 from controller import new_inputs, tick
 from controller.records import as_inputs
-from plant import chain
+from plant import chain, places
 from plant import parameters as par
 
 __all__ = ["SIGNALS", "run"]
@@ -39,7 +39,7 @@ def drive(x, u, rated, w, damping, gain, lvdt_lag):
 @njit(cache=True)
 def vanes_step(s, p, stroke):
     """Linkage and potentiometers: one tick at ``stroke`` (m)."""
-    s[chain.X, 0] = stroke
+    s[places.X, 0] = stroke
     chain.vane_step(s, p, 0, 0.0, 0.0)
 
 
@@ -78,12 +78,12 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
     def linkage(x):
         if ticks[0] > 1:  # the state at t = 0 is given
             vanes_step(linkage_state, p, x)
-        return tuple(linkage_state[chain.POT : chain.POT + 3, 0])
+        return tuple(linkage_state[places.POT : places.POT + 3, 0])
 
     source = Source(lambda t: n_dem[min(int(t * 100.0 + 1e-6), len(n_dem) - 1)])
-    engine = ODE(lambda x, u, t: rotor(x, u, *engine_values), np.array([s[chain.N_R, 0]]))
+    engine = ODE(lambda x, u, t: rotor(x, u, *engine_values), np.array([s[places.N_R, 0]]))
     actuator = ODE(
-        lambda x, u, t: drive(x, u, *drive_values), s[[chain.SPOOL, chain.SPOOL_RATE, chain.X, chain.X_LVDT], 0]
+        lambda x, u, t: drive(x, u, *drive_values), s[[places.SPOOL, places.SPOOL_RATE, places.X, places.X_LVDT], 0]
     )
     servo, vanes = Wrapper(firmware, T=1e-3), Wrapper(linkage, T=1e-3)
     scope = Scope(sampling_period=1e-2)

@@ -4,58 +4,35 @@ real time, diagnosis.
 State ``s`` and parameters ``p`` are float64[n, lanes]; lane ``j`` is one plant, so that many parameter sets run side by
 side. Units: SI.
 
-To add an effect: its file in `plant.effects`, one constant below, one call where it acts. Where all effects of a part
-are neutral, the part takes a short way that holds the nominal equations only; both ways give the same bits then, which
-a test checks.
+Valve, piston and LVDT with their effects are `plant.drive`, a vane stage with its effects `plant.stem`. To add an
+effect: its file in `plant.effects`, its name in `plant.places`, one call where it acts. Where all effects of a part are
+neutral, the part takes a short way that holds the nominal equations only; both ways give the same bits then, which a
+test checks.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from plant import drive, stem
 from plant.actuator import speed_factor, stroke_step
 from plant.effect import T_REF
 from plant.effects import (
     N_STATE,
-    ROW,
     STATE,
-    STATE_ROW,
     acceleration_limit_error,
     aero_load,
-    crank_length_error,
-    end_stop_shift,
-    internal_leakage,
-    link_length_error,
-    linkage_backlash,
-    linkage_compliance,
-    linkage_friction,
-    linkage_wear,
     lvdt_bias,
     lvdt_gain,
-    lvdt_lag,
     lvdt_nonlinearity,
     lvdt_thermal_drift,
-    oil_compressibility,
     oil_viscosity,
-    piston_friction,
-    piston_stiction,
-    pot_bias,
-    pot_gain,
-    ring_eccentricity,
     rotor_lag_error,
-    supply_pressure_droop,
-    thermal_growth,
-    valve_dead_band,
-    valve_flow_saturation,
     valve_gain_asymmetry,
     valve_hysteresis,
-    valve_lag,
     valve_null_bias,
 )
 from plant.engine import engine_step
-from plant.layout import NOMINAL_STATE
 from plant.linkage import (
     G_AX,
     G_AY,
@@ -76,7 +53,6 @@ from plant.linkage import (
 )
 from plant.parameters import (
     ACCELERATION,
-    AREA,
     DECELERATION,
     DRIVE_EFFECTS,
     DRIVE_LOADED,
@@ -84,7 +60,6 @@ from plant.parameters import (
     GEOMETRY,
     LAG,
     LVDT_FACTOR,
-    LVDT_SHARE,
     LVDT_STEP,
     P_REF,
     PLAY,
@@ -97,8 +72,36 @@ from plant.parameters import (
     VALVE_A12,
     VALVE_A21,
     VALVE_A22,
-    VALVE_SHARE,
     VANE_EFFECTS,
+)
+from plant.places import (
+    ACCELERATION_LIMIT_ERROR,
+    AERO_LOAD,
+    BRISTLE,
+    CURRENT,
+    DRIVEN,
+    FRICTION,
+    GIVE,
+    LAGGED,
+    LINKAGE_FRICTION,
+    LVDT_BIAS,
+    LVDT_GAIN,
+    LVDT_NONLINEARITY,
+    LVDT_THERMAL_DRIFT,
+    N_R,
+    OIL_VISCOSITY,
+    POT,
+    READING,
+    RING,
+    ROTOR_LAG_ERROR,
+    SPEED,
+    SPOOL,
+    SPOOL_RATE,
+    VALVE_GAIN_ASYMMETRY,
+    VALVE_HYSTERESIS,
+    VALVE_NULL_BIAS,
+    X_LVDT,
+    X,
 )
 from plant.play import play_step
 from plant.sensors import quantise
@@ -111,7 +114,6 @@ __all__ = [
     "SUBSTEPS",
     "TICK",
     "drive_step",
-    "drive_substep",
     "measured_stroke",
     "rotor_step",
     "sample_lvdt",
@@ -125,56 +127,6 @@ __all__ = [
 
 TICK = 1e-3  # s, one servo tick
 SUBSTEPS = 10  # plant steps a tick: 10 kHz
-
-(N_R, SPOOL, SPOOL_RATE, SPEED, X, X_LVDT, RING, _, _, POT, _, _) = range(len(NOMINAL_STATE))
-
-# ---- the effects' first rows in p, in the order of the signal flow
-CAN_DELAY = ROW["can_delay"]
-FRAME_HOLD = ROW["frame_hold"]
-SCHEDULE_ERROR = ROW["schedule_error"]
-TREND_THRESHOLD_ERROR = ROW["trend_threshold_error"]
-CONTROLLER_GAIN_ERROR = ROW["controller_gain_error"]
-ROTOR_LAG_ERROR = ROW["rotor_lag_error"]
-ACCELERATION_LIMIT_ERROR = ROW["acceleration_limit_error"]
-VALVE_NULL_BIAS = ROW["valve_null_bias"]
-VALVE_HYSTERESIS = ROW["valve_hysteresis"]  # width, spread
-VALVE_LAG = ROW["valve_lag"]  # used through VALVE_SHARE
-VALVE_DEAD_BAND = ROW["valve_dead_band"]
-VALVE_GAIN_ASYMMETRY = ROW["valve_gain_asymmetry"]
-OIL_VISCOSITY = ROW["oil_viscosity"]
-AERO_LOAD = ROW["aero_load"]
-SUPPLY_PRESSURE_DROOP = ROW["supply_pressure_droop"]
-VALVE_FLOW_SATURATION = ROW["valve_flow_saturation"]
-INTERNAL_LEAKAGE = ROW["internal_leakage"]
-PISTON_STICTION = ROW["piston_stiction"]  # excess, speed
-PISTON_FRICTION = ROW["piston_friction"]
-OIL_COMPRESSIBILITY = ROW["oil_compressibility"]  # compliance, drag
-END_STOP_SHIFT = ROW["end_stop_shift"]
-LVDT_LAG_ERROR = ROW["lvdt_lag"]  # used through LVDT_SHARE
-LVDT_NONLINEARITY = ROW["lvdt_nonlinearity"]  # amplitude, cubic
-LVDT_GAIN = ROW["lvdt_gain"]
-LVDT_THERMAL_DRIFT = ROW["lvdt_thermal_drift"]
-LVDT_BIAS = ROW["lvdt_bias"]
-CRANK_LENGTH_ERROR = ROW["crank_length_error"]  # here and below: one row a vane stage
-LINK_LENGTH_ERROR = ROW["link_length_error"]
-RING_ECCENTRICITY = ROW["ring_eccentricity"]  # three amplitudes, phase
-THERMAL_GROWTH = ROW["thermal_growth"]
-LINKAGE_COMPLIANCE = ROW["linkage_compliance"]  # one row for all
-LINKAGE_BACKLASH = ROW["linkage_backlash"]
-LINKAGE_WEAR = ROW["linkage_wear"]
-LINKAGE_FRICTION = ROW["linkage_friction"]  # three widths, distance
-POT_GAIN = ROW["pot_gain"]
-POT_LAG_ERROR = ROW["pot_lag"]  # used through POT_SHARE
-POT_BIAS_ERROR = ROW["pot_bias"]
-
-# ---- and in s
-CURRENT = STATE_ROW["valve_hysteresis"]  # four of A: the valve's memory
-LAGGED = STATE_ROW["valve_lag"]  # A, behind the valve's lag
-FRICTION = STATE_ROW["piston_friction"]  # N: force, off centre
-GIVE = STATE_ROW["oil_compressibility"]  # m
-READING = STATE_ROW["lvdt_lag"]  # m, stroke behind both lags of the LVDT
-BRISTLE = STATE_ROW["linkage_friction"]  # three of -1..1
-DRIVEN = BRISTLE + 3  # rad, three rings at the last tick, as friction saw them
 
 
 @in_place
@@ -219,89 +171,23 @@ def drive_step(
     s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
 
 
-@inlined
-def drive_substep(
-    u: float, du: float, v: float, x: float, y: float, lagged: float, z: float, off: float, give: float, reading: float,
-    i: float, rated: float, share: float, a11: float, a12: float, a21: float, a22: float, overlap: float,
-    extending: float, retracting: float, root: float, p_s: float, per_p_ref: float, per_area: float, load: float,
-    droop: float,
-    limit: float, roundness: float,
-    leakage: float, force: float, excess: float, stribeck: float, stiffness: float, compliance: float, drag: float,
-    per_stroke: float, low: float, high: float, lvdt_factor: float, lvdt_share: float, dt: float,
-    loaded: bool, lossy: bool, sticky: bool,
-) -> tuple[float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
-    """One plant step ``dt`` of spool, oil, piston and LVDT with every effect; state in, state out.
-
-    loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
-    lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where
-            these are neutral
-    """
-    lagged = valve_lag.step(lagged, i, share)
-    u, du = valve_step(u, du, lagged / rated, a11, a12, a21, a22)
-    opening = valve_dead_band.step(u, overlap)
-    gain = extending if opening > 0.0 else retracting
-    v_before = v
-    if loaded:
-        p_load = (load + z) * per_area
-        against = p_load if opening > 0.0 else -p_load
-        v = opening * (gain * math.sqrt(max(0.0, (p_s - against) * per_p_ref)))
-        if lossy:
-            v = supply_pressure_droop.step(v, p_s - against, droop)
-            v = valve_flow_saturation.step(v, limit, roundness)
-            v = internal_leakage.step(v, p_load, drag * per_area, leakage)
-        else:
-            v = valve_flow_saturation.corner(v, limit)
-        travel = 0.5 * (v_before + v) * dt
-        level = piston_stiction.step(force, v, excess, stribeck) if sticky else force
-        z_before, give_before = z, give
-        r = piston_friction.off_middle(x, per_stroke)
-        k = 1.0 - r * r
-        z = piston_friction.step(z, travel, level, stiffness / k)
-        off, back = piston_friction.recentre(off, r * (z - z_before), abs(travel) * stiffness * (0.5 * per_area / p_s))
-        give = oil_compressibility.step(load, v, compliance, drag)
-        travel += (give - give_before) - (k * (z - z_before) + r * back) / stiffness
-    else:
-        v = valve_flow_saturation.corner(opening * (gain * root), limit)
-        travel = 0.5 * (v_before + v) * dt
-    x = min(max(x + travel, low), high)
-    y += lvdt_factor * (x - y)
-    reading = lvdt_lag.step(reading, y, lvdt_share)
-    return u, du, v, x, y, lagged, z, off, give, reading
-
-
 @in_place
 def _drive_step(
     s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, p_s: float, t_oil: float, dt: float, substeps: int
 ) -> None:
-    """`drive_step` with every effect: what changes within the step is in `drive_substep`."""
+    """`drive_step` with every effect: what changes within the step is in `plant.drive`."""
     i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
     y1, y2, y3, y4 = s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j]
     y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j], p[VALVE_HYSTERESIS + 1, j])
     i = valve_hysteresis.mean(y1, y2, y3, y4)
     gain = oil_viscosity.step(p[FLOW_GAIN, j], t_oil, p[OIL_VISCOSITY, j])
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
-    load = aero_load.step(n_r, p[AERO_LOAD, j])
-    low, high = end_stop_shift.step(p[STROKE, j], p[END_STOP_SHIFT, j])
-    overlap = p[VALVE_DEAD_BAND, j] / p[RATED_CURRENT, j]
-    root = speed_factor(p_s, 0.0, p[P_REF, j])
-    per_p_ref, per_area = 1.0 / p[P_REF, j], 1.0 / p[AREA, j]
-    stiffness = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, j])
-    u, du, v, x, y = s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j]
-    lagged, z, off, give, reading = s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j]
+    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), aero_load.step(n_r, p[AERO_LOAD, j]))
+    d, z = drive.prepare(p, j), drive.taken(s, j)
     for _ in range(substeps):
-        u, du, v, x, y, lagged, z, off, give, reading = drive_substep(
-            u, du, v, x, y, lagged, z, off, give, reading,
-            i, p[RATED_CURRENT, j], p[VALVE_SHARE, j], p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j],
-            p[VALVE_A22, j],
-            overlap, extending, retracting, root, p_s, per_p_ref, per_area, load, p[SUPPLY_PRESSURE_DROOP, j],
-            p[VALVE_FLOW_SATURATION, j], p[VALVE_FLOW_SATURATION + 1, j], p[INTERNAL_LEAKAGE, j],
-            p[PISTON_FRICTION, j], p[PISTON_STICTION, j], p[PISTON_STICTION + 1, j],
-            stiffness, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j], 1.0 / p[STROKE, j], low, high,
-            p[LVDT_FACTOR, j], p[LVDT_SHARE, j], dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True,
-        )  # fmt: skip
-    s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
+        z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True)
+    drive.stored(s, j, z)
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
-    s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j] = lagged, z, off, give, reading
 
 
 @in_place
@@ -362,13 +248,9 @@ def sample_lvdt(s: np.ndarray, p: np.ndarray, j: int, noise: float, t_oil: float
 @in_place
 def unloaded_ring_angle(p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float) -> float:
     """Return the angle (rad) to which crank direction (c, d) drives the ring of stage ``k``, before its play."""
-    o = GEOMETRY + N_CRANK + k * N_PER_STAGE
-    lb = crank_length_error.step(p[o + G_LB, j], p[CRANK_LENGTH_ERROR + k, j])
-    lc = link_length_error.step(p[o + G_LC, j], p[LINK_LENGTH_ERROR + k, j])
-    theta = ring_angle(c, d, p[o + G_AX, j], p[o + G_AY, j], lb, lc, p[o + G_LD, j])
-    theta = ring_eccentricity.step(theta, p[RING_ECCENTRICITY + k, j], p[RING_ECCENTRICITY + 3, j])
-    theta = thermal_growth.step(theta, t_oil, p[THERMAL_GROWTH + k, j], p[o + G_L, j] / p[o + G_LDP, j])
-    return linkage_compliance.step(theta, n_r, p[LINKAGE_COMPLIANCE, j])
+    stage = stem.prepare(p, j, k)
+    theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
+    return stem.drive(stage, theta, n_r, t_oil, True)
 
 
 @in_place
@@ -378,21 +260,12 @@ def stem_angle(
     """Turn ring ``k`` after the crank direction (c, d) at time ``t`` (s); return the angle (rad) for its potentiometer,
     bias included.
     """
-    o = GEOMETRY + N_CRANK + k * N_PER_STAGE
-    ratio = p[o + G_L, j] / p[o + G_LDP, j]
-    drive = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
-    play = linkage_backlash.step(p[PLAY + k, j], p[LINKAGE_BACKLASH + k, j], ratio)
-    play = linkage_wear.step(play, p[LINKAGE_WEAR + k, j], ratio, t)
-    ring = play_step(s[RING + k, j], drive, play)
-    s[RING + k, j] = ring
-    if p[LINKAGE_FRICTION + k, j] != 0.0:
-        bristle = linkage_friction.step(s[BRISTLE + k, j], ring - s[DRIVEN + k, j], p[LINKAGE_FRICTION + 3, j])
-        s[BRISTLE + k, j] = bristle
-        s[DRIVEN + k, j] = ring
-        ring = linkage_friction.loop(ring, bristle, p[LINKAGE_FRICTION + k, j], ratio)
-    vane = vane_angle(ring, p[o + G_LDP, j], p[o + G_L, j])
-    vane = pot_gain.step(vane, p[POT_GAIN + k, j])
-    return vane + pot_bias.step(p[POT_BIAS + k, j], p[POT_BIAS_ERROR + k, j])
+    stage = stem.prepare(p, j, k)
+    theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
+    theta = stem.drive(stage, theta, n_r, t_oil, True)
+    z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.friction != 0.0)
+    stem.stored(s, j, k, z)
+    return stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
 
 
 @in_place

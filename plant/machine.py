@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plant import chain
+from plant import chain, places
 from plant.effect import T_REF
 from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain
 from plant.geometry import Geometry, Schedules, load_schedules
@@ -54,27 +54,27 @@ class Plant:
         """
         p = self.p[:, 0]
         s = np.zeros((chain.N_STATE, 1))
-        s[chain.N_R, 0] = n_r
-        s[chain.X, 0] = s[chain.X_LVDT, 0] = s[chain.READING, 0] = stroke
-        load = aero_load.step(n_r, p[chain.AERO_LOAD])
-        s[chain.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[chain.OIL_COMPRESSIBILITY :][:2])
-        s[chain.CURRENT : chain.CURRENT + 4, 0] = s[chain.LAGGED, 0] = p[chain.VALVE_NULL_BIAS]
+        s[places.N_R, 0] = n_r
+        s[places.X, 0] = s[places.X_LVDT, 0] = s[places.READING, 0] = stroke
+        load = aero_load.step(n_r, p[places.AERO_LOAD])
+        s[places.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[places.OIL_COMPRESSIBILITY :][:2])
+        s[places.CURRENT : places.CURRENT + 4, 0] = s[places.LAGGED, 0] = p[places.VALVE_NULL_BIAS]
         for k, ring in enumerate(self._rings(stroke, n_r, t_oil)):
-            s[chain.RING + k, 0] = s[chain.DRIVEN + k, 0] = ring
-            s[chain.POT + k, 0] = self._reading(ring, k)
+            s[places.RING + k, 0] = s[places.DRIVEN + k, 0] = ring
+            s[places.POT + k, 0] = self._reading(ring, k)
         return s
 
     def place_rings(self, s: np.ndarray, angles: tuple[float, ...], n_r: float = 0.0, t_oil: float = T_REF) -> None:
         """Set each ring, as far as its play allows, to where the vane angle is the given one (rad; NaN = leave it)."""
         p = self.p[:, 0]
-        for k, drive in enumerate(self._rings(s[chain.X, 0], n_r, t_oil)):
+        for k, drive in enumerate(self._rings(s[places.X, 0], n_r, t_oil)):
             if np.isfinite(angles[k]):
                 ldp, lever = self.lever(k)
-                half = 0.5 * linkage_backlash.step(p[PLAY + k], p[chain.LINKAGE_BACKLASH + k], lever / ldp)
-                vane = (angles[k] - p[POT_BIAS + k] - p[chain.POT_BIAS_ERROR + k]) / p[chain.POT_GAIN + k]
+                half = 0.5 * linkage_backlash.step(p[PLAY + k], p[places.LINKAGE_BACKLASH + k], lever / ldp)
+                vane = (angles[k] - p[POT_BIAS + k] - p[places.POT_BIAS_ERROR + k]) / p[places.POT_GAIN + k]
                 ring = min(max(ring_angle_of_vane(vane, ldp, lever), drive - half), drive + half)
-                s[chain.RING + k, 0] = s[chain.DRIVEN + k, 0] = ring
-                s[chain.POT + k, 0] = self._reading(ring, k)
+                s[places.RING + k, 0] = s[places.DRIVEN + k, 0] = ring
+                s[places.POT + k, 0] = self._reading(ring, k)
 
     def _rings(self, stroke: float, n_r: float, t_oil: float) -> list[float]:
         g = self.p[GEOMETRY:, 0]
@@ -82,8 +82,8 @@ class Plant:
         return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(3)]
 
     def _reading(self, ring: float, k: int) -> float:
-        vane = pot_gain.step(vane_angle(ring, *self.lever(k)), self.p[chain.POT_GAIN + k, 0])
-        return vane + pot_bias.step(self.p[POT_BIAS + k, 0], self.p[chain.POT_BIAS_ERROR + k, 0])
+        vane = pot_gain.step(vane_angle(ring, *self.lever(k)), self.p[places.POT_GAIN + k, 0])
+        return vane + pot_bias.step(self.p[POT_BIAS + k, 0], self.p[places.POT_BIAS_ERROR + k, 0])
 
     def lever(self, k: int) -> tuple[float, float]:
         """Return Ld' and L (m) of stage ``k``: their ratio turns a small angle of the ring into one of the vane."""

@@ -15,93 +15,33 @@ import math
 import os
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import chain
+from plant import chain, drive, lanes, places, stem
 from plant.actuator import speed_factor
-from plant.chain import (
-    AERO_LOAD,
-    BRISTLE,
-    CRANK_LENGTH_ERROR,
-    CURRENT,
-    DRIVEN,
-    END_STOP_SHIFT,
-    FRICTION,
-    GIVE,
-    INTERNAL_LEAKAGE,
-    LAGGED,
-    LINK_LENGTH_ERROR,
-    LINKAGE_BACKLASH,
-    LINKAGE_COMPLIANCE,
-    LINKAGE_FRICTION,
-    LINKAGE_WEAR,
-    LVDT_BIAS,
-    LVDT_GAIN,
-    LVDT_LAG_ERROR,
-    LVDT_NONLINEARITY,
-    LVDT_THERMAL_DRIFT,
-    N_R,
-    OIL_COMPRESSIBILITY,
-    OIL_VISCOSITY,
-    PISTON_FRICTION,
-    PISTON_STICTION,
-    POT,
-    POT_BIAS_ERROR,
-    POT_GAIN,
-    POT_LAG_ERROR,
-    READING,
-    RING,
-    RING_ECCENTRICITY,
-    SPEED,
-    SPOOL,
-    SPOOL_RATE,
-    SUPPLY_PRESSURE_DROOP,
-    THERMAL_GROWTH,
-    VALVE_DEAD_BAND,
-    VALVE_FLOW_SATURATION,
-    VALVE_GAIN_ASYMMETRY,
-    VALVE_HYSTERESIS,
-    VALVE_LAG,
-    VALVE_NULL_BIAS,
-    X_LVDT,
-    X,
-    measured_stroke,
-    true_stroke,
-)
+from plant.chain import measured_stroke, true_stroke
 from plant.effects import (
     EFFECTS,
     NEUTRAL,
     ROW,
     acceleration_limit_error,
     aero_load,
-    crank_length_error,
-    end_stop_shift,
-    link_length_error,
-    linkage_backlash,
-    linkage_compliance,
-    linkage_friction,
-    linkage_wear,
     lvdt_nonlinearity,
     oil_compressibility,
     oil_viscosity,
-    pot_bias,
-    pot_gain,
     pot_lag,
-    ring_eccentricity,
     rotor_lag_error,
-    thermal_growth,
     valve_gain_asymmetry,
     valve_hysteresis,
     valve_null_bias,
 )
 from plant.engine import engine_step
 from plant.layout import N_NOMINAL
-from plant.linkage import G_AX, G_AY, G_L, G_LB, G_LC, G_LD, G_LDP, G_LE, G_LX0, G_X1, G_Y1, N_CRANK, N_PER_STAGE, crank
+from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import (
     ACCELERATION,
-    AREA,
     DECELERATION,
     DRIVE_EFFECTS,
     DRIVE_LOADED,
@@ -112,18 +52,37 @@ from plant.parameters import (
     LVDT_LAG,
     LVDT_SHARE,
     P_REF,
-    PLAY,
-    POT_BIAS,
     POT_LAG,
-    RATED_CURRENT,
     STROKE,
-    VALVE_A11,
-    VALVE_A12,
-    VALVE_A21,
-    VALVE_A22,
     VALVE_SHARE,
 )
-from plant.play import play_step
+from plant.places import (
+    AERO_LOAD,
+    CURRENT,
+    GIVE,
+    INTERNAL_LEAKAGE,
+    LAGGED,
+    LVDT_BIAS,
+    LVDT_GAIN,
+    LVDT_LAG_ERROR,
+    LVDT_NONLINEARITY,
+    LVDT_THERMAL_DRIFT,
+    N_R,
+    OIL_COMPRESSIBILITY,
+    OIL_VISCOSITY,
+    PISTON_STICTION,
+    POT,
+    POT_LAG_ERROR,
+    READING,
+    SUPPLY_PRESSURE_DROOP,
+    VALVE_FLOW_SATURATION,
+    VALVE_GAIN_ASYMMETRY,
+    VALVE_HYSTERESIS,
+    VALVE_LAG,
+    VALVE_NULL_BIAS,
+    X_LVDT,
+    X,
+)
 from plant.series import arctangent, tangent
 from vaneloop.base.compiled import compiled_free, inlined
 
@@ -338,8 +297,8 @@ def _engine_run(n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.n
         for j in range(W):
             q = min(j0 + j, lanes - 1)
             b[0, j] = s[N_R, q]
-            b[1, j] = rotor_lag_error.step(p[LAG, q], p[chain.ROTOR_LAG_ERROR, q])
-            b[2, j] = acceleration_limit_error.step(p[ACCELERATION, q], p[chain.ACCELERATION_LIMIT_ERROR, q])
+            b[1, j] = rotor_lag_error.step(p[LAG, q], p[places.ROTOR_LAG_ERROR, q])
+            b[2, j] = acceleration_limit_error.step(p[ACCELERATION, q], p[places.ACCELERATION_LIMIT_ERROR, q])
             b[3, j] = p[DECELERATION, q]
         last = min(W, lanes - j0)
         for k in range(len(n_dem)):
@@ -400,14 +359,44 @@ def _actuator_lanes(
             out[j, k] = measured_stroke(s[READING, j], p, j, t_oil[k]) if effects else s[READING, j]
 
 
-# rows of a block's scratch array: state, what the step needs, what the sample needs
-(_U, _DU, _V, _X, _Y, _LAGGED, _Z, _GIVE, _READING, _H1, _H2, _H3, _H4) = range(13)
-(_BIAS, _WIDTH, _RATED, _VALVE_SHARE, _A11, _A12, _A21, _A22, _OVERLAP, _LIMIT, _LOW, _HIGH, _LVDT, _LVDT_SHARE) = (
-    range(13, 27)
-)
-(_DROOP, _LEAK, _FORCE, _EXCESS, _STRIBECK, _STIFFNESS, _COMPLIANCE, _DRAG, _PER_P_REF, _PER_AREA) = range(27, 37)
-(_EXTENDING, _RETRACTING, _ROOT, _LOAD, _SPREAD, _FLOW, _VISCOSITY, _ASYMMETRY, _P_REF, _AERO) = range(37, 47)
-(_LVDT_GAIN, _LVDT_DRIFT, _LVDT_BIAS, _LOGGED, _PER_STROKE, _OFF, _ROUNDNESS, _N_ROWS) = range(47, 55)
+class _Around(NamedTuple):
+    """What a block of lanes needs of each beside `drive.Drive`: the valve's hysteresis, flow, load, reading."""
+
+    bias: float
+    width: float
+    spread: float
+    flow: float
+    viscosity: float
+    asymmetry: float
+    p_ref: float
+    aero: float
+    lvdt_gain: float
+    lvdt_drift: float
+    lvdt_bias: float
+
+
+_MEMORY = ("y1", "y2", "y3", "y4")  # A, of the valve's hysteresis
+_ACTUATOR = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, _Around, more=(*_MEMORY, "logged"))
+_state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
+_drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
+_feed, _put_around = lanes.getter(drive.Feed), lanes.putter(_Around)
+
+
+@inlined
+def _around(p: np.ndarray, q: int) -> _Around:
+    return _Around(
+        p[VALVE_NULL_BIAS, q],
+        p[VALVE_HYSTERESIS, q],
+        p[VALVE_HYSTERESIS + 1, q],
+        p[FLOW_GAIN, q],
+        p[OIL_VISCOSITY, q],
+        p[VALVE_GAIN_ASYMMETRY, q],
+        p[P_REF, q],
+        p[AERO_LOAD, q],
+        p[LVDT_GAIN, q],
+        p[LVDT_THERMAL_DRIFT, q],
+        p[LVDT_BIAS, q],
+    )
 
 
 @compiled_free
@@ -427,7 +416,8 @@ def _actuator_blocks(
     """The lanes of ``order``, eight at a time; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
-    b = np.empty((_N_ROWS, W))
+    memory_of_block = np.empty(1, _ACTUATOR)
+    b = memory_of_block[0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
         loaded = lossy = sticky = memory = viscous = sensed = curved = False
@@ -444,70 +434,23 @@ def _actuator_blocks(
             viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
-            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = (
-                s[SPOOL, q],
-                s[SPOOL_RATE, q],
-                s[SPEED, q],
-                s[X, q],
-                s[X_LVDT, q],
-            )
-            b[_LAGGED, j], b[_Z, j], b[_OFF, j] = s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q]
-            b[_GIVE, j], b[_READING, j] = s[GIVE, q], s[READING, q]
-            b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = (
-                s[CURRENT, q],
-                s[CURRENT + 1, q],
-                s[CURRENT + 2, q],
-                s[CURRENT + 3, q],
-            )
-            b[_BIAS, j], b[_WIDTH, j], b[_SPREAD, j] = (
-                p[VALVE_NULL_BIAS, q],
-                p[VALVE_HYSTERESIS, q],
-                p[VALVE_HYSTERESIS + 1, q],
-            )
-            b[_RATED, j], b[_VALVE_SHARE, j] = p[RATED_CURRENT, q], p[VALVE_SHARE, q]
-            b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j] = (
-                p[VALVE_A11, q],
-                p[VALVE_A12, q],
-                p[VALVE_A21, q],
-                p[VALVE_A22, q],
-            )
-            b[_OVERLAP, j] = p[VALVE_DEAD_BAND, q] / p[RATED_CURRENT, q]
-            b[_LIMIT, j], b[_ROUNDNESS, j] = p[VALVE_FLOW_SATURATION, q], p[VALVE_FLOW_SATURATION + 1, q]
-            b[_LOW, j], b[_HIGH, j] = end_stop_shift.step(p[STROKE, q], p[END_STOP_SHIFT, q])
-            b[_LVDT, j], b[_LVDT_SHARE, j] = p[LVDT_FACTOR, q], p[LVDT_SHARE, q]
-            b[_DROOP, j], b[_LEAK, j] = p[SUPPLY_PRESSURE_DROOP, q], p[INTERNAL_LEAKAGE, q]
-            b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j] = (
-                p[PISTON_FRICTION, q],
-                p[PISTON_STICTION, q],
-                p[PISTON_STICTION + 1, q],
-            )
-            b[_STIFFNESS, j] = 1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, q])
-            b[_COMPLIANCE, j], b[_DRAG, j] = p[OIL_COMPRESSIBILITY, q], p[OIL_COMPRESSIBILITY + 1, q]
-            b[_PER_P_REF, j], b[_PER_AREA, j] = 1.0 / p[P_REF, q], 1.0 / p[AREA, q]
-            b[_FLOW, j], b[_VISCOSITY, j], b[_ASYMMETRY, j] = (
-                p[FLOW_GAIN, q],
-                p[OIL_VISCOSITY, q],
-                p[VALVE_GAIN_ASYMMETRY, q],
-            )
-            b[_P_REF, j], b[_AERO, j], b[_PER_STROKE, j] = p[P_REF, q], p[AERO_LOAD, q], 1.0 / p[STROKE, q]
-            b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j] = (
-                p[LVDT_GAIN, q],
-                p[LVDT_THERMAL_DRIFT, q],
-                p[LVDT_BIAS, q],
-            )
+            _put_state(b, j, drive.taken(s, q))
+            _put_drive(b, j, drive.prepare(p, q))
+            _put_around(b, j, _around(p, q))
+            b.y1[j], b.y2[j], b.y3[j], b.y4[j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
         for k in range(n):
             if k > 0:
                 supply, warm, speed = _between(p_s, k), _between(t_oil, k), _between(n_r, k)
                 if viscous or k == 1:
                     for j in range(W):
-                        gain = oil_viscosity.step(b[_FLOW, j], warm, b[_VISCOSITY, j])
-                        b[_EXTENDING, j], b[_RETRACTING, j] = valve_gain_asymmetry.step(gain, b[_ASYMMETRY, j])
+                        gain = oil_viscosity.step(b.flow[j], warm, b.viscosity[j])
+                        b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(gain, b.asymmetry[j])
                 if loaded:
                     for j in range(W):
-                        b[_LOAD, j] = aero_load.step(speed, b[_AERO, j])
+                        b.load[j] = aero_load.step(speed, b.aero[j])
                 else:
                     for j in range(W):
-                        b[_ROOT, j] = speed_factor(supply, 0.0, b[_P_REF, j])
+                        b.root[j] = speed_factor(supply, 0.0, b.p_ref[j])
                 if loaded and (memory or (lossy and sticky)):
                     for m in range(substeps):
                         _block_substep(b, current[k, m], supply, h, True, True, True, True)
@@ -530,74 +473,49 @@ def _actuator_blocks(
                 for j in range(last):
                     x = true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k])
                     if k == 0:
-                        b[_X, j] = b[_Y, j] = b[_READING, j] = x
+                        b.x[j] = b.x_lvdt[j] = b.reading[j] = x
                     else:
-                        shift = x - b[_READING, j]
-                        b[_X, j] += shift
-                        b[_Y, j] += shift
-                        b[_READING, j] += shift
+                        shift = x - b.reading[j]
+                        b.x[j] += shift
+                        b.x_lvdt[j] += shift
+                        b.reading[j] += shift
             for j in range(W):
-                b[_LOGGED, j] = b[_READING, j]
+                b.logged[j] = b.reading[j]
             if curved:
                 for j in range(last):
                     q = order[j0 + j]
-                    b[_LOGGED, j] = lvdt_nonlinearity.step(
-                        b[_READING, j], p[STROKE, q], p[LVDT_NONLINEARITY, q], p[LVDT_NONLINEARITY + 1, q]
+                    b.logged[j] = lvdt_nonlinearity.step(
+                        b.reading[j], p[STROKE, q], p[LVDT_NONLINEARITY, q], p[LVDT_NONLINEARITY + 1, q]
                     )
             if sensed:
                 for j in range(W):
-                    b[_LOGGED, j] = chain.straight_reading(
-                        b[_LOGGED, j], b[_LVDT_GAIN, j], b[_LVDT_DRIFT, j], b[_LVDT_BIAS, j], t_oil[k]
+                    b.logged[j] = chain.straight_reading(
+                        b.logged[j], b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[k]
                     )
             for j in range(last):
-                out[order[j0 + j], k] = b[_LOGGED, j]
+                out[order[j0 + j], k] = b.logged[j]
         for j in range(last):
             q = order[j0 + j]
-            s[SPOOL, q], s[SPOOL_RATE, q], s[SPEED, q], s[X, q], s[X_LVDT, q] = (
-                b[_U, j],
-                b[_DU, j],
-                b[_V, j],
-                b[_X, j],
-                b[_Y, j],
-            )
-            s[LAGGED, q], s[FRICTION, q], s[FRICTION + 1, q] = b[_LAGGED, j], b[_Z, j], b[_OFF, j]
-            s[GIVE, q], s[READING, q] = b[_GIVE, j], b[_READING, j]
-            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = (
-                b[_H1, j],
-                b[_H2, j],
-                b[_H3, j],
-                b[_H4, j],
-            )
+            drive.stored(s, q, _state(b, j))
+            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b.y1[j], b.y2[j], b.y3[j], b.y4[j]
 
 
 @inlined
 def _block_substep(
-    b: np.ndarray, i_cmd: float, p_s: float, h: float, loaded: bool, lossy: bool, sticky: bool, memory: bool
+    b: Any, i_cmd: float, p_s: float, h: float, loaded: bool, lossy: bool, sticky: bool, memory: bool
 ) -> None:
     """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see
-    `chain.drive_substep`.
+    `plant.drive.step`.
     """
     for j in range(W):
-        i = valve_null_bias.step(i_cmd, b[_BIAS, j])
+        i = valve_null_bias.step(i_cmd, b.bias[j])
         y1 = y2 = y3 = y4 = i
         if memory:
-            y1, y2, y3, y4 = valve_hysteresis.step(
-                b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j], i, b[_WIDTH, j], b[_SPREAD, j]
-            )
+            y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
             i = valve_hysteresis.mean(y1, y2, y3, y4)
-        u, du, v, x, y, lagged, z, off, give, reading = chain.drive_substep(
-            b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j], b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j],
-            b[_READING, j],
-            i, b[_RATED, j], b[_VALVE_SHARE, j], b[_A11, j], b[_A12, j], b[_A21, j], b[_A22, j], b[_OVERLAP, j],
-            b[_EXTENDING, j], b[_RETRACTING, j], b[_ROOT, j], p_s, b[_PER_P_REF, j], b[_PER_AREA, j], b[_LOAD, j],
-            b[_DROOP, j],
-            b[_LIMIT, j], b[_ROUNDNESS, j], b[_LEAK, j], b[_FORCE, j], b[_EXCESS, j], b[_STRIBECK, j], b[_STIFFNESS, j],
-            b[_COMPLIANCE, j], b[_DRAG, j], b[_PER_STROKE, j], b[_LOW, j], b[_HIGH, j], b[_LVDT, j], b[_LVDT_SHARE, j],
-            h, loaded, lossy, sticky,
-        )  # fmt: skip
-        b[_U, j], b[_DU, j], b[_V, j], b[_X, j], b[_Y, j] = u, du, v, x, y
-        b[_H1, j], b[_H2, j], b[_H3, j], b[_H4, j] = y1, y2, y3, y4
-        b[_LAGGED, j], b[_Z, j], b[_OFF, j], b[_GIVE, j], b[_READING, j] = lagged, z, off, give, reading
+        z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky)
+        _put_state(b, j, z)
+        b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
 
 
 # ---- linkage ---------------------------------------------------------------------------------------------------------
@@ -645,28 +563,24 @@ def _linkage_lanes(
                 out[m, k, j] = s[POT + k, j]
 
 
-# rows of a block's scratch array: of the lane, then of each stage
-(_LX0, _X1, _Y1, _LE, _BEND, _PHASE, _DISTANCE, _LATE, _STROKE, _C, _D, _N_LANE) = range(12)
-(
-    _RING,
-    _BRISTLE,
-    _DRIVEN,
-    _POT,
-    _BEFORE,
-    _THETA,
-    _AX,
-    _AY,
-    _LB,
-    _LC,
-    _LD,
-    _RATIO,
-    _PLAY,
-    _WEAR,
-    _FRICTION,
-    _AMPLITUDE,
-    _WARM,
-) = range(17)
-(_LEVER, _GAIN, _OFFSET, _E, _B, _N_STAGE) = range(17, 23)
+class _Crank(NamedTuple):
+    """What a block of lanes needs of each crank; by how much (s) the LVDT trails the stroke."""
+
+    lx0: float
+    x1: float
+    y1: float
+    le: float
+    late: float
+
+
+_LINKAGE = lanes.block(
+    WIDE,
+    _Crank,
+    more=("stroke", "c", "d"),
+    each=(3, (stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever")),
+)
+_stem, _put_stem = lanes.getter(stem.Stem, "k"), lanes.putter(stem.Stem, "k")
+_stem_state, _put_stem_state = lanes.getter(stem.StemState, "k"), lanes.putter(stem.StemState, "k")
 
 
 @compiled_free
@@ -684,94 +598,64 @@ def _linkage_blocks(
 ) -> None:
     """The lanes of ``order``, `WIDE` at a time."""
     g = GEOMETRY
-    b = np.empty((_N_LANE, WIDE))
-    w = np.empty((3, _N_STAGE, WIDE))
+    memory_of_block = np.empty(1, _LINKAGE)
+    b = memory_of_block[0]
     for j0 in range(0, len(order), WIDE):
         last = min(WIDE, len(order) - j0)
         rubbed = eccentric = False
         for j in range(WIDE):
             q = order[j0 + min(j, last - 1)]
-            b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j] = (
-                p[g + G_LX0, q],
-                p[g + G_X1, q],
-                p[g + G_Y1, q],
-                p[g + G_LE, q],
-            )
-            b[_BEND, j], b[_PHASE, j] = p[LINKAGE_COMPLIANCE, q], p[RING_ECCENTRICITY + 3, q]
-            b[_DISTANCE, j], b[_LATE, j] = p[LINKAGE_FRICTION + 3, q], max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
+            b.lx0[j], b.x1[j], b.y1[j], b.le[j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
+            b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
             for k in range(3):
-                o = g + N_CRANK + k * N_PER_STAGE
-                ratio = p[o + G_L, q] / p[o + G_LDP, q]
-                w[k, _RING, j], w[k, _BRISTLE, j], w[k, _DRIVEN, j] = (
-                    s[RING + k, q],
-                    s[BRISTLE + k, q],
-                    s[DRIVEN + k, q],
-                )
-                w[k, _POT, j] = s[POT + k, q]
-                w[k, _AX, j], w[k, _AY, j], w[k, _LD, j], w[k, _RATIO, j] = (
-                    p[o + G_AX, q],
-                    p[o + G_AY, q],
-                    p[o + G_LD, q],
-                    ratio,
-                )
-                w[k, _LB, j] = crank_length_error.step(p[o + G_LB, q], p[CRANK_LENGTH_ERROR + k, q])
-                w[k, _LC, j] = link_length_error.step(p[o + G_LC, q], p[LINK_LENGTH_ERROR + k, q])
-                w[k, _PLAY, j] = linkage_backlash.step(p[PLAY + k, q], p[LINKAGE_BACKLASH + k, q], ratio)
-                w[k, _WEAR, j], w[k, _FRICTION, j] = p[LINKAGE_WEAR + k, q], p[LINKAGE_FRICTION + k, q]
-                w[k, _AMPLITUDE, j], w[k, _WARM, j] = p[RING_ECCENTRICITY + k, q], p[THERMAL_GROWTH + k, q]
-                w[k, _LEVER, j], w[k, _GAIN, j] = p[o + G_LDP, q] / p[o + G_L, q], p[POT_GAIN + k, q]
-                w[k, _OFFSET, j] = pot_bias.step(p[POT_BIAS + k, q], p[POT_BIAS_ERROR + k, q])
-                w[k, _E, j], w[k, _B, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
-                rubbed |= w[k, _FRICTION, j] != 0.0
-                eccentric |= w[k, _AMPLITUDE, j] != 0.0
+                d = stem.prepare(p, q, k)
+                _put_stem(b, k, j, d)
+                _put_stem_state(b, k, j, stem.taken(s, q, k))
+                b.pot[k, j], b.lever[k, j] = s[POT + k, q], d.ldp / d.length
+                b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
+                rubbed |= d.friction != 0.0
+                eccentric |= d.amplitude != 0.0
         for m in range(len(x_lvdt)):
             for j in range(WIDE):
                 q = order[j0 + min(j, last - 1)]
-                b[_STROKE, j] = true_stroke(x_lvdt[m] + b[_LATE, j] * speed[m], p, q, t_oil[m])
+                b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
             for j in range(WIDE):
-                b[_C, j], b[_D, j] = _crank(b[_STROKE, j], b[_LX0, j], b[_X1, j], b[_Y1, j], b[_LE, j])
+                b.c[j], b.d[j] = _crank(b.stroke[j], b.lx0[j], b.x1[j], b.y1[j], b.le[j])
             for k in range(3):
                 for j in range(WIDE):
-                    w[k, _THETA, j] = _ring(
-                        b[_C, j], b[_D, j], w[k, _AX, j], w[k, _AY, j], w[k, _LB, j], w[k, _LC, j], w[k, _LD, j]
-                    )
+                    b.theta[k, j] = _ring(b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.lc[k, j], b.ld[k, j])
                 if eccentric:
                     for j in range(WIDE):
-                        w[k, _THETA, j] = ring_eccentricity.step(w[k, _THETA, j], w[k, _AMPLITUDE, j], b[_PHASE, j])
-                for j in range(WIDE):
-                    theta = thermal_growth.step(w[k, _THETA, j], t_oil[m], w[k, _WARM, j], w[k, _RATIO, j])
-                    theta = linkage_compliance.step(theta, n_r[m], b[_BEND, j])
-                    play = linkage_wear.step(w[k, _PLAY, j], w[k, _WEAR, j], w[k, _RATIO, j], t[m])
-                    ring = play_step(w[k, _RING, j], theta, play)
-                    w[k, _RING, j] = ring
-                    w[k, _THETA, j] = ring
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], True)
+                else:
+                    for j in range(WIDE):
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], False)
                 if rubbed:
                     for j in range(WIDE):
-                        ring = w[k, _RING, j]
-                        bristle = linkage_friction.step(w[k, _BRISTLE, j], ring - w[k, _DRIVEN, j], b[_DISTANCE, j])
-                        w[k, _BRISTLE, j] = bristle
-                        w[k, _DRIVEN, j] = ring
-                        w[k, _THETA, j] = linkage_friction.loop(ring, bristle, w[k, _FRICTION, j], w[k, _RATIO, j])
+                        z, b.theta[k, j] = stem.follow(
+                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], True
+                        )
+                        _put_stem_state(b, k, j, z)
+                else:
+                    for j in range(WIDE):
+                        z, b.theta[k, j] = stem.follow(
+                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], False
+                        )
+                        _put_stem_state(b, k, j, z)
                 for j in range(WIDE):
-                    vane = pot_gain.step(_vane(w[k, _THETA, j], w[k, _LEVER, j]), w[k, _GAIN, j]) + w[k, _OFFSET, j]
-                    before = vane if m == 0 else w[k, _BEFORE, j]
-                    slow = w[k, _E, j] * w[k, _POT, j] + (
-                        (w[k, _B, j] - w[k, _E, j]) * before + (1.0 - w[k, _B, j]) * vane
-                    )
-                    w[k, _POT, j] = w[k, _POT, j] if m == 0 else slow
-                    w[k, _BEFORE, j] = vane
+                    vane = stem.reading(_stem(b, k, j), _vane(b.theta[k, j], b.lever[k, j]))
+                    before = vane if m == 0 else b.before[k, j]
+                    slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
+                    b.pot[k, j] = b.pot[k, j] if m == 0 else slow
+                    b.before[k, j] = vane
                 for j in range(last):
-                    out[m, k, order[j0 + j]] = w[k, _POT, j]
+                    out[m, k, order[j0 + j]] = b.pot[k, j]
         for j in range(last):
             q = order[j0 + j]
-            s[X, q] = b[_STROKE, j]
+            s[X, q] = b.stroke[j]
             for k in range(3):
-                s[RING + k, q], s[BRISTLE + k, q], s[DRIVEN + k, q] = (
-                    w[k, _RING, j],
-                    w[k, _BRISTLE, j],
-                    w[k, _DRIVEN, j],
-                )
-                s[POT + k, q] = w[k, _POT, j]
+                stem.stored(s, q, k, _stem_state(b, k, j))
+                s[POT + k, q] = b.pot[k, j]
 
 
 @inlined

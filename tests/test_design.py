@@ -144,7 +144,7 @@ def test_halving_the_plants_step_changes_nothing_that_matters() -> None:
 
 def test_simulation_is_the_products_plant() -> None:
     """The chain that lockstep runs, tick by tick with the same current, goes the same way."""
-    from plant import build_plant, chain
+    from plant import build_plant, chain, places
 
     x_ref, dx_ref = ramp_demand(MIDDLE + 0.05 * np.clip(np.arange(50) * 0.01 - 0.1, 0.0, 0.2), PLANT)
     run = simulate(GAINS, PLANT, x_ref, dx_ref)
@@ -152,7 +152,7 @@ def test_simulation_is_the_products_plant() -> None:
     s = machine.start(MIDDLE, 80.0)
     x, x_lvdt = np.empty(run.t.size), np.empty(run.t.size)
     for n, i in enumerate(run.i):
-        x[n], x_lvdt[n] = s[chain.X, 0], s[chain.X_LVDT, 0]
+        x[n], x_lvdt[n] = s[places.X, 0], s[places.X_LVDT, 0]
         chain.drive_step(s, machine.p, 0, i, 80.0, 21e6, 40.0)
     np.testing.assert_allclose(run.x, x, rtol=0, atol=1e-12)
     np.testing.assert_allclose(run.x_lvdt, x_lvdt, rtol=0, atol=1e-12)

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from controller import load_calibration, new_state
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.tick import flashed
-from plant import Model, build_plant, chain, load_model, stages, write_model
+from plant import Model, build_plant, chain, load_model, places, stages, write_model
 from plant import effects as library
 from plant.effect import DEG, STAGES
 from plant.effects import (
@@ -158,7 +158,7 @@ def drive(machine, current, ticks, *, n_r=100.0, p_s=21e6, t_oil=40.0, stroke=0.
 
 def speed(machine, current, **conditions):
     """Steady speed (m/s) of the piston under a constant current (A)."""
-    out = drive(machine, current, 200, **conditions)[:, chain.X]
+    out = drive(machine, current, 200, **conditions)[:, places.X]
     return (out[-1] - out[-101]) / 0.1
 
 
@@ -265,7 +265,7 @@ def test_neutral_chain_with_every_effect_in_it_is_the_nominal_chain_bit_by_bit(c
             chain.drive_step(s, p, 0, i, 70.0, p_s, t_oil)
             chain.vane_step(s, p, 0, 70.0, t_oil, k * 1e-3)
             samples.append(chain.sample_lvdt(s, p, 0, 0.0, t_oil))
-        runs.append(np.concatenate([s[: chain.RING + 6, 0], samples]))
+        runs.append(np.concatenate([s[: places.RING + 6, 0], samples]))
     assert np.array_equal(runs[0], runs[1])
     # with the load's equations in it, one product is rounded differently
     assert np.allclose(runs[0], runs[2], rtol=1e-12, atol=1e-15)
@@ -398,7 +398,7 @@ def test_any_parameters_within_their_bounds_keep_every_stage_finite() -> None:
         and np.isfinite(vanes).all()
         and np.isfinite(engine_lanes(sets, base)).all()
     )
-    assert np.all((s[chain.X] >= 0.0) & (s[chain.X] <= 0.048))
+    assert np.all((s[places.X] >= 0.0) & (s[places.X] <= 0.048))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -469,7 +469,7 @@ def test_a_block_that_leaves_out_what_its_lanes_lack_gives_the_bits_of_the_whole
         alone, state = actuator_lanes([effects], base, 600)
         assert np.array_equal(alone[:, 0], x[:, j])
         # where no effect acts, the short way of a lane alone leaves the effects' own state as it was
-        assert np.array_equal(state[: chain.X_LVDT + 1, 0], s[: chain.X_LVDT + 1, j])
+        assert np.array_equal(state[: places.X_LVDT + 1, 0], s[: places.X_LVDT + 1, j])
     everything = {name: sizes for k in KINDS.values() for effects in k for name, sizes in effects.items()}
     whole, _ = actuator_lanes([*sets[:-1], everything if loads else KINDS["hysteresis"][0]], base, 600)
     assert np.array_equal(whole[:, :-1], x[:, :-1])
@@ -582,7 +582,7 @@ def test_rotor_trails_a_ramp_by_the_rate_times_the_lag() -> None:
     p, s = lanes_of([{"rotor_lag_error": {"lag": 0.5}}], build_plant())
     out = np.empty((4000, 1))
     ramp = 50.0 + 1.0 * T
-    s[chain.N_R] = 50.0
+    s[places.N_R] = 50.0
     engine_run(ramp, 1e-2, p, s, out)
     # the demand of a sample holds until the next: half a sample later on average
     assert ramp[-1] - out[-1, 0] == pytest.approx(1.7 * 1.0, abs=0.011)
@@ -594,7 +594,7 @@ def test_acceleration_limit_error_moves_the_slope_of_a_slam_up_only() -> None:
         s = machine.start(0.02, 70.0)
         for _ in range(1000):
             chain.rotor_step(s, machine.p, 0, target)
-        assert s[chain.N_R, 0] - 70.0 == pytest.approx(slope, rel=1e-9)
+        assert s[places.N_R, 0] - 70.0 == pytest.approx(slope, rel=1e-9)
 
 
 # ---- physics: valve and supply ---------------------------------------------------------------------------------------
@@ -639,7 +639,7 @@ def test_valve_hysteresis_is_as_wide_as_it_says_and_keeps_less_of_small_turns() 
 def test_flow_saturation_limits_the_speed_and_leaves_slower_motion_alone() -> None:
     machine = machine_with(valve_flow_saturation={"limit": 100.0})
     assert speed(machine, 0.040, stroke=0.002) == pytest.approx(0.100, rel=1e-9)
-    assert np.array_equal(drive(machine, 0.020, 50)[:, chain.X], drive(build_plant(), 0.020, 50)[:, chain.X])
+    assert np.array_equal(drive(machine, 0.020, 50)[:, places.X], drive(build_plant(), 0.020, 50)[:, places.X])
 
 
 def test_a_round_flow_saturation_adds_the_pressure_drops_of_two_orifices_in_series() -> None:
@@ -657,7 +657,7 @@ def test_a_round_flow_saturation_adds_the_pressure_drops_of_two_orifices_in_seri
 def test_valve_lag_reaches_63_per_cent_after_its_time_constant() -> None:
     machine = machine_with(valve_lag={"time_constant": 20.0e-3})
     out = drive(machine, 0.010, 20)
-    assert out[-1, chain.LAGGED] == pytest.approx(0.010 * (1.0 - np.exp(-1.0)), rel=1e-9)
+    assert out[-1, places.LAGGED] == pytest.approx(0.010 * (1.0 - np.exp(-1.0)), rel=1e-9)
 
 
 def test_gain_asymmetry_keeps_the_geometric_mean() -> None:
@@ -728,14 +728,14 @@ def test_motion_lost_at_a_reversal_is_that_of_two_chambers_of_oil(x0: float) -> 
         lost.append(pushed[-1] - (x - x0))
     machine = machine_with(piston_friction={"force": force})
     s = machine.start(x0, 60.0)
-    s[chain.FRICTION, 0] = -force
+    s[places.FRICTION, 0] = -force
     way = 0.0
     compared = []
     while way < 0.0028:
-        before = s[chain.SPEED, 0]
+        before = s[places.SPEED, 0]
         chain.drive_step(s, machine.p, 0, 0.004, 60.0, p_s, 40.0)
-        way += 0.5e-3 * (before + s[chain.SPEED, 0])
-        compared.append((way - (s[chain.X, 0] - x0), np.interp(way, pushed, lost)))
+        way += 0.5e-3 * (before + s[places.SPEED, 0])
+        compared.append((way - (s[places.X, 0] - x0), np.interp(way, pushed, lost)))
     ours, theirs = np.array(compared).T
     assert theirs[-1] == pytest.approx(2.0 * force * oil_compressibility.NOMINAL, rel=0.03)
     assert np.max(np.abs(ours - theirs)) < 0.06 * theirs[-1]
@@ -771,7 +771,7 @@ def test_compressible_oil_gives_way_to_a_growing_load() -> None:
     for n in np.linspace(50.0, 100.0, 200):
         chain.drive_step(s, machine.p, 0, 0.0, n, 21e6, 40.0)
     grown = 4000.0 * (1.0 - 0.25)
-    assert s[chain.X, 0] - 0.024 == pytest.approx(-(0.05e-6 + oil_compressibility.NOMINAL) * grown, rel=1e-9)
+    assert s[places.X, 0] - 0.024 == pytest.approx(-(0.05e-6 + oil_compressibility.NOMINAL) * grown, rel=1e-9)
 
 
 def test_air_load_slows_extension_and_helps_retraction() -> None:
@@ -785,8 +785,8 @@ def test_air_load_slows_extension_and_helps_retraction() -> None:
 def test_shifted_stops_hold_the_piston() -> None:
     for shift, ends in ((3.0, (0.003, 0.048)), (-5.0, (0.0, 0.043))):
         machine = machine_with(end_stop_shift={"shift": shift})
-        assert drive(machine, -0.020, 500)[-1, chain.X] == ends[0]
-        assert drive(machine, 0.020, 500)[-1, chain.X] == pytest.approx(ends[1], abs=1e-15)
+        assert drive(machine, -0.020, 500)[-1, places.X] == ends[0]
+        assert drive(machine, 0.020, 500)[-1, places.X] == pytest.approx(ends[1], abs=1e-15)
 
 
 # ---- physics: LVDT ---------------------------------------------------------------------------------------------------
@@ -834,8 +834,8 @@ def test_lvdt_lag_trails_a_moving_piston_by_its_time_constant() -> None:
     machine = machine_with(lvdt_lag={"time_constant": 0.02})
     out = drive(machine, 0.004, 300, stroke=0.002)
     behind_first, behind_both = (
-        out[-1, chain.X_LVDT] - out[-1, chain.READING],
-        out[-1, chain.X] - out[-1, chain.READING],
+        out[-1, places.X_LVDT] - out[-1, places.READING],
+        out[-1, places.X] - out[-1, places.READING],
     )
     assert behind_first == pytest.approx(0.015 * 0.02, rel=5e-3)
     assert behind_both == pytest.approx(0.015 * 0.021, rel=5e-3)
@@ -848,9 +848,9 @@ def test_slow_raster_keeps_the_delay_of_the_lvdt() -> None:
         p, s = lanes_of([{"lvdt_lag": {"time_constant": lag}}], build_plant())
         derive(p, 2e-3, 1e-2)
         out = np.empty((n, 1))
-        s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 0.002
+        s[places.X] = s[places.X_LVDT] = s[places.READING] = 0.002
         actuator_run(step_currents(i, 1e-2, 5), same, np.full(n, 21e6), same, 1e-2, p, s, out)
-        assert s[chain.X, 0] - out[-1, 0] == pytest.approx(0.015 * delay, rel=1e-3)
+        assert s[places.X, 0] - out[-1, 0] == pytest.approx(0.015 * delay, rel=1e-3)
 
 
 # ---- physics: linkage ------------------------------------------------------------------------------------------------
@@ -939,11 +939,11 @@ def test_length_errors_are_those_of_the_linkages_equations(name, row, size) -> N
     g[N_CRANK + N_PER_STAGE + row] += size * 1e-3
     for x in (0.005, 0.024, 0.043):
         s = machine.start(x, 60.0)
-        assert s[chain.POT : chain.POT + 3, 0] == pytest.approx(vane_angles(x, g)[0], abs=1e-12)
+        assert s[places.POT : places.POT + 3, 0] == pytest.approx(vane_angles(x, g)[0], abs=1e-12)
 
 
 def test_one_millimetre_of_link_is_the_published_offset() -> None:
-    angles = [machine_with(link_length_error={"vigv": e}).start(0.024, 60.0)[chain.POT, 0] for e in (0.0, 1.0)]
+    angles = [machine_with(link_length_error={"vigv": e}).start(0.024, 60.0)[places.POT, 0] for e in (0.0, 1.0)]
     assert np.rad2deg(angles[1] - angles[0]) == pytest.approx(-1.6, abs=0.1)
 
 
@@ -952,10 +952,10 @@ def test_eccentricity_adds_a_sine_of_the_rings_own_angle() -> None:
 
 
 def test_potentiometer_reads_gain_times_angle_plus_bias() -> None:
-    plain = build_plant().start(0.010, 60.0)[chain.POT : chain.POT + 3, 0]
+    plain = build_plant().start(0.010, 60.0)[places.POT : places.POT + 3, 0]
     machine = machine_with(pot_bias={"vgv1": 0.4}, pot_gain={"vigv": 1.02, "vgv1": 0.98})
     expected = [1.02 * plain[0], 0.98 * plain[1] + 0.4 * DEG, plain[2]]
-    assert machine.start(0.010, 60.0)[chain.POT : chain.POT + 3, 0] == pytest.approx(expected, abs=1e-12)
+    assert machine.start(0.010, 60.0)[places.POT : places.POT + 3, 0] == pytest.approx(expected, abs=1e-12)
 
 
 def test_potentiometer_lag_trails_moving_vanes() -> None:

@@ -17,7 +17,7 @@ from numpy.polynomial import Legendre
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from plant import chain
+from plant import chain, places
 from tests.test_effects import machine_with, speed
 
 RNG = np.random.default_rng(0)
@@ -261,7 +261,7 @@ def test_a_load_that_holds_the_piston_stops_it_and_no_more() -> None:
     s = machine.start(0.024, 100.0)
     for _ in range(50):
         chain.drive_step(s, machine.p, 0, 0.01, 120.0, SUPPLY, 40.0)  # 28.8 kN against 25.2 kN of oil
-    assert s[chain.SPEED, 0] == 0.0
+    assert s[places.SPEED, 0] == 0.0
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
@@ -381,7 +381,7 @@ def test_the_drive_with_several_effects_is_their_equations_in_the_order_of_the_f
         65.0,
     )
     s, by_hand = machine.start(stroke=stroke, n_r=n_r, t_oil=t_oil), Drive(machine, sizes, stroke)
-    by_hand.lagged, by_hand.give = float(s[chain.LAGGED, 0]), float(s[chain.GIVE, 0])
+    by_hand.lagged, by_hand.give = float(s[places.LAGGED, 0]), float(s[places.GIVE, 0])
     current = 0.0
     for tick in range(40):
         if tick % 8 == 0:
@@ -390,8 +390,8 @@ def test_the_drive_with_several_effects_is_their_equations_in_the_order_of_the_f
         for _ in range(10):
             by_hand.step(current, n_r, p_s, t_oil)
         b = by_hand
-        rows = [chain.SPOOL, chain.SPEED, chain.X, chain.X_LVDT]
+        rows = [places.SPOOL, places.SPEED, places.X, places.X_LVDT]
         assert np.allclose(s[rows, 0], (b.spool[0], b.v, b.x, b.y), rtol=1e-7, atol=1e-12), tick
         if machine.p[chain.DRIVE_EFFECTS, 0]:
-            rows = [chain.LAGGED, chain.FRICTION, chain.FRICTION + 1, chain.GIVE, chain.READING]
+            rows = [places.LAGGED, places.FRICTION, places.FRICTION + 1, places.GIVE, places.READING]
             assert np.allclose(s[rows, 0], (b.lagged, b.friction, b.off, b.give, b.reading), rtol=1e-6, atol=1e-9), tick

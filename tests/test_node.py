@@ -10,7 +10,7 @@ import pytest
 from hil.bus import frames
 from hil.bus.frames import ECU_DEMAND, ERROR, PAUSE, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
 from hil.loop.node import Ecu, Node, replay
-from plant import chain
+from plant import places
 
 NONE = np.zeros((0, 2), np.int64)
 CYCLE = [VGV_STATUS, VGV_SERVO, VGV_ANGLES]
@@ -69,7 +69,7 @@ def test_servo_tells_the_mean_current_since_the_last_frame() -> None:
 def test_frames_tell_the_sampled_sensors_in_the_units_of_the_dbc() -> None:
     vgv = started(seed=5)
     at = vgv.loop.s[
-        chain.POT : chain.POT + 3, 0
+        places.POT : places.POT + 3, 0
     ].copy()  # what the tick samples: the machine as the tick before left it
     sent = named(vgv.tick(rows(demand(10))))
     a = vgv.loop
@@ -91,7 +91,7 @@ def test_supply_and_temperature_are_those_of_the_machine() -> None:
     for k in range(200):
         for vgv in (strong, weak):
             vgv.tick(rows(demand(k // 10, 95.0, 95.0)) if k % 10 == 0 else NONE)
-    assert strong.loop.s[chain.X, 0] > weak.loop.s[chain.X, 0] + 1e-3
+    assert strong.loop.s[places.X, 0] > weak.loop.s[places.X, 0] + 1e-3
 
 
 def test_faults_are_told_by_their_bits() -> None:
@@ -161,17 +161,17 @@ def test_the_machine_runs_at_its_own_speed_until_a_demand_has_come_and_then_at_t
     vgv = Node(n_r=60.0)
     for _ in range(50):
         vgv.tick(NONE)
-    assert vgv.loop.s[chain.N_R, 0] == pytest.approx(60.0)
+    assert vgv.loop.s[places.N_R, 0] == pytest.approx(60.0)
     for k in range(50, 300):
         vgv.tick(rows(demand(k // 10, 70.0, 65.0)) if k % 10 == 0 else NONE)
-    assert 60.1 < vgv.loop.s[chain.N_R, 0] < 70.0
+    assert 60.1 < vgv.loop.s[places.N_R, 0] < 70.0
 
 
 def test_a_machine_starts_on_the_mean_curve_of_its_speed() -> None:
     for n_r in (50.0, 90.0):
         a = Node(n_r=n_r).loop
-        assert a.s[chain.X, 0] == pytest.approx(np.interp(n_r, a.calibration.table[0], a.calibration.table[3]))
-        assert a.s[chain.N_R, 0] == n_r
+        assert a.s[places.X, 0] == pytest.approx(np.interp(n_r, a.calibration.table[0], a.calibration.table[3]))
+        assert a.s[places.N_R, 0] == n_r
 
 
 def test_a_load_of_the_air_acts_at_the_measured_speed() -> None:
@@ -183,7 +183,7 @@ def test_a_load_of_the_air_acts_at_the_measured_speed() -> None:
     for n_r in (60.0, 110.0):
         for k in range(400):
             vgv.tick(rows(demand(vgv.k // 10, 60.0, n_r)) if k % 10 == 0 else NONE)
-        currents.append(vgv.loop.s[chain.GIVE, 0])
+        currents.append(vgv.loop.s[places.GIVE, 0])
     assert currents[1] == pytest.approx(currents[0] * (110.0 / 60.0) ** 2, rel=0.05)
 
 
@@ -302,10 +302,10 @@ def test_frames_that_are_late_by_five_periods_are_stale() -> None:
 
 def test_the_controller_gets_of_each_potentiometer_what_is_left_of_it() -> None:
     vgv = started()
-    at = vgv.loop.s[chain.POT : chain.POT + 3, 0].copy()
+    at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.tick(NONE)
     assert np.allclose(vgv.loop.inputs.pots, at, atol=1e-12)  # all of it, at first
-    at = vgv.loop.s[chain.POT : chain.POT + 3, 0].copy()
+    at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.loop.pots[0] = 0.5, 0.1, 1.0, 0.0, 0.0, np.nan
     vgv.tick(NONE)
     assert np.allclose(vgv.loop.inputs.pots, [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
@@ -396,4 +396,4 @@ def test_the_engine_of_the_machine_follows_the_demand_and_not_the_measured_speed
     vgv = Node(n_r=60.0)
     for k in range(300):
         vgv.tick(rows(demand(k // 10, 70.0, 50.0)) if k % 10 == 0 else NONE)
-    assert 61.0 < vgv.loop.s[chain.N_R, 0] < 70.0
+    assert 61.0 < vgv.loop.s[places.N_R, 0] < 70.0

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from plant import build_plant, chain
+from plant import build_plant, chain, places
 from plant.actuator import speed_factor
 from plant.engine import engine_step
 from plant.parameters import BANDWIDTH, FLOW_GAIN, PLAY, VALVE_A11, VALVE_A22, derive
@@ -33,19 +33,19 @@ def drive(machine, current, ticks, p_s=21e6, stroke=0.024):
 
 def test_full_spool_moves_the_piston_at_the_rated_speed(machine) -> None:
     out = drive(machine, 0.040, 100, stroke=0.002)
-    assert out[-1, chain.SPEED] == pytest.approx(0.150, rel=1e-9)
+    assert out[-1, places.SPEED] == pytest.approx(0.150, rel=1e-9)
 
 
 def test_speed_falls_with_the_root_of_the_supply_pressure(machine) -> None:
-    full, quarter = (drive(machine, 0.040, 60, p_s=p, stroke=0.002)[-1, chain.SPEED] for p in (21e6, 5.25e6))
+    full, quarter = (drive(machine, 0.040, 60, p_s=p, stroke=0.002)[-1, places.SPEED] for p in (21e6, 5.25e6))
     assert quarter / full == pytest.approx(0.5, rel=1e-9)
     assert speed_factor(1e6, 2e6, 21e6) == 0.0  # a load above the supply stalls, it does not push back
 
 
 def test_half_current_reaches_the_stop_and_stays(machine) -> None:
     out = drive(machine, 0.020, 600, stroke=0.024)
-    assert out[-1, chain.X] == 0.048
-    assert np.all(np.diff(out[:, chain.X]) >= 0.0)
+    assert out[-1, places.X] == 0.048
+    assert np.all(np.diff(out[:, places.X]) >= 0.0)
 
 
 def test_valve_step_is_the_exact_solution_of_its_equation() -> None:
@@ -82,7 +82,7 @@ def test_valve_at_60_hz_lags_as_its_transfer_function_says(machine) -> None:
     hold = np.exp(-s * 0.5e-3) * np.sinc(f * 1e-3)  # the current is held over each tick; out[k] is at t + 1 ms
     expected = w * w / (s * s + 1.6 * w * s + w * w) * hold * np.exp(s * 1e-3)
     basis = np.exp(1j * 2 * np.pi * f * t[500:])
-    gain = 2j * np.mean(out[500:, chain.SPOOL] * basis.conj()) / 0.25
+    gain = 2j * np.mean(out[500:, places.SPOOL] * basis.conj()) / 0.25
     assert abs(gain - expected) < 2e-3
 
 
@@ -129,10 +129,10 @@ def test_hysteresis_at_the_vane_is_the_published_width(machine, stage, width) ->
     s = machine.start(stroke=0.001, n_r=60.0)
     angle = np.empty(len(strokes))
     for i, x in enumerate(strokes):
-        s[chain.X, 0] = x
+        s[places.X, 0] = x
         for _ in range(20 if i == 0 else 1):
             chain.vane_step(s, machine.p, 0, 60.0, 40.0)
-        ring = s[chain.RING + k, 0]
+        ring = s[places.RING + k, 0]
         from plant.linkage import vane_angle
 
         angle[i] = np.rad2deg(vane_angle(ring, *machine.lever(k)))
@@ -157,7 +157,7 @@ def test_halving_the_plant_step_changes_the_stroke_by_less_than_a_tenth_of_a_cou
     t = np.arange(2000) * 1e-3
     current = 0.02 * chirp(t, 0.5, 2.0, 20.0)
     machine = build_plant()
-    coarse = drive(machine, current, 2000)[:, chain.X]
+    coarse = drive(machine, current, 2000)[:, places.X]
     w, z = 2 * np.pi * 60.0, 0.8
 
     def rhs(time, y):
@@ -184,6 +184,6 @@ def test_parameters_side_by_side_do_not_touch_each_other(machine) -> None:
             chain.drive_step(s, p, j, 0.01, 60.0, 21e6, 40.0)
     alone = drive(machine, 0.01, 50, stroke=0.02)[-1]
     assert np.array_equal(s[:, 0], alone)
-    moved = s[chain.X] - 0.02
+    moved = s[places.X] - 0.02
     assert moved[1] / moved[0] == pytest.approx(1.1, rel=1e-9)
     assert moved[2] != moved[0]

@@ -168,7 +168,7 @@ def _lockstep(
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
     from hil.loop.node import Ecu, Node
-    from plant import chain
+    from plant import places
 
     started = time.perf_counter()
     points = np.array(scenario.demand)
@@ -187,10 +187,10 @@ def _lockstep(
     machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
     channel = Channel(seed=scenario.seed)
     wire, join = channel.wire, channel.join
-    places = {"ECU": join(), "VGV": join()}
+    stations = {"ECU": join(), "VGV": join()}
     outside = [join() for _ in intruders]
     ears = join(silent=True) if keep else -1
-    disturber = Disturber(of[OnBus], wire, places)
+    disturber = Disturber(of[OnBus], wire, stations)
     rows = np.zeros((256, 2), np.int64)
 
     z, s, receiver = node.loop.z, node.loop.s, node.arrays.receiver
@@ -205,8 +205,8 @@ def _lockstep(
         for m in machines:
             m.tick(k)
         disturber.tick(k)
-        from_ecu = ecu.tick(rows, take(wire, places["ECU"], rows)).tolist()
-        from_vgv = node.tick(rows, take(wire, places["VGV"], rows)).tolist()
+        from_ecu = ecu.tick(rows, take(wire, stations["ECU"], rows)).tolist()
+        from_vgv = node.tick(rows, take(wire, stations["VGV"], rows)).tolist()
         mode[k], faults[k] = z.mode, z.faults
         values[k] = (
             z.x_dem,
@@ -214,9 +214,9 @@ def _lockstep(
             z.i_cmd,
             z.n_dem,
             z.n_r_raw,
-            s[chain.POT, 0],
-            s[chain.POT + 1, 0],
-            s[chain.POT + 2, 0],
+            s[places.POT, 0],
+            s[places.POT + 1, 0],
+            s[places.POT + 2, 0],
         )
         counts[k, :8] = receiver[:8]
         counts[k, 8] = frames.refused(receiver)
@@ -225,7 +225,7 @@ def _lockstep(
             late[k : k + 10] = [n in missed for n in SENDER["VGV"]]
         for who, gateway, sent in zip(("ECU", "VGV"), gateways, (from_ecu, from_vgv), strict=True):
             for head, data in gateway.feed(k, sent):
-                put(wire, places[who], head, data)
+                put(wire, stations[who], head, data)
         for place, intruder in zip(outside, intruders, strict=True):
             if intruder.first <= k < intruder.end:
                 for head, data in intruder.tick(k, int(wire.node[place, TX_N])):

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from controller import Calibration, load_calibration
 from controller.records import SLOW
 from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
-from plant import Plant, build_plant, chain
+from plant import Plant, build_plant, places
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
@@ -123,7 +123,7 @@ def advance(
             n_dem = stimulus[frame, S_N_DEM]
             n_r = stimulus[frame, S_N_R]
             if n_r != n_r:  # not logged: the plant's engine
-                n_r = s[chain.N_R, 0] + a.sigma[4] * noise[m, 4]
+                n_r = s[places.N_R, 0] + a.sigma[4] * noise[m, 4]
             fresh = stimulus[frame, S_FRESH]
             inputs.demand_fresh = fresh
             inputs.demand_rejected = stimulus[frame, S_REJECTED]
@@ -146,7 +146,7 @@ def advance(
             out[r, 7] = t_oil
             out[r, 8], out[r, 9], out[r, 10] = a.angles[0], a.angles[1], a.angles[2]
             out[r, 11] = given.mode
-            out[r, 12] = s[chain.N_R, 0]
+            out[r, 12] = s[places.N_R, 0]
         if keep:
             for q in range(n_z):
                 snapshots[i, q] = z[q]

@@ -47,7 +47,7 @@ from hil.bus.frames import (
     stand_still,
 )
 from hil.loop.tick import Loop, arrive, control, mean_current, move, new_loop
-from plant import Plant, build_plant, chain
+from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import in_place
 
 __all__ = ["Ecu", "EcuArrays", "Node", "NodeArrays", "ecu_tick", "node_tick", "replay", "run_ticks"]
@@ -387,7 +387,7 @@ def ecu_tick(k: int, received: np.ndarray, n: int, noise: float, a: EcuArrays, s
     n_dem, n_r, request = a.demand[0], a.demand[1], int(a.demand[2])
     if k % SLOW == 0:
         if n_r != n_r:
-            n_r = a.s[chain.N_R, 0] + a.sigma[0] * noise
+            n_r = a.s[places.N_R, 0] + a.sigma[0] * noise
         m = _put(sent, m, ECU_DEMAND, encode_demand(n_dem, n_r, request, _next(a.counter, 0)))
     chain.rotor_step(a.s, a.p, 0, n_dem, chain.TICK)
     return m

@@ -24,18 +24,18 @@ import numpy as np
 
 from controller import Calibration, give, new_inputs, new_outputs, new_state, tick
 from controller.records import SLOW, Record, as_inputs, as_outputs, as_state, copy
-from plant import Plant, chain
+from plant import Plant, chain, places
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
-from vaneloop.base.compiled import in_place
+from vaneloop.base.compiled import in_place, inlined
 
 __all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "move", "new_loop"]
 
 FRAME = 1e-2  # s, period of the ECU's frame
 KEPT = 256  # contents of frames kept: can_delay and frame_hold together reach back 2 s
 CHANGED_BY = (
-    chain.SCHEDULE_ERROR,
-    chain.TREND_THRESHOLD_ERROR,
-    chain.CONTROLLER_GAIN_ERROR,
+    places.SCHEDULE_ERROR,
+    places.TREND_THRESHOLD_ERROR,
+    places.CONTROLLER_GAIN_ERROR,
 )  # rows of p that the flashed calibration has
 
 
@@ -117,9 +117,9 @@ def flashed(calibration: Calibration, plant: Plant) -> Calibration:
 def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarray) -> None:
     """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``."""
     flash[0], flash[1], flash[2] = (
-        p[chain.SCHEDULE_ERROR, 0],
-        p[chain.TREND_THRESHOLD_ERROR, 0],
-        p[chain.CONTROLLER_GAIN_ERROR, 0],
+        p[places.SCHEDULE_ERROR, 0],
+        p[places.TREND_THRESHOLD_ERROR, 0],
+        p[places.CONTROLLER_GAIN_ERROR, 0],
     )
     for row in range(1, built.table.shape[0]):
         for i in range(built.table.shape[1]):
@@ -147,7 +147,7 @@ def _last_by(sent: np.ndarray, then: int, now: int) -> int:
     return first % KEPT
 
 
-@in_place
+@inlined
 def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> None:
     """Give the controller what it gets of a good frame of the ECU that comes at tick ``k``: the content of this one or
     of an older one.
@@ -155,7 +155,7 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
     now = k // SLOW
     at = now % KEPT
     a.sent[at, 0], a.sent[at, 1], a.sent[at, 2], a.sent[at, 3] = now, n_dem, n_r, mode_request
-    delay, period = a.p[chain.CAN_DELAY, 0], a.p[chain.FRAME_HOLD, 0]
+    delay, period = a.p[places.CAN_DELAY, 0], a.p[places.FRAME_HOLD, 0]
     if delay > 0.0 or period > 0.0:
         content = can_delay.step(now * SLOW * chain.TICK, delay)
         content = frame_hold.step(content, period)
@@ -163,7 +163,7 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
     a.inputs.n_dem, a.inputs.n_r, a.inputs.mode_request = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
 
 
-@in_place
+@inlined
 def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     """Sample the sensors and run the firmware at tick ``k``.
 
@@ -171,14 +171,14 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     """
     s, p, inputs, sigma = a.s, a.p, a.inputs, a.sigma
     if (
-        p[chain.SCHEDULE_ERROR, 0] != a.flash[0]
-        or p[chain.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
-        or p[chain.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
+        p[places.SCHEDULE_ERROR, 0] != a.flash[0]
+        or p[places.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
+        or p[places.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
     ):
         _flash(a.built, a.calibration, a.flash, p)
     inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
     for q in range(3):
-        a.angles[q] = s[chain.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
+        a.angles[q] = s[places.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
         inputs.pots[q] = a.angles[q]
     if a.pots.shape[0] > 0:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
@@ -190,7 +190,7 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     a.mean[1] += 1.0
 
 
-@in_place
+@inlined
 def mean_current(a: Loop) -> float:
     """Return the mean current (A) of the ticks since it was last asked for."""
     mean = a.mean[0] / a.mean[1]
@@ -198,7 +198,7 @@ def mean_current(a: Loop) -> float:
     return mean
 
 
-@in_place
+@inlined
 def move(k: int, a: Loop, n_dem: float, n_r: float, p_s: float, t_oil: float) -> None:
     """Let the machine move on from tick ``k`` to the next under the controller's current, at demand ``n_dem`` and speed
     ``n_r`` (%).

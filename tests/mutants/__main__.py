@@ -42,7 +42,7 @@ TARGETS = (
     ),
     Target("node", ("hil/loop/node.py",), ("tests/test_node.py",)),
     Target("effects", ("plant/effects/*.py",), ("tests/test_effects_reference.py",), constants=False),
-    Target("drive", ("plant/chain.py",), ("tests/test_effects_reference.py",), constants=False, only="drive_substep"),
+    Target("drive", ("plant/drive.py",), ("tests/test_effects_reference.py",), constants=False, only="step"),
     Target(
         "search",
         (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from controller import STATE, STRATEGIES, Calibration
 from hil.loop.lockstep import Stimulus, lockstep
-from plant import Model, Plant, build_plant, chain
+from plant import Model, Plant, build_plant, places
 from plant.effect import T_REF
 from vaneloop.base.compiled import compiled
 
@@ -138,7 +138,7 @@ class _Recorder:
     """Keeps of every tick's states what the figures need."""
 
     KEPT = (
-        *(len(STATE) + row for row in (chain.N_R, *range(chain.RING, chain.RING + 3))),
+        *(len(STATE) + row for row in (places.N_R, *range(places.RING, places.RING + 3))),
         *map(STATE.index, ("x_dem",)),
     )
     LEARNED = tuple(map(STATE.index, ("offset_in_use", "width_in_use", "crossing")))
@@ -149,7 +149,7 @@ class _Recorder:
 
     def __call__(self, states: Array) -> None:
         self.rows.append(states[::EVERY, [*self.KEPT, *self.LEARNED]])
-        x, i = np.ascontiguousarray(states[:, len(STATE) + chain.X]), states[:, STATE.index("i_cmd")]
+        x, i = np.ascontiguousarray(states[:, len(STATE) + places.X]), states[:, STATE.index("i_cmd")]
         if np.isnan(self.start[0]):
             self.start[:] = x[0], x[0], 0.0
         _motions(x, MOVE, self.total, self.start)

@@ -40,7 +40,7 @@ from controller.trend import trend_step
 from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
 from hil.loop.tick import flashed
-from plant import Plant, build_plant, chain
+from plant import Plant, build_plant, chain, places
 from plant.effects import EFFECTS, ROW
 from plant.geometry import STANDS_FOR
 from plant.linkage import STAGES
@@ -512,7 +512,7 @@ def _engine(
             # second
             for stop in (head, piece.stop):
                 inside = slice(piece.start * inner, stop * inner)
-                s[chain.N_R] = start
+                s[places.N_R] = start
                 engine_run(n_dem[inside], dt / inner, p, s, out[inside])
                 start = start + np.mean(
                     c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
@@ -547,7 +547,7 @@ def _actuator(
         p = _lanes(machine, thetas, rows, si)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
-        s[chain.X] = s[chain.X_LVDT] = x[0]
+        s[places.X] = s[places.X_LVDT] = x[0]
         out = np.empty((len(thetas), 1, len(t)))
         actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)))
         out *= 1e3
@@ -706,7 +706,7 @@ def _without_noise(t: Array, c: dict[str, Array], machine: Plant) -> _Smooth:
     p[NAMES.index("actuator.stroke")] = 2e3  # the stops out of the way: a wrong null runs away in minutes
     derive(p, dt / SUBSTEPS, dt)
     s = np.zeros((chain.N_STATE, 1))
-    s[chain.X] = s[chain.X_LVDT] = s[chain.READING] = 1e3
+    s[places.X] = s[places.X_LVDT] = s[places.READING] = 1e3
     out = np.empty((len(t), 1))
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
