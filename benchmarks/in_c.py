@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ours import COLUMNS, Setup
-from controller import flat
 from plant import parameters as par
 from plant.linkage import N_GEOMETRY
 
@@ -78,8 +77,7 @@ class CLoop:
         s = self._setup = setup
         # kept: the C side reads the table where it is
         self._arrays = [
-            np.ascontiguousarray(a)
-            for a in (flat(s.calibration.k), s.calibration.table, s.plant.p[_PARAMETERS, 0], s.sigma)
+            np.ascontiguousarray(a) for a in (s.calibration.k, s.calibration.table, s.plant.p[_PARAMETERS, 0], s.sigma)
         ]
         k, table, p, sigma = self._arrays
         expected = [len(k), len(p), s.stimulus.rows.shape[1], len(sigma)]

@@ -91,6 +91,6 @@ def run(setup: Setup) -> np.ndarray:
     t = np.arange(setup.ticks) * chain.TICK
     fresh = (np.arange(setup.ticks) % 10 == 0).astype(float)
     start = OurLoop(setup)
-    x0 = np.concatenate([flat(start.loop.z), start.loop.s[:, 0]])
+    x0 = np.concatenate([start.loop.z, start.loop.s[:, 0]])
     response = control.input_output_response(loop, t, np.array([np.repeat(rows[:, 0], 10), fresh]), x0)
     return response.outputs[:, ::10].T

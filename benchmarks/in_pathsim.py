@@ -54,7 +54,7 @@ def run(setup: Setup, step: float, solver: str) -> np.ndarray:
 
     cal, p, rows = setup.calibration, setup.plant.p, setup.stimulus.rows
     start = OurLoop(setup)
-    z, s = start.loop.z, start.loop.s
+    z, s = start.loop.state, start.loop.s
     n_dem, inputs, ticks = rows[:, 0], as_inputs(new_inputs()), [0]
     gain = p[par.FLOW_GAIN, 0] * math.sqrt(rows[0, 2] / p[par.P_REF, 0])
     engine_values = [float(v) for v in p[[par.LAG, par.ACCELERATION, par.DECELERATION], 0]]

@@ -65,7 +65,7 @@ class OurLoop:
     @property
     def faults(self) -> int:
         """Fault bits that stand now."""
-        return int(self.loop.outputs.faults)
+        return int(self.loop.given.faults)
 
 
 def profile(seconds: float) -> np.ndarray:

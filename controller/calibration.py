@@ -12,11 +12,11 @@ from controller.monitors import FAR
 from controller.records import (
     INPUT_FIELDS,
     OUTPUTS,
-    SCALAR_FIELDS,
     SCALARS,
     STATE_FIELDS,
     STRATEGIES,
     Record,
+    as_scalars,
     flat,
     record,
 )
@@ -38,14 +38,19 @@ _SI = {
 class Calibration(NamedTuple):
     """What `controller.tick` reads.
 
-    k       record of `records.SCALAR_FIELDS`, SI
+    k       float64[n] of `records.SCALARS`, SI; ``scalars``: their record
     table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
     angles  float64[4, m]: stroke (m), then the angle (rad) of VIGV, VGV1, VGV2 at it in the middle of the play
     """
 
-    k: Record
+    k: np.ndarray
     table: np.ndarray
     angles: np.ndarray
+
+    @property
+    def scalars(self) -> Record:
+        """The scalars by name, in the same memory: ``calibration.scalars.kp``."""
+        return as_scalars(self.k)
 
 
 class Trend(Bounded):
@@ -315,7 +320,7 @@ def load_calibration(
             if isinstance(q, Quantity):
                 values[key] = q.value * _SI.get(q.unit, 1.0)
     values |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
-    k = record(SCALAR_FIELDS, np.array([values[name] for name in SCALARS]))
+    k = np.array([values[name] for name in SCALARS])
     table = np.array(
         [stroke.speed.values]
         + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]

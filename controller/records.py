@@ -1,8 +1,8 @@
 """What the firmware works on, declared once: inputs, outputs, state, calibration scalars.
 
 Every record is a row of float64 in the order below, so its memory is also a C struct of doubles. As a `record` its
-fields are attributes, in compiled code and in Python: ``state.x_dem``, ``state.width[stage]``, ``calibration.k.kp``.
-`flat` shows the same memory as numbers; the firmware takes either. Units are SI, speeds %.
+fields are attributes, in compiled code and in Python: ``state.x_dem``, ``state.width[stage]``. `as_state` and its like
+show numbers as a record, `flat` a record as numbers: the same memory. The firmware takes either. Units: SI, speeds %.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numba.extending import overload
 __all__ = [
     "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OUTPUTS", "OUTPUT_FIELDS", "SCALARS", "SCALAR_FIELDS",
     "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs", "as_scalars", "as_state",
-    "copy", "flat", "flat_names", "kind", "record",
+    "flat", "flat_names", "kind", "record",
 ]  # fmt: skip
 
 Record = Any  # a numpy.record: its fields are attributes, which the types of numpy do not know
@@ -231,11 +231,6 @@ def record(fields: tuple[Field, ...], values: np.ndarray | None = None) -> Recor
 def flat(of: Record) -> np.ndarray:
     """The numbers of a record, float64[n]: the same memory."""
     return np.asarray(of.base).view(np.float64).reshape(-1)
-
-
-def copy(of: Record) -> Record:
-    """A record of its own with the same numbers."""
-    return flat(of).copy().view(of.dtype)[0]
 
 
 def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from numba import njit
 
-import controller
-from controller import monitors, new_state, records, schedule, servo, strategies, tick, trend
-from controller.calibration import Calibration
+from controller import load_calibration, monitors, new_state, records, schedule, servo, strategies, tick, trend
 from controller.records import FAULTS, INPUTS, SCALARS, STATE
 from controller.schedule import look_up
 
@@ -36,12 +34,6 @@ for module in (records, schedule, strategies):
     globals().update({n: v for n, v in vars(module).items() if n.isupper()})
 globals().update(named("", SCALARS) | named("IN_", INPUTS) | named("", STATE))
 N_INPUTS, N_SCALARS, N_STATE = len(INPUTS), len(SCALARS), len(STATE)
-
-
-def load_calibration(*args, **options) -> Calibration:
-    """The calibration with its scalars as a row of numbers."""
-    cal = controller.load_calibration(*args, **options)
-    return cal._replace(k=records.flat(cal.k))
 
 
 on_rows = njit(error_model="numpy")

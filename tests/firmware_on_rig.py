@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from controller import Calibration, load_calibration, new_inputs, new_state, tick
-from controller.records import copy
+from controller.records import as_scalars, flat
 from tests.columns import (
     I_CMD,
     IN_FRESH,
@@ -34,7 +34,7 @@ def firmware(calibration: Calibration | None = None) -> Compiled:
     )  # fmt: skip
 
     def change(name: str, parameters: dict[str, float]) -> Compiled:
-        k, table = copy(cal.k), cal.table.copy()
+        k, table = as_scalars(cal.k.copy()), cal.table.copy()
         if name == "schedule_error":
             table[[ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE]] += parameters["offset"]
         elif name == "trend_threshold_error":
@@ -42,6 +42,6 @@ def firmware(calibration: Calibration | None = None) -> Compiled:
             k.trend_change *= parameters["factor"]
         else:
             k.kp, k.ki, k.kff = (parameters["factor"] * v for v in (k.kp, k.ki, k.kff))
-        return replace(out, calibration=cal._replace(k=k, table=table), change=None)
+        return replace(out, calibration=cal._replace(k=flat(k), table=table), change=None)
 
     return replace(out, change=change)

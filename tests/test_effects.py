@@ -339,7 +339,7 @@ def demand_of(machine):
         fw.schedule_step(z, cal.k, cal.table)
         if k == 0:
             z[fw.X_DEM] = z[fw.X_TARGET]
-        fw.move_demand(z, cal.k, z[fw.X_TARGET], cal.k.stroke_rate)
+        fw.move_demand(z, cal.k, z[fw.X_TARGET], cal.scalars.stroke_rate)
         out[k] = z[fw.X_DEM]
     return out
 

@@ -70,7 +70,7 @@ def test_the_same_scenario_gives_the_same_run_bit_for_bit() -> None:
 
 def test_a_controller_that_reacts_too_late_is_found_out() -> None:
     slow = load_calibration()
-    slow.k.demand_timeout = 0.1
+    slow.scalars.demand_timeout = 0.1
     outcome = inject.run("demand_stops", calibration=slow)
     assert not outcome.held
     broken = [c for c in outcome.checks if c.held is False]

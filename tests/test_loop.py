@@ -226,7 +226,7 @@ def test_a_demand_arrives_with_the_age_that_delay_and_hold_give_it(delay: float,
         if period:
             content = np.floor((content + 1e-6) / period) * period
         frame = max(int(np.floor(content / 0.01 + 1e-6)), 0)
-        assert (a.inputs.n_dem, a.inputs.n_r) == (frame * 0.1, frame * 0.05)
+        assert (a.fed.n_dem, a.fed.n_r) == (frame * 0.1, frame * 0.05)
 
 
 def test_a_late_demand_after_a_gap_is_the_last_that_came_before_it() -> None:
@@ -234,4 +234,4 @@ def test_a_late_demand_after_a_gap_is_the_last_that_came_before_it() -> None:
     came = [j for j in range(200) if not 40 <= j < 55 and j % 7]
     for j in came:
         arrive(10 * j + 3, node.loop, float(j), float(j), 1.0)
-        assert node.loop.inputs.n_dem == max([i for i in came if i <= j - 10], default=came[0])
+        assert node.loop.fed.n_dem == max([i for i in came if i <= j - 10], default=came[0])

@@ -60,7 +60,7 @@ def test_servo_tells_the_mean_current_since_the_last_frame() -> None:
     currents: list[float] = []
     for k in range(100, 141):
         sent = vgv.tick(rows(demand(k // 10, 90.0, 89.0)) if k % 10 == 0 else NONE)
-        currents.append(vgv.loop.z.i_cmd)
+        currents.append(vgv.loop.state.i_cmd)
         if k % 10 == 0 and k > 100:
             assert named(sent)[VGV_SERVO]["i_cmd"] == pytest.approx(1e3 * np.mean(currents[-10:]), abs=0.0011)
     assert np.ptp(currents) > 1e-3
@@ -77,7 +77,7 @@ def test_frames_tell_the_sampled_sensors_in_the_units_of_the_dbc() -> None:
     assert list(sent[VGV_ANGLES].values()) == pytest.approx(vane.tolist(), abs=0.0011)
     assert not np.allclose(vane, np.rad2deg(at), atol=0.01)  # its noise is in it
     assert sent[VGV_STATUS]["x_lvdt"] == pytest.approx(1e3 * a.inputs[5], abs=0.00051)
-    assert sent[VGV_STATUS]["x_dem"] == pytest.approx(1e3 * a.z.x_dem, abs=0.00051)
+    assert sent[VGV_STATUS]["x_dem"] == pytest.approx(1e3 * a.state.x_dem, abs=0.00051)
     assert sent[VGV_STATUS]["state"] == 2 and sent[VGV_SERVO]["faults"] == 0
     health = sent[VGV_HEALTH]
     assert (health["p_s"], health["t_oil"]) == (pytest.approx(21.0), pytest.approx(40.0))
@@ -112,18 +112,18 @@ def test_the_last_good_frame_of_a_tick_counts_and_refused_ones_are_counted_in_it
     wrong = demand(11)[0], demand(11)[1] ^ 1 << 30
     vgv.tick(rows(demand(10, 61.0, 62.0), wrong, demand(11, 63.0, 64.0), wrong))
     a = vgv.loop
-    assert (a.inputs.demand_fresh, a.inputs.demand_rejected) == (1.0, 2.0)
-    assert (a.z.n_dem, a.z.n_r_raw) == (pytest.approx(63.0), pytest.approx(64.0))
+    assert (a.fed.demand_fresh, a.fed.demand_rejected) == (1.0, 2.0)
+    assert (a.state.n_dem, a.state.n_r_raw) == (pytest.approx(63.0), pytest.approx(64.0))
     vgv.tick(NONE)
-    assert (a.inputs.demand_fresh, a.inputs.demand_rejected) == (0.0, 0.0) and a.z.demand_age > 0.0
+    assert (a.fed.demand_fresh, a.fed.demand_rejected) == (0.0, 0.0) and a.state.demand_age > 0.0
     vgv.tick(rows(demand(12, request=0)))
-    assert a.z.run_request == 0.0 and vgv.mode == "STANDBY"
+    assert a.state.run_request == 0.0 and vgv.mode == "STANDBY"
 
 
 def test_only_the_first_n_rows_are_received() -> None:
     vgv = started()
     vgv.tick(rows(demand(10, 61.0), demand(11, 63.0)), 1)
-    assert vgv.loop.z.n_dem == pytest.approx(61.0)
+    assert vgv.loop.state.n_dem == pytest.approx(61.0)
 
 
 def test_frames_of_others_are_counted_by_whose_they_seem_to_be() -> None:
@@ -198,7 +198,7 @@ def test_noise_is_drawn_once_for_each_hundred_ticks_and_used_row_by_row() -> Non
 
 def test_the_fingerprint_is_of_everything() -> None:
     prints = {Node(seed=1).fingerprint()}
-    for part in ("numbers", "s", "mean", "receiver", "counter"):
+    for part in ("z", "s", "mean", "receiver", "counter"):
         vgv = Node(seed=1)
         getattr(vgv.loop if hasattr(vgv.loop, part) else vgv.arrays, part).reshape(-1)[1] += 1
         prints.add(vgv.fingerprint())
@@ -304,11 +304,11 @@ def test_the_controller_gets_of_each_potentiometer_what_is_left_of_it() -> None:
     vgv = started()
     at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.tick(NONE)
-    assert np.allclose(vgv.loop.inputs.pots, at, atol=1e-12)  # all of it, at first
+    assert np.allclose(vgv.loop.fed.pots, at, atol=1e-12)  # all of it, at first
     at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.loop.pots[0] = 0.5, 0.1, 1.0, 0.0, 0.0, np.nan
     vgv.tick(NONE)
-    assert np.allclose(vgv.loop.inputs.pots, [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
+    assert np.allclose(vgv.loop.fed.pots, [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
 
 
 def test_a_frame_with_counter_0_is_heard_like_any_other() -> None:
@@ -343,18 +343,18 @@ def test_a_pause_is_told_in_seconds_for_one_tick_and_is_no_frame() -> None:
     vgv = started()
     before = vgv.counts
     vgv.tick(rows((PAUSE, 30), (PAUSE, 12)))
-    assert vgv.loop.inputs.pause == pytest.approx(0.042)
+    assert vgv.loop.fed.pause == pytest.approx(0.042)
     assert {name: v - before[name] for name, v in vgv.counts.items() if v != before[name]} == {"stale": 1}
     vgv.tick(NONE)
-    assert vgv.loop.inputs.pause == 0.0
+    assert vgv.loop.fed.pause == 0.0
 
 
 def test_after_a_pause_the_first_frame_only_shows_where_the_counter_is() -> None:
     vgv = started()
     vgv.tick(rows((PAUSE, 20), demand(10)))
-    assert vgv.loop.inputs.demand_fresh == 0.0 and vgv.counts["sync"] == 2
+    assert vgv.loop.fed.demand_fresh == 0.0 and vgv.counts["sync"] == 2
     vgv.tick(rows(demand(11)))
-    assert vgv.loop.inputs.demand_fresh == 1.0
+    assert vgv.loop.fed.demand_fresh == 1.0
 
 
 def test_a_controller_that_stood_still_is_safe_first() -> None:
@@ -385,10 +385,10 @@ def test_the_machine_follows_only_demands_within_the_limits_of_the_calibration(
     n_dem: float, n_r: float, mode: int, plausible: bool
 ) -> None:
     vgv = started()
-    k = vgv.loop.calibration.k
+    k = vgv.loop.calibration.scalars
     k.demand_low, k.demand_high = 50.0, 110.0
     vgv.tick(rows(demand(10, n_dem, n_r, mode)))
-    assert vgv.counts["good"] == 10 and vgv.loop.inputs.demand_fresh == 1.0
+    assert vgv.counts["good"] == 10 and vgv.loop.fed.demand_fresh == 1.0
     assert vgv.arrays.supply[2:].tolist() == pytest.approx([n_dem, n_r] if plausible else [70.0, 69.0])
 
 

@@ -346,7 +346,7 @@ def run_loop(
     states     float64[ticks or 0, n] the firmware's and the plant's state after each tick
     """
     rows = 0
-    z, s = vgv.loop.numbers, vgv.loop.s
+    z, s = vgv.loop.z, vgv.loop.s
     n_z, n_s = z.shape[0], s.shape[0]
     for i in range(ticks):
         k = k0 + i
@@ -437,7 +437,7 @@ def run_lockstep(
         noise, row = vgv.noise()
         n = min(len(noise) - row, ticks - vgv.k)
         some = np.empty((16 * n if keep else 0, 3), np.int64)
-        states = np.empty((n if hashed else 0, len(vgv.loop.numbers) + len(vgv.loop.s)))
+        states = np.empty((n if hashed else 0, len(vgv.loop.z) + len(vgv.loop.s)))
         m = run_loop(
             vgv.k,
             n,

@@ -29,8 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from controller import flat, load_calibration
-from controller.records import DEGRADED, FAIL_SAFE, INIT, RUN, STANDBY
+from controller import load_calibration
+from controller.records import DEGRADED, FAIL_SAFE, INIT, RUN, STANDBY, as_outputs
 from hil.bus.frames import (
     ECU_DEMAND,
     ERROR,
@@ -98,22 +98,23 @@ def _watched_ticks(
     seen      int64[5, 5] counts mode transitions; ticks_in int64[5] ticks in each mode
     """
     first, since = 0, attack_end
+    out = as_outputs(a.loop.outputs)
     for k in range(k0, k_end):
         last = first
         while last < len(at) and at[last] <= k:
             last += 1
-        before = int(a.loop.outputs.mode)
+        before = int(out.mode)
         m = node_tick(k, received[first:last], last - first, noise, k % NOISE_ROWS, a, sent)
         first = last
-        mode = int(a.loop.outputs.mode)
+        mode = int(out.mode)
         ticks_in[mode] += 1
-        if not abs(a.loop.outputs.i_cmd) <= limits[0]:
+        if not abs(out.i_cmd) <= limits[0]:
             return CURRENT, k, 0
-        if not limits[1] <= a.loop.outputs.x_dem <= limits[2]:
+        if not limits[1] <= out.x_dem <= limits[2]:
             return STROKE, k, 0
         total = 0.0
-        for q in range(a.loop.numbers.shape[0]):
-            total += a.loop.numbers[q]
+        for q in range(a.loop.z.shape[0]):
+            total += a.loop.z[q]
         for q in range(a.loop.s.shape[0]):
             total += a.loop.s[q, 0]
         if not abs(total) < 1e12:
@@ -125,7 +126,7 @@ def _watched_ticks(
         for q in range(m):
             if crc(sent[q, 0] & IDENT_MASK, sent[q, 1]) != sent[q, 1] & 0xFF:
                 return SENT_CRC, k, 0
-        if mode != RUN or a.loop.outputs.faults != 0.0:
+        if mode != RUN or out.faults != 0.0:
             since = k + 1
     if since >= k_end:
         return NO_RECOVERY, k_end - 1, 0
@@ -301,7 +302,7 @@ class Bench:
     def __init__(self, limits: np.ndarray | None = None, recovery: int = RECOVERY):
         self.node = Node(n_r=60.0, seed=0)
         self.recovery = recovery
-        k = load_calibration().k
+        k = load_calibration().scalars
         self.limits = np.array([k.current_limit, k.stroke_min, k.stroke_max]) if limits is None else limits
         self.noise = np.random.Generator(np.random.PCG64(0)).standard_normal((NOISE_ROWS, 5))
         self.transitions, self.ticks_in = np.zeros((5, 5), np.int64), np.zeros(5, np.int64)
@@ -313,17 +314,7 @@ class Bench:
     def _arrays(self) -> list[np.ndarray]:
         a = self.node.arrays
         loop = a.loop
-        return [
-            flat(loop.inputs),
-            flat(loop.outputs),
-            loop.numbers,
-            loop.s,
-            loop.mean,
-            loop.sent,
-            a.supply,
-            a.receiver,
-            a.counter,
-        ]
+        return [loop.inputs, loop.outputs, loop.z, loop.s, loop.mean, loop.sent, a.supply, a.receiver, a.counter]
 
     def _saved(self) -> list[np.ndarray]:
         return [x.copy() for x in self._arrays()]

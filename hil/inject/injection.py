@@ -113,7 +113,7 @@ class MachineChange:
         for i, v in supply.items():
             self.fed[i] = v
         if rows:
-            chain.wake(self.loop.s, self.loop.p, 0, self.loop.outputs.i_cmd)
+            chain.wake(self.loop.s, self.loop.p, 0, self.loop.given.i_cmd)
             for p in (self.loop.p, self.engine.p):
                 for r, v in rows.items():
                     p[r, 0] = v
@@ -193,7 +193,7 @@ def _lockstep(
     disturber = Disturber(of[OnBus], wire, stations)
     rows = np.zeros((256, 2), np.int64)
 
-    z, s, receiver = node.loop.z, node.loop.s, node.arrays.receiver
+    z, s, receiver = node.loop.state, node.loop.s, node.arrays.receiver
     mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
     values = np.empty((ticks, 8))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
@@ -235,7 +235,7 @@ def _lockstep(
             recorded += [(k, head, data) for head, data in rows[: take(wire, ears, rows)].tolist()]
         if progress is not None and k % 1000 == 0:
             progress(k / ticks)
-    cal = node.loop.calibration.k
+    cal = node.loop.calibration.scalars
     trace = Trace(
         np.arange(ticks) * TICK,
         mode,
@@ -297,7 +297,7 @@ class _Witness:
 
         table = np.array(self.rows)
         table = table[table[:, 0] >= begin]
-        cal = load_calibration().k
+        cal = load_calibration().scalars
         return Trace(
             table[:, 0] - begin,
             table[:, 1].astype(int),

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller import Calibration, load_calibration
-from controller.records import SLOW
+from controller.records import SLOW, as_inputs, as_outputs
 from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, places
 from vaneloop.base.compiled import compiled_free
@@ -109,7 +109,7 @@ def advance(
     out        float64[rows or 0, 13] in SI, a row every ``every`` ticks
     snapshots  float64[ticks or 0, n] copies of the whole state at each tick
     """
-    z, s, inputs, given = a.numbers, a.s, a.inputs, a.outputs
+    z, s, inputs, given = a.z, a.s, as_inputs(a.inputs), as_outputs(a.outputs)
     noisy = noise.shape[0] > 1
     keep = snapshots.shape[0] > 0
     n_z, n_s = z.shape[0], s.shape[0]
@@ -204,8 +204,8 @@ def lockstep(
         noisy=seed is not None,
         pots=pots,
     )
-    z, s = loop.z, loop.s
-    z.direction, z.blend = _starting_curve(loop.calibration, n0, stroke_demand)
+    state, s = loop.state, loop.s
+    state.direction, state.blend = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
     silent = np.zeros((1, 5))
     advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
@@ -214,7 +214,7 @@ def lockstep(
         machine.place_rings(s, angles, n0, t_oil)
 
     out = np.empty((-(-ticks // every), len(COLUMNS)))
-    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.numbers) + len(s))) for _ in range(2)]
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.z) + len(s))) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()
     with ThreadPoolExecutor(1) as pool:
@@ -234,7 +234,7 @@ def lockstep(
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
     columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
-    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.outputs.faults))
+    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))
 
 
 def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from controller import MODES, Calibration, load_calibration
-from controller.records import SLOW
+from controller.records import SLOW, as_inputs, as_outputs, as_scalars
 from hil.bus import frames
 from hil.bus.frames import (
     ECU_DEMAND,
@@ -107,11 +107,11 @@ def _take(a: NodeArrays, received: np.ndarray, n: int, k: int) -> None:
     grow_old(a.receiver, k)
     if fresh == 1.0:
         arrive(k, a.loop, n_dem, n_r, float(request))
-        k_of = a.loop.calibration.k
+        k_of = as_scalars(a.loop.calibration.k)
         low, high = k_of.demand_low, k_of.demand_high
         if low <= n_dem <= high and low <= n_r <= high and request <= 1:
             a.supply[2], a.supply[3] = n_dem, n_r
-    inputs = a.loop.inputs
+    inputs = as_inputs(a.loop.inputs)
     inputs.demand_fresh = fresh
     inputs.pause = pause
     inputs.demand_rejected = float(refused(a.receiver) - before)
@@ -145,17 +145,12 @@ def node_tick(
     """
     _take(a, received, n, k)
     loop, p_s, t_oil = a.loop, a.supply[0], a.supply[1]
-    out = loop.outputs
+    out, x_lvdt = as_outputs(loop.outputs), as_inputs(loop.inputs).x_lvdt
     control(k, loop, noise, row, t_oil)
     m = 0
     if k % SLOW == 0:
         c = a.counter
-        m = _put(
-            sent,
-            m,
-            VGV_STATUS,
-            encode_status(out.x_dem * 1e3, loop.inputs.x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS)),
-        )
+        m = _put(sent, m, VGV_STATUS, encode_status(out.x_dem * 1e3, x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS)))
         m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(out.faults), _next(c, C_SERVO)))
         vigv, vgv1, vgv2 = loop.angles[0] * DEGREES, loop.angles[1] * DEGREES, loop.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
@@ -220,12 +215,12 @@ class Node:
     @property
     def mode(self) -> str:
         """Mode of the controller."""
-        return MODES[int(self.loop.outputs.mode)]
+        return MODES[int(self.loop.given.mode)]
 
     @property
     def faults(self) -> int:
         """Fault bits that stand now (`controller.FAULTS`)."""
-        return int(self.loop.outputs.faults)
+        return int(self.loop.given.faults)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -241,7 +236,7 @@ class Node:
         """Return the SHA-256 of the whole state: firmware, plant, receiver, counters."""
         digest = hashlib.sha256()
         a = self.arrays
-        for part in (a.loop.numbers, a.loop.s, a.loop.mean, a.receiver, a.counter):
+        for part in (a.loop.z, a.loop.s, a.loop.mean, a.receiver, a.counter):
             digest.update(part.tobytes())
         return digest.hexdigest()
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from controller import Calibration, give, new_inputs, new_outputs, new_state, tick
-from controller.records import SLOW, Record, as_inputs, as_outputs, as_state, copy
+from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state
 from plant import Plant, chain, places
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place, inlined
@@ -42,7 +42,7 @@ CHANGED_BY = (
 class Loop(NamedTuple):
     """What the one tick works on.
 
-    inputs, outputs, z  the firmware's records (`controller.records`); numbers: z's memory as float64
+    inputs, outputs, z  float64[n], the firmware's (`controller.records`); ``fed``, ``given``, ``state``: their records
     built        calibration as the tables have it
     calibration  the same as it is flashed: with the effects that change tables and gains
     flash        float64[3] those effects' parameters, as flashed
@@ -56,10 +56,9 @@ class Loop(NamedTuple):
                  mode_request
     """
 
-    inputs: Record
-    outputs: Record
-    z: Record
-    numbers: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
+    z: np.ndarray
     built: Calibration
     calibration: Calibration
     flash: np.ndarray
@@ -70,6 +69,21 @@ class Loop(NamedTuple):
     angles: np.ndarray
     pots: np.ndarray
     sent: np.ndarray
+
+    @property
+    def fed(self) -> Record:
+        """The firmware's inputs by name."""
+        return as_inputs(self.inputs)
+
+    @property
+    def given(self) -> Record:
+        """The firmware's outputs by name."""
+        return as_outputs(self.outputs)
+
+    @property
+    def state(self) -> Record:
+        """The firmware's state by name."""
+        return as_state(self.z)
 
 
 def new_loop(
@@ -87,12 +101,10 @@ def new_loop(
     """
     cal = flashed(calibration, plant)
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
-    z = new_state()
     return Loop(
-        as_inputs(new_inputs()),
-        as_outputs(new_outputs()),
-        as_state(z),
-        z,
+        new_inputs(),
+        new_outputs(),
+        new_state(),
         calibration,
         cal,
         plant.p[list(CHANGED_BY), 0],
@@ -108,7 +120,7 @@ def new_loop(
 
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
-    cal = calibration._replace(k=copy(calibration.k), table=calibration.table.copy())
+    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
     _flash(calibration, cal, np.empty(3), plant.p)
     return cal
 
@@ -124,11 +136,12 @@ def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarra
     for row in range(1, built.table.shape[0]):
         for i in range(built.table.shape[1]):
             cal.table[row, i] = schedule_error.step(built.table[row, i], flash[0])
-    cal.k.trend_rate_on = trend_threshold_error.step(built.k.trend_rate_on, flash[1])
-    cal.k.trend_change = trend_threshold_error.step(built.k.trend_change, flash[1])
-    cal.k.kp = controller_gain_error.step(built.k.kp, flash[2])
-    cal.k.ki = controller_gain_error.step(built.k.ki, flash[2])
-    cal.k.kff = controller_gain_error.step(built.k.kff, flash[2])
+    k, was = as_scalars(cal.k), as_scalars(built.k)
+    k.trend_rate_on = trend_threshold_error.step(was.trend_rate_on, flash[1])
+    k.trend_change = trend_threshold_error.step(was.trend_change, flash[1])
+    k.kp = controller_gain_error.step(was.kp, flash[2])
+    k.ki = controller_gain_error.step(was.ki, flash[2])
+    k.kff = controller_gain_error.step(was.kff, flash[2])
 
 
 @in_place
@@ -160,7 +173,8 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
         content = can_delay.step(now * SLOW * chain.TICK, delay)
         content = frame_hold.step(content, period)
         at = _last_by(a.sent, int(math.floor(content / FRAME + 1e-6)), now)
-    a.inputs.n_dem, a.inputs.n_r, a.inputs.mode_request = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
+    inputs = as_inputs(a.inputs)
+    inputs.n_dem, inputs.n_r, inputs.mode_request = a.sent[at, 1], a.sent[at, 2], a.sent[at, 3]
 
 
 @inlined
@@ -169,7 +183,7 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
 
     noise  float64[:, 5] standard normal numbers (LVDT, three potentiometers, speed), of this tick those in ``row``
     """
-    s, p, inputs, sigma = a.s, a.p, a.inputs, a.sigma
+    s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
     if (
         p[places.SCHEDULE_ERROR, 0] != a.flash[0]
         or p[places.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
@@ -184,9 +198,9 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
         for q in range(3):
             inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
-    tick(inputs, a.z, a.calibration)
+    tick(a.inputs, a.z, a.calibration)
     give(a.z, a.outputs)
-    a.mean[0] += a.outputs.i_cmd
+    a.mean[0] += as_outputs(a.outputs).i_cmd
     a.mean[1] += 1.0
 
 
@@ -205,5 +219,5 @@ def move(k: int, a: Loop, n_dem: float, n_r: float, p_s: float, t_oil: float) ->
     """
     s, p = a.s, a.p
     chain.rotor_step(s, p, 0, n_dem, chain.TICK)
-    chain.drive_step(s, p, 0, a.outputs.i_cmd, n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
+    chain.drive_step(s, p, 0, as_outputs(a.outputs).i_cmd, n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
     chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)

@@ -70,7 +70,7 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--seed (={args.seed}) must be 0 to 2^63 - 1")
     if not 0.01 <= args.recovery <= 3600:
         raise InputError(f"--recovery (={args.recovery:g}) must be 0.01 to 3600 s")
-    k = load_calibration().k
+    k = load_calibration().scalars
     limits = np.array([k.current_limit, k.stroke_min, k.stroke_max])
     if args.current_limit is not None:
         if not 0 < args.current_limit <= 1000:

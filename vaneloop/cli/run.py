@@ -138,7 +138,7 @@ def _node_json(node: Any) -> dict[str, Any]:
     from controller import FAULTS
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
-    n_dem = float(node.loop.z.n_dem)
+    n_dem = float(node.loop.state.n_dem)
     return {
         "mode": node.mode,
         "n_dem": n_dem,

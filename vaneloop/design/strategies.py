@@ -216,10 +216,10 @@ def run(
     angle = 180.0 / np.pi
     offset, width, crossing = a[:, 5:8].T
     drive = np.interp(x_dem, calibration.angles[0], calibration.angles[1])
-    aim = drive + offset - 0.5 * crossing * (calibration.k.play[0] + width)
+    aim = drive + offset - 0.5 * crossing * (calibration.scalars.play[0] + width)
     return Outcome(
         scenario.name,
-        STRATEGIES[int(calibration.k.strategy)],
+        STRATEGIES[int(calibration.scalars.strategy)],
         np.arange(len(a), dtype=np.float64) * (EVERY * 1e-3),
         n_r,
         errors,

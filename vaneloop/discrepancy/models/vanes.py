@@ -34,7 +34,7 @@ from scipy.ndimage import binary_propagation, uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from controller import Calibration, load_calibration, new_state
-from controller.records import RUN, SLOW_TICK, Record, as_state, copy
+from controller.records import RUN, SLOW_TICK, Record, as_scalars, as_state
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
 from hil.figures import noise_floor
@@ -164,7 +164,7 @@ def build_chain(
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
             unknown = off.mean(axis=1) - off[:, -1] if sampled else None
-            size = cal.k.kp * smooth.noise
+            size = cal.scalars.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
                 _between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
@@ -746,7 +746,7 @@ def _law(t: Array, c: dict[str, Array], cal: Calibration, smooth: _Smooth) -> tu
     of how much they are off because the stroke between two rows is not logged, of the same shape.
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
-    kp, ki, kff = (cal.k.kp, cal.k.ki, cal.k.kff)  # A/m = mA/mm
+    kp, ki, kff = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
     # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
     before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
     before[0], two[:2] = x_dem[0], x_dem[0]
@@ -792,7 +792,7 @@ def _between_rows(
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
     ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
-    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.k.current_limit)
+    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.scalars.current_limit)
     ticks[alone] = c["i_cmd"][alone, None]
     if unknown is not None and seed:
         ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
@@ -811,7 +811,7 @@ def _other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: C
     the other ticks added.
     """
     width = int(round(WINDOW / RASTER))
-    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.k.current_limit)
+    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.scalars.current_limit)
 
     def misfit(model: Array) -> float:
         e = np.where(use, c["i_cmd"] - model, np.nan)[: len(t) // width * width].reshape(-1, width)
@@ -845,7 +845,7 @@ def _servo(
         return i[:, None, :]
 
     # at the limit the integral stands still: its constant is another one before and after
-    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.k.current_limit, np.ones(5), "same") > 0.5
+    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.scalars.current_limit, np.ones(5), "same") > 0.5
     near = _no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
     stage = Stage(
         "servo",
@@ -928,13 +928,13 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     known = np.ones(len(n_dem), dtype=bool)
     for direction in (1.0, -1.0):
         out = np.empty((2, len(n_dem)))
-        for back, row in zip((0.0, 0.999 * cal.k.trend_change), out, strict=True):
+        for back, row in zip((0.0, 0.999 * cal.scalars.trend_change), out, strict=True):
             z = as_state(new_state())
             z.trend_n = z.trend_last = n_dem[0]
             z.trend_turn, z.direction = n_dem[0] + direction * back, direction
-            _directions(n_dem, cal.k, z, row)
+            _directions(n_dem, cal.scalars, z, row)
         known &= out[0] == out[1]
-    return known & ~_lately(~known, cal.k.blend_time + 0.1)
+    return known & ~_lately(~known, cal.scalars.blend_time + 0.1)
 
 
 def _lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
@@ -970,7 +970,7 @@ def _demand(
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
         for i, theta in enumerate(thetas):
-            k, table = copy(cal.k), cal.table.copy()
+            k, table = as_scalars(cal.k.copy()), cal.table.copy()
             factor = value(theta, "trend_threshold_error", 1.0)
             k.trend_rate_on *= factor
             k.trend_change *= factor
