@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from vaneloop.discrepancy import laws
-from vaneloop.discrepancy.laws import FORCE_LAWS, PARAMETERS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.discrepancy.laws import PARAMETERS
+from vaneloop.discrepancy.library import FORCE_LAWS, LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 
 T = np.arange(0.0, 10.0, 0.01)
 U = 2.0 * np.sin(1.3 * T) + 0.4 * np.sin(9.0 * T)
@@ -36,7 +37,7 @@ def force(
     )
 
 
-ALL = [(family, law) for family, by in laws.LAWS.items() for law in by.values()]
+ALL = [(family, law) for family, by in LAWS.items() for law in by.values()]
 
 
 @pytest.mark.parametrize(("family", "law"), ALL, ids=[f"{f}-{x.name}" for f, x in ALL])

@@ -12,7 +12,8 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.discrepancy.models.vanes import SETTLE, Chain, build_chain
+from vaneloop.discrepancy.models.vane_stages.raster import SETTLE
+from vaneloop.discrepancy.models.vanes import Chain, build_chain
 from vaneloop.discrepancy.workflow import diagnose
 
 DURATION = 120.0  # s

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from hil.inject.scenario import Scenario
     from hil.logs import Channel, Log, read_log, write_log
     from vaneloop.base.errors import InputError
-    from vaneloop.discrepancy.models.system import Record, System, load_system, unknown
+    from vaneloop.discrepancy.models.load import load_system
+    from vaneloop.discrepancy.models.system import Record, System, unknown
     from vaneloop.discrepancy.stage import Parameter
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import replay
@@ -42,7 +43,7 @@ _HOME = {
     "diagnose": "vaneloop.verbs.search",
     "experiment": "vaneloop.verbs.search",
     "extend": "vaneloop.verbs.search",
-    "load_system": "vaneloop.discrepancy.models.system",
+    "load_system": "vaneloop.discrepancy.models.load",
     "locate": "vaneloop.verbs.search",
     "open_bus": "hil.bus.port",
     "read_log": "hil.logs",

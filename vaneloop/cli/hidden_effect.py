@@ -242,7 +242,7 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     value.
     """
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.models.vanes import SHAPES
+    from vaneloop.discrepancy.models.vane_stages.declared import SHAPES
 
     if effect["probability"] < LIKELY and not effect["rivals"]:
         return True

@@ -22,7 +22,9 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.laws import HYSTERETIC
 from vaneloop.discrepancy.locate import Located, Shape, agrees, shape
 from vaneloop.discrepancy.locate import locate as where
-from vaneloop.discrepancy.models.system import STARTS_LOADED, Bound, Record, System
+from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.runner import STARTS_LOADED
+from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["Answer", "Model", "compare", "diagnose", "extend", "load_model", "locate", "write_model"]
@@ -198,7 +200,7 @@ def _steps(bound: Bound, test: Bound | None, named: Mapping[str, Array]) -> dict
 
 def _as_is(bound: Bound) -> StageDiagnosis:
     """The model with its parameters as they are, nothing added."""
-    judge = Judge(bound.thinned, bound.noise())
+    judge = Judge(bound.thinned, bound.data.noise())
     theta = bound.stage.neutral()
     fit = judge.fit((), theta, 0)
     rms = np.sqrt(
@@ -261,13 +263,13 @@ def diagnose(
         by = other.figures(other.theta_from(bound, theta))
         return float(
             np.mean(
-                [np.log(np.maximum(v, 1e-300) / bound.noise()).mean() for v in by.values() if np.isfinite(v).all()]
+                [np.log(np.maximum(v, 1e-300) / bound.data.noise()).mean() for v in by.values() if np.isfinite(v).all()]
                 or [0.0]
             )
         )
 
     d, decided = diagnose_system(
-        bound.thinned, bound.noise(), tick, on_test if other is not None else None, bound.guess
+        bound.thinned, bound.data.noise(), tick, on_test if other is not None else None, bound.guess
     )
     answer = _finish("diagnose", bound, other, d, started, model or Model())
     answer.notes += decided
@@ -298,7 +300,7 @@ def extend(
                 else f"it can have {', '.join(have)}"
             )
             raise StageError(f"--effect {e!r}: not a law that system {system.name!r} can be given; {hint}")
-    d = extend_system(bound.thinned, bound.noise(), tuple(dict.fromkeys(effects)))
+    d = extend_system(bound.thinned, bound.data.noise(), tuple(dict.fromkeys(effects)))
     return _finish("extend", bound, other, d, started, model or Model())
 
 
@@ -361,14 +363,14 @@ def _loaded(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
     """What it would change to start springs with the force that was measured at the start."""
     codes = {q.effect: q.law.code for q in bound.placed}
     springs = [e for e in (*d.final.effects, *bound.present) if codes[e] in HYSTERETIC]
-    if bound.system.kind != "force" or bound.loaded or not springs:
+    if bound.system.kind != "force" or bound.runner.loaded or not springs:
         return []
-    held = [bound.held(k) for k in range(len(bound.logs))]
-    if max(np.abs(held)) < STARTS_LOADED * bound.noise_of_force:
+    held = [bound.data.held(k) for k in range(len(bound.logs))]
+    if max(np.abs(held)) < STARTS_LOADED * bound.runner.noise_of_force:
         return []
-    bound.loaded = True
+    bound.runner.loaded = True
     other = judge.fit(d.final.effects, judge.fit(d.final.effects, d.final.theta, 12).theta, 12)
-    bound.loaded = False
+    bound.runner.loaded = False
     before, after = (float(np.sqrt(f.cost.sum() / max(judge.n, 1)) * d.floor[0]) for f in (d.final, other))
     unit = d.units[0]
     names = [p.name for e in bound.stage.effects for p in e.parameters]

@@ -1,0 +1,289 @@
+"""A system held against logs: its unknown parameters fitted, laws placed where they may act, all as one `Stage`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.nominal import Course, nominal_course
+from vaneloop.discrepancy.models.places import places
+from vaneloop.discrepancy.models.runner import Placed, Runner
+from vaneloop.discrepancy.models.system import Record, System
+from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError
+
+__all__ = ["Bound"]
+
+WIDE = 4.0  # half-width, in sizes of a parameter that the user calls unknown, of the interval that later fits may use
+MOST_STEPS = 16
+MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
+
+
+class Bound:
+    """A system held against logs: the `Stage`, and which samples belong to which log.
+
+    like      take sizes, fitted parameters and cut-off from an earlier one (for test logs)
+    values    parameters fitted before, by name
+    present   laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
+
+    stage     what the search works on; the logs follow each other in time
+    thinned   the same on fewer samples, where there are many
+    guess     the stage's parameters as the user gave them
+    data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
+    runner    the model on them; ``run`` is its
+    effects, placed   every law at every place: what the search is told of it, and what runs
+    logs      name -> slice of samples
+    notes     what the user should know
+    """
+
+    def __init__(
+        self,
+        system: System,
+        records: Sequence[Record],
+        like: Bound | None = None,
+        values: Mapping[str, float] | None = None,
+        present: Mapping[str, Mapping[str, float]] | None = None,
+    ):
+        self.system, self.like = system, like
+        self.values: dict[str, float] = dict(values or {}) if like is None else like.values
+        self.present: dict[str, dict[str, float]]
+        self.present = {k: dict(v) for k, v in (present or {}).items()} if like is None else like.present
+        self.data: Data = Data(system, records, like.data if like else None)
+        self.logs, self.notes = self.data.logs, self.data.notes
+        self.t, self.u, self.measured = self.data.t, self.data.u, self.data.measured
+        self.runner: Runner = Runner(self.data, like.runner if like else None)
+        self.run = self.runner.run
+        self.effects: list[Effect]
+        self.placed: list[Placed]
+        self.stage: Stage
+        self._make()
+
+    def _make(self) -> None:
+        """Fit what is unknown, place the laws, and make the stage."""
+        s = self.system
+        if self.like is not None:
+            self.effects, self.placed = self.like.effects, self.like.placed
+        starts: list[Parameter] = []
+        if s.kind in ("simulate", "closed_loop"):
+            starts = self._starts()
+        if self.like is None:
+            known = [p.name for p in s.parameters]
+            for name in self.values:
+                if name not in known and not name.startswith("start_"):
+                    raise StageError(
+                        f"model file: parameter {name!r} is not one of system {s.name!r}; allowed: {', '.join(known)}"
+                    )
+            first = [
+                Parameter(p.name, float(np.clip(self.values[p.name], p.low, p.high)), p.unit, p.low, p.high, 0.0)
+                if p.name in self.values
+                else p
+                for p in (*s.parameters, *starts)
+            ]
+            if s.kind in ("simulate", "closed_loop"):
+                self.run(np.array([[p.value for p in first]]))
+            self.runner.ready = True
+            fitted = self._prefit(first)
+            course = Course()
+            if s.kind in ("simulate", "closed_loop"):
+                course = nominal_course(self.runner, fitted)
+                self.runner.smalls = course.smalls
+            self.placed, self.effects = places(self.data, course)
+            parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
+        else:
+            mine = self.like.stage.parameters[: len(s.parameters)]
+            parameters = [*mine, *starts]
+        at = len(parameters)
+        placed = []
+        for name in self.present:
+            if all(e.name != name for e in self.effects):
+                raise StageError(
+                    f"model file: effect {name!r} is not one that system {s.name!r} can have; "
+                    f"it has {', '.join(e.name for e in self.effects)}"
+                )
+        both = list(zip(self.placed, self.effects, strict=True))
+        both = [b for b in both if b[1].name in self.present] + [b for b in both if b[1].name not in self.present]
+        self.placed, self.effects = [b[0] for b in both], [b[1] for b in both]
+        searched = []
+        for q, e in both:
+            if e.name in self.present:
+                for w in e.parameters:
+                    v = self.present[e.name].get(w.name)
+                    if v is None or not np.isfinite(v):
+                        raise StageError(f"model file: effect {e.name!r} needs a number for {w.name}")
+                    v = float(np.clip(v, w.low, w.high))
+                    size = w.scale or max(abs(v), 1e-300)
+                    parameters.append(
+                        Parameter(f"{e.name}.{w.name}", v, w.unit, w.low, w.high, WIDE * size, scale=0.1 * size)
+                    )
+            else:
+                searched.append(e)
+            placed.append(
+                Placed(q.effect, q.law, q.place, q.at, q.constant, slice(at, at + len(e.parameters)), q.neutral)
+            )
+            at += len(e.parameters)
+        self.placed = self.runner.placed = placed
+        regimes, units = self.data.regimes()
+        self.stage = Stage(
+            s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t,
+            self.measured,
+            regimes=regimes, regime_units=units,
+        )  # fmt: skip
+        self.guess = self.stage.neutral()
+        self.guess[: len(s.parameters)] = [p.value for p in s.parameters]
+        if self.like is None and not self.values and starts:
+            n_p = len(s.parameters)
+            self.guess[n_p : n_p + len(starts)] = [p.value for p in starts]
+            self._scan_starts(self.guess, list(range(n_p, n_p + len(starts))))
+        # the search looks at fewer samples where there are many: neighbours say the same
+        stride = max(1, len(self.t) // MOST_SAMPLES)
+        self.thinned = Stage(
+            s.name, self.stage.outputs, self.stage.units, self.stage.parameters, self.stage.effects,
+            lambda thetas: self.run(thetas)[:, :, ::stride], self.t[::stride], self.measured[:, ::stride],
+            regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units,
+        )  # fmt: skip
+
+    def theta_from(self, other: Bound, theta: Array) -> Array:
+        """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""
+        from scipy.optimize import least_squares
+
+        n_p = len(self.system.parameters)
+        out = np.concatenate(
+            [
+                theta[:n_p],
+                [p.value for p in self.stage.parameters[n_p : n_p + len(self.runner.free_starts)]],
+                theta[n_p + len(other.runner.free_starts) :],
+            ]
+        )
+        k = len(self.runner.free_starts)
+        if not k:
+            return out
+        use = np.isfinite(self.measured)
+        size = np.array([self._unit_size(p) for p in self.stage.parameters[n_p : n_p + k]])
+
+        def error(z: Array) -> Array:
+            trial = out.copy()
+            trial[n_p : n_p + k] = z * size
+            return np.where(use, self.run(trial[None])[0] - np.where(use, self.measured, 0.0), 0.0).ravel()
+
+        self._scan_starts(out, list(range(n_p, n_p + k)))
+        first = out[n_p : n_p + k] / size
+        out[n_p : n_p + k] = least_squares(error, first, diff_step=1e-3, max_nfev=30).x * size
+        return out
+
+    def figures(self, theta: Array) -> dict[str, Array]:
+        """RMS error of every output, log by log."""
+        e = self.run(theta[None])[0] - self.measured
+        with np.errstate(invalid="ignore"):
+            return {
+                name: np.array(
+                    [
+                        np.sqrt(np.mean(row[np.isfinite(row)] ** 2)) if np.isfinite(row).any() else np.nan
+                        for row in e[:, at]
+                    ]
+                )
+                for name, at in self.logs.items()
+            }
+
+    def _starts(self) -> list[Parameter]:
+        """Initial states that no log tells, as parameters to fit."""
+        s = self.system
+        out: list[Parameter] = []
+        if s.window:
+            return out
+        for log in range(len(self.data.records)):
+            for m, (name, unit) in enumerate(s.states.items()):
+                if name in s.start or (name in s.outputs and name in self.data.records[log].columns):
+                    continue
+                if name in s.rates:
+                    continue  # machines start at rest
+                self.runner.free_starts.append((log, m))
+                suffix = f"_{log + 1}" if len(self.data.records) > 1 else ""
+                out.append(Parameter(f"start_{name}{suffix}", self._guess(log, name), unit, -np.inf, np.inf, np.inf))
+        return out
+
+    def _guess(self, log: int, name: str) -> float:
+        return 0.0
+
+    def _prefit(self, parameters: Sequence[Parameter]) -> Array:
+        """Values of the unknown parameters that suit the logs best while nothing is added."""
+        from scipy.optimize import least_squares
+
+        values = np.array([p.value for p in parameters], dtype=float)
+        free = [i for i, p in enumerate(parameters) if np.isinf(p.tolerance)]
+        scale = np.nanstd(self.measured, axis=1)
+        scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
+        first = self.run(values[None])[0]
+        if not np.all(np.abs(first) < self.runner.far):
+            k = np.unravel_index(int(np.argmax(~(np.abs(first) < self.runner.far))), first.shape)
+            raise StageError(
+                f"system {self.system.name!r}: the model leaves all bounds or turns NaN for "
+                f"{list(self.system.outputs)[k[0]]} at t = {self.t[k[1]]:g} s with its first parameters; other values "
+                f"of {', '.join(p.name for p in parameters) or 'the model'} are needed, or a window="
+            )
+        if self.system.kind in ("simulate", "closed_loop"):
+            self._choose_steps(values)
+        if not free:
+            return values
+        self._scan_starts(values, [i for i in free if parameters[i].name.startswith("start_")])
+        size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
+        low = np.array([parameters[i].low for i in free])
+        high = np.array([parameters[i].high for i in free])
+        use = np.isfinite(self.measured)
+        stride = max(1, self.measured.shape[1] // 20000)
+
+        def error(z: Array) -> Array:
+            trial = values.copy()
+            trial[free] = z * size
+            e = (self.run(trial[None])[0] - np.where(use, self.measured, 0.0)) / scale[:, None]
+            return np.where(use, e, 0.0)[:, ::stride].ravel()
+
+        z0 = values[free] / size
+        result = least_squares(
+            error, np.clip(z0, low / size, high / size), bounds=(low / size, high / size), diff_step=1e-4, max_nfev=60
+        )
+        values[free] = result.x * size
+        if self.system.kind in ("simulate", "closed_loop"):
+            self._choose_steps(values)
+        return values
+
+    def _scan_starts(self, theta: Array, columns: list[int]) -> None:
+        """Set unknown initial states in place to the best of some round sizes of the outputs, one after the other."""
+        good = self.measured[np.isfinite(self.measured)]
+        size = float(np.max(np.abs(good))) if len(good) else 1.0
+        for c in columns:
+            trials = np.repeat(theta[None], 11, axis=0)
+            trials[:, c] = size * np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, -0.1, -0.25, -0.5, -1.0, -2.0])
+            e = np.where(np.isfinite(self.measured), self.run(trials) - np.nan_to_num(self.measured), 0.0)
+            theta[c] = trials[int(np.argmin(np.sum(e**2, axis=(1, 2)))), c]
+
+    def _unit_size(self, p: Parameter) -> float:
+        if p.name.startswith("start_"):
+            y = self.measured[np.isfinite(self.measured)]
+            return float(np.std(y)) or 1.0
+        return min((abs(v) for v in (p.low, p.high) if np.isfinite(v) and v != 0.0), default=1.0)
+
+    def _choose_steps(self, values: Array) -> None:
+        """Steps of the integration between two samples: doubled until the outputs no longer change by more than 1e-3 of
+        their spread.
+        """
+        scale = np.nanstd(self.measured, axis=1)
+        scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
+        before = self.run(values[None])[0]
+        while self.runner.steps < MOST_STEPS:
+            self.runner.steps *= 2
+            after = self.run(values[None])[0]
+            change = float(np.max(np.sqrt(np.mean((after - before) ** 2, axis=1)) / scale))
+            before = after
+            if change < 1e-3:
+                self.runner.steps //= 2
+                break
+
+    def _fixed(self, p: Parameter, value: float) -> Parameter:
+        """An unknown parameter, once fitted, may move by a few of its own sizes."""
+        if np.isfinite(p.tolerance):
+            return p
+        size = max(abs(value), abs(p.value), 1e-3 * self._unit_size(p))
+        if p.name.startswith("start_"):
+            size = max(size, self._unit_size(p))
+        return Parameter(p.name, float(value), p.unit, p.low, p.high, WIDE * size)

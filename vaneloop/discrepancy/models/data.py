@@ -1,0 +1,214 @@
+"""The logs of a system, checked, one after the other on one time axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vaneloop.discrepancy.evidence import noise_of_channel
+from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass, motion, smoothed, uses
+from vaneloop.discrepancy.models.system import Record, System
+from vaneloop.discrepancy.stage import Array, StageError
+
+__all__ = ["Data"]
+
+EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differentiated log
+
+
+class Data:
+    """The logs that a system is held against.
+
+    records   the logs, from time 0; what drives the model has no NaN
+    logs      name -> slice of samples
+    in_names  what drives the model: for kind force the motion, then the inputs
+    u, y      log by log: float64[in_names, samples] and float64[outputs, samples]
+    t         s, of all logs, one after the other
+    measured  float64[outputs, samples], of all logs
+    cutoff    Hz, up to which motion is differentiated and forces are compared; None: they are as measured
+    notes     what the user should know
+    like      take the cut-off from an earlier one (for test logs)
+    """
+
+    def __init__(self, system: System, records: Sequence[Record], like: Data | None = None):
+        self.system, self.like = system, like
+        self.cutoff: float | None = None
+        self.notes: list[str] = []
+        if not records:
+            raise StageError(f"system {system.name!r}: no log")
+        self.records = [self._checked(r) for r in records]
+        self.logs: dict[str, slice] = {}
+        at = 0
+        for r in self.records:
+            name = r.name
+            while name in self.logs or (like is not None and name in like.logs):
+                name += "'"
+            self.logs[name] = slice(at, at + len(r.t))
+            at += len(r.t)
+        self._prepare()
+        self._restart_cache: dict[int, tuple[Array, Array]] = {}
+
+    def _checked(self, r: Record) -> Record:
+        s = self.system
+        for c in s.channels():
+            if c not in r.columns and c not in s.optional():
+                import difflib
+
+                close = difflib.get_close_matches(c, r.columns, 1)
+                hint = f"; close: {close[0]}" if close else ""
+                raise StageError(
+                    f"{r.name}: no channel {c!r}, which system {s.name!r} needs{hint}; the log has "
+                    f"{', '.join(list(r.columns)[:12])}"
+                )
+        t = np.asarray(r.t, dtype=float)
+        if t.ndim != 1 or len(t) < 50:
+            raise StageError(f"{r.name}: {t.size} samples; at least 50 are needed")
+        if not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
+            raise StageError(f"{r.name}: time must rise from sample to sample")
+        columns = {}
+        for c, v in r.columns.items():
+            v = np.asarray(v, dtype=float)
+            if v.shape != t.shape:
+                raise StageError(f"{r.name}: channel {c!r} has shape {v.shape}; {t.shape} is needed, as the time has")
+            if c in (*s.inputs, s.position, s.velocity):
+                bad = ~np.isfinite(v)
+                if bad.mean() > 0.2:
+                    raise StageError(
+                        f"{r.name}: channel {c!r}: {bad.sum()} of {len(v)} samples are NaN; an input may lack 20 % at "
+                        f"most"
+                    )
+                if bad.any():
+                    v = np.interp(t, t[~bad], v[~bad])
+                    self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
+            columns[c] = v
+        return Record(r.name, t - t[0], columns)
+
+    def _prepare(self) -> None:
+        s = self.system
+        outs, ins = list(s.outputs), list(s.inputs)
+        self.in_names = list(ins)
+        if s.kind == "force":
+            self._choose_cutoff()
+            self.in_names = [*MOTION, *ins]
+        self.u: list[Array] = []
+        self.y: list[Array] = []
+        for r in self.records:
+            y = np.array([r.columns.get(o, np.full(len(r.t), np.nan)) for o in outs])
+            u = [r.columns[c] for c in ins]
+            if s.kind == "force":
+                x, v, a = motion(s, r, self.cutoff)
+                u = [x, v, a, *u]
+                if self.cutoff:
+                    y = np.array([low_pass(r.t, row, self.cutoff) for row in y])
+                    edge = EDGE / self.cutoff
+                    y[:, (r.t < edge) | (r.t > r.t[-1] - edge)] = np.nan
+            self.u.append(np.ascontiguousarray(np.array(u, dtype=float).reshape(len(u), len(r.t))))
+            self.y.append(y)
+        gap = 0.0
+        times = []
+        for r in self.records:
+            times.append(r.t + gap)
+            gap = times[-1][-1] + float(np.median(np.diff(r.t)))
+        self.t = np.concatenate(times)
+        self.measured = np.concatenate(self.y, axis=1)
+
+    def _choose_cutoff(self) -> None:
+        """Up to which frequency the motion is differentiated."""
+        s = self.system
+        if s.velocity and not uses(s.model, "acceleration"):
+            return
+        if self.like is not None:
+            self.cutoff = self.like.cutoff
+            return
+        if s.cutoff is not None:
+            self.cutoff = s.cutoff
+            return
+        self.cutoff = highest_frequency(s.outputs, self.records)
+        self.notes.append(
+            f"motion differentiated, and forces compared, up to {self.cutoff:.3g} Hz (cutoff= sets another)"
+        )
+
+    def first_state(self, log: int, state: str, fallback: float, at: int = 0) -> float:
+        """A state at the start of a log: given, measured, or else ``fallback``."""
+        s = self.system
+        if state in s.start and at == 0:
+            return s.start[state]
+        r = self.records[log]
+        if state in s.outputs and state in r.columns:
+            y = r.columns[state][at : at + 3]
+            good = y[np.isfinite(y)]
+            if len(good):
+                return float(good[0])
+        return fallback
+
+    def restarts(self, log: int, n: int) -> tuple[Array, Array]:
+        """At which of a log's first ``n`` samples a window starts anew, bool[n]; states there, float64[states, n]."""
+        s = self.system
+        restart = np.zeros(n, dtype=np.bool_)
+        if not s.window:
+            return restart, np.zeros((len(s.states), 1))
+        if log not in self._restart_cache:
+            r = self.records[log]
+            w = (r.t / s.window + 1e-9).astype(int)
+            first = np.diff(w, prepend=-1) > 0
+            values = np.zeros((len(s.states), len(r.t)))
+            moving = dict(s.rates)
+            for i, name in enumerate(s.states):
+                if name in r.columns:
+                    values[i] = r.columns[name]
+                elif name in moving and moving[name] in r.columns:
+                    values[i] = np.gradient(smoothed(r.t, r.columns[moving[name]]), r.t)
+                else:
+                    raise StageError(
+                        f"system {s.name!r}: window= needs state {name!r} measured at every start; the log has "
+                        f"{', '.join(r.columns)} (name a channel like it, or declare it in rates= as the rate of a "
+                        "measured one)"
+                    )
+            first &= np.all(np.isfinite(values), axis=0)
+            self._restart_cache[log] = first, values
+        first, values = self._restart_cache[log]
+        return first[:n], np.ascontiguousarray(values[:, :n])
+
+    def held(self, log: int) -> float:
+        """Measured force at the start of a log."""
+        y = self.records[log].columns[next(iter(self.system.outputs))][:5]
+        return float(np.median(y[np.isfinite(y)])) if np.isfinite(y).any() else 0.0
+
+    def noise(self) -> Array:
+        """RMS of the noise in every measured output, as far as its samples tell, and never quite zero."""
+        out = []
+        for name, y in zip(self.system.outputs, self.measured, strict=True):
+            good = y[np.isfinite(y)]
+            level = noise_of_channel(good)
+            if self.cutoff:  # what the low-pass leaves of the noise in the force as it was logged
+                raw = [r.columns[name] for r in self.records]
+                rate = 1.0 / float(np.median(np.diff(self.records[0].t)))
+                level = max(noise_of_channel(v) for v in raw) * float(np.sqrt(min(2.0 * self.cutoff / rate, 1.0)))
+            out.append(max(level, 1e-6 * float(np.std(good)) if len(good) else 0.0, 1e-300))
+        return np.array(out)
+
+    def regimes(self) -> tuple[dict[str, Array], dict[str, str]]:
+        """Conditions under which the model may fail, and their units."""
+        s = self.system
+        out: dict[str, Array] = {"time": self.t}
+        units = {"time": "s"}
+        u = np.concatenate(self.u, axis=1) if self.u[0].size else np.zeros((0, len(self.t)))
+        names = self.in_names
+        unit = s.units.get("position", "m")
+        all_units = {**s.inputs, "position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2"}
+        for i, n in enumerate(names):
+            if n == "acceleration" and not np.any(u[i]):
+                continue
+            out[n], units[n] = u[i], all_units.get(n, "")
+        if s.kind == "force":
+            v = u[1]
+            still = 0.01 * float(np.sqrt(np.mean(v**2)))
+            out["direction"], units["direction"] = np.sign(np.where(np.abs(v) > still, v, 0.0)), ""
+        for i, o in enumerate(s.outputs):
+            y = self.measured[i]
+            if o not in out and np.isfinite(y).any():
+                out[o], units[o] = np.where(np.isfinite(y), y, np.nanmean(y)), s.outputs[o]
+        if len(self.records) > 1:
+            out["log"] = np.concatenate([np.full(len(r.t), float(k + 1)) for k, r in enumerate(self.records)])
+            units["log"] = ""
+        return out, units

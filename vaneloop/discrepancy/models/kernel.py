@@ -1,0 +1,214 @@
+"""The function that simulates a system on a log: source written for its states, inputs and parameters, and compiled."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from vaneloop.discrepancy import laws
+from vaneloop.discrepancy.laws import MEMORY
+from vaneloop.discrepancy.models.user_code import UserCode
+
+__all__ = ["Kernel", "build_kernels"]
+
+Kernel = Callable[..., Any]
+
+
+def build_kernels(code: UserCode) -> tuple[Kernel, Kernel]:
+    """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled."""
+    s = code.system
+    rates = "\n".join(f"dx[{i}] = d" if code.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
+    u = (", ".join(f"u[{i}]" for i in range(len(code.U._fields))) + ",") if s.inputs or s.commands else "0.0,"
+    p = (", ".join(f"p[{i}]" for i in range(len(s.parameters))) + ",") if s.parameters else "0.0,"
+
+    def rhs(match: re.Match[str]) -> str:
+        indent, at, to = match.groups()
+        states = ", ".join(f"AT[{i}]" for i in range(len(s.states))) + ","
+        text = _RHS.format(x=states, u=u, p=p, rates=rates).strip()
+        text = re.sub(r"\bAT\b", at, re.sub(r"\bdx\b", to, text))
+        return textwrap.indent(text, indent)
+
+    source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
+    source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
+
+    def build(jit: Callable[[Any], Any]) -> Kernel:
+        space: dict[str, Any] = {
+            "np": np, "jit": jit, "X": code.X, "U": code.U, "P": code.P, "Y": code.Y, "R": code.R,
+            "model": jit(s.model),
+            "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
+            "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": laws.transform, "MEMORY": MEMORY,
+            "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
+        }  # fmt: skip
+        exec(compile(source, f"<{s.name}>", "exec"), space)
+        return space["run"]
+
+    def compiled(f: Any) -> Any:
+        return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
+
+    return build(compiled), build(lambda f: getattr(f, "py_func", f))
+
+
+def _output_source(code: UserCode) -> str:
+    s = code.system
+    if s.output is not None:
+        call = (
+            "o = output(X(*xs), U(*us), P(*ps))".replace("X(*xs)", "X({x})")
+            .replace("U(*us)", "U({u})")
+            .replace("P(*ps)", "P({p})")
+        )
+        fill = {
+            "x": ", ".join(f"x[{i}]" for i in range(len(s.states))),
+            "u": ", ".join(f"u[{i}]" for i in range(len(code.U._fields))) if s.inputs or s.commands else "0.0",
+            "p": ", ".join(f"p[{i}]" for i in range(len(s.parameters))) if s.parameters else "0.0",
+        }
+        lines = [call.format(**fill)]
+        lines += [f"y[{i}] = o" if code.single_out else f"y[{i}] = o[{i}]" for i in range(len(s.outputs))]
+    else:
+        states, commands = list(s.states), list(s.commands)
+        lines = [
+            f"y[{i}] = x[{states.index(o)}]" if o in states else f"y[{i}] = u[{commands.index(o)}]"
+            for i, o in enumerate(s.outputs)
+        ]
+    return "\n    ".join(lines)
+
+
+def _control_source(code: UserCode) -> str:
+    s = code.system
+    if s.kind != "closed_loop":
+        return "pass"
+    r = ", ".join(f"r[{i}]" for i in range(len(code.in_names))) if code.in_names else "0.0"
+    y = ", ".join(f"y[{i}]" for i in range(len(s.outputs)))
+    p = ", ".join(f"p[{i}]" for i in range(len(s.parameters))) if s.parameters else "0.0"
+    lines = [f"c = control(R({r},), Y({y},), P({p},))"]
+    lines += [f"u[{i}] = c" if code.single_control else f"u[{i}] = c[{i}]" for i in range(len(s.commands))]
+    return "\n    ".join(lines)
+
+
+# what stands for "rhs x k": the derivative k at x. Written out in place, since handing fifteen arrays to a function
+# costs more
+_RHS = """
+d = model(X({x}), U({u}), P({p}))
+{rates}
+if len(code) > 0:
+    for i in range(len(code)):
+        w = where[i]
+        c = code[i]
+        if c > 40:
+            if c != STATE_LIMIT and c != STATE_RATE_LIMIT:
+                dx[w] -= state_rate(c, AT[w], rows[i])
+        elif not memory[i]:
+            dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
+    for w in range(m):
+        dx[w] -= held[w]
+    for i in range(len(code)):
+        if code[i] == STATE_RATE_LIMIT:
+            w = where[i]
+            dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
+"""
+
+_SOURCE = """
+@jit
+def outputs(x, u, p, y):
+    {outs}
+
+
+@jit
+def controls(r, y, p, u):
+    {control}
+
+
+@jit
+def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps,
+        line, loop,
+        n_commands, e_code, e_at, e_out, e_rows, out):
+    n, m = len(t), len(x0)
+    x = x0.copy()
+    u = np.zeros(max(n_commands if loop else len(inputs), 1))
+    r = np.zeros(max(len(inputs), 1))
+    y = np.zeros(len(out))
+    seen = np.zeros(len(out))
+    remembered = np.zeros((len(code), MEMORY))
+    e_memory = np.zeros((len(e_code), MEMORY))
+    e_past = np.zeros((len(e_code), n if loop else 1))
+    none = np.zeros(MEMORY)
+    held = np.zeros(m)
+    k1, k2, k3, k4, z = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
+    first = True
+    for k in range(n):
+        if restart[k]:
+            for j in range(m):
+                x[j] = at_restart[j, k]
+            first = True
+        if loop:
+            for j in range(len(inputs)):
+                r[j] = inputs[j, k]
+            outputs(x, u, p, y)
+            for j in range(len(out)):
+                seen[j] = y[j]
+            for i in range(len(e_code)):
+                if e_out[i]:
+                    e_past[i, k] = seen[e_at[i]]
+                    seen[e_at[i]] = transform(e_code[i], k, t, e_past[i], e_rows[i], e_memory[i])
+            controls(r, seen, p, u)
+            outputs(x, u, p, y)
+            for j in range(len(out)):
+                out[j, k] = y[j]
+            for i in range(len(e_code)):
+                if e_out[i]:
+                    out[e_at[i], k] = seen[e_at[i]]
+                else:
+                    e_past[i, k] = u[e_at[i]]
+                    u[e_at[i]] = transform(e_code[i], k, t, e_past[i], e_rows[i], e_memory[i])
+        else:
+            for j in range(len(inputs)):
+                u[j] = inputs[j, k]
+            outputs(x, u, p, y)
+            for j in range(len(out)):
+                out[j, k] = y[j]
+        if k == n - 1:
+            break
+        h = (t[k + 1] - t[k]) / steps
+        for q in range(steps):
+            for w in range(m):
+                held[w] = 0.0
+            for i in range(len(code)):
+                if memory[i] and code[i] <= 40:
+                    w = where[i]
+                    f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
+                                 remembered[i])
+                    held[w] += f / mass[w]
+            first = False
+            if line and not loop:
+                for j in range(len(inputs)):
+                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * q / steps
+            rhs x k1
+            if line and not loop:
+                for j in range(len(inputs)):
+                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 0.5) / steps
+            for w in range(m):
+                z[w] = x[w] + 0.5 * h * k1[w]
+            rhs z k2
+            for w in range(m):
+                z[w] = x[w] + 0.5 * h * k2[w]
+            rhs z k3
+            if line and not loop:
+                for j in range(len(inputs)):
+                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 1.0) / steps
+            for w in range(m):
+                z[w] = x[w] + h * k3[w]
+            rhs z k4
+            for w in range(m):
+                x[w] += h / 6.0 * (k1[w] + 2.0 * k2[w] + 2.0 * k3[w] + k4[w])
+            for i in range(len(code)):
+                if code[i] == STATE_LIMIT:
+                    w = where[i]
+                    x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
+        for w in range(m):
+            if not np.isfinite(x[w]) or abs(x[w]) > 1e150:
+                return
+"""

@@ -1,0 +1,124 @@
+"""Where laws may act on a system, and how large the data are there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vaneloop.discrepancy.library import FORCE_LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.nominal import Course
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.system import Record, System
+from vaneloop.discrepancy.stage import Array, Effect
+
+__all__ = ["places"]
+
+SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
+
+
+def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
+    """Every law at every place where it may act, in the same order: what runs, and what the search is told of it."""
+    s = data.system
+    out: list[Placed] = []
+    effects: list[Effect] = []
+
+    def add(prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()) -> None:
+        for law in family.values():
+            if law.name in leave:
+                continue
+            ps, starts = law.make(size)
+            effects.append(Effect(f"{prefix}.{law.name}", tuple(ps), starts, law.looks))
+            out.append(
+                Placed(
+                    f"{prefix}.{law.name}",
+                    law,
+                    place,
+                    at,
+                    law.constant(size) if law.constant else 0.0,
+                    neutral=np.array([q.value for q in ps]),
+                )
+            )
+
+    outputs = list(s.outputs)
+    if s.kind == "force" and _allowed(s, "force", "force"):
+        v = np.concatenate([u[1] for u in data.u])
+        x = np.concatenate([u[0] for u in data.u])
+        force = float(np.sqrt(np.nanmean(data.measured[0] ** 2)))
+        unit = s.units.get("position", "m")
+        size = _size(
+            data.records, [u[0] for u in data.u], unit, force=force, force_unit=next(iter(s.outputs.values())),
+            speed=max(float(np.sqrt(np.mean(v**2))), 1e-300), speed_unit=f"{unit}/s",
+            travel=max(0.5 * float(np.ptp(x)), 1e-300), travel_unit=unit,
+        )  # fmt: skip
+        add("force", "force", 0, FORCE_LAWS, size)
+    if s.kind in ("simulate", "closed_loop"):
+        for i, (name, unit) in enumerate(s.states.items()):
+            if not (_allowed(s, "state", name) or (name in s.rates and _allowed(s, "force", name))):
+                continue
+            if name in s.rates.values() and name not in s.rates:
+                continue  # a displacement is the integral of its velocity, whatever else is missing
+            values = course.states[i]
+            rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
+            if name in s.rates:
+                j = list(s.states).index(s.rates[name])
+                z = course.states[j]
+                m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
+                force_unit = s.force_unit if name in s.masses else f"({unit})/s"
+                size = _size(
+                    data.records, values, unit, force=max(float(np.sqrt(np.nanmean(rates**2))) * m, 1e-300),
+                    force_unit=force_unit,
+                    speed=max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), 1e-300), speed_unit=unit,
+                    travel=max(0.5 * float(np.ptp(np.concatenate(z))), 1e-300), travel_unit=s.states[s.rates[name]],
+                )  # fmt: skip
+                add(name, "force", i, FORCE_LAWS, size)
+            else:
+                add(name, "state", i, STATE_LAWS, _size(data.records, values, unit))
+    signals = s.commands if s.kind == "closed_loop" else s.inputs
+    for i, (name, unit) in enumerate(signals.items()):
+        if _allowed(s, "input", name):
+            rows = (
+                course.commands[i]
+                if s.kind == "closed_loop"
+                else [u[i + (3 if s.kind == "force" else 0)] for u in data.u]
+            )
+            add(name, "input", i + (3 if s.kind == "force" else 0), SIGNAL_LAWS, _size(data.records, rows, unit))
+    for i, name in enumerate(outputs):
+        if name in s.commands or not _allowed(s, "output", name):
+            continue
+        rows = [y[i] for y in data.y]
+        if not np.isfinite(np.concatenate(rows)).any():
+            rows = [np.zeros(len(y[i])) for y in data.y]
+        # a constant force and a constant in the sensor of a force are the same; so are gains
+        named = any(p in (s.places or ()) for p in ("output", name))
+        leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
+        prefix = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
+        add(prefix, "output", i, SIGNAL_LAWS, _size(data.records, rows, s.outputs[name]), leave)
+    return out, effects
+
+
+def _allowed(system: System, place: str, name: str) -> bool:
+    chosen = system.places
+    return chosen is None or place in chosen or name in chosen
+
+
+def _size(records: Sequence[Record], rows: list[Array], unit: str, **more: Any) -> Size:
+    """How large the data of a place are, given log by log."""
+    good = np.concatenate([v[np.isfinite(v)] for v in rows])
+    if not len(good):
+        good = np.zeros(2)
+    low, high = np.quantile(good, [0.001, 0.999])
+    if not high > low:
+        low, high = float(good.min()), float(good.max())
+    if not high > low:
+        low, high = low - 0.5 * max(abs(low), 1.0), high + 0.5 * max(abs(high), 1.0)
+    rates = np.concatenate([np.gradient(v, r.t)[np.isfinite(v)] for v, r in zip(rows, records, strict=True)])
+    rates = rates[np.isfinite(rates)] if len(rates) else np.zeros(1)
+    rms = float(np.sqrt(np.mean(rates**2))) if len(rates) else 0.0
+    span = max(float(r.t[-1]) for r in records)
+    fastest = float(np.quantile(np.abs(rates), 0.999)) if len(rates) else 0.0
+    least = (high - low) / span
+    step = float(np.median(np.diff(records[0].t)))
+    return Size(float(low), float(high), max(rms, least), max(fastest, least), step, span, unit=unit, **more)

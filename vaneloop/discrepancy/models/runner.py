@@ -1,0 +1,261 @@
+"""What a system's model, with any laws at any places, says to the logs: the outputs of any set of parameters."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba.core.errors import NumbaError
+
+from vaneloop.base.compiled import compiled_free
+from vaneloop.discrepancy import laws
+from vaneloop.discrepancy.laws import PARAMETERS
+from vaneloop.discrepancy.library import Law
+from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.kernel import Kernel, build_kernels
+from vaneloop.discrepancy.models.motion import low_pass
+from vaneloop.discrepancy.models.user_code import UserCode
+from vaneloop.discrepancy.stage import Array, StageError
+
+__all__ = ["STARTS_LOADED", "Placed", "Runner"]
+
+STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
+
+
+@dataclass
+class Placed:
+    """A law at a place: effect name, law, kind of place, index of the signal or state there, constant."""
+
+    effect: str
+    law: Law
+    place: str  # input, output, force, state
+    at: int
+    constant: float
+    columns: slice = field(default_factory=lambda: slice(0, 0))
+    neutral: Array = field(default_factory=lambda: np.zeros(0))
+
+
+class Runner:
+    """The model on its logs.
+
+    placed       laws and their columns in a set of parameters
+    free_starts  (log, state) of initial states that follow the model's own parameters in a set
+    steps        of the integration between two samples
+    smalls       state by state, speed within which friction is regularised in a simulation; ``small``: with measured
+                 motion
+    loaded       hysteretic elements start with the measured force
+    far          size of an output beyond all measured ones; what is beyond it, or not finite, counts as that
+    like         take compiled model, steps and these speeds from an earlier one (for test logs)
+    """
+
+    def __init__(self, data: Data, like: Runner | None = None):
+        s = data.system
+        self.system, self.data = s, data
+        self.code = UserCode(s, data.in_names)
+        self.kernel: Kernel
+        self.slow: Kernel  # the same, not compiled
+        self.ready = like is not None  # the model ran with the user's own values
+        self.placed: list[Placed] = []
+        self.free_starts: list[tuple[int, int]] = []
+        self.steps: int = like.steps if like else 1
+        self.small: float = like.small if like else 0.0
+        self.smalls: Array = like.smalls if like else np.zeros(len(s.states))
+        self.loaded = s.start_force == "measured"
+        self._compile(like)
+        n_out = len(s.outputs)
+        far = np.nanmax(np.abs(data.measured), axis=1) if np.isfinite(data.measured).any() else np.ones(n_out)
+        self.far = 100.0 * float(np.nanmax(np.where(np.isfinite(far), far, 1.0))) + 1e-300
+        self.noise_of_force = float(data.noise()[0]) if s.kind == "force" else 0.0
+
+    def _compile(self, like: Runner | None) -> None:
+        """Try the user's functions once, then compile what runs sample by sample."""
+        s, data = self.system, self.data
+        if s.kind in ("static", "force"):
+            values = np.array([q.value for q in s.parameters])
+            self.code.static(values, data.u[0], data.records[0].t, check=True)
+            return
+        if like is not None:
+            self.kernel, self.slow = like.kernel, like.slow
+            return
+        states = [data.first_state(0, n, 0.0) for n in s.states]
+        self.code.try_once(states, data.u[0][:, 0], data.measured[:, 0])
+        self.kernel = self._tried()
+
+    def _tried(self) -> Kernel:
+        """The kernel, tried on three samples: compiled, or where numba cannot, as plain Python."""
+        s = self.system
+        fast, self.slow = build_kernels(self.code)
+        try:
+            self._try(fast)
+        except NumbaError as e:
+            why = next((line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line), "")[
+                :100
+            ]
+            self.data.notes.append(
+                f"system {s.name!r}: numba cannot compile the model ({why}); it runs as plain Python, some 100 times "
+                f"slower"
+            )
+            self.code.call("model", self._try, self.slow)
+            return self.slow
+        return fast
+
+    def _try(self, kernel: Kernel) -> None:
+        self.kernel = kernel
+        theta = np.array([q.value for q in self.system.parameters])
+        n = min(3, len(self.data.records[0].t))
+        self._simulate(
+            theta, np.array([self.data.first_state(0, m, 0.0) for m in self.system.states]), 0, [], 1, upto=n
+        )
+
+    def _active(self, theta: Array) -> list[tuple[Placed, Array]]:
+        out = []
+        for q in self.placed:
+            values = theta[q.columns]
+            if not np.array_equal(values, q.neutral):
+                row = np.zeros(PARAMETERS + 1)
+                row[: len(values)] = values
+                row[len(values)] = q.constant
+                out.append((q, row))
+        return out
+
+    def run(self, thetas: Array) -> Array:
+        """Outputs float64[sets, outputs, samples] of parameter sets; what is not finite is far off."""
+        s = self.system
+        out = np.empty((len(thetas), len(s.outputs), len(self.data.t)))
+        n_p = len(s.parameters)
+
+        def one(i: int) -> None:
+            theta = thetas[i]
+            active = self._active(theta)
+            for log, at in enumerate(self.data.logs.values()):
+                if s.kind in ("static", "force"):
+                    try:
+                        out[i, :, at] = self._algebraic(theta[:n_p], log, active)
+                    except StageError:
+                        if not self.ready:
+                            raise
+                        out[i, :, at] = np.nan
+                else:
+                    x0 = np.array([self.data.first_state(log, m, 0.0) for m in s.states])
+                    for k, (which, m) in enumerate(self.free_starts):
+                        if which == log:
+                            x0[m] = theta[n_p + k]
+                    out[i, :, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
+
+        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
+            with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
+                list(pool.map(one, range(len(thetas))))
+        else:
+            for i in range(len(thetas)):
+                one(i)
+        bad = ~np.isfinite(out)
+        if bad.any():
+            out[bad] = self.far
+        return np.clip(out, -self.far, self.far)
+
+    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]]) -> Array:
+        t, u = self.data.records[log].t, self.data.u[log]
+        inputs = [(q, row) for q, row in active if q.place == "input"]
+        if inputs:
+            u = u.copy()
+            for q, row in inputs:
+                u[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
+        y = self.code.static(p, u, t)
+        forces = [(q, row) for q, row in active if q.place == "force"]
+        if forces:
+            gap = sum(row[0] for q, row in forces if q.law.code == laws.BACKLASH_GAP)
+            asymmetry = sum(row[0] for q, row in forces if q.law.code == laws.FRICTION_ASYMMETRY)
+            for q, row in forces:
+                if q.law.code not in laws.HYSTERETIC:
+                    y[0] += _forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, 0.0)
+            springs = [(q, row) for q, row in forces if q.law.code in laws.HYSTERETIC and row[1] > 0.0]
+            held = self.data.held(log) - y[0, 0] if self.loaded else 0.0
+            if not abs(held) > STARTS_LOADED * self.noise_of_force:
+                held = 0.0
+            total = sum(row[1] for _, row in springs)
+            parts = [
+                _forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, held * row[1] / total)
+                for q, row in springs
+            ]
+            y[0] += np.sum(parts, axis=0)
+        if self.data.cutoff:
+            y = np.array([low_pass(t, row, self.data.cutoff) for row in y])
+        for q, row in active:
+            if q.place == "output":
+                y[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
+        return y
+
+    def _simulate(
+        self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
+    ) -> Array:
+        s = self.system
+        t, u = self.data.records[log].t[:upto], self.data.u[log][:, :upto]
+        loop = s.kind == "closed_loop"
+        n_states = len(s.states)
+        names = list(s.states)
+        inside = [(q, row) for q, row in active if q.place in ("force", "state") and q.law.code not in laws.MODIFIERS]
+        gap, asymmetry = np.zeros(n_states), np.zeros(n_states)
+        for q, row in active:
+            if q.law.code == laws.BACKLASH_GAP:
+                gap[q.at] += row[0]
+            elif q.law.code == laws.FRICTION_ASYMMETRY:
+                asymmetry[q.at] += row[0]
+        code = np.array([q.law.code for q, _ in inside], dtype=np.int64)
+        where = np.array([q.at for q, _ in inside], dtype=np.int64)
+        memory = np.array([q.law.memory for q, _ in inside], dtype=np.bool_)
+        rows = np.array([row for _, row in inside]).reshape(len(inside), PARAMETERS + 1)
+        position = np.array([names.index(s.rates[n]) if n in s.rates else -1 for n in names], dtype=np.int64)
+        known = [q.name for q in s.parameters]
+        mass = np.array([p[known.index(s.masses[n])] if n in s.masses else 1.0 for n in names])
+        if not loop:
+            for q, row in active:
+                if q.place == "input":
+                    u = u.copy() if u is self.data.u[log] or u.base is not None else u
+                    u[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
+        ends = [(q, row) for q, row in active if q.place in ("input", "output")] if loop else []
+        e_code = np.array([q.law.code for q, _ in ends], dtype=np.int64)
+        e_at = np.array([q.at for q, _ in ends], dtype=np.int64)
+        e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
+        e_rows = np.array([row for _, row in ends]).reshape(len(ends), PARAMETERS + 1)
+        restart, at_restart = self.data.restarts(log, len(t))
+        out = np.full((len(s.outputs), len(t)), np.nan)
+        arguments = (
+            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
+            rows, position, gap,
+            asymmetry, self.smalls, mass, steps, s.between == "line", loop,
+            len(s.commands),
+            e_code, e_at, e_out, e_rows, out,
+        )  # fmt: skip
+        try:
+            with np.errstate(all="ignore"):
+                self.kernel(*arguments)
+        except NumbaError:
+            raise
+        except Exception as e:  # with the user's own values that is told; what a search tries may be far off
+            out[:] = np.nan
+            if not self.ready:
+                with np.errstate(all="ignore"):
+                    self.code.call("model", self.slow, *arguments)  # says in which line
+                raise StageError(f"system {s.name!r}: the model failed: {type(e).__name__}: {e}") from None
+        if not loop:
+            for q, row in active:
+                if q.place == "output":
+                    out[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(out[q.at]), row)
+        return out
+
+
+@compiled_free
+def _forces(
+    code: int, v: Array, x: Array, row: Array, gap: float, asymmetry: float, small: float, held: float
+) -> Array:
+    """A law's force on a whole log; elements with a memory start with the force ``held``, in the middle of their gap
+    where that is 0.
+    """
+    s = np.zeros(laws.MEMORY)
+    out = np.empty(len(v))
+    for k in range(len(v)):
+        out[k] = laws.force_of(code, v[k], x[k], k == 0, row, gap, asymmetry, small, s)
+        if k == 0 and held != 0.0:
+            out[k] = laws.load(code, x[0], row, gap, asymmetry, held, s)
+    return out

@@ -1,0 +1,91 @@
+"""Stage `actuator`: stroke from the servo valve's current, in windows with the stroke free."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller import Calibration
+from plant import Plant, chain, places
+from plant.parameters import derive
+from plant.stages import actuator_run, step_currents
+from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
+from vaneloop.discrepancy.models.vane_stages.twins import like_time
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = ["actuator_stage"]
+
+NEAR_STOP = 0.3  # mm, where a piston rests on its stop
+# mm: what a valve and piston without mass and oil spring leave of one that has them; logs of the rig without noise
+# leave 0.0004
+QUASI_STATIC = 4e-4
+
+
+def actuator_stage(
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
+) -> Stage:
+    """Stroke from the current of every tick, started anew in each window."""
+    parameters, effects, rows, si = declared("actuator", machine, present)
+    dt = float(t[1] - t[0])
+    # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
+    substeps = c["ticks"].shape[1] if "ticks" in c else SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
+    i = np.ascontiguousarray(c.get("ticks", c["i_cmd"]) * 1e-3)
+    others = np.ascontiguousarray(c["other_ticks"] * 1e-3) if "other_ticks" in c else i
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
+    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+
+    logged = step_currents(i, dt, substeps)
+
+    def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil) -> Array:
+        p = lanes(machine, thetas, rows, si)
+        derive(p, dt / current.shape[1], dt)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        s[places.X] = s[places.X_LVDT] = x[0]
+        out = np.empty((len(thetas), 1, len(t)))
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)))
+        out *= 1e3
+        return out
+
+    # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no
+    # valve's curve tells
+    stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
+    leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
+    run = run & (leaning | ~lately(leaning, WINDOW, dt))
+    measured = np.where(run, c["x_lvdt"], np.nan)[None]
+    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
+    stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
+    ageing = like_time(t, t_oil)
+    stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
+    window = int(round(WINDOW / dt))
+
+    def hidden(theta: Array) -> Array:
+        return rms(stage, simulate(theta[None])[0] - simulate(theta[None], step_currents(others, dt, substeps))[0])
+
+    stage.raster_error = np.array([QUASI_STATIC])
+    if others is not i:
+        stage.hidden = hidden
+        stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
+
+    def excerpt(at: Array) -> Stage:
+        begins = np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1)
+        keep = run[at]
+        for b in begins:  # the spool and the lags come from another time
+            keep[b : b + window] = False
+        part = actuator_stage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
+        part.floor, part.quiet, part.noise, part.raster_error = (
+            stage.floor,
+            stage.quiet,
+            stage.noise,
+            stage.raster_error,
+        )
+        return part
+
+    stage.excerpt = excerpt
+    return stage

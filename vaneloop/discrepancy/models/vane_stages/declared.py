@@ -1,0 +1,132 @@
+"""Parameters and effects of a stage as the search takes them, with the starts of their fits, and the rows of the
+plant's parameters behind them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plant import Plant
+from plant.effects import EFFECTS, ROW
+from plant.geometry import STANDS_FOR
+from plant.linkage import STAGES
+from plant.parameters import nominal
+from vaneloop.discrepancy.stage import Array, Effect, Parameter
+
+__all__ = ["FREE", "SHAPES", "declared", "lanes"]
+
+FREE = {  # nominal parameters that a stage refits within their tolerance
+    "demand": (),
+    "servo": (),
+    "engine": ("engine.lag", "engine.acceleration", "engine.deceleration"),
+    "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping", "sensors.lvdt_lag"),
+    "linkage": (
+        *(f"linkage.{s}_play" for s in STAGES),
+        *(f"sensors.{s}_bias" for s in STAGES),
+        *(f"linkage.{s}_{length}" for s in STAGES for length in STANDS_FOR),
+    ),
+}
+SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
+FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
+SHAPES = (*FIXED_START, "phase", "roundness")
+KNOWN = {
+    "drag": 0.5
+}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
+FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
+
+
+def declared(
+    stage: str, machine: Plant, present: tuple[str, ...]
+) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
+    """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors
+    to SI.
+    """
+    known = {n.name: n for n in nominal(machine.table, machine.geometry)}
+    parameters, rows, si = [], [], []
+    for name in FREE[stage]:
+        if name not in known:
+            continue
+        n = known[name]
+        value = float(machine.p[n.row, 0]) / n.si
+        if name.endswith("_play"):
+            # the play is known at the vane and used at the ring
+            factor = machine.p[n.row, 0] / (n.value * n.si)
+            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, _vane(name)))
+            si.append(n.si * factor)
+        else:
+            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, _vane(name)))
+            si.append(n.si)
+        rows.append(n.row)
+    effects = []
+    for e in EFFECTS.values():
+        if stage not in e.stages or e.name in present:
+            continue
+        ps = tuple(
+            Parameter(
+                p.name,
+                p.neutral,
+                p.unit,
+                p.low,
+                p.high,
+                KNOWN.get(p.name, 0.0) * p.neutral,
+                _vane(p.name),
+                shape=p.name in SHAPES,
+                period=p.period,
+            )
+            for p in e.parameters
+        )
+        effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
+        rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
+        si += [p.si for p in e.parameters]
+    return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
+
+
+def _vane(name: str) -> str | None:
+    """The vane stage that a parameter belongs to."""
+    return next((v for v in STAGES if v in name), None)
+
+
+def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ...]:
+    """Sizes from which a fit of the effect starts: small to gross, both signs where the bounds allow."""
+    if name == "valve_flow_saturation":
+        # a sharp limit above all speeds of the log has no slope to follow, and one a tenth too low costs more than none
+        return (
+            *((4.0 * 1.18**k, 0.0) for k in range(24)),
+            *((v, 1.0) for v in (4.0, 8.0, 14.0, 25.0, 50.0, 100.0, 200.0)),
+        )
+    if name in ("can_delay", "frame_hold"):
+        return tuple((v,) for v in np.arange(0.01, 0.51, 0.01) if name != "frame_hold" or v > 0.015)
+    if name == "trend_threshold_error":
+        return tuple((float(v),) for v in np.geomspace(0.1, 12.0, 121))
+    if name == "end_stop_shift":
+        return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
+    second = [FIXED_START.get(p.name, p.value) for p in ps]
+    mains = [i for i, p in enumerate(ps) if p.name not in SHAPES]
+    out = []
+    for size in SIZES if ps[mains[0]].value == 0.0 else range(len(FACTORS)):
+        for sign in (1.0, -1.0):
+            start = list(second)
+            ok = True
+            for i in mains:
+                p = ps[i]
+                if p.value == 0.0:
+                    v = sign * size * (p.high if sign > 0 else -p.low)
+                else:
+                    v = p.value * FACTORS[int(size)]
+                    ok &= sign > 0
+                ok &= p.low <= v <= p.high and v != p.value
+                start[i] = v
+            if ok:
+                phases = (0.0, 90.0, 180.0, 270.0) if any(p.name == "phase" for p in ps) else (None,)
+                for phase in phases:
+                    out.append(
+                        tuple(phase if p.name == "phase" and phase is not None else start[i] for i, p in enumerate(ps))
+                    )
+    return tuple(out)
+
+
+def lanes(machine: Plant, thetas: Array, rows: Array, si: Array) -> Array:
+    """The plant's parameter array with one lane per parameter set."""
+    p = np.repeat(machine.p, len(thetas), axis=1)
+    p[rows] = (thetas * si).T
+    return p

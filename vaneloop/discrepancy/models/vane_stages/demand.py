@@ -1,0 +1,158 @@
+"""Stage `demand`: the stroke demand that the firmware's own trend, tables and rate limits make of the logged speeds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller import Calibration, new_state
+from controller.records import SLOW_TICK, Record, as_scalars, as_state
+from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
+from controller.trend import trend_step
+from plant import Plant
+from plant.effects import ROW
+from vaneloop.base.compiled import compiled
+from vaneloop.discrepancy.models.vane_stages.declared import declared
+from vaneloop.discrepancy.models.vane_stages.raster import RASTER, lately, pieces_of
+from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
+
+__all__ = ["demand_stage"]
+
+
+@compiled
+def _demand_run(
+    first: int,
+    last: int,
+    t: np.ndarray,
+    n_dem: np.ndarray,
+    n_r: np.ndarray,
+    delay: float,
+    hold: float,
+    phase: float,
+    k: Record,
+    table: np.ndarray,
+    z: Record,
+    out: np.ndarray,
+) -> None:
+    """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every
+    frame.
+    """
+    dt = t[1] - t[0]
+    for i in range(first, last):
+        at = t[i]
+        if hold > 0.0:
+            at = np.floor((at - phase) / hold + 1e-9) * hold + phase
+        at = (at - delay) / dt
+        j = min(max(int(np.floor(at + 1e-9)), first), last - 1)
+        w = min(max(at - j, 0.0), 1.0)
+        if w < 1e-6 or j == last - 1:
+            a, b = n_dem[j], n_r[j]
+        else:
+            a = n_dem[j] + w * (n_dem[j + 1] - n_dem[j])
+            b = n_r[j] + w * (n_r[j + 1] - n_r[j])
+        if i == first:
+            z.trend_n = a
+            z.trend_turn = a
+            z.trend_last = a
+            z.n_r = b
+        z.n_dem = a
+        z.n_r += (b - z.n_r) * SLOW_TICK / (k.speed_filter + SLOW_TICK)
+        trend_step(z, k, a)
+        schedule_step(z, k, table)
+        if i == first:
+            z.x_dem = z.x_target
+        move_demand(z, k, z.x_target, k.stroke_rate)
+        out[i] = z.x_dem
+
+
+@compiled
+def _directions(n_dem: np.ndarray, k: Record, z: Record, out: np.ndarray) -> None:
+    """Direction of the demand's trend at each row, from the trend's state ``z``."""
+    for i in range(len(n_dem)):
+        trend_step(z, k, n_dem[i])
+        out[i] = z.direction
+
+
+def _direction_known(n_dem: Array, cal: Calibration) -> Array:
+    """Rows at which the trend's direction does not turn on what the demand did before the first of them.
+
+    How far the demand had already come back then is not known: nothing, or nearly all that turns the direction. Where
+    the two lead to different directions, from either, the row does not count, nor those in which the curves blend.
+    """
+    known = np.ones(len(n_dem), dtype=bool)
+    for direction in (1.0, -1.0):
+        out = np.empty((2, len(n_dem)))
+        for back, row in zip((0.0, 0.999 * cal.scalars.trend_change), out, strict=True):
+            z = as_state(new_state())
+            z.trend_n = z.trend_last = n_dem[0]
+            z.trend_turn, z.direction = n_dem[0] + direction * back, direction
+            _directions(n_dem, cal.scalars, z, row)
+        known &= out[0] == out[1]
+    return known & ~lately(~known, cal.scalars.blend_time + 0.1)
+
+
+def demand_stage(
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
+) -> Stage:
+    """Stroke demand from logged speeds, by the firmware as it is flashed."""
+    _, effects, _, _ = declared("demand", machine, present)
+    n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
+    pieces = pieces_of(c["spell"])
+    run = (
+        run
+        & np.concatenate([_direction_known(n_dem[piece], cal) for piece in pieces])
+        & ~lately(c["missing"] > 0.0, 0.4)
+    )
+    measured = np.where(run, c["x_dem"], np.nan)
+    at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
+
+    def value(theta: Array, name: str, neutral: float) -> float:
+        return float(theta[at[name]]) if name in at else neutral
+
+    def simulate(thetas: Array) -> Array:
+        out = np.empty((len(thetas), 1, len(t)))
+        other = np.empty(len(t))
+        for i, theta in enumerate(thetas):
+            k, table = as_scalars(cal.k.copy()), cal.table.copy()
+            factor = value(theta, "trend_threshold_error", 1.0)
+            k.trend_rate_on *= factor
+            k.trend_change *= factor
+            offset = value(theta, "schedule_error", 0.0)
+            table[1:] += offset * 1e-3
+            hold = value(theta, "frame_hold", float(machine.p[ROW["frame_hold"], 0]))
+            phase = float(theta[at["frame_hold"] + 1]) * hold if hold > 0.0 and "frame_hold" in at else 0.0
+            delay = value(theta, "can_delay", float(machine.p[ROW["can_delay"], 0]))
+            for piece in pieces:
+                first, last = piece.start, piece.stop
+                curves = [
+                    float(np.interp(n_r[first], table[0], table[row])) * 1e3 for row in (ROW_EXTENSION, ROW_RETRACTION)
+                ]
+                rising = abs(curves[0] - c["x_dem"][first]) <= abs(curves[1] - c["x_dem"][first])
+                # at the start of a log the demand stands on a curve; later both directions are tried
+                for x, up in ((out[i, 0], rising), (other, not rising)) if first else ((out[i, 0], rising),):
+                    z = as_state(new_state())
+                    z.demand_seen = 1.0
+                    z.direction, z.blend = (1.0, 1.0) if up else (-1.0, 0.0)
+                    _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, x)
+                if first:
+                    one, two = (np.nansum((x[piece] * 1e3 - measured[piece]) ** 2) for x in (out[i, 0], other))
+                    if two < one:
+                        out[i, 0, piece] = other[piece]
+        return out * 1e3
+
+    # the hold's clock is not the log's: where it stands is a nuisance that is fitted with it
+    held = []
+    for e in effects:
+        if e.name == "frame_hold":
+            phase = Parameter("phase", 0.0, "-", 0.0, 1.0, shape=True, period=1.0)
+            starts = tuple((s[0], k * RASTER / s[0]) for s in e.starts for k in range(max(1, round(s[0] / RASTER))))
+            e = Effect(e.name, (*e.parameters, phase), starts, e.excites)
+        held.append(e)
+    effects = tuple(held)
+    at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
+    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, measured[None])

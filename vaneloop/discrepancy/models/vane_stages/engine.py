@@ -1,0 +1,55 @@
+"""Stage `engine`: rotor speed from its demand, run freely."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller import Calibration
+from plant import Plant, chain, places
+from plant.stages import engine_run
+from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.raster import RASTER, pieces_of
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = ["engine_stage"]
+
+
+def engine_stage(
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
+) -> Stage:
+    """Rotor speed from its demand; the speed at the start of each stretch is what suits its first second."""
+    parameters, effects, rows, si = declared("engine", machine, present)
+    dt = float(t[1] - t[0])
+    n_dem = np.ascontiguousarray(c["n_dem"])
+    inner = 1
+    if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
+        inner = int(round(dt / RASTER))
+        n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+    pieces = pieces_of(c["stretch"])
+    second = max(1, int(round(1.0 / dt)))
+
+    def simulate(thetas: Array) -> Array:
+        p = lanes(machine, thetas, rows, si)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        out = np.empty((len(n_dem), len(thetas)))
+        for piece in pieces:
+            head = min(piece.start + second, piece.stop)
+            start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
+            # at its rate limit the engine never forgets how it began: the speed at the start is what suits the first
+            # second
+            for stop in (head, piece.stop):
+                inside = slice(piece.start * inner, stop * inner)
+                s[places.N_R] = start
+                engine_run(n_dem[inside], dt / inner, p, s, out[inside])
+                start = start + np.mean(
+                    c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
+                )
+        return out[::inner].T[:, None, :]
+
+    return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])

@@ -1,0 +1,105 @@
+"""Stage `linkage`: the vane angles from the stroke, jointly, run freely; the play is a state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+
+from controller import Calibration
+from plant import Plant
+from plant.linkage import STAGES
+from plant.parameters import derive
+from plant.stages import linkage_run
+from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
+from vaneloop.discrepancy.models.vane_stages.twins import like_temperature, like_time
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = ["linkage_stage"]
+
+
+def linkage_stage(
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
+) -> Stage:
+    """Vane angles that the log has, from the stroke."""
+    parameters, effects, rows, si = declared("linkage", machine, present)
+    dt = float(t[1] - t[0])
+    x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    t_oil = np.ascontiguousarray(c["t_oil"])
+    which = [STAGES.index(o) for o in outputs]
+    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in STAGES]
+
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
+        p = lanes(machine, thetas, rows, si)
+        derive(p, dt, dt)
+        start = machine.start(stroke=x[0], n_r=n_r[0])
+        machine.place_rings(start, tuple(first))
+        s = np.repeat(start, len(thetas), axis=1)
+        out = np.empty((len(t), 3, len(thetas)))
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out)
+        return np.rad2deg(out[:, which].transpose(2, 1, 0))
+
+    # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
+    # left at full speed by a controller that had to catch up, which turns between two rows
+    first_spell, settled = c["machine_spell"] == c["machine_spell"][0], since(t, c["machine_spell"]) >= SETTLE
+    known = np.zeros(len(t), dtype=bool)
+    for piece in pieces_of(c["machine_spell"]):
+        counts = np.flatnonzero((first_spell | settled)[piece]) + piece.start
+        known[counts] = _crossed(c["x_lvdt"][counts])
+    if known.any():
+        run = run & known
+    measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
+    both = partial(_on_two_cores, simulate, least=32)  # a block of lanes
+    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, both, t, measured)
+    ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)
+    stage.twins = {
+        "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
+        **{
+            name: ("time", lambda thetas: simulate(thetas, t_oil=ageing))
+            for name in ("thermal_growth", "lvdt_thermal_drift")
+        },
+    }
+
+    def excerpt(at: Array) -> Stage:
+        keep = run[at]
+        for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
+            keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
+        part = linkage_stage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
+        part.floor, part.quiet, part.noise, part.raster_error = (
+            stage.floor,
+            stage.quiet,
+            stage.noise,
+            stage.raster_error,
+        )
+        return part
+
+    stage.excerpt = excerpt
+    return stage
+
+
+def _crossed(x: Array) -> Array:
+    """Samples from which on the stroke x (mm) has crossed any ring's play: where in it the ring began is forgotten."""
+    return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
+
+
+def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int) -> Array:
+    """simulate(thetas), half of it in a second thread where there are more than ``least`` sets: compiled code needs no
+    interpreter.
+    """
+    if len(thetas) <= least:
+        return simulate(thetas)
+    half = -(-len(thetas) // 2 // least) * least
+    with ThreadPoolExecutor(1) as other:
+        second = other.submit(simulate, thetas[half:])
+        first = simulate(thetas[:half])
+        return np.concatenate([first, second.result()])

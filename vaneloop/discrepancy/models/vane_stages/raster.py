@@ -1,0 +1,182 @@
+"""A log of the vanes on one raster: 10 ms, the ECU frame's period, or the log's own where that is slower; which rows
+count; and the conditions under which a stage may fail.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+
+from hil.logs import Channel, Log, LogError
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = [
+    "RASTER",
+    "SETTLE",
+    "SUBSTEPS",
+    "WINDOW",
+    "every_other",
+    "lately",
+    "no_gap_in_window",
+    "on_raster",
+    "pieces_of",
+    "regimes_of",
+    "rms",
+    "since",
+    "stretches",
+]
+
+RASTER = 1e-2  # s
+WINDOW = 1.0  # s
+SUBSTEPS = 5  # of the actuator between two samples of 10 ms
+SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
+
+
+def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
+    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
+    its own; notes.
+    """
+    channels = log.channels
+    steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
+    if not steps:
+        raise LogError(f"{log.path}: no channel has more than 10 samples")
+    dt = max(RASTER, round(float(np.median(steps)) / RASTER) * RASTER)
+    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
+    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    start += _to_frame(channels, start, dt)
+    reference = max((c for c in channels.values()), key=lambda c: len(c.t))
+    own = float(np.median(np.diff(reference.t)))
+    phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
+    t = np.arange(max(1, int((end - start) / dt + 1e-6) + 1)) * dt
+    fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
+    columns = {}
+    for name, c in channels.items():
+        if len(c.t) < 2:
+            columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
+            continue
+        when = t + start + phase
+        step = float(np.median(np.diff(c.t)))
+        uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
+        if name == "i_cmd" and step < 0.6 * dt:
+            total = np.concatenate([[0.0], np.cumsum(c.values)])
+            edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
+            count = np.maximum(np.diff(edge), 1)
+            columns[name] = np.diff(total[edge]) / count
+        elif (
+            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state") or _held(c, dt)
+        ):
+            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
+            # hold their value
+            i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
+            columns[name] = c.values[i]
+        else:
+            columns[name] = np.interp(when, c.t, c.values)
+        i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
+        away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
+        fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
+        missing |= away > 0.75 * max(step, dt)
+    return t, columns, fresh, missing, list(log.notes)
+
+
+def _held(c: Channel, dt: float) -> bool:
+    """Whether the channel is logged faster than the raster and yet holds its value for rows: it came in frames."""
+    step = float(np.median(np.diff(c.t))) if len(c.t) > 1 else np.inf
+    return bool(step < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t))
+
+
+def _to_frame(channels: Mapping[str, Channel], start: float, dt: float) -> float:
+    """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames
+    show it; else 0.
+    """
+    for name in ("x_dem", "n_dem"):
+        if name in channels and _held(channels[name], dt):
+            c = channels[name]
+            turn = np.exp(2j * np.pi * (c.t[1:][np.diff(c.values) != 0.0] - start) / dt)
+            if len(turn) > 20 and abs(turn.mean()) > 0.5:
+                return float(np.angle(turn.mean()) / (2.0 * np.pi) % 1.0 * dt)
+    return 0.0
+
+
+def every_other(columns: dict[str, Array]) -> dict[str, Array]:
+    """Every other row; of the current, which is a mean since the row before, the mean of two."""
+    out = {k: v[::2] for k, v in columns.items()}
+    if "i_cmd" in columns:
+        i = columns["i_cmd"]
+        out["i_cmd"] = np.concatenate([i[:1], 0.5 * (i[1:-1:2] + i[2::2])])
+    return out
+
+
+def rms(stage: Stage, difference: Array) -> Array:
+    """RMS of a difference of outputs where the stage counts them, its windows' constants free: float64[outputs]."""
+    e = np.where(np.isfinite(stage.measured), difference, np.nan)
+    if stage.window:
+        w = int(round(stage.window / (stage.t[1] - stage.t[0])))
+        e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
+        e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
+    return np.asarray(np.sqrt(np.nansum(e**2, axis=1) / np.maximum(np.isfinite(e).sum(axis=1), 1)))
+
+
+def stretches(good: Array) -> Array:
+    """Number of the stretch of good rows that each row belongs to, from 0; a row that is not good belongs to the
+    stretch before it.
+    """
+    begins = good & ~np.concatenate([[False], good[:-1]])
+    begins[0] = False
+    return np.cumsum(begins)
+
+
+def since(t: Array, stretch: Array) -> Array:
+    """Time since the first row of each row's stretch, s."""
+    return np.asarray(t - t[np.searchsorted(stretch, stretch)])
+
+
+def pieces_of(stretch: Array) -> list[slice]:
+    """Rows of each stretch."""
+    edges = [0, *(np.flatnonzero(np.diff(stretch)) + 1).tolist(), len(stretch)]
+    return [slice(a, b) for a, b in itertools.pairwise(edges)]
+
+
+def no_gap_in_window(t: Array, fresh: Array) -> Array:
+    """Rows of windows that have only good rows."""
+    w = (t / WINDOW).astype(int)
+    bad = np.unique(w[~fresh])
+    return ~np.isin(w, bad)
+
+
+def lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
+    """Whether any of these rows, ``dt`` (s) apart, was less than some seconds ago."""
+    n = np.arange(len(rows))
+    return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -len(rows))) < seconds / dt)
+
+
+def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Conditions under which a stage may fail."""
+    out: dict[str, Array] = {"time": t}
+    units = {"time": "s"}
+    dt = t[1] - t[0]
+    if "x_lvdt" in columns:
+        x = columns["x_lvdt"]
+        k = max(3, int(round(0.1 / dt)))
+        smooth = np.convolve(np.pad(x, k, mode="edge"), np.ones(2 * k + 1) / (2 * k + 1), mode="valid")
+        v = np.gradient(smooth, dt)
+        out |= {"stroke": x, "stroke speed": v, "direction": np.sign(np.where(np.abs(v) > 0.2, v, 0.0))}
+        units |= {"stroke": "mm", "stroke speed": "mm/s", "direction": ""}
+        turns = np.zeros(len(t))
+        last, sign = smooth[0], 0.0
+        for i in range(1, len(t)):
+            if abs(v[i]) > 0.2 and np.sign(v[i]) != sign:
+                sign, last = float(np.sign(v[i])), smooth[i]
+            turns[i] = abs(smooth[i] - last)
+        out["distance since reversal"], units["distance since reversal"] = turns, "mm"
+    for name, label, unit in (
+        ("n_r", "rotor speed", "%"),
+        ("t_oil", "oil temperature", "degC"),
+        ("p_s", "supply pressure", "MPa"),
+    ):
+        if name in columns:
+            out[label], units[label] = columns[name], unit
+    if "i_cmd" in columns:
+        out["current"], units["current"] = columns["i_cmd"], "mA"
+    return out, units

@@ -1,0 +1,53 @@
+"""Stage `servo`: the firmware's current from logged demand and stroke, in windows with the integral free."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller import Calibration
+from hil.figures import noise_floor
+from plant import Plant
+from vaneloop.discrepancy.models.vane_stages.declared import declared
+from vaneloop.discrepancy.models.vane_stages.raster import WINDOW, no_gap_in_window, rms
+from vaneloop.discrepancy.stage import Array, Stage
+
+__all__ = ["servo_stage"]
+
+
+def servo_stage(
+    t: Array,
+    c: dict[str, Array],
+    machine: Plant,
+    cal: Calibration,
+    outputs: tuple[str, ...],
+    run: Array,
+    present: tuple[str, ...],
+) -> Stage:
+    """Current from logged demand and stroke, by the firmware's law."""
+    parameters, effects, _, _ = declared("servo", machine, present)
+    mean, hidden = c["law"].mean(axis=1), c["law_error"]
+
+    def simulate(thetas: Array) -> Array:
+        factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
+        i = factor * mean[None]
+        return i[:, None, :]
+
+    # at the limit the integral stands still: its constant is another one before and after
+    at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.scalars.current_limit, np.ones(5), "same") > 0.5
+    near = no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
+    stage = Stage(
+        "servo",
+        outputs,
+        ("mA",),
+        parameters,
+        effects,
+        simulate,
+        t,
+        np.where(run & near, c["i_cmd"], np.nan)[None],
+        window=WINDOW,
+    )
+    # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
+    seen = min(noise_floor(t, hidden), noise_floor(t, stage.measured[0] - mean))
+    stage.raster_error = np.sqrt(np.maximum(rms(stage, hidden) ** 2 - seen**2, 0.0))
+    stage.lost = hidden[None]
+    return stage
