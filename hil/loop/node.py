@@ -150,7 +150,9 @@ def node_tick(
     m = 0
     if k % SLOW == 0:
         c = a.counter
-        m = _put(sent, m, VGV_STATUS, encode_status(out.x_dem * 1e3, fed.x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS)))
+        m = _put(
+            sent, m, VGV_STATUS, encode_status(out.x_dem * 1e3, fed.x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS))
+        )
         m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(out.faults), _next(c, C_SERVO)))
         vigv, vgv1, vgv2 = loop.angles[0] * DEGREES, loop.angles[1] * DEGREES, loop.angles[2] * DEGREES
         m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
