@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -107,7 +107,8 @@ LINKAGE_BLOCKS = (
 )  # fmt: skip
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
-# Each block makes its scratch array (so compiled_free, not in_place), of constant width: the compiler sees the strides.
+# A block's memory comes from the caller, who keeps it: a record that compiled code takes out of an array of its own
+# does not keep that array alive. Its width is constant, so that the compiler sees the strides.
 
 
 def engine_run(n_dem: np.ndarray, dt: float, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
@@ -172,14 +173,16 @@ def actuator_run(
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
     order = np.lexsort((p[VALVE_HYSTERESIS] != 0.0, p[PISTON_STICTION] != 0.0, lossy, p[DRIVE_LOADED] != 0.0, alone))
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
-    work: list[tuple[Callable[..., None], np.ndarray]] = [
-        (_actuator_blocks, order[j : min(j + W, wide)]) for j in range(0, wide, W)
-    ]
+    work = [range(j, min(j + W, wide)) for j in range(0, wide, W)]
     if wide < p.shape[1]:
-        work.append((_actuator_lanes, order[wide:]))
+        work.append(range(wide, p.shape[1]))
 
-    def run(part: Any) -> None:
-        part[0](current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, part[1])
+    def run(part: range) -> None:
+        some = order[part.start : part.stop]
+        if part.start < wide:
+            _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, np.empty(1, _ACTUATOR))
+        else:
+            _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some)
 
     if len(work) == 1:
         run(work[0])
@@ -218,7 +221,7 @@ def linkage_run(
     order = np.argsort(alone, kind="stable")
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     if wide:
-        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide])
+        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _LINKAGE))
     if wide < p.shape[1]:
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
 
@@ -412,12 +415,12 @@ def _actuator_blocks(
     x_lvdt: np.ndarray,
     window: int,
     order: np.ndarray,
+    block: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, eight at a time; out[lane, k]."""
+    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `_ACTUATOR`."""
     n, substeps = current.shape
     h = dt / substeps
-    memory_of_block = np.empty(1, _ACTUATOR)
-    b = memory_of_block[0]
+    b = block[0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
         loaded = lossy = sticky = memory = viscous = sensed = curved = False
@@ -595,11 +598,11 @@ def _linkage_blocks(
     s: np.ndarray,
     out: np.ndarray,
     order: np.ndarray,
+    block: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, `WIDE` at a time."""
+    """The lanes of ``order``, `WIDE` at a time. ``block``: memory for one record `_LINKAGE`."""
     g = GEOMETRY
-    memory_of_block = np.empty(1, _LINKAGE)
-    b = memory_of_block[0]
+    b = block[0]
     for j0 in range(0, len(order), WIDE):
         last = min(WIDE, len(order) - j0)
         rubbed = eccentric = False

@@ -314,6 +314,59 @@ def test_no_file_names_a_place_on_one_machine() -> None:
     assert not found, "\n" + "\n".join(found)
 
 
+def records_of_own_arrays(source: str) -> list[str]:
+    """Compiled functions that make an array of records, or show as a record one that they made.
+
+    numba frees an array when its name is used no more, also while a record taken out of it is still in use.
+    """
+    views = {"as_inputs", "as_outputs", "as_scalars", "as_state"}
+    makers = {"empty", "zeros", "ones", "full", "copy", "empty_like", "zeros_like"}
+    found = []
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        if not any("compiled" in ast.unparse(d) or "njit" in ast.unparse(d) for d in function.decorator_list):
+            continue
+        calls = [c for c in ast.walk(function) if isinstance(c, ast.Call)]
+        made = [c for c in calls if isinstance(c.func, ast.Attribute) and c.func.attr in makers]
+        own = {
+            ast.unparse(name)
+            for a in ast.walk(function)
+            if isinstance(a, ast.Assign) and a.value in made
+            for name in a.targets
+        }
+        of_records = [c for c in made for d in [*c.args[1:], *(k.value for k in c.keywords)] if isinstance(d, ast.Name)]
+        shown = [
+            c
+            for c in calls
+            if isinstance(c.func, ast.Name) and c.func.id in views
+            if c.args[0] in made or ast.unparse(c.args[0]) in own
+        ]
+        found += [f"{function.name}: {ast.unparse(c)}" for c in [*of_records, *shown]]
+    return found
+
+
+def test_no_record_outlives_the_array_it_stands_in() -> None:
+    files = [f for top in PACKAGES for f in python_files(top)]
+    found = [f"{f.relative_to(ROOT)} {c}" for f in files for c in records_of_own_arrays(f.read_text())]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("body", "caught"),
+    [
+        ("m = np.empty(1, LAYOUT)\n    b = m[0]", True),
+        ("m = np.zeros(1, dtype=LAYOUT)", True),
+        ("z = as_state(np.zeros(40))", True),
+        ("z0 = z1.copy()\n    z = as_state(z0)", True),
+        ("m = np.empty(4, np.int64)\n    z = as_state(row)", False),
+    ],
+)
+def test_a_record_of_an_own_array_is_caught(body: str, caught: bool) -> None:
+    assert bool(records_of_own_arrays(f"@compiled_free\ndef f(row, z1):\n    {body}\n")) == caught
+    assert not records_of_own_arrays(f"def f(row, z1):\n    {body}\n")
+
+
 def test_no_tracked_file_is_larger_than_a_mebibyte() -> None:
     large = [
         f"{f.relative_to(ROOT)}: {f.stat().st_size / 2**20:.2f} MiB"
