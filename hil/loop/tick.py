@@ -12,11 +12,6 @@ while the loop runs acts from the next tick on; `plant.parameters.derive` must f
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
-
 import math
 from typing import NamedTuple
 

@@ -31,6 +31,7 @@ from plant.linkage import STAGES
 from vaneloop.discrepancy.models.vane_stages.actuator import actuator_stage
 from vaneloop.discrepancy.models.vane_stages.current import SAMPLED, between_rows, other_current, servo_law
 from vaneloop.discrepancy.models.vane_stages.demand import demand_stage
+from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.engine import engine_stage
 from vaneloop.discrepancy.models.vane_stages.linkage import linkage_stage
 from vaneloop.discrepancy.models.vane_stages.raster import (
@@ -149,7 +150,7 @@ def build_chain(
             )
         have["stroke"] = smooth.stroke
     regimes, units = regimes_of(t, columns)
-    makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Stage]]] = {
+    makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
         "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
         "engine": (("n_dem",), ("n_r",), engine_stage),
@@ -168,7 +169,8 @@ def build_chain(
             absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
             continue
         rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
-        stage = make(t, have, machine, cal, outputs, rows, present)
+        driven = Driven(t, have, machine, cal, outputs, rows, present)
+        stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
@@ -176,7 +178,7 @@ def build_chain(
         if dt > 1.5 * RASTER:
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
             # besides
-            coarse = make(t[::2], every_other(have), machine, cal, outputs, rows[::2], present)
+            coarse = make(driven._replace(t=t[::2], columns=every_other(have), run=rows[::2]))
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]

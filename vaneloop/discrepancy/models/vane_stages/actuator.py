@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller import Calibration
-from plant import Plant, chain, places
+from plant import chain, places
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
 from vaneloop.discrepancy.models.vane_stages.twins import like_time
 from vaneloop.discrepancy.stage import Array, Stage
@@ -21,16 +21,9 @@ NEAR_STOP = 0.3  # mm, where a piston rests on its stop
 QUASI_STATIC = 4e-4
 
 
-def actuator_stage(
-    t: Array,
-    c: dict[str, Array],
-    machine: Plant,
-    cal: Calibration,
-    outputs: tuple[str, ...],
-    run: Array,
-    present: tuple[str, ...],
-) -> Stage:
+def actuator_stage(driven: Driven) -> Stage:
     """Stroke from the current of every tick, started anew in each window."""
+    t, c, machine, _, outputs, run, present = driven
     parameters, effects, rows, si = declared("actuator", machine, present)
     dt = float(t[1] - t[0])
     # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
@@ -73,19 +66,11 @@ def actuator_stage(
         stage.hidden = hidden
         stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
 
-    def excerpt(at: Array) -> Stage:
-        begins = np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1)
+    def kept(at: Array) -> Array:
         keep = run[at]
-        for b in begins:  # the spool and the lags come from another time
+        for b in np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1):  # the spool and the lags come from another time
             keep[b : b + window] = False
-        part = actuator_stage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.quiet, part.noise, part.raster_error = (
-            stage.floor,
-            stage.quiet,
-            stage.noise,
-            stage.raster_error,
-        )
-        return part
+        return keep
 
-    stage.excerpt = excerpt
+    stage.excerpt = excerpts(actuator_stage, driven, stage, kept)
     return stage

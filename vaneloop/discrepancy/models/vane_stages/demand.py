@@ -8,10 +8,10 @@ from controller import Calibration, new_state
 from controller.records import SLOW_TICK, Record, as_scalars, as_state
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
-from plant import Plant
 from plant.effects import ROW
 from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.models.vane_stages.declared import declared
+from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, lately, pieces_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
 
@@ -90,16 +90,9 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     return known & ~lately(~known, cal.scalars.blend_time + 0.1)
 
 
-def demand_stage(
-    t: Array,
-    c: dict[str, Array],
-    machine: Plant,
-    cal: Calibration,
-    outputs: tuple[str, ...],
-    run: Array,
-    present: tuple[str, ...],
-) -> Stage:
+def demand_stage(driven: Driven) -> Stage:
     """Stroke demand from logged speeds, by the firmware as it is flashed."""
+    t, c, machine, cal, outputs, run, present = driven
     _, effects, _, _ = declared("demand", machine, present)
     n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
     pieces = pieces_of(c["spell"])

@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller import Calibration
-from plant import Plant, chain, places
+from plant import chain, places
 from plant.stages import engine_run
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, pieces_of
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = ["engine_stage"]
 
 
-def engine_stage(
-    t: Array,
-    c: dict[str, Array],
-    machine: Plant,
-    cal: Calibration,
-    outputs: tuple[str, ...],
-    run: Array,
-    present: tuple[str, ...],
-) -> Stage:
+def engine_stage(driven: Driven) -> Stage:
     """Rotor speed from its demand; the speed at the start of each stretch is what suits its first second."""
+    t, c, machine, _, outputs, run, present = driven
     parameters, effects, rows, si = declared("engine", machine, present)
     dt = float(t[1] - t[0])
     n_dem = np.ascontiguousarray(c["n_dem"])

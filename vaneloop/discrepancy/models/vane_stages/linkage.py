@@ -8,12 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from controller import Calibration
-from plant import Plant
 from plant.linkage import STAGES
 from plant.parameters import derive
 from plant.stages import linkage_run
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
 from vaneloop.discrepancy.models.vane_stages.twins import like_temperature, like_time
 from vaneloop.discrepancy.stage import Array, Stage
@@ -21,16 +20,9 @@ from vaneloop.discrepancy.stage import Array, Stage
 __all__ = ["linkage_stage"]
 
 
-def linkage_stage(
-    t: Array,
-    c: dict[str, Array],
-    machine: Plant,
-    cal: Calibration,
-    outputs: tuple[str, ...],
-    run: Array,
-    present: tuple[str, ...],
-) -> Stage:
+def linkage_stage(driven: Driven) -> Stage:
     """Vane angles that the log has, from the stroke."""
+    t, c, machine, _, outputs, run, present = driven
     parameters, effects, rows, si = declared("linkage", machine, present)
     dt = float(t[1] - t[0])
     x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
@@ -70,20 +62,13 @@ def linkage_stage(
         },
     }
 
-    def excerpt(at: Array) -> Stage:
+    def kept(at: Array) -> Array:
         keep = run[at]
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
-        part = linkage_stage(t[at], {k: v[at] for k, v in c.items()}, machine, cal, outputs, keep, present)
-        part.floor, part.quiet, part.noise, part.raster_error = (
-            stage.floor,
-            stage.quiet,
-            stage.noise,
-            stage.raster_error,
-        )
-        return part
+        return keep
 
-    stage.excerpt = excerpt
+    stage.excerpt = excerpts(linkage_stage, driven, stage, kept)
     return stage
 
 

@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller import Calibration
 from hil.figures import noise_floor
-from plant import Plant
 from vaneloop.discrepancy.models.vane_stages.declared import declared
+from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.raster import WINDOW, no_gap_in_window, rms
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = ["servo_stage"]
 
 
-def servo_stage(
-    t: Array,
-    c: dict[str, Array],
-    machine: Plant,
-    cal: Calibration,
-    outputs: tuple[str, ...],
-    run: Array,
-    present: tuple[str, ...],
-) -> Stage:
+def servo_stage(driven: Driven) -> Stage:
     """Current from logged demand and stroke, by the firmware's law."""
+    t, c, machine, cal, outputs, run, present = driven
     parameters, effects, _, _ = declared("servo", machine, present)
     mean, hidden = c["law"].mean(axis=1), c["law_error"]
 
