@@ -19,8 +19,9 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from vaneloop.discrepancy import fit as fitting
-from vaneloop.discrepancy.diagnose import Search, diagnose_stage
+from vaneloop.discrepancy.diagnose import diagnose_stage
 from vaneloop.discrepancy.fit import DIFFERENCE, Fit, Judge
+from vaneloop.discrepancy.search import Search
 from vaneloop.discrepancy.stage import Stage
 
 __all__ = ["in_scipy", "ours"]

@@ -13,9 +13,11 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.discrepancy.diagnose import Search, StageDiagnosis
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.discrepancy.noise_floor import NoiseFloor
+from vaneloop.discrepancy.search import Search
+from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import diagnose
 
 
@@ -56,7 +58,7 @@ def test_a_sharp_limit_is_found_wherever_it_lies_below_the_speeds_of_the_log() -
         theta[stage.index()["valve_flow_saturation"]] = limit, 0.0
         limited = stage.run(theta[None])[0] + noise
         judge = Judge(replace(stage, measured=np.where(np.isfinite(stage.measured), limited, np.nan)), stage.floor)
-        fit = Search(judge).single("valve_flow_saturation")
+        fit = Search(NoiseFloor(judge)).single("valve_flow_saturation")
         assert fit.theta[stage.index()["valve_flow_saturation"]][0] == pytest.approx(limit, rel=0.01), limit
 
 

@@ -13,11 +13,12 @@ import pytest
 
 from vaneloop.base.terminal import plain
 from vaneloop.discrepancy import Effect, Parameter, Stage, StageError
-from vaneloop.discrepancy.diagnose import Found, StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import locate, onset, regimes, shape
 from vaneloop.discrepancy.stage import noise_of, reach_of
-from vaneloop.discrepancy.workflow import compare_stages, diagnose, diagnosis_json, extend_stage, locate_stages
+from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
+from vaneloop.discrepancy.workflow import compare_stages, diagnose, diagnosis_json, locate_stages
 
 DT = 0.01  # s
 N = 10_000  # samples: 100 s

@@ -13,9 +13,11 @@ import pytest
 from tests.test_discrepancy import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
 from tests.test_search_limits import SIDES, verdict
 from vaneloop.discrepancy import Effect, Parameter, Stage
-from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage, with_rivals
+from vaneloop.discrepancy.diagnose import diagnose_stage
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import shape
+from vaneloop.discrepancy.noise_floor import with_rivals
+from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
 SMALL = Effect(

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from vaneloop.cli import extend
-from vaneloop.discrepancy.diagnose import Search
+from vaneloop.discrepancy.diagnose import extend_stage
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.vanes import Chain
+from vaneloop.discrepancy.noise_floor import NoiseFloor
+from vaneloop.discrepancy.search import Search
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
-from vaneloop.discrepancy.workflow import extend_stage, no_better
+from vaneloop.discrepancy.workflow import no_better
 from vaneloop.verbs import search as verbs
 
 N = 1200
@@ -55,7 +57,7 @@ def rough_stage(seed: int) -> Stage:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_no_fit_is_worse_than_one_it_contains(seed):
-    search = Search(Judge(rough_stage(seed), np.array([0.1])))
+    search = Search(NoiseFloor(Judge(rough_stage(seed), np.array([0.1]))))
     total = search.judge.total_of
     names = [e.name for e in search.stage.effects]
     if search.quiet:

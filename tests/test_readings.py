@@ -12,9 +12,10 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.diagnose import diagnose_stage
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.discrepancy.stage_answer import StageDiagnosis
 
 
 def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
@@ -118,8 +119,8 @@ def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> 
 
 def test_many_effects_that_leave_much_are_an_imitation() -> None:
     """Three effects that bring an error from 6 to 2 floors: enough of it for one effect, not for three."""
-    from vaneloop.discrepancy import diagnose as search
     from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.noise_floor import NoiseFloor
 
     stage = chain_of(recorded([], 37, 100, 60.0)).stage("engine")
     assert stage.floor is not None
@@ -128,6 +129,6 @@ def test_many_effects_that_leave_much_are_an_imitation() -> None:
     before, after = (replace(base, held_out=base.held_out * r**2 / (base.held_out.sum() / judge.n)) for r in (6.0, 2.0))
 
     def verdict(*effects: str) -> str:
-        return search._conclude(judge, before, replace(after, effects=effects), [], [], 1.0, []).verdict
+        return NoiseFloor(judge).conclude(before, replace(after, effects=effects), [], [], []).verdict
 
     assert verdict("a") == "missing" and verdict("a", "b", "c") == "unknown"

@@ -6,7 +6,8 @@ import pytest
 
 from tests.rig import Hidden
 from tests.test_readings import chain_of, recorded
-from vaneloop.discrepancy.diagnose import StageDiagnosis, diagnose_stage
+from vaneloop.discrepancy.diagnose import diagnose_stage
+from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import diagnose
 
 

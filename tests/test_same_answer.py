@@ -19,9 +19,9 @@ from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import locate as core
-from vaneloop.discrepancy.diagnose import diagnose_stage
+from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.workflow import compare_stages, extend_stage, locate_stages
+from vaneloop.discrepancy.workflow import compare_stages, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
 SENSOR = {

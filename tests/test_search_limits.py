@@ -18,8 +18,10 @@ import pytest
 from scipy.stats import norm
 
 from tests.conftest import ROOT
-from vaneloop.discrepancy import diagnose, fit, locate, workflow
+from vaneloop.discrepancy import diagnose, fit, locate, noise_floor, stage_answer, workflow
 from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.noise_floor import NoiseFloor
+from vaneloop.discrepancy.search import Search
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 
 DOCUMENTED = {
@@ -39,7 +41,7 @@ def test_the_page_documents_the_numbers_that_are_in_force():
             found.setdefault(name, set()).add(float(value))
     for name, value in DOCUMENTED.items():
         assert found[name] == {value}, name
-        assert getattr(diagnose, name) == value, name
+        assert getattr(noise_floor, name) == value, name
 
 
 # ---- made-up errors --------------------------------------------------------------------------------------------------
@@ -72,14 +74,14 @@ def rms_after(judge: Any, nats: float) -> float:
 def test_an_effect_must_gain_twelve_nats(times: float, beyond: bool) -> None:
     judge = judge_of(4, 2)  # so few samples that the nats decide
     before = fit_of(rms_after(judge, 12.0 * times), judge)
-    assert diagnose.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
+    assert noise_floor.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
 
 
 @SIDES
 def test_an_effect_must_lower_the_error_by_three_spreads(times: float, beyond: bool) -> None:
     judge = judge_of(20, 100)
     before = fit_of(1.0 + 3.0 * times / np.sqrt(2.0 * judge.n), judge)
-    assert diagnose.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
+    assert noise_floor.significant(judge, before, fit_of(1.0, judge, ("a",)), 1.0) == beyond
 
 
 @SIDES
@@ -87,14 +89,14 @@ def test_an_effect_that_acts_rarely_must_lower_its_two_blocks_by_eight_spreads(t
     judge = judge_of(400, 100)
     errors = np.ones(400)
     errors[[7, 300]] += 8.0 * times / np.sqrt(200.0)
-    assert diagnose.significant(judge, fit_of(errors, judge), fit_of(1.0, judge, ("a",)), 1.0) == beyond
+    assert noise_floor.significant(judge, fit_of(errors, judge), fit_of(1.0, judge, ("a",)), 1.0) == beyond
 
 
 @SIDES
 def test_an_effect_must_explain_a_seventh_of_the_excess(times: float, beyond: bool) -> None:
     judge = judge_of(20, 10_000)
     after = fit_of(np.sqrt(1.0 + 2.0 * (1.0 - 0.15 * times)), judge, ("a",))
-    assert diagnose.significant(judge, fit_of(np.sqrt(3.0), judge), after, 1.0) == beyond
+    assert noise_floor.significant(judge, fit_of(np.sqrt(3.0), judge), after, 1.0) == beyond
 
 
 # ---- is anything missing? --------------------------------------------------------------------------------------------
@@ -106,7 +108,7 @@ def test_a_search_begins_one_per_cent_or_three_spreads_above_the_floor(
     blocks: int, each: int, edge: float, times: float, beyond: bool
 ) -> None:
     judge = judge_of(blocks, each)
-    assert diagnose._above_floor(judge, fit_of(1.0 + edge * times, judge), 1.0) == beyond
+    assert noise_floor._above_floor(judge, fit_of(1.0 + edge * times, judge), 1.0) == beyond
 
 
 @SIDES
@@ -114,17 +116,17 @@ def test_a_search_begins_where_one_block_stands_eight_spreads_above_the_floor(ti
     judge = judge_of(2000, 100)
     errors = np.ones(2000)
     errors[3] += 0.01 + 8.0 * times / np.sqrt(200.0)
-    assert diagnose._above_floor(judge, fit_of(errors, judge), 1.0) == beyond
+    assert noise_floor._above_floor(judge, fit_of(errors, judge), 1.0) == beyond
 
 
 def verdict(monkeypatch: pytest.MonkeyPatch, before: float, after: float, effects: tuple[str, ...]) -> str:
     judge = judge_of(20, 1_000_000)
     judge.stage = SimpleNamespace(name="s", outputs=("x",), units=("mm",), parameters=())
     judge.floor = np.ones(1)
-    monkeypatch.setattr(diagnose, "rms_per_output", lambda *_: np.ones(1))
-    monkeypatch.setattr(diagnose, "recalibrated", lambda *_: [])
-    said = diagnose._conclude(judge, fit_of(before, judge), fit_of(after, judge, effects), [], [], 1.0, [])
-    return said.verdict
+    for module in (noise_floor, stage_answer):
+        monkeypatch.setattr(module, "rms_per_output", lambda *_: np.ones(1))
+    monkeypatch.setattr(stage_answer, "recalibrated", lambda *_: [])
+    return NoiseFloor(judge).conclude(fit_of(before, judge), fit_of(after, judge, effects), [], [], []).verdict
 
 
 @SIDES
@@ -158,22 +160,24 @@ def test_a_named_model_may_leave_three_floors_and_two_effects_two(
 @SIDES
 def test_a_rival_goes_at_odds_of_twenty_to_one(times: float, beyond: bool) -> None:
     judge = judge_of(4, 2)
-    assert diagnose._worse(judge, fit_of(rms_after(judge, 3.0 * times), judge), fit_of(1.0, judge), 1.0, 0.0) == beyond
+    assert (
+        noise_floor._worse(judge, fit_of(rms_after(judge, 3.0 * times), judge), fit_of(1.0, judge), 1.0, 0.0) == beyond
+    )
 
 
 @SIDES
 def test_a_rival_goes_where_it_needs_three_nats_more_freedom(times: float, beyond: bool) -> None:
     judge = judge_of(4, 2)
-    assert diagnose._worse(judge, fit_of(1.0, judge), fit_of(1.0, judge), 1.0, 3.0 * times) == beyond
+    assert noise_floor._worse(judge, fit_of(1.0, judge), fit_of(1.0, judge), 1.0, 3.0 * times) == beyond
 
 
 @SIDES
 def test_a_rival_goes_for_a_third_of_a_spread_and_not_for_less(times: float, beyond: bool) -> None:
     judge = judge_of(20, 10_000)
     other = fit_of(1.0 + 0.3 * times / np.sqrt(2.0 * judge.n), judge)
-    nats = diagnose.gain(judge, other, fit_of(1.0, judge), 1.0)[0]
+    nats = noise_floor.gain(judge, other, fit_of(1.0, judge), 1.0)[0]
     assert nats > 30.0
-    assert diagnose._worse(judge, other, fit_of(1.0, judge), 1.0, 0.0) == beyond
+    assert noise_floor._worse(judge, other, fit_of(1.0, judge), 1.0, 0.0) == beyond
 
 
 @SIDES
@@ -182,7 +186,7 @@ def test_a_rival_must_be_worse_by_a_quarter_of_what_is_left(times: float, beyond
     best = fit_of(2.0, judge)
     left = 0.5 * judge.n * (4.0 - 1.01**2)
     other = fit_of(np.sqrt(4.0 + 2.0 * 0.25 * left * times / judge.n), judge)
-    assert diagnose._worse(judge, other, best, 1.0, 0.0) == beyond
+    assert noise_floor._worse(judge, other, best, 1.0, 0.0) == beyond
 
 
 # ---- how much is tried -----------------------------------------------------------------------------------------------
@@ -193,9 +197,16 @@ class Endless:
 
     asked: list[list[tuple[str, ...]]]
 
-    def __init__(self, judge: Any, tick: Any = None):
-        self.judge, self.quiet, Endless.asked = judge, False, []
+    def __init__(self, judge: Any):
+        self.judge, self.stage, self.criterion, self.quiet, Endless.asked = (
+            judge,
+            judge.stage,
+            NoiseFloor(judge),
+            False,
+            [],
+        )
         self.base = self._fit(())
+        self.fits: dict[frozenset[str], Fit] = {}
         self.reach = dict.fromkeys((e.name for e in judge.stage.effects), 1e9)
 
     def _fit(self, effects: tuple[str, ...]) -> Fit:
@@ -208,8 +219,8 @@ class Endless:
         self.asked.append(list(sets))
         return [self._fit(s) for s in sets]
 
-    def joined(self, effects: tuple[str, ...]) -> Fit:
-        return self._fit(effects)
+    def pruned(self, fit: Fit) -> Fit:
+        return fit
 
 
 def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_taken(
@@ -219,18 +230,18 @@ def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_t
     stage: Any = SimpleNamespace(effects=effects, effect=lambda n: None)
     judge = judge_of(20, 100)
     judge.stage = stage
-    monkeypatch.setattr(diagnose, "Judge", lambda *_: judge)
-    monkeypatch.setattr(diagnose, "Search", Endless)
-    monkeypatch.setattr(diagnose, "correlation_of", lambda *_: 1.0)
-    _, current, candidates, _, _ = diagnose._search(stage, np.ones(1), None, None)
+    monkeypatch.setattr(noise_floor, "correlation_of", lambda *_: 1.0)
+    search: Any = Endless(judge)
+    _, current, candidates, _ = diagnose._search(search)
     assert len(current.effects) == 4
     leaders = [c.effect for c in candidates[:5]]
     assert {frozenset(s) for s in Endless.asked[0]} == {frozenset(s) for s in itertools.combinations(leaders, 2)}
 
 
 def test_the_three_leading_sets_are_finished() -> None:
-    search: Any = object.__new__(diagnose.Search)
+    search: Any = object.__new__(Search)
     judge = judge_of(2, 10)
+    search.criterion, search.fits = NoiseFloor(judge), {}
     finished = []
 
     def joined(effects: tuple[str, ...], whole: bool) -> Any:
@@ -291,7 +302,14 @@ def straight(n: int, dt: float, noise: float = 0.1, tolerance: float = 0.0) -> S
 
 @pytest.mark.parametrize(("seconds", "blocks"), [(30.0, 12), (119.0, 12), (131.0, 13), (405.0, 40), (5000.0, 60)])
 def test_a_log_is_cut_into_blocks_of_ten_seconds_twelve_at_least_and_sixty_at_most(seconds: float, blocks: int) -> None:
-    assert Judge(straight(round(seconds / 0.1) + 1, 0.1), np.ones(1)).n_blocks == blocks
+    stage = straight(round(seconds / 0.1) + 1, 0.1)
+    stage.memory = 10.0
+    assert Judge(stage, np.ones(1)).n_blocks == blocks
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.1, 3600.0])
+def test_blocks_of_a_stage_of_unknown_memory_do_not_turn_on_the_unit_of_time(dt: float) -> None:
+    assert Judge(straight(301, dt), np.ones(1)).n_blocks == 24
 
 
 @pytest.mark.parametrize(("n", "worth"), [(150, 150), (20_000, 200)])

@@ -12,7 +12,7 @@ first order otherwise).
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,13 +27,14 @@ Task = Generator[
 ]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
 
 MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
-BLOCK_S = 10.0  # s, longer than the memory of any stage here
+BLOCKS, MOST_BLOCKS = 24, 60  # blocks of a stage of unknown memory; at most
 MAX_SETS = 64  # parameter sets in one call of run
 MAX_VALUES = 8_000_000  # errors of several tasks held at one time
 # Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
 # error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
 # often as they say (docs/diagnosis.md).
 EVIDENCE = 200.0
+MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
@@ -48,6 +49,7 @@ class Fit:
     held_out  the same with the parameters fitted to the other blocks
     low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the
     value is in
+    stalled   no step along the slope, however short, brought what the slope promises: it stands at a kink
     """
 
     effects: tuple[str, ...]
@@ -60,6 +62,7 @@ class Fit:
     prior: Array
     low: Array
     high: Array
+    stalled: bool = False
 
 
 class Judge:
@@ -70,6 +73,7 @@ class Judge:
         ones).
         """
         self.stage, self.floor = stage, np.asarray(floor, dtype=float)
+        self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
             self.valid &= keep
@@ -80,7 +84,7 @@ class Judge:
             w = np.minimum(((t - t[0]) / stage.window + 1e-9).astype(int), max(int(span / stage.window + 1e-9) - 1, 0))
         else:
             w = None
-        blocks = int(np.clip(span / BLOCK_S, MIN_BLOCKS, 60))
+        blocks = int(np.clip(span / (stage.memory or span / BLOCKS), MIN_BLOCKS, MOST_BLOCKS))
         if w is not None:
             per = max(1, round((w[-1] + 1) / blocks))
             block_of = w // per
@@ -161,7 +165,7 @@ class Judge:
     def columns(self, effects: tuple[str, ...]) -> Array:
         """Columns that a fit with these effects sets free."""
         s = self.stage
-        free = [i for i, p in enumerate(s.parameters) if p.tolerance > 0]
+        free = [i for i, p in enumerate(s.parameters) if p.tolerance > 0 and i not in self.spared]
         index = s.index()
         for name in effects:
             sl = index[name]
@@ -252,7 +256,7 @@ class Judge:
         low, high = self.bounds()
         linear: tuple[Array, Array, Array] | None = None  # costs, gradients and normals of the blocks at theta
         if isinstance(start, Fit):
-            if start.effects == effects:
+            if start.effects == effects and np.array_equal(start.free, free):
                 linear = start.cost, start.gradients, start.normals
             start = start.theta
         theta = self.wrapped(np.clip(np.array(start, dtype=float), low, high))
@@ -267,6 +271,7 @@ class Judge:
             return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
 
         damping = 1e-3
+        stalled = False
         best: float | None = None
         known: Array | None = None  # errors at theta
         for _ in range(iterations):
@@ -282,18 +287,26 @@ class Judge:
                 break
             a = np.tensordot(block_weights, normals, 1) + np.diag(prior * scale**2)
             g = block_weights @ gradients - prior * scale * (theta[free] - nominal[free])
-            trials = []
-            for factor in (0.01, 1.0, 300.0):
-                lam = damping * factor
-                damped = a + lam * np.diag(np.maximum(np.diag(a), 1e-9))
-                step = bounded_step(damped, g, *((b[free] - theta[free]) / scale for b in (low, high)))
-                trial = theta.copy()
-                trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
-                trials.append((lam, self.wrapped(trial)))
-            thetas = np.array([t for _, t in trials])
-            errors = yield thetas
-            costs = total(self.block_costs(errors), thetas)
-            k = int(np.argmin(costs))
+            limits = [(b[free] - theta[free]) / scale for b in (low, high)]
+            for _ in range(MOST_DAMPED):
+                trials = []
+                for factor in (0.01, 1.0, 300.0):
+                    lam = damping * factor
+                    damped = a + lam * np.diag(np.maximum(np.diag(a), 1e-9))
+                    step = bounded_step(damped, g, *limits)
+                    trial = theta.copy()
+                    trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
+                    trials.append((lam, self.wrapped(trial)))
+                thetas = np.array([t for _, t in trials])
+                errors = yield thetas
+                costs = total(self.block_costs(errors), thetas)
+                k = int(np.argmin(costs))
+                # the last step is the shortest: where even it promises much and nothing came of it, the slope is not
+                # to be trusted so far away
+                stalled = not costs[k] < here and 2.0 * float(step @ g) - float(step @ a @ step) > 0.2 * len(free)
+                if not stalled:
+                    break
+                damping *= 1e5
             if not costs[k] < here:
                 break
             damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
@@ -302,7 +315,7 @@ class Judge:
         if linear is None:
             thetas, derivative = self._differences(theta, free, scale, high, known)
             linear = self._blocks(*derivative((yield thetas)))
-        return self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear)
+        return replace(self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear), stalled=stalled)
 
     def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives

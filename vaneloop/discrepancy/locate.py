@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import rms_per_output
 from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.stage import Array, without_jumps
+from vaneloop.discrepancy.stage_answer import rms_per_output
 
 __all__ = [
     "AGREES",

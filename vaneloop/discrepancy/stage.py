@@ -95,6 +95,9 @@ class Stage:
               the best model is known, whose errors hold less of the machine's motion
     twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of
               theirs)
+    memory    s: longer than the stage remembers; blocks of the log that are judged apart are as long. None: not known
+    begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
+              what it lacks may have lost its way to; None: there are none
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
     """
@@ -118,6 +121,8 @@ class Stage:
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None
     twins: Mapping[str, tuple[str, Callable[[Array], Array]]] = field(default_factory=dict)
+    memory: float | None = None
+    begins: Array | None = None
     excerpt: Callable[[Array], Stage] | None = None
 
     def __post_init__(self) -> None:

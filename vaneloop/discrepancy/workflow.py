@@ -12,22 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import (
-    NATS,
-    Search,
-    StageDiagnosis,
-    as_close,
-    correlation_of,
-    diagnose_stage,
-    found_of,
-    parameters_of,
-    recalibrated,
-    rms_per_output,
-    significant,
-)
+from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage, floor_of
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
-from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
+from vaneloop.discrepancy.noise_floor import NATS, as_close, correlation_of, significant
+from vaneloop.discrepancy.stage import Stage, StageError
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output
 
 __all__ = [
     "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage",
@@ -63,13 +53,6 @@ def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None
 def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
     """Error of every output of every stage, driven by its own logged inputs, with nothing added."""
     return [figures for located in locate_stages(stages) for figures in located.signals]
-
-
-def floor_of(stage: Stage) -> Array:
-    """The stage's noise floor, which whoever made the stage must have given."""
-    if stage.floor is None or not np.all(np.isfinite(stage.floor)):
-        raise StageError(f"stage {stage.name!r}: no noise floor")
-    return stage.floor
 
 
 _WORK: list[Stage] = []
@@ -204,65 +187,6 @@ def _fits(
     start[theirs] = size
     held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
     return not significant(judge, held, other.final, correlation_of(judge, other.final))
-
-
-def _one_by_one(
-    stage: Stage, floor: Array, effects: tuple[str, ...], tick: Callable[[], None] | None
-) -> tuple[Judge, Search, tuple[str, ...], list[Fit]]:
-    """Fits with no effect, one, two and so on up to all; the one that explains most first."""
-    judge = Judge(stage, floor)
-    search = Search(judge, tick)
-    search.singles(effects)
-    order: tuple[str, ...] = ()
-    while len(order) < len(effects):
-        order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
-    return judge, search, order, [search.base, *(search.joined(order[: k + 1]) for k in range(len(order)))]
-
-
-def extend_stage(stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None) -> StageDiagnosis:
-    """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
-
-    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step.
-    Errors are held-out.
-    Raises StageError for an effect that the stage does not have.
-    """
-    for e in effects:
-        if all(e != x.name for x in stage.effects):
-            raise StageError(
-                f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
-            )
-    floor = floor_of(stage)
-    for attempt in range(3):
-        judge, search, order, fits = _one_by_one(stage, floor, effects, tick)
-        if stage.noise is None or attempt == 2:
-            break
-        lower = noise_of(stage, fits[-1].theta)
-        if not np.any(lower < 0.9 * floor):
-            break
-        floor = np.minimum(lower, floor)  # the nominal model's error held motion that passed for noise
-    reach = reach_of(stage, floor, fits[-1].theta)
-    if np.any(reach > floor):
-        judge, search, order, fits = _one_by_one(stage, reach, effects, tick)
-    final = fits[-1]
-
-    def rms(fit: Fit) -> float:
-        return float(np.sqrt(fit.held_out.sum() / max(judge.n, 1)))
-
-    names = ["nominal", *(f"+ {e}" for e in order)]
-    steps = list(zip(names, map(rms, fits), strict=True))
-    if stage.finer is not None:
-        d = judge.errors(final.theta[None]) - judge._whiten(stage.finer(final.theta[None]))
-        numerical = float(np.sqrt(np.sum(d * d) / max(judge.n, 1)))
-        steps.append(("without numerical error", float(np.sqrt(max(rms(final) ** 2 - numerical**2, 0.0)))))
-    found = found_of(judge, final, effects)
-    before, after = (rms_per_output(judge, f) for f in (search.base, final))
-    return StageDiagnosis(
-        stage=stage.name, outputs=stage.outputs, units=stage.units, verdict="missing" if effects else "none",
-        floor=judge.floor,
-        base=search.base, final=final, error_before=before, error_after=after, effects=found,
-        recalibrated=recalibrated(stage, final),
-        candidates=[], correlation=1.0, steps=steps, excess=rms(final),
-    )  # fmt: skip
 
 
 def no_better(r: StageDiagnosis) -> str | None:

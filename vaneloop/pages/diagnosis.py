@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import StageDiagnosis
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located, bins_of, locate
 from vaneloop.discrepancy.models.vanes import Chain
+from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
 from vaneloop.pages.figures import Line, Panel, heat, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page

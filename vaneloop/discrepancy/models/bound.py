@@ -15,7 +15,12 @@ from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageErr
 
 __all__ = ["Bound"]
 
-WIDE = 4.0  # half-width, in sizes of a parameter that the user calls unknown, of the interval that later fits may use
+# Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
+# that the user gave, which may be wrong by a factor of ten.
+WIDE, GIVEN = 4.0, 12.0
+FACTOR = 10.0  # by which a value that the user gave may be wrong
+MOST_DRAWN = 7  # powers of two: sets of values drawn in all, by the number of unknown parameters
+FROM = 4  # of these that a fit begins from, beside the user's own
 MOST_STEPS = 16
 MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
 
@@ -29,7 +34,7 @@ class Bound:
 
     stage     what the search works on; the logs follow each other in time
     thinned   the same on fewer samples, where there are many
-    guess     the stage's parameters as the user gave them
+    others    values of the parameters in other valleys of the error than the best
     data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
     runner    the model on them; ``run`` is its
     effects, placed   every law at every place: what the search is told of it, and what runs
@@ -57,6 +62,7 @@ class Bound:
         self.effects: list[Effect]
         self.placed: list[Placed]
         self.stage: Stage
+        self.others: list[Array] = []  # values of the parameters in other valleys of the error
         self._make()
 
     def _make(self) -> None:
@@ -129,18 +135,20 @@ class Bound:
             self.measured,
             regimes=regimes, regime_units=units,
         )  # fmt: skip
-        self.guess = self.stage.neutral()
-        self.guess[: len(s.parameters)] = [p.value for p in s.parameters]
-        if self.like is None and not self.values and starts:
-            n_p = len(s.parameters)
-            self.guess[n_p : n_p + len(starts)] = [p.value for p in starts]
-            self._scan_starts(self.guess, list(range(n_p, n_p + len(starts))))
+        if self.like is None:
+            given = np.array([p.value for p in (*s.parameters, *starts)])
+            self._scan_starts(given, list(range(len(s.parameters), len(given))))
+            begins = np.repeat(self.stage.neutral()[None], 1 + len(self.others), axis=0)
+            begins[:, : len(given)] = [given, *self.others]
+            self.stage.begins = None if self.values else begins  # a model file's values are better than these
+            self.stage.floor = self.data.noise()
         # the search looks at fewer samples where there are many: neighbours say the same
         stride = max(1, len(self.t) // MOST_SAMPLES)
         self.thinned = Stage(
             s.name, self.stage.outputs, self.stage.units, self.stage.parameters, self.stage.effects,
             lambda thetas: self.run(thetas)[:, :, ::stride], self.t[::stride], self.measured[:, ::stride],
-            regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units,
+            regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units, floor=self.stage.floor,
+            begins=self.stage.begins,
         )  # fmt: skip
 
     def theta_from(self, other: Bound, theta: Array) -> Array:
@@ -227,25 +235,65 @@ class Bound:
             return values
         self._scan_starts(values, [i for i in free if parameters[i].name.startswith("start_")])
         size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
-        low = np.array([parameters[i].low for i in free])
-        high = np.array([parameters[i].high for i in free])
+        low, high = (np.array([getattr(parameters[i], side) for i in free]) / size for side in ("low", "high"))
         use = np.isfinite(self.measured)
+        measured = np.where(use, self.measured, 0.0)
         stride = max(1, self.measured.shape[1] // 20000)
 
         def error(z: Array) -> Array:
             trial = values.copy()
             trial[free] = z * size
-            e = (self.run(trial[None])[0] - np.where(use, self.measured, 0.0)) / scale[:, None]
+            e = (self.run(trial[None])[0] - measured) / scale[:, None]
             return np.where(use, e, 0.0)[:, ::stride].ravel()
 
-        z0 = values[free] / size
-        result = least_squares(
-            error, np.clip(z0, low / size, high / size), bounds=(low / size, high / size), diff_step=1e-4, max_nfev=60
-        )
-        values[free] = result.x * size
+        first = np.clip(values[free] / size, low, high)
+        begins = [first, *self._drawn(values, free, size, first, low, high, scale)]
+        fits = [least_squares(error, b, bounds=(low, high), diff_step=1e-4, max_nfev=20) for b in begins]
+        fits.sort(key=lambda f: f.cost)
+        again = [least_squares(error, f.x, bounds=(low, high), diff_step=1e-4, max_nfev=60) for f in fits[:2]]
+        best = min(again, key=lambda f: f.cost)
+        self.others = []
+        for f in fits:  # other valleys
+            if all(np.max(np.abs(f.x - o)) > 0.1 * np.max(np.abs(o)) for o in (best.x, *self.others)):
+                self.others.append(f.x)
+        self.others = [self._with(values, free, x * size) for x in self.others[:2]]
+        values[free] = best.x * size
         if self.system.kind in ("simulate", "closed_loop"):
             self._choose_steps(values)
         return values
+
+    def _with(self, values: Array, columns: list[int], new: Array) -> Array:
+        out = values.copy()
+        out[columns] = new
+        return out
+
+    def _drawn(
+        self, values: Array, free: list[int], size: Array, first: Array, low: Array, high: Array, scale: Array
+    ) -> list[Array]:
+        """Values (in sizes) from which a fit may begin beside the user's own: of many drawn within `FACTOR`, those that
+        come nearest to the logs, as they are or but for a gain and an offset of each output.
+        """
+        from scipy.stats import qmc
+
+        power = min(4 + len(free), MOST_DRAWN)
+        unit, drawn = qmc.Sobol(len(free), seed=0).random_base2(power), 2**power
+        z = np.clip(np.where(first == 0.0, 2.0 * unit - 1.0, first * FACTOR ** (2.0 * unit - 1.0)), low, high)
+        thetas = np.repeat(values[None], drawn, axis=0)
+        thetas[:, free] = z * size
+        use = np.isfinite(self.measured)
+        weight = use / np.maximum(use.sum(axis=1), 1)[:, None]
+        y = np.where(use, self.measured, 0.0) / scale[:, None]
+        plain, bent = np.empty(drawn), np.empty(drawn)
+        for i in range(0, drawn, 32):
+            m = self.run(thetas[i : i + 32]) / scale[:, None]
+            plain[i : i + 32] = np.sum(weight * (m - y) ** 2, axis=(1, 2))
+            my, mm = np.sum(weight * y, axis=1), np.sum(weight * m, axis=2)
+            var = np.sum(weight * (m - mm[:, :, None]) ** 2, axis=2)
+            both = np.sum(weight * (m - mm[:, :, None]) * (y - my[:, None]), axis=2)
+            total = np.sum(weight * (y - my[:, None]) ** 2, axis=1)
+            bent[i : i + 32] = np.sum(total - both**2 / np.maximum(var, 1e-12), axis=1)
+        best = [*np.argsort(plain)[: FROM // 2], *np.argsort(bent)[: FROM // 2]]
+        return [z[i] for i in dict.fromkeys(int(i) for i in best)]
 
     def _scan_starts(self, theta: Array, columns: list[int]) -> None:
         """Set unknown initial states in place to the best of some round sizes of the outputs, one after the other."""
@@ -286,4 +334,5 @@ class Bound:
         size = max(abs(value), abs(p.value), 1e-3 * self._unit_size(p))
         if p.name.startswith("start_"):
             size = max(size, self._unit_size(p))
-        return Parameter(p.name, float(value), p.unit, p.low, p.high, WIDE * size)
+        wide = max(WIDE * size, GIVEN * abs(p.value))
+        return Parameter(p.name, float(value), p.unit, p.low, p.high, wide, scale=WIDE * max(abs(value), 0.1 * size))

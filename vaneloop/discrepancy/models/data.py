@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import welch
 
-from vaneloop.discrepancy.evidence import noise_of_channel
 from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass, motion, smoothed, uses
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
@@ -212,3 +212,21 @@ class Data:
             out["log"] = np.concatenate([np.full(len(r.t), float(k + 1)) for k, r in enumerate(self.records)])
             units["log"] = ""
         return out, units
+
+
+def noise_of_channel(y: Array) -> float:
+    """RMS of the white noise that evenly sampled values can hold at most; 0 is possible.
+
+    The smaller of two bounds: third differences over the quieter half of the stretches (motion is smooth), and the
+    quietest tenth of the spectrum (white noise is everywhere).
+    """
+    y = y[np.isfinite(y)]
+    if len(y) < 40:
+        return 0.0
+    d = np.diff(y, 3)
+    width = max(10, len(d) // 60)
+    parts = d[: len(d) // width * width].reshape(-1, width)
+    level = np.sort(np.sqrt(np.mean(parts**2, axis=1) / 20.0))
+    smooth = float(np.median(level[: max(1, len(level) // 2)]))
+    _, power = welch(y, 1.0, nperseg=min(1024, len(y) // 4))
+    return min(smooth, float(np.sqrt(np.quantile(power[1:], 0.1) * 0.5)))

@@ -77,10 +77,11 @@ def divergence(
     from hil.logs import Channel, Log
     from hil.loop.lockstep import Stimulus, lockstep
     from plant import Model, build_plant
-    from vaneloop.discrepancy.diagnose import Search, correlation_of, gain
+    from vaneloop.discrepancy.diagnose import floor_of
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.models.vanes import build_chain
-    from vaneloop.discrepancy.workflow import floor_of
+    from vaneloop.discrepancy.noise_floor import NoiseFloor, correlation_of, gain
+    from vaneloop.discrepancy.search import Search
 
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
@@ -104,7 +105,7 @@ def divergence(
 
     s.run = reduced
     judge = Judge(s, floor_of(s))
-    search = Search(judge)
+    search = Search(NoiseFloor(judge))
     best, other = (search.joined((*beside, name)) for name in (named, rival))
     return gain(judge, other, best, correlation_of(judge, best))
 
@@ -124,7 +125,7 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.diagnose import NATS, RIVAL_SPREADS
+    from vaneloop.discrepancy.noise_floor import NATS, RIVAL_SPREADS
 
     pairs = [(s, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
     if not pairs:

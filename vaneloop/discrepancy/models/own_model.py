@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import StageDiagnosis
-from vaneloop.discrepancy.evidence import diagnose_system, extend_system
+from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
+from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.laws import HYSTERETIC
 from vaneloop.discrepancy.locate import Located, Shape, agrees, shape
@@ -26,6 +26,7 @@ from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.runner import STARTS_LOADED
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, answer_of, rms_of
 
 __all__ = ["Answer", "Model", "compare", "diagnose", "extend", "load_model", "locate", "write_model"]
 
@@ -203,16 +204,7 @@ def _as_is(bound: Bound) -> StageDiagnosis:
     judge = Judge(bound.thinned, bound.data.noise())
     theta = bound.stage.neutral()
     fit = judge.fit((), theta, 0)
-    rms = np.sqrt(
-        np.sum((judge.errors(theta[None])[0] * judge.floor[:, None]) ** 2, axis=1)
-        / np.maximum(judge.valid.sum(axis=1), 1)
-    )
-    excess = float(np.sqrt(np.sum(judge.errors(theta[None])[0] ** 2) / max(judge.n, 1)))
-    return StageDiagnosis(
-        bound.stage.name, bound.stage.outputs, bound.stage.units, "none", judge.floor, fit, fit, rms, rms, [], [], [],
-        1.0,
-        [("model", excess)], excess,
-    )  # fmt: skip
+    return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
 
 
 def compare(system: System, logs: Sequence[Record], test: Sequence[Record] = (), model: Model | None = None) -> Answer:
@@ -258,21 +250,21 @@ def diagnose(
         if progress:
             progress(1.0 - 1.0 / (1.0 + done / 60.0))  # nobody knows how many laws there will be
 
-    def on_test(theta: Array) -> float:
-        assert other is not None
-        by = other.figures(other.theta_from(bound, theta))
-        return float(
-            np.mean(
-                [np.log(np.maximum(v, 1e-300) / bound.data.noise()).mean() for v in by.values() if np.isfinite(v).all()]
-                or [0.0]
-            )
-        )
+    names = frozenset(other.logs) if other is not None else frozenset[str]()
 
-    d, decided = diagnose_system(
-        bound.thinned, bound.data.noise(), tick, on_test if other is not None else None, bound.guess
+    def figures(theta: Array) -> dict[str, float]:
+        """Log of the error on each log, over its outputs."""
+        by = bound.figures(theta)
+        if other is not None:
+            by |= other.figures(other.theta_from(bound, theta))
+        floor = bound.data.noise()
+        return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in by.items() if np.isfinite(v).all()}
+
+    d = diagnose_stage(
+        bound.thinned, bound.data.noise(), tick=tick, judged=lambda judge: ErrorShare(judge, figures, names)
     )
     answer = _finish("diagnose", bound, other, d, started, model or Model())
-    answer.notes += decided
+    answer.notes += d.notes
     return answer
 
 
@@ -300,7 +292,7 @@ def extend(
                 else f"it can have {', '.join(have)}"
             )
             raise StageError(f"--effect {e!r}: not a law that system {system.name!r} can be given; {hint}")
-    d = extend_system(bound.thinned, bound.data.noise(), tuple(dict.fromkeys(effects)))
+    d = extend_stage(bound.thinned, tuple(dict.fromkeys(effects)), judged=ErrorShare)
     return _finish("extend", bound, other, d, started, model or Model())
 
 

@@ -52,6 +52,7 @@ from vaneloop.discrepancy.stage import Array, Stage, noise_of
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
 STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
+MEMORY = 10.0  # s, longer than any stage here remembers
 LEAST_FLOOR = {
     "demand": 2e-3,
     "servo": 1e-3,
@@ -188,6 +189,7 @@ def build_chain(
             channel = noise_floor(t, stage.measured[0])
             freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
             stage.quiet = np.maximum([min(channel, freed)], least)
+        stage.memory = MEMORY
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)

@@ -43,7 +43,7 @@ def excerpts(
         columns = {k: v[at] for k, v in driven.columns.items()}
         part = make(driven._replace(t=driven.t[at], columns=columns, run=keep(at)))
         part.floor, part.quiet, part.noise = stage.floor, stage.quiet, stage.noise
-        part.raster_error = stage.raster_error
+        part.raster_error, part.memory = stage.raster_error, stage.memory
         return part
 
     return excerpt

@@ -1,0 +1,412 @@
+"""Fits of one stage with sets of effects: each made once, begun where it may come to the best.
+
+What is a better set is the criterion's to say: `vaneloop.discrepancy.noise_floor` for a model that may come down to the
+noise of its log, `vaneloop.discrepancy.error_share` for one that will not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step
+from vaneloop.discrepancy.stage import Array, Effect
+
+if TYPE_CHECKING:
+    from vaneloop.discrepancy.stage_answer import Candidate, Found, StageDiagnosis
+
+__all__ = ["Criterion", "Search"]
+
+FINISHED = 5  # leading sets whose fits are finished
+SCREENED = 32  # starts simulated at one time
+DIRECTIONS = 12  # from which a fit of an effect with a direction may start
+STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
+
+
+class Criterion(Protocol):
+    """When an effect is worth its place, and what is said in the end.
+
+    most     effects in one stage
+    leaders  effects tried in pairs
+    fitted   of all effects that could be added, so many are fitted; the others are screened
+    finished so many leading sets have their fits finished
+    least    fall of the sum of squares below which the fit of a single effect is not finished
+    left_out effects that help and are not to be named, and why
+    roams    the model's own parameters are known roughly: they are refitted at each start of an effect
+    """
+
+    judge: Judge
+    most: int
+    leaders: int
+    fitted: int
+    finished: int
+    least: float
+    roams: bool
+    left_out: dict[str, str]
+
+    def learn(self, fit: Fit) -> None:
+        """Note what the errors of the best single effect say of the log."""
+
+    def order(self, fit: Fit) -> float:
+        """By what sets of effects are ranked; less is better."""
+
+    def fails(self, fit: Fit) -> bool:
+        """Whether the model needs anything more."""
+
+    def earns(self, before: Fit, after: Fit) -> bool:
+        """Whether ``after`` is worth the effects that it has more."""
+
+    def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
+        """What ``after`` gains over ``before``, as `Candidate` has it."""
+
+    def shows(self, reach: float) -> bool:
+        """Whether an effect that changes the sum of squares by so much at its largest could have been seen."""
+
+    def spared(self, fit: Fit) -> Fit:
+        """The fit without what the model itself does not need any more."""
+
+    def settle(self, search: Search, fit: Fit) -> Fit:
+        """The best model found, with what does as well and is simpler."""
+
+    def name(self, search: Search, fit: Fit, candidates: list[Candidate]) -> tuple[list[Found], Fit]:
+        """For each effect of the model: its rivals, how probable it is, its parameters; and the fit with them."""
+
+    def conclude(
+        self, base: Fit, fit: Fit, effects: list[Found], candidates: list[Candidate], steps: list[tuple[str, float]]
+    ) -> StageDiagnosis:
+        """Give the verdict."""
+
+
+class Search:
+    """The search on one stage: fits made once, compared by their held-out blocks."""
+
+    def __init__(self, criterion: Criterion, tick: Callable[[], None] | None = None):
+        """Fit the model as it is, and see what each effect could do for it."""
+        self.criterion, self.judge = criterion, criterion.judge
+        judge, self.stage = self.judge, self.judge.stage
+        self.tick = tick or (lambda: None)
+        self.fits: dict[frozenset[str], Fit] = {}
+        self.finished: set[frozenset[str]] = set()
+        self.begun: dict[frozenset[str], list[tuple[float, Array]]] = {}
+        begins = [self.stage.neutral()]
+        if self.stage.begins is not None:
+            begins += list(self.stage.begins)
+        firsts = judge.together([self._finished(judge.fitting((), b), len(begins) > 1) for b in begins])
+        self.base = self.fits[frozenset()] = min(firsts, key=judge.total_of)
+        self.tick()
+        # other places from which a model without what it lacks sees nothing better: a law may lead on from there
+        self.nominal = [self.base.theta, *begins[1:]]
+        # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the
+        # largest sizes
+        self.quiet = not criterion.fails(self.base)
+        self.starts = self._screen()
+
+    def _finished(self, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
+        """The fit, gone on with until its error falls no more."""
+        fit = yield from task
+        for _ in range(4 if go_on else 0):
+            more = yield from self.judge.fitting(fit.effects, fit, 8)
+            gained = self.judge.total_of(fit) - self.judge.total_of(more)
+            if gained > 0.0:
+                fit = more
+            if gained < STILL * fit.cost.sum():
+                break
+        return fit
+
+    # ---- one effect --------------------------------------------------------------------------------------------------
+
+    def _followers(self, theta: Array) -> tuple[Array, Array, Callable[[Array], list[float]]]:
+        """Error at ``theta``; its derivatives by the nominal parameters; and the function from errors of sets that
+        differ by an effect to the sum of squares that is left when the nominal parameters have followed, as the slopes
+        at ``theta`` have it.
+        """
+        judge, free = self.judge, self.base.free
+        e0, jac = judge.linearise(theta, free)
+        flat = jac.reshape(len(free), e0.size)
+        a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
+        room = [(b[free] - theta[free]) / judge.scale[free] for b in judge.bounds()]
+
+        def costs(errors: Array) -> list[float]:
+            errors = errors.reshape(-1, e0.size)
+            pull = errors @ flat.T
+            step = np.clip(np.linalg.solve(a, pull.T).T, *room)  # nominal parameters stay within their tolerances
+            left = np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ a) * step, axis=1)
+            return [float(v) for v in left]
+
+        return e0, jac, costs
+
+    def _screen(self) -> dict[str, list[Array]]:
+        """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal
+        model.
+        """
+        stage, judge, roams = self.stage, self.judge, self.criterion.roams
+        index = stage.index()
+        thetas: list[Array] = []
+        owner: list[str] = []
+        costs: list[float] = []
+        base_cost = 0.0
+        for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
+            e0, jac, left = self._followers(nominal)
+            first = len(thetas)
+            for e in stage.effects:
+                for s in e.starts[-2:] if self.quiet else e.starts:
+                    theta = nominal.copy()
+                    theta[index[e.name]] = s
+                    thetas.append(theta)
+                    owner.append(e.name)
+            if k == 0:
+                base_cost = float(np.sum(e0 * e0))
+                for e in stage.effects if not self.quiet else ():
+                    turned = self._turned(e, e0, jac)
+                    thetas += turned
+                    owner += [e.name] * len(turned)
+            for i in range(first, len(thetas), SCREENED):
+                costs += left(judge.errors(np.array(thetas[i : i + SCREENED])))
+        out: dict[str, list[Array]] = {}
+        self.reach: dict[str, float] = {}
+        self.level: dict[str, float] = {}
+        for name in dict.fromkeys(owner):
+            mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
+            # a second start is worth its time where it is nearly as good as the first
+            near = mine[0][0] + 0.2 * max(base_cost - mine[0][0], 0.02 * base_cost)
+            out[name] = [thetas[i] for c, i in mine[:4] if roams or c <= near][: 4 if roams else 2]
+            self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
+            self.level[name] = mine[0][0]
+        return out
+
+    def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
+        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
+        are best there.
+
+        Size and direction are polar coordinates: from a wrong direction a fit comes to the right one by a long way
+        round. In a fixed direction the sizes act linearly near neutral, so that their best values follow from one
+        simulation.
+
+        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
+        """
+        judge, at = self.judge, self.stage.index()[effect.name]
+        turning = [i for i, p in enumerate(effect.parameters) if p.period]
+        sizes = np.array([at.start + i for i, p in enumerate(effect.parameters) if not p.shape], dtype=int)
+        if not turning or len(turning) + len(sizes) < len(effect.parameters):
+            return []
+        p, (low, high) = effect.parameters[turning[0]], judge.bounds()
+        columns = np.concatenate([self.base.free, sizes])
+        scale = judge.scale[columns]
+        prior = np.concatenate([self.base.prior, np.zeros(len(sizes))]) * scale**2
+        thetas, asked, derivatives = [], [], []
+        for k in range(DIRECTIONS):
+            theta = self.base.theta.copy()
+            theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
+            moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
+            thetas.append(theta)
+            asked.append(moved)
+            derivatives.append(derivative)
+        errors = judge.errors(np.concatenate(asked))
+        for k, (theta, derivative) in enumerate(zip(thetas, derivatives, strict=True)):
+            own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
+            flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
+            a = flat @ flat.T + np.diag(prior + 1e-9)
+            step = bounded_step(
+                a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale
+            )
+            theta[columns] += step * scale
+        return thetas
+
+    def single(self, name: str) -> Fit:
+        """Fit with one effect, from its best starts."""
+        return self.singles([name])[name]
+
+    def singles(self, names: Sequence[str]) -> dict[str, Fit]:
+        """Fits with one effect each, side by side; where there are too many, of those that promise most."""
+        if len(names) > self.criterion.fitted:
+            names = sorted(names, key=lambda n: self.level[n])[: 2 * self.criterion.fitted]
+            followed = dict(zip(names, self.judge.together([self._followed(n) for n in names]), strict=True))
+            names = sorted(names, key=lambda n: followed[n])[: self.criterion.fitted]
+        return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
+
+    def _followed(self, name: str) -> Task[float]:
+        """What the best start of an effect leaves once the model's own parameters have followed it; the starts are put
+        in that order.
+        """
+        fits = []
+        for start in self.starts[name]:
+            fits.append((yield from self.judge.fitting((), start, 3)))
+        fits.sort(key=self.judge.total_of)
+        self.starts[name] = [f.theta for f in fits]
+        return self.judge.total_of(fits[0])
+
+    def _single(self, name: str) -> Task[Fit]:
+        key = frozenset((name,))
+        if key not in self.fits:
+            fits = []
+            for start in self.starts[name][:2]:
+                fits.append((yield from self.judge.fitting((name,), start, 3)))
+            best = min(fits, key=self.judge.total_of)
+            if float(self.base.cost.sum() - best.cost.sum()) > self.criterion.least:  # worth finishing
+                turns = any(p.period for p in self.stage.effect(name).parameters)
+                # along a curve from direction to direction
+                task = self.judge.fitting((name,), best, 30 if turns else 8)
+                best = yield from self._finished(task, self.criterion.roams)
+                best = yield from self._refine(name, best)
+            self.fits[key] = yield from self._no_worse(best)
+            self.tick()
+        return self.fits[key]
+
+    def _no_worse(self, fit: Fit) -> Task[Fit]:
+        """The fit, or a better one from the best fit of a part of its effects: with more effects a fit never ends
+        higher.
+
+        A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher
+        than it starts.
+        """
+        mine = frozenset(fit.effects)
+        parts = [f for key, f in self.fits.items() if key < mine]
+        part = min(parts, key=self.judge.total_of, default=None)
+        if part is None or self.judge.total_of(fit) <= self.judge.total_of(part):
+            return fit
+        again = yield from self.judge.fitting(fit.effects, part.theta, 8)
+        return min(again, fit, key=self.judge.total_of)
+
+    def _refine(self, name: str, fit: Fit) -> Task[Fit]:
+        """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no
+        slope to follow.
+        """
+        starts = np.unique([s[0] for s in self.stage.effect(name).starts])
+        column = self.stage.index()[name].start
+        at = fit.theta[column]
+        parameters = self.stage.effect(name).parameters
+        if sum(not p.shape for p in parameters) != 1 or any(p.period for p in parameters):
+            return fit
+        if np.min(np.abs(starts - at)) > 1e-9 * max(1.0, abs(at)) and not fit.stalled:
+            return fit  # it moved away from its start: there is a slope
+        i = int(np.argmin(np.abs(starts - at)))
+        low, high = starts[max(i - 1, 0)], starts[min(i + 1, len(starts) - 1)]
+        best = at
+        for _ in range(2):
+            sizes = np.linspace(low, high, 13)
+            thetas = np.repeat(fit.theta[None], len(sizes), axis=0)
+            thetas[:, column] = sizes
+            costs = self.judge.block_costs((yield thetas)).sum(axis=1)
+            k = int(np.argmin(costs))
+            best, low, high = sizes[k], sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]
+        theta = fit.theta.copy()
+        theta[column] = best
+        refined = yield from self.judge.fitting((name,), theta, 4)
+        return refined if refined.cost.sum() < fit.cost.sum() else fit
+
+    # ---- several effects ---------------------------------------------------------------------------------------------
+
+    def joined(self, effects: tuple[str, ...]) -> Fit:
+        """Fit with several effects, started from the fits with one fewer."""
+        return self.judge.together([self._joined(effects, True)])[0] if effects else self.base
+
+    def _begins(self, effects: tuple[str, ...]) -> Task[list[tuple[float, Array]]]:
+        """Where a fit with several effects may begin, each with what it would minimise there; best first."""
+        index, judge = self.stage.index(), self.judge
+        single: dict[str, Array] = {}
+        for name in effects:
+            if not self.criterion.roams:
+                single[name] = (yield from self._single(name)).theta
+            elif (key := frozenset((name,))) in self.fits:
+                single[name] = self.fits[key].theta
+        begins: list[tuple[tuple[str, ...], Array]] = []  # what stands in the fit before, and the beginning
+        for leave in effects:
+            rest = tuple(e for e in effects if e != leave)
+            if (known := self.fits.get(frozenset(rest))) is not None:
+                sources = [self.starts[leave][0], single[leave]] if leave in single else [self.starts[leave][0]]
+                sizes = [source[index[leave]] for source in sources]
+                if self.criterion.roams:
+                    sizes += [np.array(start, dtype=float) for start in self.stage.effect(leave).starts]
+                for size in sizes:
+                    theta = known.theta.copy()
+                    theta[index[leave]] = size
+                    begins.append((rest, theta))
+        if not begins:
+            theta = single.get(effects[0], self.starts[effects[0]][0]).copy()
+            for other in effects[1:]:
+                theta[index[other]] = single.get(other, self.starts[other][0])[index[other]]
+            begins.append(((), theta))
+        thetas = np.array([theta for _, theta in begins])
+        costs = judge.totals((yield thetas), thetas)
+        if not self.criterion.roams:
+            k = int(np.argmin(costs))
+            return [(float(costs[k]), begins[k][1])]
+        out = []
+        for k in np.argsort(costs, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
+            rest, theta = begins[k]
+            fit = yield from judge.fitting(rest, theta, 2)
+            out.append((judge.total_of(fit), fit.theta))
+        return sorted(out, key=lambda c: c[0])
+
+    def _joined(self, effects: tuple[str, ...], finished: bool) -> Task[Fit]:
+        """``finished`` False: a few iterations, enough to rank it."""
+        if len(effects) == 1:
+            return (yield from self._single(effects[0]))
+        key = frozenset(effects)
+        if key not in self.fits:
+            begins = self.begun.get(key) or (yield from self._begins(effects))
+            fits = []
+            for _, theta in begins:
+                fits.append((yield from self.judge.fitting(tuple(effects), theta, 3)))
+            self.fits[key] = min(fits, key=self.judge.total_of)
+            self.tick()
+        if finished and key not in self.finished:
+            task = self.judge.fitting(tuple(effects), self.fits[key], 8)
+            self.fits[key] = yield from self._finished(task, self.criterion.roams)
+            self.finished.add(key)
+            self.tick()
+        self.fits[key] = yield from self._no_worse(self.fits[key])
+        return self.fits[key]
+
+    def without(self, fit: Fit, drop: str) -> Fit:
+        """Fit without one effect: the known one; of a model that roams also where the other parameters of ``fit`` lead.
+
+        An effect that changes nothing may have shown the way out of a local minimum; it must not take the credit.
+        """
+        rest = tuple(e for e in fit.effects if e != drop)
+        known = self.joined(rest)
+        if not self.criterion.roams:
+            return known
+        at = self.stage.index()[drop]
+        first, neutral = fit.theta[at], self.stage.neutral()[at]
+        theta = fit.theta
+        for share in (0.25, 0.5, 0.75, 1.0):  # by and by, so that the others can follow
+            theta = theta.copy()
+            theta[at] = first + share * (neutral - first)
+            theta = self.judge.fit(rest, theta, 5).theta
+        other = self.judge.together([self._finished(self.judge.fitting(rest, theta, 8))])[0]
+        if self.judge.total_of(other) < 0.99 * self.judge.total_of(known):
+            self.fits[frozenset(rest)] = known = other
+            if not rest:
+                self.base = other
+        return known
+
+    def pruned(self, fit: Fit) -> Fit:
+        """The fit without the effects that it does not need any more."""
+        while len(fit.effects) > 1:
+            less = [self.without(fit, drop) for drop in fit.effects]
+            idle = [f for f in less if not self.criterion.earns(f, fit)]
+            if not idle:
+                break
+            fit = min(idle, key=self.criterion.order)
+        return fit
+
+    def beside(self, rest: Sequence[str]) -> list[Fit]:
+        """Fits made with one effect more than ``rest``."""
+        return [f for key, f in self.fits.items() if len(key) == len(rest) + 1 and key.issuperset(rest)]
+
+    def best_of(self, sets: Sequence[tuple[str, ...]]) -> list[Fit]:
+        """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
+        new = [s for s in sets if frozenset(s) not in self.fits]
+        if len(new) > self.criterion.fitted:
+            for s, begins in zip(new, self.judge.together([self._begins(s) for s in new]), strict=True):
+                self.begun[frozenset(s)] = begins
+            promise = sorted(new, key=lambda s: self.begun[frozenset(s)][0][0])[: self.criterion.fitted]
+            sets = [s for s in sets if frozenset(s) in self.fits or s in promise]
+        quick = self.judge.together([self._joined(s, False) for s in sets])
+        quick.sort(key=self.criterion.order)
+        leading = self.criterion.finished
+        out = self.judge.together([self._joined(f.effects, True) for f in quick[:leading]]) + quick[leading:]
+        return sorted(out, key=self.criterion.order)
