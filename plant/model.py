@@ -24,7 +24,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from plant import chain
 from plant.effects import EFFECTS, ROW
@@ -53,8 +53,24 @@ class Model(Table):
     effects: dict[str, dict[str, Finite]] = Field(default_factory=dict)
     meta: dict[str, str | bool | int | float | list[str]] = Field(default_factory=dict)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _older(cls, data: Any) -> Any:
+        """Files of users' own systems once had their name and history at the top."""
+        if isinstance(data, dict) and (own := {k: data[k] for k in ("system", "history") if k in data}):
+            return {**{k: v for k, v in data.items() if k not in own}, "meta": {**own, **data.get("meta", {})}}
+        return data
+
+    def noted(self, command: str) -> Model:
+        """The same model with ``command`` at the end of its history."""
+        history = self.meta.get("history", [])
+        lines = [*(history if isinstance(history, list) else [str(history)]), command]
+        return self.model_copy(update={"meta": {**self.meta, "history": lines}})
+
     def check(self, plant: Plant, source: str | Path = "model") -> None:
         """Refuse what is not in the library or out of bounds: InputError in one line, naming ``source``."""
+        if system := self.meta.get("system"):
+            raise InputError(f"{source}: is a model of the system {system!r}; --system says where that is")
         known = {n.name: n for n in nominal(plant.table, plant.geometry)}
         for name, value in self.parameters.items():
             if name not in known:
@@ -125,7 +141,7 @@ def write_model(path: str | Path, model: Model) -> None:
         units = {p.name: p.unit for p in EFFECTS[effect].parameters} if effect in EFFECTS else {}
         lines += [
             f"[effects.{_key(effect)}]",
-            *(f"{_key(k)} = {float(v)!r}  # {units.get(k, '?')}" for k, v in values.items()),
+            *(f"{_key(k)} = {float(v)!r}{f'  # {units[k]}' if k in units else ''}" for k, v in values.items()),
             "",
         ]
     try:

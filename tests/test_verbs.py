@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 from vaneloop.base import terminal
 from vaneloop.cli.main import main
 from vaneloop.verbs.answer import Answer
-from vaneloop.verbs.search import Diagnosed, Experiment, Extended, OwnAnswer, Stages
+from vaneloop.verbs.search import Diagnosed, Experiment, Extended, Stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
 RUN = ROOT / "examples" / "engine_run.blf"
@@ -132,12 +132,14 @@ def test_the_verbs_take_a_system_of_the_user(tmp_path: Path) -> None:
     u = np.sin(0.4 * t) + 0.7 * np.sin(1.7 * t + 1.0) + 0.3 * np.sin(4.1 * t)
     log = vaneloop.Record("made", t, {"u": u, "y": np.abs(2.0 * u + 0.3) + 0.01 * rng.standard_normal(len(t))})
     answer = vaneloop.diagnose(log, system)
-    assert isinstance(answer, OwnAnswer) and answer.effects == ["y.absolute_value"] and answer.verdict == "missing"
+    assert isinstance(answer, Diagnosed) and answer.effects == ["y.absolute_value"] and answer.verdict == "missing"
     there = cells(shown(answer, tmp_path))
     assert "y.absolute_value" in there
     better = vaneloop.extend([log], answer.effects, system, test=[log])
-    assert isinstance(better, OwnAnswer) and better.answer.model.effects
-    assert not isinstance(vaneloop.compare(log, system), Stages)
+    assert isinstance(better, Extended) and better.model is not None and better.model.effects
+    better.write(tmp_path / "better.toml")
+    assert vaneloop.diagnose(log, system, added=better.model).verdict == "none"
+    assert isinstance(vaneloop.compare(log, system), Stages)
     with pytest.raises(vaneloop.InputError, match="not a law"):
         vaneloop.extend(log, ["y.nothing"], system)
 

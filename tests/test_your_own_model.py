@@ -15,7 +15,7 @@ import pytest
 
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
-from vaneloop.discrepancy.models import own_model
+from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_model.md"
 RNG = np.random.default_rng(3)
@@ -49,8 +49,13 @@ STRAIGHT = System(
 )
 
 
-def named(answer: own_model.Answer) -> list[str]:
-    return [f.effect for f in answer.diagnosis.effects]
+def named(answer: Diagnosed) -> list[str]:
+    return [f.effect for f in answer.diagnosis.stages[0].effects]
+
+
+def last_test_error(answer: Diagnosed) -> float:
+    assert answer.by_log is not None
+    return float(list(answer.by_log.together().values())[-1]["test"][0])
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +92,13 @@ def test_the_page_s_example_runs_as_it_is_written(page: Path) -> None:
 def test_diagnosing_a_model_that_has_a_law_already_keeps_the_law() -> None:
     u = wave(6)
     log = Record("log", T, {"u": u, "y": 2.0 * (u + 0.1 * u**3) + 0.3 + 0.02 * noise()})
-    model = own_model.extend(STRAIGHT, [log], ["u.cubic"]).model
-    answer = own_model.diagnose(STRAIGHT, [log], model=model)
-    assert answer.diagnosis.verdict == "none" and answer.json()["effects"] == []
-    assert answer.model.effects["u.cubic"]["coefficient"] == pytest.approx(0.1, rel=0.05)
-    assert set(own_model.locate(STRAIGHT, [log], model=model).model.effects) == {"u.cubic"}
+    model = extend([log], ["u.cubic"], STRAIGHT).model
+    answer = diagnose([log], STRAIGHT, added=model)
+    assert answer.verdict == "none" and answer.to_dict()["effects"] == []
+    assert answer.by_log is not None and model is not None
+    assert answer.by_log.model.effects["u.cubic"]["coefficient"] == pytest.approx(0.1, rel=0.05)
+    by_log = locate([log], STRAIGHT, added=model).by_log
+    assert by_log is not None and set(by_log.model.effects) == {"u.cubic"}
 
 
 @pytest.mark.parametrize("law", ["absolute_value", "saturation", "dead_time", "none"])
@@ -107,13 +114,13 @@ def test_a_sensor_s_fault_is_named_and_a_sound_sensor_is_left_alone(law: str) ->
             y = 2.0 * np.interp(T - 0.3, T, u) + 0.3
         return Record(f"log {seed}", T, {"u": u, "y": y + 0.02 * noise() + 0.005 * np.sin(3.0 * u)})
 
-    answer = own_model.diagnose(STRAIGHT, [record(1)], [record(2)])
+    answer = diagnose([record(1)], STRAIGHT, test=[record(2)])
     if law == "none":
-        assert answer.diagnosis.verdict == "none"
+        assert answer.verdict == "none"
         assert named(answer) == []
     else:
         assert [n.rpartition(".")[2] for n in named(answer)] == [law]
-        assert answer.together()[list(answer.logs)[-1]]["test"][0] < 0.05
+        assert last_test_error(answer) < 0.05
 
 
 def test_friction_and_offset_are_found_from_measured_force() -> None:
@@ -129,13 +136,13 @@ def test_friction_and_offset_are_found_from_measured_force() -> None:
         "axis", "force", force, outputs={"force": "N"}, position="x",
         parameters=[unknown("mass", 5.0, "kg", low=0.0), unknown("viscous", 10.0, "N s/m", low=0.0)],
     )  # fmt: skip
-    answer = own_model.diagnose(s, [Record("axis", t, {"x": x, "force": f})])
-    found = {e.effect: e.parameters for e in answer.diagnosis.effects}
+    answer = diagnose([Record("axis", t, {"x": x, "force": f})], s)
+    found = {e.effect: e.parameters for e in answer.diagnosis.stages[0].effects}
     assert float(str(found["force.coulomb"]["friction"]["value"])) == pytest.approx(5.0, rel=0.05)
     # while it moves, a constant force and a friction that differs with the direction are the same
     same = {"force.force_offset", "force.friction_asymmetry"}
     (last,) = set(found) - {"force.coulomb"}
-    assert {last, *next(e.rivals for e in answer.diagnosis.effects if e.effect == last)} == same
+    assert {last, *next(e.rivals for e in answer.diagnosis.stages[0].effects if e.effect == last)} == same
     ((_, value),) = found[last].items()
     assert float(str(value["value"])) * (1.0 if last == "force.force_offset" else 5.0) == pytest.approx(-2.0, rel=0.05)
 
@@ -155,8 +162,8 @@ def test_springs_may_start_with_the_measured_force() -> None:
             start_force=start,
             parameters=[unknown("c", 0.1, "kN s/mm", low=0.0)], units={"position": "mm"},
         )  # fmt: skip
-        answer = own_model.extend(system, [log], ["force.elastic_plastic"])
-        return float(answer.diagnosis.error_after[0])
+        answer = extend([log], ["force.elastic_plastic"], system)
+        return float(answer.diagnosis.stages[0].error_after[0])
 
     assert left("measured") < 0.5 * left("unloaded")
 
@@ -167,14 +174,14 @@ def test_samples_may_be_missing_and_times_uneven() -> None:
     y = np.abs(2.0 * u + 0.3) + 0.02 * noise(2000)
     y[RNG.random(2000) < 0.1] = np.nan
     u[::37] = np.nan
-    answer = own_model.diagnose(STRAIGHT, [Record("gaps", t, {"u": u, "y": y})])
+    answer = diagnose([Record("gaps", t, {"u": u, "y": y})], STRAIGHT)
     assert named(answer) == ["y.absolute_value"]
-    assert any("NaN filled" in n for n in answer.notes)
+    assert any("NaN filled" in n for n in answer.diagnosis.notes)
 
 
 def test_a_log_without_excitation_names_nothing() -> None:
     log = Record("still", T, {"u": np.full(len(T), 1.5), "y": 3.0 + 0.02 * noise()})
-    assert named(own_model.diagnose(STRAIGHT, [log])) == []
+    assert named(diagnose([log], STRAIGHT)) == []
 
 
 BASE = """from discrepancy import Parameter, System, unknown

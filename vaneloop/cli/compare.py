@@ -33,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     if own_model.asked(args):
-        return own_model.command(args, "compare")
+        return _own(args)
     from hil.logs import LogError
     from vaneloop.discrepancy.workflow import locate_stages
     from vaneloop.verbs.search import Stages
@@ -77,3 +77,15 @@ def command(args: argparse.Namespace) -> int:
             report = None
     args.report = report
     return replay.command(args, {"stages": stages, **extra}, floors)
+
+
+def _own(args: argparse.Namespace) -> int:
+    """`command` of a model of the user's own: no loop around it."""
+    answer = own_model.ask(args, "compare")
+    own_model.show(args, answer.by_log)
+    terminal.say(args, answer.sentence())
+    terminal.write_json(args, answer.to_dict())
+    if args.report:
+        words = " ".join(["vaneloop compare", *sys.argv[2:]])
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    return 0

@@ -38,16 +38,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if own_model.asked(args):
-        return own_model.command(args, "diagnose")
     from vaneloop.base.errors import InputError
     from vaneloop.verbs.search import diagnosed
 
     if not 1 <= args.workers <= 64:
         raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
-    chain = chain_of(args)
-    with terminal.progress_bar(args, "searching the library of effects") as progress:
-        answer = diagnosed(chain, args.log, args.workers, progress)
+    if own_model.asked(args):
+        with terminal.progress_bar(args, "searching laws at all places") as progress:
+            answer = own_model.ask(args, "diagnose", progress=progress)
+    else:
+        chain = chain_of(args)
+        with terminal.progress_bar(args, "searching the library of effects") as progress:
+            answer = diagnosed(chain, args.log, args.workers, progress)
     show(args, answer)
     terminal.write_json(args, answer.to_dict())
     if args.report:
@@ -67,6 +69,8 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     for name, why in d.not_observed.items():
         rows.append([name, "not observed", why, "-", "-", "-", ""])
     columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
+    if answer.by_log is not None:
+        own_model.show(args, answer.by_log)
     terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
     for s in d.stages:
         for f in s.effects:

@@ -43,31 +43,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if own_model.asked(args):
-        return own_model.command(args, "extend")
     from plant import Model
     from vaneloop.verbs.search import extended, known
 
     wanted = list(dict.fromkeys(e for group in args.effect for e in group))
     if not wanted:
         raise InputError("extend needs at least one --effect NAME; vaneloop diagnose names candidates")
-    known(wanted)
     out = Path(args.out)
     if out.is_dir() or not out.parent.is_dir():  # before the fit, which takes a while
         raise InputError(
             f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})"
         )
-    before = options.machine_of(args).added
-    answer = extended(chain_of(args, Model()), wanted, before, args.log)
+    if own_model.asked(args):
+        answer = own_model.ask(args, "extend", effects=wanted)
+    else:
+        known(wanted)
+        answer = extended(chain_of(args, Model()), wanted, options.machine_of(args).added, args.log)
     if answer.refused:
         print(f"vaneloop extend: {args.log}: {answer.refused}; {args.out} is not written", file=sys.stderr)
         return 1
-    history = before.meta.get("history", [])
-    meta = {**before.meta, "history": [*(history if isinstance(history, list) else [str(history)]), _words()]}
-    assert answer.model is not None
-    answer = replace(answer, model=answer.model.model_copy(update={"meta": meta}), path=args.out)
+    answer = replace(answer, model=answer.model.noted(_words()), path=args.out)
     answer.write(args.out)
     results = answer.diagnosis.stages
+    if answer.by_log is not None:
+        own_model.show(args, answer.by_log)
     rows = []
     for r in results:
         for k in range(len(r.floor)):

@@ -33,13 +33,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if own_model.asked(args):
-        return own_model.command(args, "locate")
     from vaneloop.discrepancy.workflow import locate_stages
     from vaneloop.verbs.search import Stages
 
-    chain = chain_of(args)
-    answer = Stages(chain, locate_stages(chain.stages), args.log)
+    if own_model.asked(args):
+        answer = own_model.ask(args, "locate")
+        own_model.show(args, answer.by_log)
+    else:
+        chain = chain_of(args)
+        answer = Stages(chain, locate_stages(chain.stages), args.log)
     for x in answer.located:
         say_located(args, x)
     terminal.write_json(args, answer.to_dict())

@@ -283,8 +283,6 @@ class ErrorShare:
     ) -> StageDiagnosis:
         """Missing what was found; else unknown where the error left follows from what was logged, or none."""
         judge, stage = self.judge, self.judge.stage
-        for c in candidates:
-            c.reason = self.left_out.get(c.effect, c.reason)
         left = rms_of(judge, fit)
         unknown = not agrees(left, 1.0) and structure(judge, fit) > STRUCTURE
         for f in effects:
@@ -292,7 +290,7 @@ class ErrorShare:
                 self.notes.append(f"{f.effect} stands at the end of its physical range: the log would have it go on")
         verdict = "missing" if effects else "unknown" if unknown else "none"
         out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
-        out.notes = self.notes
+        out.notes, out.gain = self.notes, "fall of the held-out error [%]"
         return out
 
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
-__all__ = ["Effect", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
+__all__ = ["Bound", "Effect", "Model", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
 
 Array = np.ndarray
 FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
@@ -161,6 +162,26 @@ class Stage:
     def effect(self, name: str) -> Effect:
         """Return the effect of that name."""
         return next(e for e in self.effects if e.name == name)
+
+
+class Bound(Protocol):
+    """A model held against logs: what the search looks at, whatever machine it is of.
+
+    stages        each driven by its own logged inputs
+    not_observed  stage -> what the logs lack for it
+    notes         what the user should know
+    """
+
+    stages: list[Stage]
+    not_observed: dict[str, str]
+    notes: list[str]
+
+
+class Model(Protocol):
+    """What can be held against logs: the vane machine, a user's own system."""
+
+    def bind(self, logs: Any) -> Bound:
+        """Hold it against logs. Raises StageError or InputError, in one line, for logs that it cannot be held to."""
 
 
 KNOWN_TO = 0.05  # share by which two estimates of one noise differ on clean logs of some 100 s

@@ -21,7 +21,7 @@ class Candidate:
 
     nats, spreads  as the criterion counts a gain: nats and noise-floor spreads, or per cent of the error and the share
                    of the change that is improvement
-    reason         why it cannot be seen in this log, if it cannot; or why it is not named though it helps
+    reason         why it cannot be seen in this log, if it cannot
     """
 
     effect: str
@@ -72,6 +72,7 @@ class StageDiagnosis:
     excess: float = 1.0  # whitened RMS after the best model
     nearest: list[str] = field(default_factory=list)  # where the verdict is unknown: the effects that come nearest
     refused: list[str] = field(default_factory=list)  # and why they are no answer, in words
+    gain: str = "gain on held-out data [nats]"  # what `Candidate.nats` counts
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
 
 

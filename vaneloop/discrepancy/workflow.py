@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import time
@@ -12,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage, floor_of
+from vaneloop.discrepancy.diagnose import Judged, diagnose_stage, extend_stage, floor_of
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
-from vaneloop.discrepancy.noise_floor import NATS, as_close, correlation_of, significant
+from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, as_close, correlation_of, significant
 from vaneloop.discrepancy.stage import Stage, StageError
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output
 
@@ -56,12 +57,18 @@ def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
 
 
 _WORK: list[Stage] = []
+_JUDGED: list[Judged] = [NoiseFloor]  # of the work
 
 
-def _one(i: int) -> tuple[StageDiagnosis, list[Shape]]:
+def _one(i: int, tick: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
-    d = diagnose_stage(stage, floor_of(stage))
-    return d, shape(Judge(stage, d.floor), d.final) if d.verdict == "unknown" or not agrees(d.excess, 1.0) else []
+    d = diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0])
+    return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
+
+
+def _leaves(d: StageDiagnosis) -> bool:
+    """Whether what is left asks for words: something is missing, or still missing."""
+    return d.verdict == "unknown" or (d.verdict != "none" and not agrees(d.excess, 1.0))
 
 
 def diagnose(
@@ -69,12 +76,15 @@ def diagnose(
     not_observed: dict[str, str] | None = None,
     progress: Callable[[float], None] | None = None,
     workers: int = 2,
+    judged: Judged = NoiseFloor,
 ) -> Diagnosis:
     """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can
     fork.
+
+    judged  what an effect must do to be named
     """
     started = time.perf_counter()
-    _WORK[:] = list(stages)
+    _WORK[:], _JUDGED[:] = list(stages), [judged]
     # the longest first
     order = sorted(range(len(_WORK)), key=lambda i: -len(_WORK[i].effects) * len(_WORK[i].outputs))
     done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
@@ -86,8 +96,14 @@ def diagnose(
                 if progress:
                     progress((n + 1) / len(order))
     else:
+        fits = itertools.count(1)
         for n, i in enumerate(order):
-            done[i] = _one(i)
+
+            def tick(n: int = n) -> None:  # nobody knows how many fits there will be
+                if progress:
+                    progress((n + 1.0 - 1.0 / (1.0 + next(fits) / 60.0)) / len(order))
+
+            done[i] = _one(i, tick)
             if progress:
                 progress((n + 1) / len(order))
     results = [done[i][0] for i in range(len(_WORK))]
@@ -190,7 +206,7 @@ def _fits(
 
 
 def no_better(r: StageDiagnosis) -> str | None:
-    """Say in one line that the effects of `extend_stage` or `extend_system` do not bring the model nearer to the log;
+    """Say in one line that the effects of `extend_stage` do not bring the model nearer to the log;
     None: they do.
 
     Errors are held-out; on the data that it was fitted to, a model with more effects is never farther off.
@@ -233,7 +249,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
                 }
             )  # fmt: skip
         recalibrated += s.recalibrated
-        if s.verdict == "unknown" or not agrees(s.excess, 1.0):
+        if _leaves(s):
             text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
             text = "; ".join([text, *s.refused])
             leaning = s.nearest or [c.effect for c in s.candidates if c.nats > NATS][:3]

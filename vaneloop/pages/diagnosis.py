@@ -10,9 +10,11 @@ import numpy as np
 
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located, bins_of, locate
-from vaneloop.discrepancy.models.vanes import Chain
+from vaneloop.discrepancy.models.by_log import ByLog
+from vaneloop.discrepancy.stage import Bound, Stage
 from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Line, Panel, heat, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import TONE_OF, number
@@ -20,9 +22,13 @@ from vaneloop.pages.style import TONE_OF, number
 __all__ = ["compare_page", "diagnosis_page", "located_sentence", "located_tone", "verdict_sentence"]
 
 
-def verdict_sentence(d: Diagnosis) -> str:
-    """The answer in one sentence."""
+def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
+    """The answer in one sentence; of a user's own model with what is left."""
     parts = []
+    if by_log is not None:
+        left, name = by_log.sentence(), by_log.d.stage
+        if d.verdict == "none":
+            return f"Nothing is missing that the library could add to {name}; {left}."
     for s in d.stages:
         if s.verdict == "missing":
             names = [f"{f.effect}" + (f" (or {', '.join(f.rivals)})" if f.rivals else "") for f in s.effects]
@@ -33,7 +39,7 @@ def verdict_sentence(d: Diagnosis) -> str:
             parts.append(f"the {s.stage} stage lacks something that the library does not have{what}")
     if not parts:
         return "Nothing is missing: every observed stage explains its measurements down to the noise floor."
-    text = "; ".join(parts)
+    text = "; ".join([*parts, by_log.sentence()] if by_log is not None else parts)
     return text[0].upper() + text[1:] + "."
 
 
@@ -56,7 +62,11 @@ def located_tone(located: Sequence[Located]) -> Literal["good", "neutral", "bad"
     return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
 
 
-def compare_page(located: Sequence[Located], chain: Chain, command: str, log: str) -> Page:
+def _stage(bound: Bound, name: str) -> Stage:
+    return next(s for s in bound.stages if s.name == name)
+
+
+def compare_page(located: Sequence[Located], bound: Bound, command: str, log: str, by_log: ByLog | None = None) -> Page:
     """The page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
     page = Page(
         f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
@@ -73,23 +83,39 @@ def compare_page(located: Sequence[Located], chain: Chain, command: str, log: st
         for x in located for f in x.signals
     ]  # fmt: skip
     rows += [
-        [name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in chain.not_observed.items()
+        [name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in bound.not_observed.items()
     ]
     page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
-        judge = Judge(chain.stage(x.stage), x.floor)
+        judge = Judge(_stage(bound, x.stage), x.floor)
         _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
         _failure_map(page, x)
+    if by_log is not None:
+        log_by_log(page, by_log)
+        curves_by_log(page, by_log)
+        _notes(page, by_log.notes)
     return page
 
 
+def _notes(page: Page, notes: Sequence[str]) -> None:
+    if notes:
+        page.section("Notes")
+        for n in notes:
+            page.text(n[0].upper() + n[1:] + ".")
+
+
 def diagnosis_page(
-    d: Diagnosis, chain: Chain, command: str, log: str, experiment: dict[str, Any] | None = None
+    d: Diagnosis,
+    bound: Bound,
+    command: str,
+    log: str,
+    experiment: dict[str, Any] | None = None,
+    by_log: ByLog | None = None,
 ) -> Page:
     """The page of ``vaneloop diagnose`` or ``extend``."""
     title = f"Diagnosis of {Path(log).name}"
-    page = Page(title, verdict_sentence(d), tone=TONE_OF[d.verdict], command=command, log=log)
+    page = Page(title, verdict_sentence(d, by_log), tone=TONE_OF[d.verdict], command=command, log=log)
     for s in d.stages:
         k = int(np.argmax(s.error_before / s.floor))
         page.tile(
@@ -130,10 +156,13 @@ def diagnosis_page(
                     ]
                 )
         page.table(["effect", "stage", "probability", "parameter", "value", "low", "high", "unit", "rivals"], rows)
+    if by_log is not None:
+        log_by_log(page, by_log)
+        curves_by_log(page, by_log)
     for s in d.stages:
         if s.verdict == "none":
             continue
-        _stage_story(page, s, chain)
+        _stage_story(page, s, bound)
         for x in d.shapes.get(s.stage, []):
             page.text(x.text[0].upper() + x.text[1:] + ".")
             page.plot(
@@ -162,11 +191,12 @@ def diagnosis_page(
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
         page.table(["effect", "stage", "what would excite it"], unseen)
+    _notes(page, by_log.notes if by_log is not None else ())
     return page
 
 
-def _stage_story(page: Page, s: StageDiagnosis, chain: Chain) -> None:
-    stage = chain.stage(s.stage)
+def _stage_story(page: Page, s: StageDiagnosis, bound: Bound) -> None:
+    stage = _stage(bound, s.stage)
     judge = Judge(stage, s.floor)
     page.section(
         f"The {s.stage} stage",
@@ -181,7 +211,7 @@ def _stage_story(page: Page, s: StageDiagnosis, chain: Chain) -> None:
     if top:
         chosen = [f.effect for f in s.effects]
         page.plot(
-            ranking([c.effect for c in top], [c.nats for c in top], "gain on held-out data [nats]", highlight=chosen),
+            ranking([c.effect for c in top], [c.nats for c in top], s.gain, highlight=chosen),
             "Effects tried alone, by what they gain on data that they were not fitted to.",
         )
     page.plot(

@@ -1,20 +1,19 @@
 """Compare, locate, diagnose, extend, experiment: where a model fails, what it lacks, and what to measure next.
 
-Each verb takes one log of the vane machine (`Machine`), or records of a user's own machine (`System`).
+A model is the vane machine (`Machine`), held against one log, or a user's own (`System`), held against several records.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import Record, StageError, System
 from vaneloop.discrepancy.locate import Located, agrees
-from vaneloop.discrepancy.models import own_model
 from vaneloop.discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage, locate_stages, no_better
 from vaneloop.discrepancy.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
@@ -24,12 +23,14 @@ from vaneloop.verbs.replay import log_of
 if TYPE_CHECKING:
     from hil.logs import Log
     from plant import Model
+    from vaneloop.discrepancy.models.by_log import ByLog, Logs
     from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.discrepancy.stage import Bound
     from vaneloop.pages.page import Page
 
 __all__ = [
-    "Diagnosed", "Experiment", "Extended", "OwnAnswer", "Stages", "compare", "diagnose", "experiment", "extend",
-    "locate", "read_record",
+    "Diagnosed", "Experiment", "Extended", "Stages", "compare", "diagnose", "experiment", "extend", "locate",
+    "read_record",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]
@@ -37,11 +38,16 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Stages(Answer):
-    """Every stage on its own logged inputs, nothing added: how large its error is, where it fails, since when."""
+    """Every stage on its own logged inputs, nothing added: how large its error is, where it fails, since when.
 
-    chain: Chain
+    bound   the model held against the log
+    by_log  of a `System`, what that means log by log
+    """
+
+    bound: Bound
     located: list[Located]
     log: str = ""
+    by_log: ByLog | None = None
 
     @property
     def fails(self) -> bool:
@@ -56,24 +62,32 @@ class Stages(Answer):
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop locate``."""
-        stages = [x.json() for x in self.located]
-        lacks = {"not_observed": self.chain.not_observed, "notes": self.chain.notes}
-        return {"schema": 1, "log": self.log, "stages": stages, **lacks}
+        out: dict[str, Any] = {"schema": 1, "log": self.log, "stages": [x.json() for x in self.located]}
+        out |= {"not_observed": self.bound.not_observed, "notes": self.bound.notes}
+        if self.by_log is not None:
+            signals = [{**f.json(), "reference": "measured"} for x in self.located for f in x.signals]
+            out |= {"signals": signals, **self.by_log.json(), "verdict": "fails" if self.fails else "agrees"}
+        return out
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         from vaneloop.pages.diagnosis import compare_page
 
-        return compare_page(self.located, self.chain, command, self.log)
+        return compare_page(self.located, self.bound, command, self.log, self.by_log)
 
 
 @dataclass(frozen=True)
 class Diagnosed(Answer):
-    """What each stage lacks: effects with probability, parameters and rivals, or "unknown" with its shape."""
+    """What each stage lacks: effects with probability, parameters and rivals, or "unknown" with its shape.
 
-    chain: Chain
+    bound   the model held against the log
+    by_log  of a `System`, what that means log by log
+    """
+
+    bound: Bound
     diagnosis: Diagnosis
     log: str = ""
+    by_log: ByLog | None = None
 
     @property
     def verdict(self) -> str:
@@ -89,24 +103,24 @@ class Diagnosed(Answer):
         """The answer in one sentence."""
         from vaneloop.pages.diagnosis import verdict_sentence
 
-        return verdict_sentence(self.diagnosis)
+        return verdict_sentence(self.diagnosis, self.by_log)
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop diagnose``."""
-        return diagnosis_json(self.diagnosis, self.log)
+        return diagnosis_json(self.diagnosis, self.log) | (self.by_log.json() if self.by_log else {})
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         from vaneloop.pages.diagnosis import diagnosis_page
 
-        return diagnosis_page(self.diagnosis, self.chain, command, self.log)
+        return diagnosis_page(self.diagnosis, self.bound, command, self.log, by_log=self.by_log)
 
 
 @dataclass(frozen=True)
 class Extended(Diagnosed):
     """The model with effects added and fitted.
 
-    model    `plant.Model`: recalibrated parameters and all effects
+    model    recalibrated parameters and all effects
     refused  why the model is no better with them; "": it is
     path     where the model file was written; "": nowhere
     """
@@ -166,56 +180,7 @@ class Experiment(Answer):
         """The answer as a page."""
         from vaneloop.pages.diagnosis import diagnosis_page
 
-        return diagnosis_page(self.diagnosed.diagnosis, self.diagnosed.chain, command, self.log, self.recommended)
-
-
-@dataclass(frozen=True)
-class OwnAnswer(Answer):
-    """What a verb found on a user's own model (`vaneloop.discrepancy.models.own_model.Answer`)."""
-
-    answer: own_model.Answer
-    log: str = ""
-    more: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def verdict(self) -> str:
-        """Missing, none or unknown."""
-        return self.answer.diagnosis.verdict
-
-    @property
-    def effects(self) -> list[str]:
-        """Names of the laws named as missing."""
-        return [f.effect for f in self.answer.diagnosis.effects]
-
-    def sentence(self) -> str:
-        """The answer in one sentence."""
-        return self.answer.sentence()
-
-    def to_dict(self) -> dict[str, Any]:
-        """The answer as the commands' JSON."""
-        out = self.answer.json()
-        if self.answer.verb == "locate":
-            out["stages"] = [self.answer.located.json()]
-        if self.answer.verb == "compare":
-            out["signals"] = self._signals()
-        return {**out, "log": self.log or out["log"], **self.more}
-
-    def _signals(self) -> list[dict[str, Any]]:
-        d, measured = self.answer.diagnosis, self.answer.bound.measured
-        return [
-            {
-                "signal": d.outputs[k], "stage": d.stage, "unit": d.units[k], "reference": "measured",
-                "rms": d.error_before[k], "noise_floor": d.floor[k],
-                "samples": int((measured[k] == measured[k]).sum()),
-            }
-            for k in range(len(d.outputs))
-        ]  # fmt: skip
-
-    def page(self, command: str = "") -> Page:
-        """The answer as a page."""
-        from vaneloop.pages.own_model import own_page
-
-        return own_page(self.answer, command, self.log)
+        return diagnosis_page(self.diagnosed.diagnosis, self.diagnosed.bound, command, self.log, self.recommended)
 
 
 # ---- the verbs -------------------------------------------------------------------------------------------------------
@@ -231,35 +196,43 @@ def _records(logs: Any, system: System) -> list[Record]:
     return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
 
 
-def _own(verb: str, logs: Any, system: System, test: Any, **options: Any) -> OwnAnswer:
-    records = _records(logs, system)
+def _logs(log: Any, system: System, test: Any, added: Model | None) -> tuple[Logs, str]:
+    """The records held against a system, and the first one's name."""
+    from vaneloop.discrepancy.models.by_log import bind
+
+    records = _records(log, system)
     try:
-        answer = getattr(own_model, verb)(system, records, test=_records(test, system), **options)
+        return bind(system, records, _records(test, system), added), records[0].name
     except StageError as e:
         raise InputError(str(e)) from None
-    return OwnAnswer(answer, records[0].name)
 
 
 def compare(
-    log: Any, model: Machine | System | None = None, *, test: Any = (), progress: Progress | None = None
-) -> Stages | OwnAnswer:
+    log: Any,
+    model: Machine | System | None = None,
+    *,
+    test: Any = (),
+    added: Model | None = None,
+    progress: Progress | None = None,
+) -> Stages:
     """By how much does the model miss? Each stage driven by its own logged inputs, so that none hides behind another.
 
     log    a log of the vane machine (`Log` or a file's name); of a `System`, one or several `Record` or files' names
-    model  the machine that the log is held against; default: the shipped tables
+    model  what the log is held against; default: the machine of the shipped tables
     test   records that nothing is fitted to, of a `System`
+    added  parameters and laws that a `System` has by now; a `Machine` has its own
     """
     if isinstance(model, System):
-        return _own("compare", log, model, test)
+        from vaneloop.discrepancy.models.by_log import ByLog, as_given
+
+        logs, name = _logs(log, model, test, added)
+        d = as_given(logs)
+        return Stages(logs.fitted, locate_stages(logs.fitted.stages), name, ByLog.of(logs, d, added))
     chain, name = _chain(log, model or Machine())
     return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
 
 
-def locate(
-    log: Any, model: Machine | System | None = None, *, test: Any = (), progress: Progress | None = None
-) -> Stages | OwnAnswer:
-    """Which stage fails, under which conditions, since when? Arguments as of `compare`."""
-    return _own("locate", log, model, test) if isinstance(model, System) else compare(log, model, progress=progress)
+locate = compare  # which stage fails, under which conditions, since when? The same answer, asked for its details
 
 
 def diagnose(
@@ -267,12 +240,19 @@ def diagnose(
     model: Machine | System | None = None,
     *,
     test: Any = (),
+    added: Model | None = None,
     workers: int = 2,
     progress: Progress | None = None,
-) -> Diagnosed | OwnAnswer:
+) -> Diagnosed:
     """Which physical effects does the model lack? Arguments as of `compare`; ``workers``: stages searched at a time."""
     if isinstance(model, System):
-        return _own("diagnose", log, model, test, progress=progress)
+        from vaneloop.discrepancy.models.by_log import ByLog
+
+        logs, name = _logs(log, model, test, added)
+        d = search(logs.fitted.stages, None, progress, 1, logs.judged())
+        by_log = ByLog.of(logs, d.stages[0], added)
+        d.notes = by_log.notes
+        return Diagnosed(logs.fitted, d, name, by_log)
     chain, name = _chain(log, model or Machine())
     return diagnosed(chain, name, workers, progress)
 
@@ -285,18 +265,48 @@ def diagnosed(chain: Chain, log: str, workers: int = 2, progress: Progress | Non
 
 
 def extend(
-    log: Any, effects: Sequence[str], model: Machine | System | None = None, *, test: Any = ()
-) -> Extended | OwnAnswer:
+    log: Any,
+    effects: Sequence[str],
+    model: Machine | System | None = None,
+    *,
+    test: Any = (),
+    added: Model | None = None,
+) -> Extended:
     """Add effects to the model and fit them, together with those it has. Other arguments as of `compare`.
 
     Raises InputError for an effect that is not in the library, or whose stage the log does not show.
     """
     if isinstance(model, System):
-        return _own("extend", log, model, test, effects=effects)
+        return _extended(*_logs(log, model, test, added), effects, added)
     machine = model or Machine()
     known(effects)
     chain, name = _chain(log, Machine(machine.tables, None, machine.strategy))
     return extended(chain, effects, machine.added, name)
+
+
+def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None) -> Extended:
+    """`extend` of a system that has been held against its logs."""
+    from vaneloop.discrepancy.error_share import ErrorShare
+    from vaneloop.discrepancy.models.by_log import ByLog
+
+    started = time.perf_counter()
+    bound = logs.fitted
+    have = [e.name for e in bound.stage.effects]
+    for e in effects:
+        if e not in have:
+            why = "it is part of the model already" if e in bound.present else _close(e, have)
+            raise InputError(f"--effect {e!r}: not a law that system {bound.system.name!r} can be given; {why}")
+    r = extend_stage(bound.thinned, tuple(dict.fromkeys(effects)), judged=ErrorShare)
+    by_log = ByLog.of(logs, r, added)
+    d = Diagnosis("missing", [r], {}, {}, time.perf_counter() - started, by_log.notes)
+    return Extended(bound, d, name, by_log, by_log.model, no_better(r) or "")
+
+
+def _close(name: str, known: Sequence[str]) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(name, known, 3, 0.4)
+    return f"close: {', '.join(close)}" if close else f"it can have {', '.join(known)}"
 
 
 def known(effects: Sequence[str]) -> None:
@@ -339,7 +349,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     model = Model(parameters=parameters, effects=effects, meta=before.meta)
     seconds = time.perf_counter() - started
     d = Diagnosis("missing", results, {}, chain.not_observed, seconds, list(chain.notes))
-    return Extended(chain, d, log, model, next(filter(None, map(no_better, results)), ""))
+    return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
 
 
 def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None) -> Experiment:

@@ -32,8 +32,8 @@ class Bound:
     values    parameters fitted before, by name
     present   laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
 
-    stage     what the search works on; the logs follow each other in time
-    thinned   the same on fewer samples, where there are many
+    stage     the model on all samples; the logs follow each other in time
+    thinned   the same on fewer samples, where there are many; ``stages``: it, which is what the search works on
     others    values of the parameters in other valleys of the error than the best
     data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
     runner    the model on them; ``run`` is its
@@ -150,6 +150,9 @@ class Bound:
             regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units, floor=self.stage.floor,
             begins=self.stage.begins,
         )  # fmt: skip
+
+        self.stages: list[Stage] = [self.thinned]
+        self.not_observed: dict[str, str] = {}
 
     def theta_from(self, other: Bound, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""

@@ -1,0 +1,276 @@
+"""A user's own model, log by log: how much each law brings on each log, fitted or only tested, and what it all says.
+
+The search is that of every model (`vaneloop.discrepancy.workflow`); here is what several logs have beyond one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plant import Model
+from vaneloop.base.tables import read
+from vaneloop.discrepancy.diagnose import Judged
+from vaneloop.discrepancy.error_share import ErrorShare
+from vaneloop.discrepancy.fit import Judge, recalibrate
+from vaneloop.discrepancy.laws import HYSTERETIC
+from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.runner import STARTS_LOADED
+from vaneloop.discrepancy.models.system import Record, System
+from vaneloop.discrepancy.stage import Array, StageError
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, answer_of, rms_of
+
+__all__ = ["NO_HELP", "ByLog", "Logs", "as_given", "bind", "load_model_of"]
+
+NO_HELP = 0.85  # error with a law over error without it, from which it hardly helps
+
+
+@dataclass
+class Logs:
+    """A system held against the logs that it is fitted to, and against those that only test it."""
+
+    fitted: Bound
+    test: Bound | None
+
+    def figures(self, theta: Array) -> dict[str, Array]:
+        """RMS error of every output, log by log."""
+        out = self.fitted.figures(theta)
+        if self.test is not None:
+            out |= self.test.figures(self.test.theta_from(self.fitted, theta))
+        return out
+
+    def judged(self) -> Judged:
+        """What earns a law its place: its share of the error, and what the test logs say."""
+        floor = self.fitted.data.noise()
+
+        def levels(theta: Array) -> dict[str, float]:
+            by = {log: v for log, v in self.figures(theta).items() if np.isfinite(v).all()}
+            return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in by.items()}
+
+        return partial(ErrorShare, figures=levels, tests=frozenset(self.test.logs if self.test else ()))
+
+
+def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), model: Model | None = None) -> Logs:
+    """Put logs into a system, with what a model file says of it."""
+    m = model or Model()
+    bound = system.bind(list(logs), values=m.parameters, present=m.effects)
+    return Logs(bound, system.bind(list(test), like=bound) if test else None)
+
+
+def as_given(logs: Logs) -> StageDiagnosis:
+    """The model with nothing added."""
+    judge = Judge(logs.fitted.thinned, logs.fitted.data.noise())
+    fit = recalibrate(judge)
+    return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
+
+
+@dataclass
+class ByLog:
+    """What an answer (``d``) means for each log.
+
+    steps     RMS error of every output after each step of the waterfall: step -> log -> RMS per output
+    ablation  law -> log -> error with it over error without it (each refitted on the fitted logs), over all outputs
+    notes     what the user should know
+    model     the model from now on: its parameters as fitted, its laws
+    """
+
+    logs: Logs
+    d: StageDiagnosis
+    steps: dict[str, dict[str, Array]] = field(default_factory=dict)
+    ablation: dict[str, dict[str, float]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    model: Model = field(default_factory=Model)
+
+    @classmethod
+    def of(cls, logs: Logs, d: StageDiagnosis, before: Model | None = None) -> ByLog:
+        """Work it out; ``before``: the model that the answer started from."""
+        bound, final = logs.fitted, d.final
+        judge = Judge(bound.thinned, d.floor)
+        named = {"model": d.base.theta}
+        # the waterfall log by log: laws in the order in which they came in, each step fitted
+        theta = d.base.theta
+        for k in range(1, len(final.effects)):
+            part = judge.fit(final.effects[:k], _seeded(bound, theta, final.theta, final.effects[:k]), 12)
+            named[" + ".join(part.effects)] = theta = part.theta
+        if final.effects:
+            named[" + ".join(final.effects)] = final.theta
+        out = cls(logs, d, {step: logs.figures(theta) for step, theta in named.items()}, notes=list(bound.notes))
+        out._ablate(judge)
+        out._remark(judge)
+        m = before or Model()
+        out.model = Model(
+            parameters=dict(m.parameters),
+            effects={k: dict(v) for k, v in m.effects.items()},
+            meta={"system": bound.system.name, **m.meta},
+        )
+        for p, v in zip(bound.stage.parameters, final.theta, strict=False):
+            law, _, parameter = p.name.rpartition(".")
+            (out.model.effects[law] if law else out.model.parameters)[parameter if law else p.name] = float(v)
+        for f in d.effects:
+            out.model.effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items()}
+        return out
+
+    def _ablate(self, judge: Judge) -> None:
+        bound, final = self.logs.fitted, self.d.final
+        last = list(self.steps.values())[-1]
+        for name in final.effects:
+            rest = tuple(e for e in final.effects if e != name)
+            by = self.steps["model"]
+            if rest:
+                without = judge.fit(rest, _seeded(bound, self.d.base.theta, final.theta, rest), 12)
+                by = self.logs.figures(without.theta)
+            self.ablation[name] = {log: float(np.exp(np.nanmean(np.log(last[log] / by[log])))) for log in by}
+
+    def _remark(self, judge: Judge) -> None:
+        bound, d = self.logs.fitted, self.d
+        for name, ratios in self.ablation.items():
+            for log, r in ratios.items():
+                if r > NO_HELP:
+                    how = "hardly helps" if r < 0.98 else "does not help"
+                    self.notes.append(f"{name} {how} on {log}: error with it over error without it is {r:.2f}")
+        laws = ", ".join(d.final.effects)
+        for i, p in enumerate(bound.stage.parameters):
+            v0 = d.base.theta[i]
+            if d.final.theta[i] == 0.0 and v0 != 0.0 and p.low == 0.0 and p.tolerance > 0:
+                was = f"it was {v0:.4g} {p.unit} while {laws} was missing"
+                self.notes.append(f"{p.name}: not needed any more, set to 0 ({was})")
+        self.notes += [*_loaded(bound, judge, d), *d.notes]
+
+    def together(self) -> dict[str, dict[str, Array]]:
+        """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test"
+        -> RMS.
+        """
+        out: dict[str, dict[str, Array]] = {}
+        for step, by in self.steps.items():
+            out[step] = {}
+            for what, bound in (("fitted", self.logs.fitted), ("test", self.logs.test)):
+                if bound is not None:
+                    n = np.array([np.isfinite(bound.measured[:, at]).sum(axis=1) for at in bound.logs.values()])
+                    squares = np.array([np.where(np.isfinite(by[log]), by[log], 0.0) ** 2 for log in bound.logs])
+                    out[step][what] = np.sqrt((n * squares).sum(axis=0) / np.maximum(n.sum(axis=0), 1))
+        return out
+
+    def rows(self) -> list[tuple[str, str, int, list[float], float]]:
+        """A line for each log and output, and for all logs of a kind: log, "fitted" or "test", output, error after each
+        step, RMS of the output.
+        """
+        d, out = self.d, []
+        together = self.together()
+        kinds = [("fitted", self.logs.fitted), *([("test", self.logs.test)] if self.logs.test else [])]
+        for what, bound in kinds:
+            for log, at in bound.logs.items():
+                for k in range(len(d.outputs)):
+                    errors = [float(by[log][k]) for by in self.steps.values()]
+                    out.append((log, what, k, errors, _size(bound.measured[k, at])))
+        for what, bound in kinds:
+            for k in range(len(d.outputs)) if len(bound.logs) > 1 else ():
+                errors = [float(by[what][k]) for by in together.values()]
+                out.append((f"all {len(bound.logs)} together", what, k, errors, _size(bound.measured[k])))
+        return out
+
+    def sentence(self) -> str:
+        """What is left, in words."""
+        d = self.d
+        k = int(np.argmax(d.error_before / d.floor))
+        share = 100.0 * d.error_after[k] / _size(self.logs.fitted.measured[k])
+        return (
+            f"{d.outputs[k]} is left with an error of {d.error_after[k]:.4g} {d.units[k]} ({share:.2g} % of its RMS), "
+            f"{d.excess:.3g} times the noise of its samples"
+        )
+
+    def parameters(self) -> list[dict[str, object]]:
+        """The model's own parameters as fitted, with 90 % intervals."""
+        fit = self.d.final
+        out: list[dict[str, object]] = []
+        for i, p in enumerate(self.logs.fitted.stage.parameters):
+            where = np.flatnonzero(fit.free == i)
+            value = float(fit.theta[i])
+            low, high = (float(fit.low[where[0]]), float(fit.high[where[0]])) if len(where) else (value, value)
+            out.append({"parameter": p.name, "value": value, "low": low, "high": high, "unit": p.unit})
+        return out
+
+    def json(self) -> dict[str, Any]:
+        """What the commands' JSON has beyond that of one log (docs/diagnosis.md)."""
+        d, fitted = self.d, self.logs.fitted
+        free = {p.name for p in fitted.system.parameters if np.isinf(p.tolerance)}
+        moved = [r for r in d.recalibrated if r["parameter"] not in free]
+        sizes = {(log, k): size for log, _, k, _, size in self.rows()}
+        return {
+            "recalibrated": [r for r in moved if not str(r["parameter"]).startswith("start_")],
+            "parameters": self.parameters(),
+            "waterfall": {d.stage: [{"step": n, "noise_floors": v} for n, v in d.steps]},
+            "logs": [
+                {
+                    "log": log, "fitted": log in fitted.logs, "signal": d.outputs[k], "unit": d.units[k], "step": step,
+                    "rms": float(rms[k]), "relative": float(rms[k] / sizes[log, k]),
+                }
+                for step, by in self.steps.items() for log, rms in by.items() for k in range(len(d.outputs))
+            ],
+            "together": [
+                {"logs": what, "signal": d.outputs[k], "unit": d.units[k], "step": step, "rms": float(rms[k])}
+                for step, by in self.together().items() for what, rms in by.items() for k in range(len(d.outputs))
+            ],
+            "ablation": [
+                {"effect": e, "log": log, "error_ratio": v, "helps": v < NO_HELP}
+                for e, by in self.ablation.items() for log, v in by.items()
+            ],
+            "notes": self.notes,
+        }  # fmt: skip
+
+
+def _size(y: Array) -> float:
+    return float(np.sqrt(np.nanmean(y**2))) if np.isfinite(y).any() and np.nanmax(np.abs(y)) > 0.0 else 1.0
+
+
+def _loaded(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
+    """What it would change to start springs with the force that was measured at the start."""
+    codes = {q.effect: q.law.code for q in bound.placed}
+    springs = [e for e in (*d.final.effects, *bound.present) if codes[e] in HYSTERETIC]
+    if bound.system.kind != "force" or bound.runner.loaded or not springs:
+        return []
+    held = [bound.data.held(k) for k in range(len(bound.logs))]
+    if max(np.abs(held)) < STARTS_LOADED * bound.runner.noise_of_force:
+        return []
+    bound.runner.loaded = True
+    other = judge.fit(d.final.effects, judge.fit(d.final.effects, d.final.theta, 12).theta, 12)
+    bound.runner.loaded = False
+    before, after = (float(np.sqrt(f.cost.sum() / max(judge.n, 1)) * d.floor[0]) for f in (d.final, other))
+    unit = d.units[0]
+    names = [p.name for e in bound.stage.effects for p in e.parameters]
+    index, n = bound.stage.index(), len(bound.stage.parameters)
+    moved = [
+        f"{e.rpartition('.')[2]} {names[c - n]} {d.final.theta[c]:.4g} to {other.theta[c]:.4g}"
+        for e in d.final.effects for c in range(index[e].start, index[e].stop)
+        if abs(other.theta[c] - d.final.theta[c]) > 0.02 * abs(d.final.theta[c])
+    ]  # fmt: skip
+    text = f"{' and '.join(springs)} taken as unloaded at the start, where {held[0]:.3g} {unit} was measured; "
+    text += f'with start_force="measured" the error goes from {before:.4g} to {after:.4g} {unit}'
+    return [text + (f", {', '.join(moved)}" if moved else "")]
+
+
+def _seeded(bound: Bound, base: Array, final: Array, effects: tuple[str, ...]) -> Array:
+    """Start of a fit with some laws of the final model: theirs from there, all others absent."""
+    out = bound.stage.neutral()
+    n = len(bound.stage.parameters)
+    out[:n] = final[:n] if effects else base[:n]
+    for e in effects:
+        at = bound.stage.index()[e]
+        out[at] = final[at]
+    return out
+
+
+def load_model_of(path: str | Path, system: System) -> Model:
+    """Read a model file of this system; its parameters and laws are checked when logs are put into it.
+
+    Raises InputError or StageError in one line.
+    """
+    model = read(path, Model)
+    if model.meta.get("system") != system.name:
+        whose = model.meta.get("system", "the vane chain")
+        raise StageError(f"{path}: is a model of {whose!r}; system {system.name!r} is asked for")
+    return model
