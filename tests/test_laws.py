@@ -194,3 +194,36 @@ def test_state_laws() -> None:
     assert rate["square_root"] == [-4.0, 4.0]
     assert rate["quadratic_drag"] == [-32.0, 32.0]
     assert rate["cubic"] == [-128.0, 128.0]
+
+
+# ---- what sticks -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["stiction", "stick_slip"])
+@pytest.mark.parametrize("begin", [-1.0, 0.0, 0.7])
+def test_stiction_without_a_jump_is_play(name: str, begin: float) -> None:
+    np.testing.assert_allclose(signal(name, 0.8, 0.0, begin), signal("play", 0.8, begin), atol=1e-12)
+
+
+@pytest.mark.parametrize("jump", [0.2, 0.6, 1.0])
+def test_a_valve_that_sticks_breaks_away_after_its_width_and_jumps(jump: float) -> None:
+    width = 1.0
+    u = np.concatenate([np.linspace(0.0, 5.0, 501), np.linspace(5.0, 0.0, 501)[1:]])
+    for name in ("stiction", "stick_slip"):
+        y = laws.apply(SIGNAL_LAWS[name].code, np.arange(len(u)) * 0.01, u, np.array([width, jump, 0.0, 0.0]))
+        assert np.all(np.abs(u - y) <= 0.5 * width * (1.0 + jump) + 1e-9)  # static friction holds no more
+    y = laws.apply(laws.STICTION, np.arange(len(u)) * 0.01, u, np.array([width, jump, 0.0, 0.0]))
+    back = y[500:]
+    first = int(np.flatnonzero(np.diff(back))[0])  # after turning it rests over the width
+    assert u[500] - u[500 + first] == pytest.approx(width, abs=0.011)
+    assert back[first] - back[first + 1] == pytest.approx(jump * width, abs=0.021)  # and jumps
+    slides = np.diff(back[first + 1 :])
+    np.testing.assert_allclose(slides, np.diff(u[500 + first + 1 :]), atol=1e-9)  # and then slides with its command
+
+
+def test_a_stem_that_sticks_again_at_once_moves_in_stairs() -> None:
+    u = np.linspace(0.0, 5.0, 501)
+    y = laws.apply(laws.STICK_SLIP, np.arange(501) * 0.01, u, np.array([1.0, 0.5, 0.0, 0.0]))
+    steps = np.diff(y)
+    np.testing.assert_allclose(steps[steps != 0.0][1:], 0.5, atol=0.011)  # each the jump
+    assert np.count_nonzero(steps) == pytest.approx(5.0 / 0.5, abs=2)

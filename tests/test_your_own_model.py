@@ -251,3 +251,76 @@ def test_a_system_that_cannot_be_is_refused(change: dict[str, Any], said: str) -
 def test_shipped_examples_load() -> None:
     for name in ("emps", "friction_damper", "micro_gas_turbine"):
         assert load_system(PAGE.parent.parent / "examples" / f"{name}.py").parameters
+
+
+# ---- whatever the unit, the start, the order -------------------------------------------------------------------------
+
+
+def tanks(seed: int, overflow: bool) -> Record:
+    """Two tanks in cascade, outflow after Torricelli; what runs over in the upper one falls into the lower."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 1200.0, 2.0)
+    pump = np.repeat(rng.uniform(1.0, 6.0, 20), 30)
+    upper, lower, rows = 5.0, 5.0, []
+    for k in range(len(t)):
+        rows.append((upper, lower))
+        for _ in range(20):
+            down = 0.35 * max(upper, 0.0) ** 0.5
+            upper += 0.1 * (0.25 * pump[k] - down)
+            lower += 0.1 * (down - 0.3 * max(lower, 0.0) ** 0.5)
+            if overflow and upper > 10.0:
+                lower += upper - 10.0
+                upper = 10.0
+    y = np.array(rows) + 0.02 * rng.standard_normal((len(t), 2))
+    return Record(f"tanks {seed}", t, {"pump": pump, "upper": y[:, 0], "lower": y[:, 1]})
+
+
+def cascade(x: Any, u: Any, p: Any) -> Any:
+    down = p.down * max(x.upper, 0.0) ** 0.5
+    return p.inflow * u.pump - down, down - p.out * max(x.lower, 0.0) ** 0.5
+
+
+@pytest.mark.parametrize("overflow", [True, False])
+@pytest.mark.parametrize("wrong", [0.12, 8.0])
+def test_an_overflow_into_the_next_tank_is_found_from_starts_far_off(overflow: bool, wrong: float) -> None:
+    system = System(
+        "tanks", "simulate", cascade, inputs={"pump": "V"}, states={"upper": "cm", "lower": "cm"},
+        outputs={"upper": "cm", "lower": "cm"},
+        parameters=[
+            unknown("inflow", 0.25 * wrong, "cm/(V s)", low=0.0), unknown("down", 0.35 / wrong, "cm^0.5/s", low=0.0),
+            unknown("out", 0.3 * wrong, "cm^0.5/s", low=0.0),
+        ],
+    )  # fmt: skip
+    answer = diagnose([tanks(1, overflow)], system, test=[tanks(2, overflow)])
+    assert named(answer) == (["upper.overflow_to_lower"] if overflow else [])
+    if overflow:
+        level = answer.diagnosis.stages[0].effects[0].parameters["level"]["value"]
+        assert float(str(level)) == pytest.approx(10.0, rel=0.02)
+
+
+@pytest.mark.parametrize("time", [0.05, 20.0])
+@pytest.mark.parametrize("size", [1e-3, 1e3])
+def test_the_answer_does_not_turn_on_units(time: float, size: float) -> None:
+    rng = np.random.default_rng(11)
+    t = time * T
+    u, v = wave(3), wave(4)
+
+    def record(name: str, u: np.ndarray) -> Record:
+        y = 2.0 * np.interp(T - 0.4, T, np.clip(u, -0.8, 0.9)) + 0.3 + 0.01 * rng.standard_normal(len(T))
+        return Record(name, t, {"u": u, "y": size * y})
+
+    system = System(
+        "sensor", "static", line, outputs={"y": "V"}, inputs={"u": "V"},
+        parameters=[unknown("gain", 0.7 * size, "-"), unknown("offset", 0.0, "V")],
+    )  # fmt: skip
+    answer = diagnose([record("a", u)], system, test=[record("b", v)])
+    assert sorted(n.rpartition(".")[2] for n in named(answer)) == ["dead_time", "saturation"]
+
+
+def test_a_law_that_harms_a_test_log_is_not_named() -> None:
+    u, v = wave(8), 3.0 * wave(9)
+    fitted = Record("fitted", T, {"u": u, "y": 2.0 * u + 0.5 * np.abs(u) + 0.02 * noise()})
+    other = Record("other", T, {"u": v, "y": 2.0 * v + 0.02 * noise()})  # the asymmetry was that log's own
+    answer = diagnose([fitted], STRAIGHT, test=[other])
+    assert "u.asymmetric_gain" not in named(answer)
+    assert any("is not named: makes other worse" in n for n in answer.diagnosis.notes)

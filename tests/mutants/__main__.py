@@ -48,6 +48,8 @@ TARGETS = (
         (
             "vaneloop/discrepancy/diagnose.py",
             "vaneloop/discrepancy/fit.py",
+            "vaneloop/discrepancy/noise_floor.py",
+            "vaneloop/discrepancy/search.py",
             "vaneloop/discrepancy/workflow.py",
             "vaneloop/discrepancy/locate.py",
         ),

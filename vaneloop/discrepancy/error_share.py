@@ -172,15 +172,17 @@ class ErrorShare:
         a flexible law stands in for whatever bends.
         """
         size = {e.name: len(e.parameters) for e in self.judge.stage.effects}
-        plain = [n for n in names if size[n] == 1]
-        for drop in [e for e in fit.effects if size[e] > 2]:
+        for drop in [e for e in fit.effects if size[e] > 1]:
             rest = search.joined(tuple(e for e in fit.effects if e != drop))
-            free = [n for n in plain if n not in rest.effects]
-            one = [f for f in search.best_of([(*rest.effects, n) for n in free]) if self.earns(rest, f)][:2]
+            free = [n for n in names if n not in rest.effects and size[n] < size[drop]]
+            one = [f for f in search.best_of([(*rest.effects, n) for n in free]) if self.earns(rest, f)]
+            single = [n for n in free if size[n] == 1] if size[drop] > 2 else []
             two = [
-                g for f in one for g in search.best_of([(*f.effects, n) for n in free if n not in f.effects])
+                g
+                for f in [f for f in one if f.effects[-1] in single][:2]
+                for g in search.best_of([(*f.effects, n) for n in single if n not in f.effects])
                 if self.earns(f, g)
-            ]  # fmt: skip
+            ]
             options = [f for f in (*one, *two) if len(f.free) < len(fit.free) and not self.earns(f, fit)]
             if options:
                 fit = min(options, key=self.order)
@@ -224,6 +226,10 @@ class ErrorShare:
                     fit = less
         return fit
 
+    def _sizes(self) -> dict[str, int]:
+        """How many numbers of each effect say how much of it there is."""
+        return {e.name: sum(not p.shape for p in e.parameters) for e in self.judge.stage.effects}
+
     # ---- names -------------------------------------------------------------------------------------------------------
 
     def name(self, search: Search, fit: Fit, candidates: list[Candidate]) -> tuple[list[Found], Fit]:
@@ -254,7 +260,7 @@ class ErrorShare:
         judge, stage = self.judge, self.judge.stage
         count = int(np.sum(judge.samples > 0))
         draws = np.random.default_rng(0).integers(0, count, (400, count))
-        size = {e.name: len(e.parameters) for e in stage.effects}
+        size = self._sizes()
         out = []
         for name in fit.effects:
             rest_names = tuple(e for e in fit.effects if e != name)

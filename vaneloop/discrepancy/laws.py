@@ -35,7 +35,7 @@ PARAMETERS = 3  # most parameters of one law
 BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION, SMOOTH_SATURATION, QUANTISATION = (
     range(1, 11)
 )
-PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME = range(11, 16)
+PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME, STICTION, STICK_SLIP = range(11, 18)
 
 
 @compiled_free
@@ -44,7 +44,7 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
     (changed in place).
 
     Samples after ``k`` are not looked at, so that the same function serves inside a loop. At k = 0 the memory is set
-    up: laws start at rest at the first value.
+    up: laws start at rest at the first value; what has play may begin anywhere in it.
     """
     x = u[k]
     dt = t[k] - t[k - 1] if k > 0 else 0.0
@@ -74,8 +74,10 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
         return math.floor(x / p[0] + 0.5) * p[0] if p[0] > 0.0 else x
     if code == PLAY:
         h = 0.5 * p[0]
-        s[0] = x if k == 0 else min(max(s[0], x - h), x + h)
+        s[0] = x + p[1] * h if k == 0 else min(max(s[0], x - h), x + h)
         return s[0]
+    if code == STICTION or code == STICK_SLIP:  # p[0]: width, p[1]: jump as a share of it
+        return _stuck(code, x, x - u[k - 1] if k > 0 else 0.0, k == 0, p, s)
     if code == RATE_LIMIT:
         s[0] = x if k == 0 else s[0] + min(max(x - s[0], -p[0] * dt), p[0] * dt)
         return s[0]
@@ -125,6 +127,29 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
         f = (when - t[j]) / (t[j + 1] - t[j])
         return u[j] + f * (u[j + 1] - u[j])
     return x
+
+
+@compiled_free
+def _stuck(code: int, x: float, dx: float, first: bool, p: Array, s: Array) -> float:
+    """Position of a valve's stem that sticks, for its command ``x`` that has just changed by ``dx``.
+
+    It rests until the command is farther from it than static friction holds, (1 + j) S/2 with width S and jump j; then
+    it jumps, and slides (1 - j) S/2 behind. STICTION slides on until the command stops or turns (Choudhury, Thornhill
+    and Shah 2005, S and J = j S); STICK_SLIP sticks again at once (He, Wang, Pottmann and Qin 2007). Without a jump
+    both are play of the width S. ``p``: S, j, where in its band it begins (-1 to 1); ``s``: position, direction of
+    sliding or 0.
+    """
+    holds, behind = 0.5 * p[0] * (1.0 + p[1]), 0.5 * p[0] * (1.0 - p[1])
+    if first:
+        s[0], s[1] = x + p[2] * holds, 0.0
+    if s[1] * dx <= 0.0 or code == STICK_SLIP:
+        s[1] = 0.0
+    e = x - s[0]
+    if s[1] == 0.0 and abs(e) > holds:
+        s[1] = 1.0 if e > 0.0 else -1.0
+    if s[1] != 0.0:
+        s[0] = x - s[1] * behind
+    return s[0]
 
 
 @compiled_free
@@ -255,13 +280,15 @@ def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: floa
 
 # ---- laws of a state of first order ----------------------------------------------------------------------------------
 
-STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT = range(41, 48)
+STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT, STATE_OVERFLOW = (
+    range(41, 49)
+)
 
 
 @compiled_free
 def state_rate(code: int, x: float, p: Array) -> float:
-    """What law ``code`` takes off the derivative of the state ``x``. The two limits take nothing off; the simulation
-    applies them.
+    """What law ``code`` takes off the derivative of the state ``x``. Limits take nothing off; the simulation applies
+    them.
     """
     if code == STATE_OFFSET:
         return p[0]

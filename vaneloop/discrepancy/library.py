@@ -151,8 +151,26 @@ def _quantisation(z: Size) -> _Made:
     return _one("step", z.unit, 0.0, 0.0, z.half, [part * z.half for part in (0.003, 0.01, 0.03, 0.1, 0.3)])
 
 
+_BEGIN = Parameter("begin", 0.0, "-", -1.0, 1.0, shape=True)  # where in its band something with play stands at first
+
+
 def _play(z: Size) -> _Made:
-    return _one("width", z.unit, 0.0, 0.0, 2.0 * z.half, [part * z.half for part in (0.01, 0.03, 0.1, 0.3, 0.8)])
+    widths = [part * z.half for part in (0.005, 0.015, 0.03, 0.06, 0.1, 0.2, 0.35, 0.8, 1.6, 2.6)]
+    ps = (Parameter("width", 0.0, z.unit, 0.0, 4.0 * z.half), _BEGIN)
+    return ps, tuple((width, begin) for width in widths for begin in (0.0, 0.6, -0.6))
+
+
+def _stiction(z: Size) -> _Made:
+    widths = [part * z.half for part in (0.015, 0.04, 0.1, 0.2, 0.5, 1.2, 2.6)]
+    jump = Parameter("jump", 0.5, "-", 0.0, 1.0, shape=True)
+    ps = (Parameter("width", 0.0, z.unit, 0.0, 4.0 * z.half), jump, _BEGIN)
+    return ps, tuple((width, j, begin) for width in widths for j in (0.3, 1.0) for begin in (0.6, -0.6))
+
+
+def _overflow(z: Size) -> _Made:
+    above = z.high + (z.high - z.low)
+    ps = (Parameter("level", above, z.unit, z.low, above), Parameter("share", 1.0, "-", 0.0, 2.0, shape=True))
+    return ps, tuple((z.high - part * (z.high - z.low), 1.0) for part in (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5))
 
 
 def _rate_limit(z: Size) -> _Made:
@@ -170,11 +188,11 @@ def _times(z: Size, least: float = 0.5, points: int = 7) -> list[float]:
 
 
 def _lag(z: Size) -> _Made:
-    return _one("time_constant", "s", 0.0, 0.0, z.span / 4.0, _times(z))
+    return _one("time_constant", "s", 0.0, 0.0, z.span / 8.0, _times(z))  # a log shows what ends in it
 
 
 def _second_order_lag(z: Size) -> _Made:
-    ps = (Parameter("inverse_frequency", 0.0, "s", 0.0, z.span / 4.0), Parameter("damping", 1.0, "-", 0.05, 5.0))
+    ps = (Parameter("inverse_frequency", 0.0, "s", 0.0, z.span / 16.0), Parameter("damping", 1.0, "-", 0.05, 2.0))
     return ps, tuple((v, d) for v in _times(z, points=6) for d in (0.3, 1.0))
 
 
@@ -347,6 +365,22 @@ LAWS: dict[str, dict[str, Law]] = {
                 True,
             ),
             Law(
+                "stiction",
+                laws.STICTION,
+                "sticks, jumps, then slides on behind its command",
+                _stiction,
+                "flat after each reversal or stop, a jump, then parallel",
+                True,
+            ),
+            Law(
+                "stick_slip",
+                laws.STICK_SLIP,
+                "sticks, jumps, and sticks again at once",
+                _stiction,
+                "stairs while the command moves",
+                True,
+            ),
+            Law(
                 "rate_limit",
                 laws.RATE_LIMIT,
                 "cannot change faster than a limit",
@@ -449,6 +483,14 @@ LAWS: dict[str, dict[str, Law]] = {
                 "cannot change faster than a limit",
                 _rate_limit,
                 "straight ramps",
+                True,
+            ),
+            Law(
+                "overflow",
+                laws.STATE_OVERFLOW,
+                "what is above a level goes into another state",
+                _overflow,
+                "a flat top here, a rise there",
                 True,
             ),
         )

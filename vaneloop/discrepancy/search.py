@@ -219,8 +219,8 @@ class Search:
         return self.singles([name])[name]
 
     def singles(self, names: Sequence[str]) -> dict[str, Fit]:
-        """Fits with one effect each, side by side; where there are too many, of those that promise most."""
-        if len(names) > self.criterion.fitted:
+        """Fits with one effect each, side by side; of a model that roams, of those that promise most."""
+        if self.criterion.roams:
             names = sorted(names, key=lambda n: self.level[n])[: 2 * self.criterion.fitted]
             followed = dict(zip(names, self.judge.together([self._followed(n) for n in names]), strict=True))
             names = sorted(names, key=lambda n: followed[n])[: self.criterion.fitted]

@@ -114,7 +114,7 @@ class Bound:
         for q, e in both:
             if e.name in self.present:
                 for w in e.parameters:
-                    v = self.present[e.name].get(w.name)
+                    v = self.present[e.name].get(w.name, w.value if w.shape else None)
                     if v is None or not np.isfinite(v):
                         raise StageError(f"model file: effect {e.name!r} needs a number for {w.name}")
                     v = float(np.clip(v, w.low, w.high))
@@ -224,21 +224,28 @@ class Bound:
         free = [i for i, p in enumerate(parameters) if np.isinf(p.tolerance)]
         scale = np.nanstd(self.measured, axis=1)
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
-        first = self.run(values[None])[0]
-        if not np.all(np.abs(first) < self.runner.far):
-            k = np.unravel_index(int(np.argmax(~(np.abs(first) < self.runner.far))), first.shape)
+        size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
+        low, high = (np.array([getattr(parameters[i], side) for i in free]) / size for side in ("low", "high"))
+        given = np.clip(values[free] / size, low, high)
+        moves = self.system.kind in ("simulate", "closed_loop")
+        out = self.run(values[None])[0]
+        stays = bool(np.all(np.abs(out) < self.runner.far))
+        drawn: list[Array] = []
+        if stays and moves:
+            self._choose_steps(values)
+        if free:
+            self._scan_starts(values, [i for i in free if parameters[i].name.startswith("start_")])
+            given = np.clip(values[free] / size, low, high)
+            drawn = self._drawn(values, free, size, given, low, high, scale)
+        if not stays and not drawn:
+            k = np.unravel_index(int(np.argmax(~(np.abs(out) < self.runner.far))), out.shape)
             raise StageError(
                 f"system {self.system.name!r}: the model leaves all bounds or turns NaN for "
                 f"{list(self.system.outputs)[k[0]]} at t = {self.t[k[1]]:g} s with its first parameters; other values "
                 f"of {', '.join(p.name for p in parameters) or 'the model'} are needed, or a window="
             )
-        if self.system.kind in ("simulate", "closed_loop"):
-            self._choose_steps(values)
         if not free:
             return values
-        self._scan_starts(values, [i for i in free if parameters[i].name.startswith("start_")])
-        size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
-        low, high = (np.array([getattr(parameters[i], side) for i in free]) / size for side in ("low", "high"))
         use = np.isfinite(self.measured)
         measured = np.where(use, self.measured, 0.0)
         stride = max(1, self.measured.shape[1] // 20000)
@@ -249,8 +256,9 @@ class Bound:
             e = (self.run(trial[None])[0] - measured) / scale[:, None]
             return np.where(use, e, 0.0)[:, ::stride].ravel()
 
-        first = np.clip(values[free] / size, low, high)
-        begins = [first, *self._drawn(values, free, size, first, low, high, scale)]
+        if moves and not stays:
+            self._choose_steps(self._with(values, free, drawn[0] * size))
+        begins = [given, *drawn] if stays else drawn
         fits = [least_squares(error, b, bounds=(low, high), diff_step=1e-4, max_nfev=20) for b in begins]
         fits.sort(key=lambda f: f.cost)
         again = [least_squares(error, f.x, bounds=(low, high), diff_step=1e-4, max_nfev=60) for f in fits[:2]]
@@ -274,7 +282,8 @@ class Bound:
         self, values: Array, free: list[int], size: Array, first: Array, low: Array, high: Array, scale: Array
     ) -> list[Array]:
         """Values (in sizes) from which a fit may begin beside the user's own: of many drawn within `FACTOR`, those that
-        come nearest to the logs, as they are or but for a gain and an offset of each output.
+        come nearest to the logs, as they are or but for a gain and an offset of each output; none that leaves all
+        bounds.
         """
         from scipy.stats import qmc
 
@@ -288,15 +297,17 @@ class Bound:
         y = np.where(use, self.measured, 0.0) / scale[:, None]
         plain, bent = np.empty(drawn), np.empty(drawn)
         for i in range(0, drawn, 32):
-            m = self.run(thetas[i : i + 32]) / scale[:, None]
-            plain[i : i + 32] = np.sum(weight * (m - y) ** 2, axis=(1, 2))
+            m = self.run(thetas[i : i + 32])
+            inside = np.all(np.abs(m) < self.runner.far, axis=(1, 2))
+            m = m / scale[:, None]
+            plain[i : i + 32] = np.where(inside, np.sum(weight * (m - y) ** 2, axis=(1, 2)), np.inf)
             my, mm = np.sum(weight * y, axis=1), np.sum(weight * m, axis=2)
             var = np.sum(weight * (m - mm[:, :, None]) ** 2, axis=2)
             both = np.sum(weight * (m - mm[:, :, None]) * (y - my[:, None]), axis=2)
             total = np.sum(weight * (y - my[:, None]) ** 2, axis=1)
-            bent[i : i + 32] = np.sum(total - both**2 / np.maximum(var, 1e-12), axis=1)
+            bent[i : i + 32] = np.where(inside, np.sum(total - both**2 / np.maximum(var, 1e-12), axis=1), np.inf)
         best = [*np.argsort(plain)[: FROM // 2], *np.argsort(bent)[: FROM // 2]]
-        return [z[i] for i in dict.fromkeys(int(i) for i in best)]
+        return [z[i] for i in dict.fromkeys(int(i) for i in best) if np.isfinite(plain[i])]
 
     def _scan_starts(self, theta: Array, columns: list[int]) -> None:
         """Set unknown initial states in place to the best of some round sizes of the outputs, one after the other."""

@@ -43,6 +43,7 @@ def build_kernels(code: UserCode) -> tuple[Kernel, Kernel]:
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": laws.transform, "MEMORY": MEMORY,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
+            "STATE_OVERFLOW": laws.STATE_OVERFLOW,
         }  # fmt: skip
         exec(compile(source, f"<{s.name}>", "exec"), space)
         return space["run"]
@@ -99,7 +100,7 @@ if len(code) > 0:
         w = where[i]
         c = code[i]
         if c > 40:
-            if c != STATE_LIMIT and c != STATE_RATE_LIMIT:
+            if c != STATE_LIMIT and c != STATE_RATE_LIMIT and c != STATE_OVERFLOW:
                 dx[w] -= state_rate(c, AT[w], rows[i])
         elif not memory[i]:
             dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
@@ -208,6 +209,11 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                 if code[i] == STATE_LIMIT:
                     w = where[i]
                     x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
+                elif code[i] == STATE_OVERFLOW:  # what is cut off goes into another state, the row's constant
+                    w = where[i]
+                    over = max(x[w] - rows[i, 0], 0.0)
+                    x[w] -= over
+                    x[int(rows[i, 2])] += rows[i, 1] * over
         for w in range(m):
             if not np.isfinite(x[w]) or abs(x[w]) > 1e150:
                 return

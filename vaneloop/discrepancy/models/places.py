@@ -25,22 +25,16 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
     out: list[Placed] = []
     effects: list[Effect] = []
 
+    def put(name: str, law: Law, place: str, at: int, size: Size, constant: float) -> None:
+        ps, starts = law.make(size)
+        effects.append(Effect(name, tuple(ps), starts, law.looks))
+        out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
+
     def add(prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()) -> None:
         for law in family.values():
             if law.name in leave:
                 continue
-            ps, starts = law.make(size)
-            effects.append(Effect(f"{prefix}.{law.name}", tuple(ps), starts, law.looks))
-            out.append(
-                Placed(
-                    f"{prefix}.{law.name}",
-                    law,
-                    place,
-                    at,
-                    law.constant(size) if law.constant else 0.0,
-                    neutral=np.array([q.value for q in ps]),
-                )
-            )
+            put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
 
     outputs = list(s.outputs)
     if s.kind == "force" and _allowed(s, "force", "force"):
@@ -75,7 +69,11 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
                 )  # fmt: skip
                 add(name, "force", i, FORCE_LAWS, size)
             else:
-                add(name, "state", i, STATE_LAWS, _size(data.records, values, unit))
+                size = _size(data.records, values, unit)
+                add(name, "state", i, STATE_LAWS, size, ("overflow",))
+                for j, (other, other_unit) in enumerate(s.states.items()):  # into any other of the same kind
+                    if j != i and other_unit == unit and other not in s.rates.values():
+                        put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, float(j))
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
         if _allowed(s, "input", name):

@@ -65,7 +65,9 @@ class Runner:
         self._compile(like)
         n_out = len(s.outputs)
         far = np.nanmax(np.abs(data.measured), axis=1) if np.isfinite(data.measured).any() else np.ones(n_out)
-        self.far = 100.0 * float(np.nanmax(np.where(np.isfinite(far), far, 1.0))) + 1e-300
+        # what is not integrated runs away from nothing: its gain may just start far off
+        beyond = 100.0 if s.kind in ("simulate", "closed_loop") else 1e9
+        self.far = beyond * float(np.nanmax(np.where(np.isfinite(far), far, 1.0))) + 1e-300
         self.noise_of_force = float(data.noise()[0]) if s.kind == "force" else 0.0
 
     def _compile(self, like: Runner | None) -> None:
