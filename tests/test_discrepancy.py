@@ -444,7 +444,8 @@ KEYS = {
 def test_the_json_of_a_diagnosis_keeps_its_contract(machine: list[Stage]) -> None:
     progress: list[float] = []
     d = diagnose(machine, {"third": "no pressure"}, progress.append, workers=1)
-    assert progress == pytest.approx([1 / 3, 2 / 3, 1.0])
+    assert progress == sorted(progress) and progress[-1] == 1.0
+    assert all(any(abs(p - part) < 1e-9 for p in progress) for part in (1 / 3, 2 / 3))
     text = json.dumps(plain(diagnosis_json(d, "run.csv")), allow_nan=False)
     j = json.loads(text)
     assert KEYS[""] <= set(j) and (j["schema"], j["log"], j["verdict"]) == (1, "run.csv", "missing")

@@ -84,7 +84,8 @@ class Judge:
             w = np.minimum(((t - t[0]) / stage.window + 1e-9).astype(int), max(int(span / stage.window + 1e-9) - 1, 0))
         else:
             w = None
-        blocks = int(np.clip(span / (stage.memory or span / BLOCKS), MIN_BLOCKS, MOST_BLOCKS))
+        self.memory = stage.memory or span / BLOCKS  # s, the stage's own time scale
+        blocks = int(np.clip(span / self.memory, MIN_BLOCKS, MOST_BLOCKS))
         if w is not None:
             per = max(1, round((w[-1] + 1) / blocks))
             block_of = w // per

@@ -265,7 +265,7 @@ def onset(judge: Judge, fit: Fit) -> float | None:
 
     e = judge.errors(fit.theta[None])[0]
     t = judge.stage.t
-    width = max(1, int(round(2.0 / (t[1] - t[0]))))
+    width = max(1, int(round(0.2 * judge.memory / (t[1] - t[0]))))
     n = e.shape[1] // width * width
     counts = judge.valid[:, :n].reshape(len(e), -1, width).sum(axis=(0, 2))
     power = (e[:, :n] ** 2).reshape(len(e), -1, width).sum(axis=(0, 2))
@@ -311,7 +311,8 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
     t = stage.t
     dt = t[1] - t[0]
-    k = max(1, int(round(0.1 / dt)))
+    second = 0.1 * judge.memory  # of a stage whose time scale is that of the vanes
+    k = max(1, int(round(0.1 * second / dt)))
     out: list[Shape] = []
     for o, output in enumerate(stage.outputs):
         valid = judge.valid[o].copy()
@@ -322,8 +323,8 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
         rate = np.diff(whole) / dt
         f, power = periodogram(np.where(np.isfinite(rate), rate, 0.0), 1.0 / dt)
         power[1:] /= (2.0 * np.sin(np.pi * f[1:] * dt) / dt) ** 2
-        resolution = max(0.05, 3.0 / (t[-1] - t[0]))
-        keep = f > 0.7
+        resolution = max(0.05 / second, 3.0 / (t[-1] - t[0]))
+        keep = f > 0.7 / second
         if stage.window:
             keep &= np.abs(f * stage.window - np.round(f * stage.window)) > resolution * stage.window
         if keep.any() and power[keep].max() > 0:
@@ -364,7 +365,7 @@ def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
             edges = _edges(v[ok])
             b = np.clip(np.digitize(v[ok], edges) - 1, 0, len(edges) - 2)
             half = (
-                np.arange(ok.sum()) // max(1, int(5.0 / dt))
+                np.arange(ok.sum()) // max(1, int(5.0 * second / dt))
             ) % 2 == 0  # curves from half of the stretches must hold for the other
             n1, n2 = np.bincount(b[half], minlength=len(edges) - 1), np.bincount(b, minlength=len(edges) - 1)
             mean = np.bincount(b[half], target[ok][half], minlength=len(edges) - 1) / np.maximum(n1, 1)
