@@ -10,7 +10,7 @@ import numpy as np
 
 from vaneloop import Record, System
 
-__all__ = ["SCALES", "rescaled", "reordered_laws", "variants"]
+__all__ = ["SCALES", "reordered_laws", "rescaled", "variants"]
 
 SCALES = {"time x 0.05": 0.05, "time x 20": 20.0, "channels x 1000": 1000.0, "channels x 0.001": 0.001}
 Case = Any

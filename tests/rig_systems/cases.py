@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +22,7 @@ SHARES = (0.25, 0.25, 0.20, 0.30)
 RATES = tuple(m * 10.0**e for e in range(-1, 4) for m in (1.0, 2.0, 5.0) if 0.2 <= m * 10.0**e <= 2000.0)  # Hz
 QUANTISED = 0.2  # of the sensors give whole steps
 WRONG = 10.0  # factor by which a start is off at most
+TRIES = 20  # draws of sizes until the system stays within bounds
 CHORDS = 4  # steps of the refit that decides whether a law can be seen
 
 
@@ -203,22 +205,41 @@ def draw_case(
     for k in range(count):
         kinds = [s.kinds[o[k % len(o)]] for s, o in zip(f.inputs.values(), orders, strict=True)]
         logs.append(_log(f, p, kinds, rate, n, rng))
-    hidden = hide(f, p, logs[:-1], _names(f, kind, rng) if names is None else names, rng)
+    names = _names(f, kind, rng) if names is None else names
     nominal = np.concatenate([simulate(f, p, [], log.t, log.drive, {}) for log in logs[:-1]], axis=1)
     noise, steps = {}, {}
     for name, share in f.noise.items():
         spread = float(np.std(nominal[f.outputs.index(name)])) if name in f.outputs else f.inputs[name].high
         noise[name] = spread * float(np.exp(rng.uniform(np.log(share[0]), np.log(share[1]))))
         steps[name] = noise[name] * float(rng.uniform(0.5, 1.5)) if rng.random() < QUANTISED else 0.0
-    greatest = {}
-    for g in hidden:
-        if g.law == "square_root" and f.where(g.place)[0] in ("input", "output"):
-            z = place_size(f, p, logs[:-1], g.place)
-            greatest[g.place] = z.greatest
-    case = Case(index, f, kind, p, factors, hidden, rate, logs, noise, steps, greatest, [seed, index])
-    for log in logs:
-        log.outputs = simulate(f, p, hidden, log.t, log.drive, greatest)
-    return case
+    case = Case(index, f, kind, p, factors, [], rate, logs, noise, steps, {}, [seed, index])
+    for _ in range(TRIES):
+        case.hidden = hide(f, p, logs[:-1], names, rng)
+        if _simulated(case, nominal):
+            return case
+    raise RuntimeError(f"{f.name}: no run that ends well in {TRIES} draws of {', '.join(names)}")
+
+
+def _simulated(case: Case, nominal: Array) -> bool:
+    """Simulate the logs; False where the system leaves all bounds (a levitated ball drops): nobody has such logs."""
+    f, p = case.family, case.p
+    case.greatest = {
+        g.place: place_size(f, p, case.logs[:-1], g.place).greatest
+        for g in case.hidden
+        if g.law == "square_root" and f.where(g.place)[0] in ("input", "output")
+    }
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for log in case.logs:
+                log.outputs = simulate(f, p, case.hidden, log.t, log.drive, case.greatest)
+    except (RuntimeError, OverflowError, ZeroDivisionError, ValueError):
+        return False
+    far = 10.0 * np.abs(nominal).max(axis=1)
+    return all(
+        bool(np.isfinite(y).all()) and bool((np.abs(y).max(axis=1) < far).all())
+        for y in (log.outputs for log in case.logs)
+    )
 
 
 def left_over(case: Case) -> list[float]:

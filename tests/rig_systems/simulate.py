@@ -120,9 +120,9 @@ class _System:
         self.springs: list[list[Any]] = []  # state, law, mode: 0 elastic, +-1 the slider moves
         self.slopes: list[tuple[int, float]] = []
         self.limits: list[list[Any]] = []  # state, low, high, mode
-        self.gap = {w: 0.0 for w in range(self.n)}
+        self.gap = dict.fromkeys(range(self.n), 0.0)
         rubbing: dict[int, list[Hidden]] = {}
-        uneven = {w: 0.0 for w in range(self.n)}
+        uneven = dict.fromkeys(range(self.n), 0.0)
         for g in inside:
             kind, w = f.where(g.place)
             if kind == "state" and g.law == "saturation":
@@ -320,7 +320,11 @@ def _advance(
     """Integrate over one segment into ``out``; the state at its end."""
     most = 0.0 if still else 2.0 * FINE * float(t[1] - t[0])
     if not system.switches:
-        got = odeint(lambda z, t: system(t, z, inputs(t)), z, t, rtol=RTOL, atol=1e-10, hmax=most, mxstep=20000)
+        got, info = odeint(
+            lambda z, t: system(t, z, inputs(t)), z, t, rtol=RTOL, atol=1e-10, hmax=most, mxstep=20000, full_output=True
+        )
+        if "successful" not in info["message"] or not np.isfinite(got).all():
+            raise RuntimeError(f"{system.f.name}: {info['message']}")
         out[:] = got[:, : system.n].T
         return [float(v) for v in got[-1]]
     now, end = float(t[0]), float(t[-1])
@@ -364,6 +368,8 @@ def _loop(
             if g.name not in f.outside and f.where(g.place)[0] == "output":
                 k = f.where(g.place)[1]
                 y[k] = float(on_signal(g.law, g.values, np.array([y[k]]), 1.0, True, greatest.get(g.place, 1.0))[0])
+        if not all(abs(v) < 1e6 for v in y):
+            raise RuntimeError(f"{f.name}: the loop is unstable")
         c = float(f.control([float(v) for v in u[:, a]], y, p))
         for g in hidden:
             if g.name not in f.outside and f.where(g.place)[0] == "command":
