@@ -262,7 +262,8 @@ def pendulum(start: Values, known: Values) -> System:
         "pendulum", "simulate", derivative, inputs={"torque": "N m"}, states={"rate": "rad/s", "angle": "rad"},
         outputs={"angle": "rad", "rate": "rad/s"}, rates={"rate": "angle"}, between="line",
         parameters=[
-            unknown("gravity", start["gravity"], "1/s^2", low=0.0), unknown("damping", start["damping"], "1/s", low=0.0),
+            unknown("gravity", start["gravity"], "1/s^2", low=0.0),
+            unknown("damping", start["damping"], "1/s", low=0.0),
             unknown("drive", start["drive"], "1/(kg m^2)", low=0.0),
         ],
     )  # fmt: skip
@@ -294,8 +295,8 @@ def resonator(start: Values, known: Values) -> System:
         "resonator", "simulate", derivative, inputs={"force": "N"}, states={"speed": "mm/s", "place": "mm"},
         outputs={"place": "mm", "speed": "mm/s"}, rates={"speed": "place"}, masses={"speed": "mass"}, between="line",
         parameters=[
-            unknown("spring", start["spring"], "N/mm", low=0.0), unknown("damping", start["damping"], "N s/mm", low=0.0),
-            Parameter("mass", known["mass"], "N s^2/mm"),
+            unknown("spring", start["spring"], "N/mm", low=0.0),
+            unknown("damping", start["damping"], "N s/mm", low=0.0), Parameter("mass", known["mass"], "N s^2/mm"),
         ],
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Systems of many families, simulated independently of the product, with laws hidden in them. See docs/hidden_law.md."""
+"""Systems of many families, simulated independently of the product, with laws hidden in them: docs/hidden_law.md."""
 
 from .cases import FAMILIES, KINDS, Case, Log, draw_case, left_over
 from .family import Family, Hidden, Outside, Signal

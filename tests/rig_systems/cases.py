@@ -206,7 +206,8 @@ def draw_case(
         kinds = [s.kinds[o[k % len(o)]] for s, o in zip(f.inputs.values(), orders, strict=True)]
         logs.append(_log(f, p, kinds, rate, n, rng))
     names = _names(f, kind, rng) if names is None else names
-    nominal = np.concatenate([simulate(f, p, [], log.t, log.drive, {}) for log in logs[:-1]], axis=1)
+    runs = [simulate(f, p, [], log.t, log.drive, {}) for log in logs]
+    nominal = np.concatenate(runs[:-1], axis=1)
     noise, steps = {}, {}
     for name, share in f.noise.items():
         spread = float(np.std(nominal[f.outputs.index(name)])) if name in f.outputs else f.inputs[name].high
@@ -215,7 +216,7 @@ def draw_case(
     case = Case(index, f, kind, p, factors, [], rate, logs, noise, steps, {}, [seed, index])
     for _ in range(TRIES):
         case.hidden = hide(f, p, logs[:-1], names, rng)
-        if _simulated(case, nominal):
+        if _simulated(case, np.concatenate(runs, axis=1)):
             return case
     raise RuntimeError(f"{f.name}: no run that ends well in {TRIES} draws of {', '.join(names)}")
 

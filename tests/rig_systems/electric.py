@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from tests.rig_systems.family import Family, Outside, Signal
+from tests.rig_systems.family import HELD, Family, Outside, Signal
 
 __all__ = ["FAMILIES"]
 
@@ -55,6 +55,7 @@ DC_MOTOR = Family(
         ),
         "weakening": Outside("the magnets weaken as they warm over the log", 0.01, 0.3, rate=_heats),
     },
+    apart={"voltage.dead_time": HELD},
 )  # fmt: skip
 
 
@@ -106,7 +107,7 @@ RECTIFIED_DRIVE = Family(
 
 
 def _cell(x, u, p):
-    """Thevenin model (Plett 2015): charge in Ah drawn, voltage over one RC pair; current positive where it discharges."""
+    """Thevenin model (Plett 2015): charge in Ah drawn, voltage over one RC pair; a discharge is positive."""
     return u[0] / 3600.0, (p.r1 * u[0] - x[1]) / p.tau
 
 
@@ -146,6 +147,7 @@ BATTERY = Family(
         frozenset({"current.lag", "voltage.lag"}),
         frozenset({"current.second_order_lag", "voltage.second_order_lag"}),
     ),
+    apart={"current.dead_time": HELD, "voltage.lag": HELD},
 )  # fmt: skip
 
 
@@ -203,7 +205,7 @@ LEVITATION = Family(
 
 
 def _pneumatic(x, u, p):
-    """Regulator of first order, piston against a spring: pressure bar, speed mm/s, position mm; mass known."""
+    """Regulator of first order, piston against a spring: pressure bar, speed mm/s, position mm; mass known; N, N/mm."""
     force = p.area * x[0] - p.spring * x[2] - p.damping * x[1]
     return (6.0 * u[0] - x[0]) / p.fill, 1e3 * force / p.mass, x[1]
 
@@ -212,7 +214,7 @@ PNEUMATIC_CYLINDER = Family(
     name="pneumatic_cylinder",
     text="spring-returned pneumatic cylinder behind a pressure regulator (0 to 1 opens to 6 bar)",
     kind="simulate",
-    parameters={"fill": (0.02, 0.2), "area": (50.0, 200.0), "spring": (5.0, 20.0), "damping": (0.3, 1.0)},  # N/bar, N/mm
+    parameters={"fill": (0.02, 0.2), "area": (50.0, 200.0), "spring": (5.0, 20.0), "damping": (0.3, 1.0)},
     known=lambda p: {"mass": 4.0},
     inputs={"regulator": Signal(("steps", "cycle", "multisine"), 0.05, 0.95)},
     states=("pressure", "speed", "position"),
@@ -291,6 +293,7 @@ SPOOL = Family(
         frozenset({"fuel.bias", "fuel.dead_zone"}),
         frozenset({"speed_sensor.bias", "speed_sensor.dead_zone"}),
     ),
+    apart={"fuel.rate_limit": HELD, "fuel.dead_time": HELD, "exhaust.lag": HELD, "exhaust.dead_time": HELD},
 )  # fmt: skip
 
 FAMILIES = (DC_MOTOR, RECTIFIED_DRIVE, BATTERY, LEVITATION, PNEUMATIC_CYLINDER, SPOOL)

@@ -11,9 +11,14 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "Family", "Hidden", "Outside", "Signal"]
+__all__ = ["HELD", "Array", "Family", "Hidden", "Outside", "Signal"]
 
 Array = np.ndarray
+# why a law that delays or limits a signal differs between the product and this simulator
+HELD = (
+    "an input holds from sample to sample, so that it jumps; the product's lags, dead times and rate limits take a "
+    "signal as straight between samples, and a jump comes out wrong by part of a sample"
+)
 Parameters = SimpleNamespace
 
 
@@ -40,6 +45,7 @@ class Outside:
     output  (t, x, u, p, size, y) -> y: changes the outputs; arrays over samples, t from 0 to 1 over the log.
             For kind force x is (position, velocity, acceleration)
     source  (t, u, p, size) -> u: changes what drives the system; arrays over the fine grid
+    amounts_to  sets of the library's laws that together are this law, or a series of it that no log tells apart
     """
 
     text: str
@@ -48,6 +54,7 @@ class Outside:
     rate: Callable[..., Any] | None = None
     output: Callable[..., Any] | None = None
     source: Callable[..., Any] | None = None
+    amounts_to: tuple[frozenset[str], ...] = ()
 
 
 @dataclass(frozen=True)

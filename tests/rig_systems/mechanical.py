@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from tests.rig_systems.family import Family, Outside, Signal
+from tests.rig_systems.family import HELD, Family, Outside, Signal
 
 __all__ = ["FAMILIES"]
 
@@ -37,15 +37,14 @@ SERVO_AXIS = Family(
     partners={"force.friction_asymmetry": "force.coulomb"},
     outside={
         "pulley": Outside(
-            "an eccentric pulley: friction swings with the position (0.2 m a turn)", 0.005, 0.3,
-            output=lambda t, x, u, p, s, y: y + s * p.mass * np.sign(x[1]) * (1.0 + np.sin(x[0] * 2.0 * np.pi / 0.2)),
+            "an eccentric pulley: the belt's lever swings with the position (0.2 m a turn)", 0.005, 0.2,
+            output=lambda t, x, u, p, s, y: y * (1.0 + s * np.sin(x[0] * 2.0 * np.pi / 0.2)),
         ),
         "warming": Outside(
             "viscous friction falls over the log as the grease warms", 0.05, 0.8,
             output=lambda t, x, u, p, s, y: y - s * t * p.viscous * x[1],
         ),
     },
-    same=(frozenset({"force.bias", "force.force_offset"}),),
 )  # fmt: skip
 
 
@@ -156,9 +155,12 @@ HYDRAULIC_CYLINDER = Family(
             rate=lambda t, x, u, p, s, d: [
                 d[0] * (max(u[0] - s, 0.0) / u[0] if u[0] > 0.0 else 1.0)
             ],
+            # shifted by half the overlap, a dead zone of half the overlap is one on one side
+            amounts_to=(frozenset({"valve.bias", "valve.dead_zone"}),),
         ),
     },
     same=(frozenset({"valve.asymmetric_gain", "valve.absolute_value"}),),
+    apart={"valve.rate_limit": HELD},
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.rig_systems.family import Family, Outside, Signal
+from tests.rig_systems.family import HELD, Family, Outside, Signal
 
 __all__ = ["FAMILIES"]
 
@@ -112,6 +112,7 @@ FLOW_LOOP = Family(
         # a valve above 10 % never crosses 0: a dead zone is a constant, as is one in flow, rate or sensor
         frozenset({"valve.bias", "valve.dead_zone", "flow.offset", "flow_sensor.bias", "flow_sensor.dead_zone"}),
     ),
+    apart={"valve.rate_limit": HELD},
 )  # fmt: skip
 
 
@@ -140,6 +141,8 @@ VALVE_BENCH = Family(
         "one_edge": Outside(
             "overlap on one control edge only", 0.01, 0.4,
             output=lambda t, x, u, p, s, y: y - p.gain * np.clip(u, 0.0, s),
+            # shifted by half the overlap, a dead zone of half the overlap is one on one side
+            amounts_to=(frozenset({"current.bias", "current.dead_zone"}),),
         ),
         "notches": Outside(
             "metering notches: flow ripples with the stroke", 0.003, 0.1,
@@ -188,7 +191,13 @@ THERMAL_MASS = Family(
         *("rise_sensor.lag", "rise_sensor.second_order_lag", "rise_sensor.cubic", "rise_sensor.quantisation"),
     ),
     outside={
-        "radiation": Outside("radiates with the fourth power of the temperature", 0.02, 1.0, rate=_radiate),
+        "radiation": Outside(
+            "radiates with the fourth power of the temperature", 0.02, 1.0, rate=_radiate,
+            # (T + x)^4 - T^4 = 4 T^3 x + 6 T^2 x^2 + 4 T x^3 + x^4; the loss takes the first term
+            amounts_to=(
+                frozenset({"rise.quadratic_drag"}), frozenset({"rise.quadratic_drag", "rise.cubic"}),
+            ),
+        ),
         "draught": Outside(
             "the loss swings with a draught", 0.01, 0.4,
             rate=lambda t, x, u, p, s, d: [d[0] - s * p.loss / p.capacity * x[0] * np.sin(43.0 * t)],

@@ -70,10 +70,10 @@ def course(
 def _inputs(
     f: Family, p: Any, hidden: Sequence[Hidden], t: Array, drive: Array, fine: Array, greatest: dict[str, float]
 ) -> tuple[Array, list[bool]]:
-    """What drives the system, on the fine grid, after the laws of the inputs; which inputs stand still between points."""
+    """What drives the system, on the fine grid, after the laws of the inputs; which inputs hold between points."""
     h = fine[1] - fine[0]
     rows, steps = [], []
-    for i, name in enumerate(f.inputs):
+    for i in range(len(f.inputs)):
         y = np.interp(fine, t, drive[i]) if f.line else np.append(np.repeat(drive[i][:-1], FINE), drive[i][-1])
         hold = not f.line
         for hid in hidden:
@@ -243,11 +243,12 @@ class _System:
                 add(lambda t, z, w=w, b=low: z[w] - b, -1)
         for k, spring in enumerate(self.springs):
             w, g, mode = spring
+            most = self.most(spring)
             if g.law == "elastic_plastic" and mode:
                 add(lambda t, z, w=w: z[w], -mode)
             elif g.law == "elastic_plastic":
-                add(lambda t, z, k=k + self.n, b=self.most(spring): z[k] - b, 1)
-                add(lambda t, z, k=k + self.n, b=self.most(spring): z[k] + b, -1)
+                add(lambda t, z, k=k + self.n, b=most: z[k] - b, 1)
+                add(lambda t, z, k=k + self.n, b=most: z[k] + b, -1)
         return out
 
 
@@ -267,8 +268,8 @@ def _plain(g: Hidden, v: float, x: float, half: float) -> float:
 def _spring(g: Hidden, s: float, v: float, half: float, mode: int = 0) -> tuple[float, float]:
     """Force of a hysteretic element and the rate of its state.
 
-    elastic_plastic: s is the deflection between the end and the slider, which moves in modes +-1; bouc_wen: s is the force, F' = k v (1 -
-    abs(F/f)^n) while it is loaded, k v while it is relieved.
+    elastic_plastic: s is the deflection between the end and the slider, which moves in modes +-1.
+    bouc_wen: s is the force, F' = k v (1 - abs(F/f)^n) while it is loaded, k v while it is relieved.
     """
     k, f = g.values["stiffness"], g.values["friction"]
     if g.law == "elastic_plastic":
