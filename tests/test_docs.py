@@ -98,6 +98,7 @@ LONG: dict[str, str] = {
     "vaneloop spatial --report": "tests/test_spatial.py",
     "vaneloop clearance --report": "tests/test_linkage.py",
     "vaneloop hidden-effect": "tests/test_rig.py",
+    "vaneloop hidden-law": "tests/test_hidden_law.py",
     "vaneloop experiment": "tests/test_search_commands.py",
     "vaneloop diagnose warm_play.parquet": "tests/test_search_commands.py",
     "vaneloop compare tank.csv": "tests/test_your_own_model.py",  # each command compiles the model anew

@@ -35,6 +35,10 @@ COMMANDS = {
         "vaneloop.cli.hidden_effect",
         "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)",
     ),
+    "hidden-law": (
+        "vaneloop.cli.hidden_law",
+        "blind benchmark for users' own models: laws hidden in systems of many families (needs a checkout)",
+    ),
     "schedule": (
         "vaneloop.cli.schedule",
         "links and stroke tables from geometry, schedules and a measured stroke-angle loop",

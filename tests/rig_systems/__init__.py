@@ -1,0 +1,6 @@
+"""Systems of many families, simulated independently of the product, with laws hidden in them: docs/hidden_law.md."""
+
+from .cases import FAMILIES, KINDS, Case, Log, draw_case, left_over
+from .family import Family, Hidden, Outside, Signal
+
+__all__ = ["FAMILIES", "KINDS", "Case", "Family", "Hidden", "Log", "Outside", "Signal", "draw_case", "left_over"]

@@ -1,0 +1,364 @@
+"""The blind benchmark for users' own models is honest: its families are the nominal models' own physics, its integrator
+and the product agree where both know a law, and answers are counted as the page says.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.nominal_systems import NOMINAL, nominal
+from tests.rig_systems import FAMILIES, Case, Family, draw_case, left_over
+from tests.rig_systems.cases import RATES, hide
+from tests.rig_systems.laws import on_signal
+from tests.rig_systems.simulate import course, simulate
+from tests.system_variants import SCALES, rescaled, variants
+from vaneloop import Record, System
+from vaneloop.cli import hidden_law
+from vaneloop.cli.main import main
+from vaneloop.discrepancy import Parameter
+from vaneloop.discrepancy.library import LAWS
+from vaneloop.discrepancy.models import own_model, runner
+from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.kernel import build_kernels
+
+CLOSE = 0.25  # noise floors between the product with the true law and the truth
+SHARE = 0.03  # or of what the law changes, where that is gross
+SAMPLES = 500
+# these switch within a sample; the product chooses its steps for the model without them
+SWITCHES, STEPS = ("coulomb", "stribeck", "friction_asymmetry", "elastic_plastic", "saturation"), 8
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models run as plain Python: a few short runs take less time than to compile them."""
+    monkeypatch.setattr(runner, "build_kernels", lambda code: (build_kernels(code)[1],) * 2)
+
+
+def exact(system: System, case: Case) -> System:
+    """The nominal model with its true parameters, known. Forces: all that the samples tell, not the filtered part."""
+    system.parameters = [Parameter(p.name, p.value, p.unit, p.low, p.high) for p in system.parameters]
+    if system.kind == "force":
+        system.cutoff = 0.45 * case.rate
+    return system
+
+
+def records(case: Case) -> list[Record]:
+    """The first log without noise. A state starts at its measured value: that one sample is the true state."""
+    f, log = case.family, case.logs[0]
+    columns = case.columns(0, noisy=False)
+    if f.kind in ("simulate", "closed_loop"):
+        _, states, _ = course(f, case.p, case.hidden, log.t, log.drive, case.greatest)
+        for i, name in enumerate(f.states):
+            if name in f.outputs:
+                columns[name][0] = states[i, 0]
+    return [Record("log", log.t, columns)]
+
+
+def apart(case: Case, bound: Bound, with_law: bool) -> np.ndarray:
+    """RMS between the product's model and the truth in noise floors, output by output."""
+    theta = bound.stage.neutral()
+    for h in case.hidden if with_law else ():
+        effect = bound.stage.effect(h.name)
+        theta[bound.stage.index()[h.name]] = [h.values[q.name] for q in effect.parameters]
+    e = (bound.run(theta[None])[0] - bound.measured)[:, 1:]
+    return np.sqrt(np.nanmean(e**2, axis=1)) / case.floors
+
+
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize("name", list(FAMILIES))
+def test_the_product_with_the_true_law_is_the_truth(name: str) -> None:
+    f = FAMILIES[name]
+    far: dict[str, str] = {}
+    first: Bound | None = None
+    for law in ("", *f.laws):
+        hidden = [law] if law and law not in f.partners else [f.partners[law], law] if law else []
+        case = draw_case(1, 3, (name,), names=hidden, samples=4 * SAMPLES if f.window else SAMPLES)
+        system = first.system if first else exact(nominal(f, case.values, {}), case)
+        rng = np.random.default_rng([1, 3])
+        for _ in range(20):  # other sizes, until the law shows
+            bound = system.bind(records(case), like=first)
+            first = first or bound
+            if law.rpartition(".")[2] in SWITCHES and f.kind == "simulate":
+                bound.runner.steps = STEPS
+            left, without = apart(case, bound, True), apart(case, bound, False)
+            if not law or without.max() > 4.0 * CLOSE:
+                break
+            if law.endswith("rate_limit"):
+                case.hidden[0].values["rate"] *= 0.5  # what moves slowly meets no limit of the range drawn
+            else:
+                case.hidden = hide(f, case.p, case.logs[:1], hidden, rng)
+            log = case.logs[0]
+            log.outputs = simulate(f, case.p, case.hidden, log.t, log.drive, case.greatest)
+        assert not law or without.max() > CLOSE, f"{law} does not show in this log: nothing is proven"
+        if np.any(left > np.maximum(CLOSE, SHARE * without.max())):
+            far[law] = f"{left.max():.2f} of {without.max():.2f} noise floors"
+        if law in f.apart:
+            assert left.max() < 0.4 * without.max() + CLOSE, law
+    unknown = {law: v for law, v in far.items() if law not in f.apart}
+    assert not unknown, unknown
+
+
+@pytest.mark.parametrize("name", list(FAMILIES))
+def test_every_family_and_its_nominal_model_name_the_same_things(name: str) -> None:
+    f = FAMILIES[name]
+    case = draw_case(5, 2, (name,), names=[], samples=200)
+    system = nominal(f, case.values, {})
+    assert tuple(system.states) == f.states and set(system.outputs) == set(f.outputs)
+    assert {p.name for p in system.parameters if np.isinf(p.tolerance)} == set(f.parameters)
+    assert dict(system.rates) == f.rates and dict(system.masses) == f.masses
+    for law in (*f.laws, *(n for group in f.same for n in group)):
+        place, _, short = law.rpartition(".")
+        kind, _ = f.where(place)
+        assert short in LAWS[kind if kind in ("force", "state") else "signal"], law
+    assert all(
+        law in f.laws or law.endswith((".bias", ".cubic"))
+        for o in f.outside.values()
+        for group in o.amounts_to
+        for law in group
+    )
+    assert set(f.apart) <= {"", *f.laws} and len(f.outside) >= 1
+    assert all(len(case.columns(k)) >= len(system.outputs) for k in range(len(case.logs)))
+    assert all(np.isfinite(v).all() for k in range(len(case.logs)) for v in case.columns(k).values())
+
+
+@pytest.mark.parametrize("name", list(FAMILIES))
+def test_what_is_outside_changes_the_truth_and_is_drawn_within_its_range(name: str) -> None:
+    f = FAMILIES[name]
+    clean = draw_case(1, 3, (name,), names=[], samples=300)
+    for what, outside in f.outside.items():
+        case = draw_case(1, 3, (name,), names=[what], samples=300)
+        assert outside.low <= case.hidden[0].values["size"] <= outside.high
+        change = max(
+            float(np.sqrt(np.mean((a.outputs - b.outputs) ** 2))) for a, b in zip(case.logs, clean.logs, strict=True)
+        )
+        assert change > 1e-3 * case.floors.min(), what
+
+
+def test_the_families_are_nineteen_and_cover_slow_and_fast_logs() -> None:
+    assert len(FAMILIES) >= 16 and set(FAMILIES) == set(NOMINAL)
+    rates = {
+        draw_case(9, i, (name,), names=[], samples=60).rate
+        for name in ("thermal_mass", "resonator", "dc_motor") for i in range(8)
+    }  # fmt: skip
+    assert min(rates) <= 0.5 and max(rates) == 2000.0 == max(RATES) and min(RATES) == 0.2
+
+
+def test_a_seed_draws_the_same_case_and_kinds_come_in_their_shares() -> None:
+    a, b = (draw_case(4, 1, ("tanks",), samples=200) for _ in range(2))
+    assert a.kind == b.kind and a.values == b.values and a.factors == b.factors and a.hidden == b.hidden
+    assert all(np.array_equal(a.columns(0)[c], b.columns(0)[c]) for c in a.columns(0))
+    assert all(0.1 <= f <= 10.0 for f in a.factors.values())
+    kinds = [draw_case(4, i, ("valve_bench",), samples=60).kind for i in range(200)]
+    for kind, share in zip(("clean", "outside", "pair", "single"), (0.25, 0.25, 0.2, 0.3), strict=True):
+        assert abs(kinds.count(kind) / 200 - share) < 0.1
+
+
+def test_a_lag_is_the_exponential_and_a_dead_time_is_late() -> None:
+    t = np.arange(0.0, 5.0, 0.01)
+    y = on_signal("lag", {"time_constant": 0.7}, np.where(t >= 0.01, 1.0, 0.0), 0.01, True, 1.0)
+    assert y[2:] == pytest.approx(1.0 - np.exp(-(t[2:] - 0.01) / 0.7), abs=1e-9)
+    assert np.array_equal(on_signal("dead_time", {"delay": 0.25}, t, 0.01, True, 1.0)[25:], t[:-25])
+
+
+def test_friction_stops_a_motor_in_the_time_that_mechanics_says() -> None:
+    """J w' = - friction from w0: the speed falls in a straight line, then it rests; no voltage, no resistance."""
+    f = FAMILIES["dc_motor"]
+    case = draw_case(1, 3, ("dc_motor",), names=["speed.coulomb"], samples=200)
+    p = type(case.p)(resistance=1e9, constant=0.05, inertia=1e-4)
+    rolling = replace(f, start=lambda p, u: (100.0, 0.0))
+    t = np.arange(200) * 0.001
+    case.hidden[0].values["friction"] = 0.1  # 1000 rad/s^2: at rest after 0.1 s
+    _, states, _ = course(rolling, p, case.hidden, t, np.zeros((1, 200)), {})
+    fine = np.linspace(0.0, t[-1], states.shape[1])
+    assert states[0] == pytest.approx(np.maximum(100.0 - 1000.0 * fine, 0.0), abs=1e-4)
+    assert states[1, -1] == pytest.approx(5.0, rel=1e-4)  # w0^2 / (2 a)
+
+
+def test_what_a_parameter_can_take_up_is_not_detectable() -> None:
+    """A gain at the magnet's command is its strength: nothing is left after the refit. A cubic term is not."""
+    same, other = (
+        draw_case(2, 5, ("levitation",), names=[law], samples=200) for law in ("command.gain", "command.cubic")
+    )
+    same.hidden[0].values["factor"] = 1.05
+    for log in same.logs:
+        log.outputs = simulate(same.family, same.p, same.hidden, log.t, log.drive, {})
+    assert left_over(same)[0] < 0.1
+    other.hidden[0].values["coefficient"] = 10.0
+    assert len(left_over(other)) == 1
+
+
+# ---- counting --------------------------------------------------------------------------------------------------------
+
+
+def row(kind: str, truth: list[str], left: list[float], named: dict[str, list[str]], **more: Any) -> dict[str, Any]:
+    verdict = more.pop("verdict", "missing" if named else "none")
+    same = more.pop("same", {})
+    return {
+        "seed": 1, "index": more.pop("index", 0), "families": "", "family": "tanks", "kind": kind, "truth": truth,
+        "sizes": "[]", "same": json.dumps({law: [law, *same.get(law, [])] for law in truth}), "left": left,
+        "amounts": json.dumps(more.pop("amounts", [])),
+        "verdict": verdict, "named": list(named), "rivals": json.dumps(named), "error": more.pop("error", ""),
+        "seconds": 1.0, "intervals": json.dumps(more.pop("intervals", [])), "variants": more.pop("variants", "{}"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answer", "right"),
+    [
+        (row("clean", [], [], {}), True),
+        (row("clean", [], [], {"a.lag": []}), False),
+        (row("clean", [], [], {}, verdict="unknown"), True),
+        (row("single", ["a.lag"], [5.0], {"a.lag": []}), True),
+        (row("single", ["a.lag"], [5.0], {"b.lag": ["a.lag"]}), True),
+        (row("single", ["a.lag"], [5.0], {"b.lag": []}), False),
+        (row("single", ["a.lag"], [5.0], {"b.lag": []}, same={"a.lag": ["b.lag"]}), True),
+        (row("single", ["a.lag"], [5.0], {"a.lag": [], "b.bias": []}), False),
+        (row("single", ["a.lag"], [5.0], {}), False),
+        (row("single", ["a.lag"], [0.1], {}), True),
+        (row("single", ["a.lag"], [0.1], {"b.bias": []}), False),
+        (row("pair", ["a.lag", "b.bias"], [5.0, 5.0], {"a.lag": []}), False),
+        (row("pair", ["a.lag", "b.bias"], [5.0, 0.1], {"a.lag": []}), True),
+        (row("pair", ["a.lag", "b.bias"], [5.0, 5.0], {"a.lag": [], "b.bias": []}), True),
+        (row("outside", ["spill"], [5.0], {}, verdict="unknown"), True),
+        (row("outside", ["spill"], [5.0], {}), False),
+        (row("outside", ["spill"], [0.1], {}), True),
+        (row("outside", ["spill"], [5.0], {"a.lag": []}), False),
+        (row("outside", ["edge"], [5.0], {"b": [], "a": []}, amounts=[["a", "b"]]), True),
+        (row("outside", ["edge"], [5.0], {"a": []}, amounts=[["a", "b"]]), False),
+        (row("clean", [], [], {}, error="StageError: x", verdict="error"), False),
+    ],
+)
+def test_an_answer_is_right_where_the_page_says_so(answer: dict[str, Any], right: bool) -> None:
+    assert (not hidden_law.misses([answer])) == right
+    assert hidden_law.summary([answer])["whole answer right"]["hits"] == int(right)
+
+
+def test_the_table_counts_singles_pairs_intervals_and_variants() -> None:
+    inside = {"effect": "a.lag", "parameter": "t", "truth": 1.0, "value": 1.01, "low": 0.9, "high": 1.1}
+    rows = [
+        row("single", ["a.lag"], [5.0], {"a.lag": []}, intervals=[inside, {**inside, "low": 1.005}]),
+        row("single", ["a.lag"], [5.0], {"b.lag": []}),
+        row("single", ["a.lag"], [0.1], {}),
+        row("pair", ["a.lag", "b.bias"], [5.0, 5.0], {"a.lag": []}),
+        row("clean", [], [], {}, variants=json.dumps({"time x 20": {"same": True}, "reordered": {"same": False}})),
+    ]
+    s = hidden_law.summary(rows)
+
+    def count(name: str) -> tuple[int, int]:
+        return s[name]["hits"], s[name]["of"]
+
+    assert count("detectable single named or among rivals") == (1, 2)
+    assert count("a single name given is right") == (1, 2)
+    assert count("nothing hidden, nothing named") == (1, 1)
+    assert count("both of a detectable pair") == (0, 1)
+    assert count("90 % interval covers the truth") == (1, 2)
+    assert count("size within 5 % of the truth") == (2, 2)
+    assert count("same answer: time x 20") == (1, 1) and count("same answer: reordered") == (0, 1)
+    low, high = s["a single name given is right"]["low"], s["a single name given is right"]["high"]
+    assert 0.0 < low < 0.5 < high < 1.0
+
+
+def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no way\nat all")
+
+    monkeypatch.setattr(own_model, "diagnose", fails)
+    got = hidden_law.judge_case(1, 10, ("valve_bench",), True)
+    assert got["error"] == "RuntimeError: no way at all" and got["verdict"] == "error"
+    assert hidden_law.misses([got]) and hidden_law.summary([got])["diagnosed without an error"]["hits"] == 0
+
+
+def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "r.parquet"
+    words = ["hidden-law", "--seed", "3", "--family", "valve_bench", "--workers", "1", "--out", str(out)]
+    assert main([*words, "--systems", "1", "--quiet"]) == 0
+    first = pl.read_parquet(out).to_dicts()
+    assert main([*words, "--systems", "2", "--json", str(tmp_path / "r.json")]) == 0
+    both = pl.read_parquet(out).to_dicts()
+    assert [r["index"] for r in both] == [0, 1] and both[0] == first[0]
+    assert "1 systems done before" in capsys.readouterr().out
+    assert json.loads((tmp_path / "r.json").read_text())["summary"]["systems"] == 2
+    for more, said in (
+        (["--seed", "4", "--family", "valve_bench"], "drawn with seed 3; allowed: that --seed, or another --out"),
+        (["--seed", "3"], "drawn from families valve_bench; allowed: the same --family, or another --out"),
+        (["--seed", "3", "--family", "valve_bench", "--variants"], "has rows without variants"),
+    ):
+        assert main(["hidden-law", "--systems", "1", "--out", str(out), *more]) == 2
+        err = capsys.readouterr().err
+        assert said in err and len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--systems", "0"], "--systems (=0) must be in [1, 100000]"),
+        (["--workers", "65"], "--workers (=65) must be in [1, 64]"),
+        (["--family", "tank"], "--family 'tank': not a family; allowed: tanks, flow_loop"),
+        (["--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
+    ],
+)
+def test_bad_options_are_told_in_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["hidden-law", *words]) == 2
+    err = capsys.readouterr().err
+    assert said in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.parquet"
+    pl.DataFrame({"a": [1]}).write_parquet(bad)
+    assert main(["hidden-law", "--out", str(bad)]) == 2
+    assert "not a result of hidden-law" in capsys.readouterr().err
+
+
+# ---- variants --------------------------------------------------------------------------------------------------------
+
+
+def family_of(kind: str) -> Family:
+    return next(f for f in FAMILIES.values() if f.kind == kind)
+
+
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize("name", ["tanks", "valve_bench", "servo_axis", "levitation", "pendulum", "battery"])
+def test_a_rescaled_model_says_the_same_in_other_units(name: str) -> None:
+    f = FAMILIES[name]
+    case = draw_case(1, 3, (name,), names=[], samples=200)
+    logs = [Record(f"log {k}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
+    plain_bound = exact(nominal(f, case.values, {}), case).bind(logs[:-1])
+    want = plain_bound.run(plain_bound.stage.neutral()[None])[0]
+    seen = set()
+    for what, (system, fitted, test) in variants(case, logs, lambda f, v, _: exact(nominal(f, v, {}), case)):
+        seen.add(what)
+        if what == "logs cut in two":
+            assert [len(r.t) for r in fitted] == [100] * 2 * (len(logs) - 1)
+            continue
+        assert len(test) == 1
+        bound = system.bind(fitted)
+        got = bound.run(bound.stage.neutral()[None])[0]
+        scale = np.nanstd(bound.measured, axis=1) / np.nanstd(plain_bound.measured, axis=1)
+        sign = np.sign(np.nansum(bound.measured * plain_bound.measured, axis=1))
+        assert got / (scale * sign)[:, None] == pytest.approx(want, rel=1e-5, abs=1e-5 * np.abs(want).max()), what
+    assert set(SCALES) | {"reordered", "other starts", "a sign flipped"} <= seen
+
+
+def test_reordering_leaves_the_library_as_it_was() -> None:
+    before = {k: list(v) for k, v in LAWS.items()}
+    case = draw_case(1, 3, ("tanks",), names=[], samples=100)
+    logs = [Record(f"log {k}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
+    turned = False
+    for what, _ in variants(case, logs, nominal):
+        turned |= what == "reordered" and [*LAWS["signal"]] == before["signal"][::-1]
+    assert turned and {k: list(v) for k, v in LAWS.items()} == before
+
+
+def test_a_rescaled_system_keeps_its_kind_and_its_parameters() -> None:
+    case = draw_case(1, 3, ("hydraulic_cylinder",), names=[], samples=100)
+    system = nominal(case.family, case.values, {})
+    other = rescaled(system, 20.0, {"position": -2.0})
+    assert other.window == 60.0 and other.kind == "simulate" and other.parameters is system.parameters

@@ -1,0 +1,341 @@
+"""``vaneloop hidden-law``: the blind benchmark for users' own models. An independent integrator hides laws in systems
+of many families, the diagnosis sees logs and a nominal model, and every answer is counted.
+
+The families (``tests/rig_systems``) and their nominal models (``tests/nominal_systems.py``) are part of a checkout, not
+of the installed package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base import terminal
+
+__all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
+
+DESCRIPTION = """Blind benchmark of `vaneloop diagnose --system`: systems of many families are drawn (tanks, drives,
+cylinders, resonators, ...), with no hidden law (25 %), a law that the library does not have (25 %), two laws (20 %) or
+one (30 %), from undetectable to gross, and simulated by an independent integrator. The diagnosis gets one to three
+noisy logs, a test log and a nominal model whose parameters start off by up to ten times. docs/hidden_law.md says how
+answers are judged.
+
+examples:
+  vaneloop hidden-law --systems 32 --seed 1 --out out/hidden_law.parquet
+  vaneloop hidden-law --systems 200 --seed 1 --out out/hidden_law.parquet      (continues where it was stopped)
+  vaneloop hidden-law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/variants.parquet
+
+exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
+
+DETECTABLE = 0.5  # noise floors (RMS) that a law must leave after the refit, to be one that can be seen
+BANDS = ((0.0, 0.5), (0.5, 1.0), (1.0, 3.0), (3.0, 10.0), (10.0, float("inf")))
+Row = dict[str, Any]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--systems", type=int, default=32, metavar="N", help="number of systems (default 32)")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
+    parser.add_argument(
+        "--family", action="append", default=[], metavar="NAME", help="draw from this family only; again for more"
+    )
+    parser.add_argument(
+        "--variants",
+        action="store_true",
+        help="diagnose each system again with its time and channels scaled, a sign flipped, everything reordered, "
+        "other starts, logs cut in two: is the answer the same?",
+    )
+    parser.add_argument(
+        "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="F.parquet",
+        default="out/hidden_law.parquet",
+        help="results, a row a system; an existing file is continued",
+    )
+    terminal.add_output_options(parser)
+
+
+def _systems() -> Any:
+    """Modules of the families, the nominal models and the variants."""
+    import importlib
+
+    from vaneloop.base.errors import InputError
+
+    root = str(Path(__file__).resolve().parents[2])  # the checkout, where this is one
+    if root not in sys.path:
+        sys.path.append(root)
+    try:
+        names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants")
+        return tuple(importlib.import_module(n) for n in names)
+    except ImportError:
+        raise InputError(
+            "hidden-law needs the families of systems in tests/rig_systems: run it from a checkout of the repository"
+        ) from None
+
+
+def _said(system: Any, records: list[Any], test: list[Any]) -> dict[str, Any]:
+    """What `diagnose` answers, or the error that it raised; with its processor seconds."""
+    from vaneloop.discrepancy.models import own_model
+
+    started = time.process_time()
+    try:
+        answer = terminal.plain(own_model.diagnose(system, records, test).json())
+        out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
+    except Exception as e:  # one system must not end the run; it counts as a miss
+        out = {"verdict": "error", "effects": [], "answer": {}, "error": " ".join(f"{type(e).__name__}: {e}".split())}
+    return {**out, "seconds": time.process_time() - started}
+
+
+def judge_case(seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False) -> Row:
+    """Draw, simulate and diagnose one system; a flat record."""
+    import logging
+
+    from vaneloop.discrepancy import Record
+
+    logging.getLogger("numba").setLevel(logging.ERROR)
+    rig, nominal, changes = _systems()
+    case = rig.draw_case(seed, index, families)
+    left = rig.left_over(case)
+    records = [Record(f"log {k + 1}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
+    said = _said(nominal.nominal(case.family, case.values, case.factors), records[:-1], records[-1:])
+    tried: dict[str, Any] = {}
+    if variants and not said["error"]:
+        for name, (system, fitted, test) in changes.variants(case, records, nominal.nominal):
+            other = _said(system, fitted, test)
+            named = sorted(e["effect"] for e in other["effects"])
+            same = (other["verdict"], named) == (said["verdict"], sorted(e["effect"] for e in said["effects"]))
+            tried[name] = {"same": same, "verdict": other["verdict"], "named": named, "error": other["error"]}
+    sizes = {e["effect"]: e["parameters"] for e in said["effects"]}
+    intervals = [
+        {"effect": h.name, "parameter": k, "truth": v, **sizes[h.name][k]}
+        for h in case.hidden if h.name in sizes
+        for k, v in h.values.items() if k in sizes[h.name] and abs(v) < _far(h, v)
+    ]  # fmt: skip
+    return {
+        "seed": seed, "index": index, "families": " ".join(families), "family": case.family.name, "kind": case.kind,
+        "truth": [h.name for h in case.hidden], "sizes": json.dumps([h.values for h in case.hidden]),
+        "same": json.dumps({h.name: sorted(case.family.equivalent(h.name)) for h in case.hidden}),
+        "amounts": json.dumps(
+            [sorted(s) for h in case.hidden if h.name in case.family.outside
+             for s in case.family.outside[h.name].amounts_to]
+        ),
+        "left": left, "rate": case.rate, "samples": len(case.logs[0].t), "logs": [log.kind for log in case.logs],
+        "parameters": json.dumps({k: [case.values[k], f] for k, f in case.factors.items()}),
+        "verdict": said["verdict"], "named": [e["effect"] for e in said["effects"]],
+        "rivals": json.dumps({e["effect"]: e["rivals"] for e in said["effects"]}), "error": said["error"],
+        "seconds": said["seconds"], "intervals": json.dumps(intervals), "variants": json.dumps(tried),
+        "answer": json.dumps(said["answer"]),
+    }  # fmt: skip
+
+
+def _far(hidden: Any, value: float) -> float:
+    """The limit of a saturation that nothing reaches has no size to be found."""
+    other = [abs(v) for v in hidden.values.values()]
+    return float("inf") if hidden.law != "saturation" else max(other)
+
+
+# ---- counting --------------------------------------------------------------------------------------------------------
+
+
+def _seen(row: Row) -> bool:
+    """Whether everything that is hidden can be seen."""
+    return all(v > DETECTABLE for v in row["left"])
+
+
+def _hit(law: str, row: Row) -> bool:
+    """Whether a law, or what is the same in this family, was named or given as a rival."""
+    same, rivals = set(json.loads(row["same"])[law]), json.loads(row["rivals"])
+    return any(same & {n, *rivals[n]} for n in row["named"])
+
+
+def _right(row: Row) -> bool:
+    """Whether the answer is what it should be."""
+    if row["error"]:
+        return False
+    if row["kind"] == "clean":
+        return not row["named"]
+    if row["kind"] == "outside":
+        if sorted(row["named"]) in json.loads(row["amounts"]):
+            return True
+        return not row["named"] and (row["verdict"] == "unknown" or not _seen(row))
+    wrong = [n for n in row["named"] if not any(_hit_by(n, law, row) for law in row["truth"])]
+    return not wrong and all(_hit(law, row) for law, v in zip(row["truth"], row["left"], strict=True) if v > DETECTABLE)
+
+
+def _hit_by(name: str, law: str, row: Row) -> bool:
+    return bool(set(json.loads(row["same"])[law]) & {name, *json.loads(row["rivals"])[name]})
+
+
+def _share(hits: list[bool]) -> dict[str, Any]:
+    """A share with its 90 % binomial interval (Wilson)."""
+    from statsmodels.stats.proportion import proportion_confint
+
+    n, k = len(hits), sum(hits)
+    low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
+    return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
+
+
+def summary(rows: list[Row]) -> dict[str, Any]:
+    """Count: shares with 90 % binomial intervals, and the median of the processor seconds."""
+    single = [r for r in rows if r["kind"] == "single" and _seen(r)]
+    alone = [r for r in single if len(r["named"]) == 1 and not json.loads(r["rivals"])[r["named"][0]]]
+    clean = [r for r in rows if r["kind"] == "clean"]
+    pairs = [r for r in rows if r["kind"] == "pair" and _seen(r)]
+    outside = [r for r in rows if r["kind"] == "outside"]
+    intervals = [i for r in rows for i in json.loads(r["intervals"])]
+    out: dict[str, Any] = {
+        "systems": len(rows),
+        "detectable single named or among rivals": _share([_hit(r["truth"][0], r) for r in single]),
+        "a single name given is right": _share([_hit(r["truth"][0], r) for r in alone]),
+        "a single name given": _share([r in alone for r in single]),
+        "a detectable single named, and nothing else": _share([_right(r) for r in single]),
+        "nothing hidden, nothing named": _share([not r["named"] and not r["error"] for r in clean]),
+        "nothing hidden, verdict none": _share([r["verdict"] == "none" for r in clean]),
+        "both of a detectable pair": _share([all(_hit(law, r) for law in r["truth"]) for r in pairs]),
+        "outside the library: unknown, or none where undetectable": _share([_right(r) for r in outside]),
+        "90 % interval covers the truth": _share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
+        "size within 5 % of the truth": _share(
+            [abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]
+        ),
+        "diagnosed without an error": _share([not r["error"] for r in rows]),
+        "whole answer right": _share([_right(r) for r in rows]),
+        "median processor seconds": sorted(r["seconds"] for r in rows)[len(rows) // 2] if rows else None,
+        "most processor seconds": max((r["seconds"] for r in rows), default=None),
+    }
+    tried = [json.loads(r["variants"]) for r in rows]
+    for name in sorted({name for t in tried for name in t}):
+        out[f"same answer: {name}"] = _share([t[name]["same"] for t in tried if name in t])
+    return out
+
+
+def by_size(rows: list[Row]) -> list[list[str]]:
+    """How often single laws are found, by what they leave in noise floors."""
+    out = []
+    for low, high in BANDS:
+        hits = [_hit(r["truth"][0], r) for r in rows if r["kind"] == "single" and low <= r["left"][0] < high]
+        if hits:
+            out.append([f"{low:g} to {high:g}" if high < 1e9 else f"above {low:g}", f"{sum(hits)} of {len(hits)}"])
+    return out
+
+
+def by_family(rows: list[Row]) -> list[list[str]]:
+    """Whole answers right, family by family."""
+    names = sorted({r["family"] for r in rows})
+    of = {n: [r for r in rows if r["family"] == n] for n in names}
+    return [[n, f"{sum(_right(r) for r in of[n])} of {len(of[n])}"] for n in names]
+
+
+def misses(rows: list[Row]) -> list[str]:
+    """Every answer that is not what it should be, a line each."""
+    out = []
+    for r in rows:
+        if _right(r):
+            continue
+        left = ", ".join(f"{v:.3g}" for v in r["left"])
+        line = f"#{r['index']} {r['family']} {r['kind']}: hidden {', '.join(r['truth']) or 'nothing'}"
+        line += f" {r['sizes']}, {left} noise floors" if r["truth"] else ""
+        rivals = {k: v for k, v in json.loads(r["rivals"]).items() if v}
+        said = r["error"] or " ".join([r["verdict"], ", ".join(r["named"])]).strip()
+        out.append(f"{line}; said {said}" + (f", rivals {rivals}" if rivals else ""))
+    return out
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+def _before(path: Path, families: tuple[str, ...]) -> list[Row]:
+    """Rows of an earlier run with the same families."""
+    import polars as pl
+
+    from vaneloop.base.errors import InputError
+
+    if not path.exists():
+        return []
+    try:
+        rows = pl.read_parquet(path).to_dicts()
+    except Exception as e:
+        raise InputError(f"{path}: not a result of hidden-law ({type(e).__name__})") from None
+    if any(not {"left", "variants", "families", "seed", "amounts"} <= set(r) for r in rows):
+        raise InputError(f"{path}: not a result of hidden-law (columns left, variants, families, amounts are needed)")
+    if any(r["families"] != " ".join(families) for r in rows):
+        was = rows[0]["families"] or "all"
+        raise InputError(f"{path}: drawn from families {was}; allowed: the same --family, or another --out")
+    return rows
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    import secrets
+
+    import polars as pl
+
+    from vaneloop.base.errors import InputError
+
+    rig, _, _ = _systems()
+    for name in args.family:
+        if name not in rig.FAMILIES:
+            raise InputError(f"--family {name!r}: not a family; allowed: {', '.join(rig.FAMILIES)}")
+    if not 1 <= args.systems <= 100_000:
+        raise InputError(f"--systems (={args.systems}) must be in [1, 100000]")
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    if args.seed is not None and not 0 <= args.seed < 2**63:
+        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
+    families, path = tuple(dict.fromkeys(args.family)), Path(args.out)
+    rows = _before(path, families)
+    seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
+    others = [r for r in rows if r["seed"] != seed]
+    if others:
+        raise InputError(f"{path}: drawn with seed {others[0]['seed']}; allowed: that --seed, or another --out")
+    if args.variants and any(r["variants"] == "{}" and not r["error"] for r in rows):
+        raise InputError(f"{path}: has rows without variants; allowed: no --variants, or another --out")
+    terminal.say(args, f"seed {seed}; {len(rows)} systems done before")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise InputError(f"{path.parent}: cannot be made ({e.strerror})") from None
+    done = {r["index"] for r in rows}
+    todo = [i for i in range(args.systems) if i not in done]
+    with (
+        terminal.progress_bar(args, f"{args.systems} systems") as progress,
+        ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        jobs = [pool.submit(judge_case, seed, i, families, args.variants) for i in todo]
+        for job in as_completed(jobs):
+            rows.append(job.result())
+            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
+            if progress:
+                progress(len(rows) / max(args.systems, len(rows)))
+    rows.sort(key=lambda r: r["index"])
+    _print(args, rows)
+    tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}
+    terminal.write_json(args, {"schema": 1, "seed": seed, "summary": summary(rows), **tables})
+    return 0
+
+
+def _print(args: argparse.Namespace, rows: list[Row]) -> None:
+    s = summary(rows)
+    table = [
+        [
+            k,
+            f"{v['hits']} of {v['of']}",
+            "-" if v["share"] is None else f"{v['share']:.3f}",
+            f"{v['low']:.3f} to {v['high']:.3f}",
+        ]
+        for k, v in s.items()
+        if isinstance(v, dict)
+    ]
+    title = f"{len(rows)} systems, {s['median processor seconds']:.1f} processor seconds a diagnosis (median)"
+    terminal.print_table(args, title, ["what", "count", "share", "90 % interval"], table)
+    terminal.print_table(args, "single laws, by what they leave", ["noise floors", "found"], by_size(rows))
+    terminal.print_table(args, "whole answers right", ["family", "right"], by_family(rows))
+    for line in misses(rows):
+        terminal.say(args, "miss " + line)
