@@ -24,9 +24,10 @@ from vaneloop.cli import hidden_law
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter
 from vaneloop.discrepancy.library import LAWS
-from vaneloop.discrepancy.models import own_model, runner
+from vaneloop.discrepancy.models import runner
 from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.kernel import build_kernels
+from vaneloop.verbs import search
 
 CLOSE = 0.25  # noise floors between the product with the true law and the truth
 SHARE = 0.03  # or of what the law changes, where that is gross
@@ -269,7 +270,7 @@ def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.Mon
     def fails(*_: Any, **__: Any) -> None:
         raise RuntimeError("no way\nat all")
 
-    monkeypatch.setattr(own_model, "diagnose", fails)
+    monkeypatch.setattr(search, "diagnose", fails)
     got = hidden_law.judge_case(1, 10, ("valve_bench",), True)
     assert got["error"] == "RuntimeError: no way at all" and got["verdict"] == "error"
     assert hidden_law.misses([got]) and hidden_law.summary([got])["diagnosed without an error"]["hits"] == 0

@@ -227,3 +227,15 @@ def test_a_stem_that_sticks_again_at_once_moves_in_stairs() -> None:
     steps = np.diff(y)
     np.testing.assert_allclose(steps[steps != 0.0][1:], 0.5, atol=0.011)  # each the jump
     assert np.count_nonzero(steps) == pytest.approx(5.0 / 0.5, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("bias", (0.4,)), ("gain", (1.3,)), ("asymmetric_gain", (0.2,)), ("cubic", (0.05,)), ("square_root", (0.5,))],
+)
+def test_the_argument_of_a_law_is_what_it_reads(name: str, values: tuple[float, ...]) -> None:
+    law = SIGNAL_LAWS[name]
+    p = row(law, values)
+    for x in (0.3, 1.1, 1.9):
+        y = laws.apply(law.code, np.zeros(1), np.array([x]), p)[0]
+        assert laws.argument(law.code, y, p) == pytest.approx(x, rel=1e-6)

@@ -83,11 +83,11 @@ def _systems() -> Any:
 
 def _said(system: Any, records: list[Any], test: list[Any]) -> dict[str, Any]:
     """What `diagnose` answers, or the error that it raised; with its processor seconds."""
-    from vaneloop.discrepancy.models import own_model
+    from vaneloop.verbs import search
 
     started = time.process_time()
     try:
-        answer = terminal.plain(own_model.diagnose(system, records, test).json())
+        answer = terminal.plain(search.diagnose(records, system, test=test).to_dict())
         out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
     except Exception as e:  # one system must not end the run; it counts as a miss
         out = {"verdict": "error", "effects": [], "answer": {}, "error": " ".join(f"{type(e).__name__}: {e}".split())}

@@ -51,6 +51,7 @@ RIVAL = 0.05  # log error within which two effects do equally well
 BETTER = 0.02  # log error by which one must be better to be exchanged for another
 HARM = 0.10  # log error by which a test log may get worse
 LEAST_USE = 0.02  # log error by which some log must get better
+UNKNOWN = 1.25  # times the most noise that the samples can hold: what is left is not noise, whatever predicts it
 STRUCTURE = 0.25  # share of the error left that the logged channels predict, from which it is called unknown physics
 
 Figures = Callable[[Array], Mapping[str, float]]  # parameters -> log -> log of its RMS error
@@ -287,10 +288,12 @@ class ErrorShare:
     def conclude(
         self, base: Fit, fit: Fit, effects: list[Found], candidates: list[Candidate], steps: list[tuple[str, float]]
     ) -> StageDiagnosis:
-        """Missing what was found; else unknown where the error left follows from what was logged, or none."""
+        """Missing what was found; else unknown where the error left is more than noise, or follows from what was
+        logged; or none.
+        """
         judge, stage = self.judge, self.judge.stage
         left = rms_of(judge, fit)
-        unknown = not agrees(left, 1.0) and structure(judge, fit) > STRUCTURE
+        unknown = left > UNKNOWN or (not agrees(left, 1.0) and structure(judge, fit) > STRUCTURE)
         for f in effects:
             if at_bound(stage, fit, f.effect):
                 self.notes.append(f"{f.effect} stands at the end of its physical range: the log would have it go on")

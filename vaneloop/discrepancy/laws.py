@@ -24,7 +24,10 @@ import numpy as np
 from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["HYSTERETIC", "MEMORY", "MODIFIERS", "PARAMETERS", "apply", "force_of", "load", "state_rate", "transform"]
+__all__ = [
+    "HYSTERETIC", "MEMORY", "MODIFIERS", "PARAMETERS", "SWITCHING", "apply", "argument", "force_of", "load",
+    "state_rate", "transform",
+]  # fmt: skip
 
 MEMORY = 4  # numbers that a law may remember
 PARAMETERS = 3  # most parameters of one law
@@ -162,6 +165,32 @@ def apply(code: int, t: Array, u: Array, p: Array) -> Array:
     return out
 
 
+@compiled_free
+def argument(code: int, y: float, p: Array) -> float:
+    """What a signal law without memory reads as ``y``: nearest to it where there are several; ``y`` for none.
+
+    The law is monotonic near its identity; secants from there.
+    """
+    t, u, s = np.zeros(1), np.empty(1), np.zeros(MEMORY)
+    x, size = y, max(abs(y), 1e-300)
+    u[0] = x
+    e = transform(code, 0, t, u, p, s) - y
+    slope = 1.0
+    for _ in range(30):
+        if abs(e) <= 1e-12 * size:
+            return x
+        step = -e / slope
+        u[0] = x + step
+        after = transform(code, 0, t, u, p, s) - y
+        if not abs(after) < abs(e):
+            return y if abs(e) > 1e-6 * size else x
+        slope = (after - e) / step
+        x, e = x + step, after
+        if slope == 0.0:
+            break
+    return x if abs(e) <= 1e-6 * size else y
+
+
 # ---- laws of forces --------------------------------------------------------------------------------------------------
 
 FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, ELASTIC_PLASTIC, BOUC_WEN = range(
@@ -169,6 +198,8 @@ FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, 
 )
 BACKLASH_GAP, FRICTION_ASYMMETRY = 30, 31
 HYSTERETIC = (ELASTIC_PLASTIC, BOUC_WEN)  # carry a force at rest: where they start is unknown
+SWITCHING = np.array([COULOMB, STRIBECK, ELASTIC_PLASTIC, BOUC_WEN, BACKLASH_GAP, FRICTION_ASYMMETRY])
+SWITCHING.setflags(write=False)
 MODIFIERS = (
     BACKLASH_GAP,
     FRICTION_ASYMMETRY,

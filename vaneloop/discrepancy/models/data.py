@@ -98,8 +98,8 @@ class Data:
             if s.kind == "force":
                 x, v, a = motion(s, r, self.cutoff)
                 u = [x, v, a, *u]
-                if self.cutoff:
-                    y = np.array([low_pass(r.t, row, self.cutoff) for row in y])
+                if self.cutoff:  # twice, as the model's: its motion, then the force that follows from it
+                    y = np.array([low_pass(r.t, low_pass(r.t, row, self.cutoff), self.cutoff) for row in y])
                     edge = EDGE / self.cutoff
                     y[:, (r.t < edge) | (r.t > r.t[-1] - edge)] = np.nan
             self.u.append(np.ascontiguousarray(np.array(u, dtype=float).reshape(len(u), len(r.t))))

@@ -15,6 +15,8 @@ __all__ = ["MOTION", "highest_frequency", "low_pass", "motion", "smoothed", "use
 MOTION = ("position", "velocity", "acceleration")
 FORCE_SHARE = 0.9995  # of the power of the measured force lies below the frequency to which motion is differentiated
 
+NOISE = 2.0  # times the quietest tenth of a spectrum: more than that is not its white noise
+
 
 def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> float:
     """Up to which frequency the motion is differentiated: where the measured forces have their power."""
@@ -27,7 +29,10 @@ def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> floa
             y = r.columns[o]
             y = np.where(np.isfinite(y), y, np.nanmean(y))
             f, power = welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
-            total = np.cumsum(power)
+            # white noise is everywhere; what rises into it is no force
+            total = np.cumsum(np.maximum(power - NOISE * np.quantile(power, 0.1), 0.0))
+            if not total[-1] > 0.0:
+                continue
             best = max(best, float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))]))
     rate = 1.0 / float(np.median(np.diff(records[0].t)))
     return float(np.clip(best, 5.0 / records[0].t[-1], 0.2 * rate))

@@ -20,6 +20,7 @@ from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["STARTS_LOADED", "Placed", "Runner"]
 
+SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
@@ -143,6 +144,7 @@ class Runner:
                     for k, (which, m) in enumerate(self.free_starts):
                         if which == log:
                             x0[m] = theta[n_p + k]
+                    self._read_back(x0, log, active)
                     out[i, :, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
 
         if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
@@ -155,6 +157,17 @@ class Runner:
         if bad.any():
             out[bad] = self.far
         return np.clip(out, -self.far, self.far)
+
+    def _read_back(self, x0: Array, log: int, active: list[tuple[Placed, Array]]) -> None:
+        """Put a state that starts at its sensor's reading to where the sensor, with its law, reads that."""
+        names, s = list(self.system.states), self.system
+        for q, row in active:
+            name = list(s.outputs)[q.at] if q.place == "output" else ""
+            if q.law.memory or name not in names or name in s.start:
+                continue
+            m = names.index(name)
+            if self.data.first_state(log, name, np.nan) == x0[m]:
+                x0[m] = laws.argument(q.law.code, x0[m], row)
 
     def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]]) -> Array:
         t, u = self.data.records[log].t, self.data.u[log]
@@ -220,6 +233,8 @@ class Runner:
         e_at = np.array([q.at for q, _ in ends], dtype=np.int64)
         e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
         e_rows = np.array([row for _, row in ends]).reshape(len(ends), PARAMETERS + 1)
+        if np.isin(code, laws.SWITCHING).any():
+            steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments = (
