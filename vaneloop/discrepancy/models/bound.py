@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.data import Data, noise_of_channel
 from vaneloop.discrepancy.models.nominal import Course, nominal_course
 from vaneloop.discrepancy.models.places import places
 from vaneloop.discrepancy.models.runner import Placed, Runner
@@ -35,6 +35,8 @@ class Bound:
     stage     the model on all samples; the logs follow each other in time
     thinned   the same on fewer samples, where there are many; ``stages``: it, which is what the search works on
     others    values of the parameters in other valleys of the error than the best
+    floor     RMS of each output's error where nothing is missing: its noise, and what the noise of the other channels
+              does to the model
     data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
     runner    the model on them; ``run`` is its
     effects, placed   every law at every place: what the search is told of it, and what runs
@@ -141,7 +143,8 @@ class Bound:
             begins = np.repeat(self.stage.neutral()[None], 1 + len(self.others), axis=0)
             begins[:, : len(given)] = [given, *self.others]
             self.stage.begins = None if self.values else begins  # a model file's values are better than these
-            self.stage.floor = self.data.noise()
+            self.floor: Array = np.hypot(self.data.noise(), self._carried(self.stage.neutral()))
+            self.stage.floor = self.floor
         # the search looks at fewer samples where there are many: neighbours say the same
         stride = max(1, len(self.t) // MOST_SAMPLES)
         self.thinned = Stage(
@@ -153,6 +156,24 @@ class Bound:
 
         self.stages: list[Stage] = [self.thinned]
         self.not_observed: dict[str, str] = {}
+
+    def _carried(self, theta: Array) -> Array:
+        """RMS of the error that the noise of what drives the model, and of what it starts from, causes in each output:
+        the model on the logs with as much noise again, less the model on the logs.
+        """
+        rng = np.random.default_rng(0)
+        again = []
+        for r in self.data.records:
+            columns = {
+                name: v + noise_of_channel(v) * rng.standard_normal(len(v)) if name in self.system.channels() else v
+                for name, v in r.columns.items()
+            }
+            again.append(Record(r.name, r.t, columns))
+        data = Data(self.system, again, self.data)
+        runner = Runner(data, self.runner)
+        runner.placed, runner.free_starts = self.placed, self.runner.free_starts
+        both = self.run(theta[None])[0], runner.run(theta[None])[0]
+        return np.sqrt(np.nanmean(np.where(np.isfinite(self.measured), both[1] - both[0], np.nan) ** 2, axis=1))
 
     def theta_from(self, other: Bound, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""

@@ -46,7 +46,7 @@ class Logs:
 
     def judged(self) -> Judged:
         """What earns a law its place: its share of the error, and what the test logs say."""
-        floor = self.fitted.data.noise()
+        floor = self.fitted.floor
 
         def levels(theta: Array) -> dict[str, float]:
             by = {log: v for log, v in self.figures(theta).items() if np.isfinite(v).all()}
@@ -64,7 +64,7 @@ def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), mo
 
 def as_given(logs: Logs) -> StageDiagnosis:
     """The model with nothing added."""
-    judge = Judge(logs.fitted.thinned, logs.fitted.data.noise())
+    judge = Judge(logs.fitted.thinned, logs.fitted.floor)
     fit = recalibrate(judge)
     return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
 

@@ -11,7 +11,7 @@ from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pa
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
 
-__all__ = ["Data"]
+__all__ = ["Data", "noise_of_channel"]
 
 EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differentiated log
 
