@@ -113,7 +113,7 @@ class ErrorShare:
     tests    names of those that are not fitted: they veto what harms them, and choose among rivals
     """
 
-    most, leaders, fitted, finished, least, roams = 6, 4, 12, 5, 0.0, True
+    most, leaders, fitted, finished, least, roams = 6, 4, 8, 3, 0.0, True
 
     def __init__(self, judge: Judge, figures: Figures | None = None, tests: frozenset[str] = frozenset()):
         self.judge, self.figures, self.tests = judge, figures, tests

@@ -90,6 +90,9 @@ class Search:
         self.fits: dict[frozenset[str], Fit] = {}
         self.finished: set[frozenset[str]] = set()
         self.begun: dict[frozenset[str], list[tuple[float, Array]]] = {}
+        self.passed: set[frozenset[str]] = set()  # what the screening left out
+        # of fits: effect that could be added -> what the best of its starts would leave, and that start
+        self.promises: dict[frozenset[str], dict[str, tuple[float, Array]]] = {}
         begins = [self.stage.neutral()]
         if self.stage.begins is not None:
             begins += list(self.stage.begins)
@@ -317,7 +320,9 @@ class Search:
             if (known := self.fits.get(frozenset(rest))) is not None:
                 sources = [self.starts[leave][0], single[leave]] if leave in single else [self.starts[leave][0]]
                 sizes = [source[index[leave]] for source in sources]
-                if self.criterion.roams:
+                if leave in (found := self.promises.get(frozenset(rest), {})):
+                    sizes.append(found[leave][1])
+                elif self.criterion.roams:
                     sizes += [np.array(start, dtype=float) for start in self.stage.effect(leave).starts]
                 for size in sizes:
                     theta = known.theta.copy()
@@ -397,14 +402,51 @@ class Search:
         """Fits made with one effect more than ``rest``."""
         return [f for key, f in self.fits.items() if len(key) == len(rest) + 1 and key.issuperset(rest)]
 
+    def _pass_over(self, sets: Sequence[tuple[str, ...]]) -> None:
+        """Screen sets of effects that are not fitted yet, and pass over those that promise least."""
+        most = self.criterion.fitted
+        new = [s for s in sets if frozenset(s) not in self.fits and frozenset(s) not in self.passed]
+        if len(new) <= most:
+            return
+        promise = {s: self._promise(s) for s in new}
+        leading = sorted(new, key=lambda s: promise[s])[: 2 * most]
+        for s, begins in zip(leading, self.judge.together([self._begins(s) for s in leading]), strict=True):
+            self.begun[frozenset(s)] = begins
+        kept = sorted(leading, key=lambda s: self.begun[frozenset(s)][0][0])[:most]
+        self.passed |= {frozenset(s) for s in new if s not in kept}
+
+    def _promise(self, effects: tuple[str, ...]) -> float:
+        """What is left with the last effect, at the best of its starts, on top of the others as they are fitted, when
+        the model's own parameters have followed, as their slopes there have it.
+        """
+        rest, last = effects[:-1], effects[-1]
+        key = frozenset(rest)
+        if key not in self.fits:
+            return self.level[last]
+        if key not in self.promises:
+            fit, index = self.fits[key], self.stage.index()
+            left = self._followers(fit.theta)[2]
+            thetas, owner = [], []
+            for e in self.stage.effects:
+                for start in e.starts if e.name not in rest else ():
+                    theta = fit.theta.copy()
+                    theta[index[e.name]] = start
+                    thetas.append(theta)
+                    owner.append(e.name)
+            found: dict[str, tuple[float, Array]] = {}
+            for i in range(0, len(thetas), SCREENED):
+                for j, cost in enumerate(left(self.judge.errors(np.array(thetas[i : i + SCREENED])))):
+                    name = owner[i + j]
+                    if name not in found or cost < found[name][0]:
+                        found[name] = cost, thetas[i + j][index[name]]
+            self.promises[key] = found
+        return self.promises[key][last][0]
+
     def best_of(self, sets: Sequence[tuple[str, ...]]) -> list[Fit]:
         """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
-        new = [s for s in sets if frozenset(s) not in self.fits]
-        if len(new) > self.criterion.fitted:
-            for s, begins in zip(new, self.judge.together([self._begins(s) for s in new]), strict=True):
-                self.begun[frozenset(s)] = begins
-            promise = sorted(new, key=lambda s: self.begun[frozenset(s)][0][0])[: self.criterion.fitted]
-            sets = [s for s in sets if frozenset(s) in self.fits or s in promise]
+        if self.criterion.roams:
+            self._pass_over(sets)
+            sets = [s for s in sets if frozenset(s) not in self.passed]
         quick = self.judge.together([self._joined(s, False) for s in sets])
         quick.sort(key=self.criterion.order)
         leading = self.criterion.finished
