@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import chain, drive, lanes, places, stem
+from plant import chain, drive, electromechanical, lanes, places, stem
 from plant.actuator import speed_factor
 from plant.chain import measured_stroke, true_stroke
 from plant.effects import (
@@ -47,6 +47,7 @@ from plant.parameters import (
     DRIVE_LOADED,
     FLOW_GAIN,
     GEOMETRY,
+    KIND,
     LAG,
     LVDT_FACTOR,
     LVDT_LAG,
@@ -164,18 +165,18 @@ def actuator_run(
         raise ValueError(f"window (={window}) needs x_lvdt")
     x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
     if window:
-        _rest(p, s, current[0, 0], n_r[0])
+        _rest(p, s, current[0, 0], n_r[0], t_oil[0])
     h = dt / current.shape[1]
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
-    alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS)
+    alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS) | (p[KIND] != 0.0)
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
     order = np.lexsort((p[VALVE_HYSTERESIS] != 0.0, p[PISTON_STICTION] != 0.0, lossy, p[DRIVE_LOADED] != 0.0, alone))
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
     work = [range(j, min(j + W, wide)) for j in range(0, wide, W)]
-    if wide < p.shape[1]:
-        work.append(range(wide, p.shape[1]))
+    each = max(1, -(-(p.shape[1] - wide) // (os.cpu_count() or 1)))
+    work += [range(j, min(j + each, p.shape[1])) for j in range(wide, p.shape[1], each)]
 
     def run(part: range) -> None:
         some = order[part.start : part.stop]
@@ -279,13 +280,17 @@ def _elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -
 
 
 @compiled_free
-def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float) -> None:
-    """Valve and oil at rest under the current ``i`` (A) at ``n_r`` (%)."""
+def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float, t_oil: float) -> None:
+    """Valve and oil at rest, a motor at its steady speed, under the current ``i`` (A) at ``n_r`` (%) and ``t_oil``
+    (degC).
+    """
     for j in range(p.shape[1]):
         current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
         s[CURRENT : CURRENT + 4, j] = s[LAGGED, j] = current
         load = aero_load.step(n_r, p[AERO_LOAD, j])
         s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+        if p[KIND, j] != 0.0:
+            electromechanical.rest(p, s, j, i, load, t_oil)
 
 
 # ---- engine ----------------------------------------------------------------------------------------------------------
