@@ -207,7 +207,7 @@ def _motor_step(
     h = dt / (substeps * many)
     for _ in range(substeps):
         for _ in range(many):
-            z = electromechanical.step(z, d, i_cmd, load, friction, h)
+            z = electromechanical.step(z, d, i_cmd, load, friction, h, True)
         z = electromechanical.sense(z, d)
     electromechanical.stored(s, j, z)
 

@@ -99,7 +99,7 @@ class MotorState(NamedTuple):
     integral    A, integral part of the speed loop
     i           A, motor current
     w           rad/s, motor speed
-    speed       m/s, of the rod
+    speed       m/s, of the nut
     ahead       m, by which the motor is ahead of the rod in the play
     x, x_lvdt   m, stroke, and behind the LVDT's lag
     reading     m, stroke behind both lags of the LVDT
@@ -124,7 +124,7 @@ class Motor(NamedTuple):
     gain, rate                      A s/rad, A/rad: speed loop
     peak, voltage, per_ohm          A, V, 1/Ohm
     torque                          N m/A, also V s/rad
-    per_inertia, viscous            1/(kg m2), N m s/rad
+    inertia, viscous                kg m2, N m s/rad
     r, friction, loss               m/rad, N, 1/eta - 1
     play, lead, amplitude, phase    m, m, m, rad
     low, high                       m, end stops
@@ -143,7 +143,7 @@ class Motor(NamedTuple):
     voltage: float
     per_ohm: float
     torque: float
-    per_inertia: float
+    inertia: float
     viscous: float
     r: float
     friction: float
@@ -176,7 +176,7 @@ def prepare(p: np.ndarray, j: int, temperature: float) -> Motor:
         p[VOLTAGE, j],
         1.0 / p[RESISTANCE, j],
         motor_torque_constant_error.step(p[TORQUE_CONSTANT, j], p[MOTOR_TORQUE_CONSTANT_ERROR, j]),
-        1.0 / (p[MOTOR_INERTIA, j] + p[GEAR_INERTIA, j] + p[SCREW_MASS, j] * r * r),
+        p[MOTOR_INERTIA, j] + p[GEAR_INERTIA, j] + p[SCREW_MASS, j] * r * r,
         p[SCREW_VISCOUS, j],
         r,
         screw_friction.step(p[SCREW_FRICTION, j], p[SCREW_FRICTION_ERROR, j]),
@@ -245,9 +245,11 @@ def rest(p: np.ndarray, s: np.ndarray, j: int, i_cmd: float, force: float, tempe
 
 
 @inlined
-def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h: float) -> MotorState:
+def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h: float, swaying: bool) -> MotorState:
     """One step ``h`` (s) of the motor and the rod under the command ``i_cmd`` (A) and the torques (N m) of
     `load_torques`.
+
+    swaying  False leaves out the screw's pitch error: for lanes where it is neutral
     """
     demanded = amplifier_lag.step(z.demanded, amplifier_offset.step(i_cmd, d.offset), d.lag_share)
     e = demand(d, demanded) - z.w
@@ -259,15 +261,16 @@ def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h:
     integral = z.integral + d.rate * e * h if (wanted - allowed) * e <= 0.0 else z.integral
     i = allowed + (z.i - allowed) * (1.0 - d.current_share)
     # friction takes the speed away within the step, but not beyond rest
-    share = d.per_inertia * h / (1.0 + d.per_inertia * h * d.viscous)
-    w = (z.w + d.per_inertia * h * (d.torque * i - load)) / (1.0 + d.per_inertia * h * d.viscous)
+    share = h / (d.inertia + h * d.viscous)
+    w = share * (d.inertia / h * z.w + d.torque * i - load)
     w -= min(max(w, -share * friction), share * friction)
     ahead, way = gear_backlash.step(z.ahead, 0.5 * (z.w + w) * d.r * h, d.play)
-    free = z.x + screw_pitch_error.step(z.x, way, d.lead, d.amplitude, d.phase)
+    if swaying:
+        way = screw_pitch_error.step(z.x, way, d.lead, d.amplitude, d.phase)
+    free = z.x + way
     x = min(max(free, d.low), d.high)
-    if free != x:
-        w = 0.0
-    return MotorState(demanded, integral, i, w, (x - z.x) / h, ahead, x, z.x_lvdt, z.reading)
+    w = w if free == x else 0.0
+    return MotorState(demanded, integral, i, w, d.r * w, ahead, x, z.x_lvdt, z.reading)
 
 
 @inlined

@@ -44,8 +44,7 @@ from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
-from vaneloop.base.tables import Bound, Bounded, Quantity, Table, load_toml, read
-from vaneloop.base.tables import path as shipped
+from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, load_toml, read
 
 __all__ = [
     "ACCELERATION",
@@ -140,7 +139,7 @@ KIND = MOTOR  # number in `KINDS`
 ) = range(KIND + 1, KIND + 1 + len(MOTOR_NAMES))
 CURRENT_SHARE = VOLTAGE + 1  # share of the way that current loop and amplifier_lag go in a motor's step
 AMPLIFIER_SHARE = VOLTAGE + 2
-MOTOR_STEP = 1e-4  # s, the longest step of a motor: a plant step is divided into as many as this takes
+MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
 
 _SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "deg": math.pi / 180.0}
 
@@ -274,9 +273,7 @@ def read_plant(source: str | Path = "plant.toml") -> AnyPlantTable:
 
     Raises InputError with file, key, value and what is allowed.
     """
-    file = Path(source)
-    if not file.is_file() and shipped(str(source)).is_file():
-        file = shipped(str(source))
+    file = file_of(source)
     actuator: Any = load_toml(file).get("actuator")
     kind = actuator.get("kind", KINDS[0]) if isinstance(actuator, dict) else KINDS[0]
     if not isinstance(kind, str) or kind not in _TABLES:

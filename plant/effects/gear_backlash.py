@@ -1,8 +1,8 @@
 """Lost motion between motor and rod: worn gear teeth or screw balls.
 
-The play operator on the way by which the motor is ahead, with u the way of the motor and w the total width::
+Equation::
 
-    d <- min(max(d + du, -w/2), w/2),   the rod moves by what is left of du
+    d <- min(max(d + du, -w/2), w/2),   the rod moves by what is left of du      (play operator)
 
 Symbols: d motor ahead of the rod (m), du way of the motor in the step, seen at the rod (m), w width (m).
 Limits: the vanes' friction holds the rod while the motor crosses the play; no blow at its end, and the rod's load does

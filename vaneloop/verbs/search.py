@@ -321,6 +321,8 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     by_stage: dict[str, list[str]] = {}
     effects: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys([*before.effects, *wanted]):
+        if (kind := chain.plant.kind) not in EFFECTS[name].kinds:
+            raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
         stage = next((s for s in EFFECTS[name].stages if any(s == c.name for c in chain.stages)), None)
         if stage is not None:
             by_stage.setdefault(stage, []).append(name)
