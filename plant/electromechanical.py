@@ -15,15 +15,16 @@ Coulomb friction seen at the rod (N), eta efficiency of the screw when it lifts 
 rotor, gear and rod (kg m2), r way of the rod for an angle of the motor (m/rad).
 
 A screw loses a share of its load. Written as friction this gives the efficiency eta where the motor drives the load and
-2 - 1/eta where the load drives the motor; a screw with eta <= 1/2 locks itself.
+2 - 1/eta where the load drives the motor; a screw with eta <= 1/2 locks itself. That is what lead angle l and friction
+angle q give while q is small: eta = tan l / tan(l + q) = 1 / (1 + q/l), back-driven tan(l - q) / tan l = 1 - q/l.
 
 The motor is the direct-current one that is equivalent to a machine with sinusoidal currents. Rod and screw are stiff.
 The end stops take the speed away (inelastic) and the current goes on to its limit. The step of the current is exact;
 that of the friction is implicit, so that it stops a motor and never turns it back.
 
-Sources: Krishnan, Electric Motor Drives (2001), ch. 4 (PI speed loop, current loop); Budynas and Nisbett, Shigley's
-Mechanical Engineering Design (2015), section 8-2 (power screws, self-locking); NSK, Ball Screws technical guide, B5
-(efficiency eta, back-driving 2 - 1/eta); Moreau, Numerical aspects of the sweeping process (1999) (implicit friction).
+Sources: Krishnan, Electric Motor Drives (2001), ch. 3 (current and speed controllers of a direct-current drive);
+Budynas and Nisbett, Shigley's Mechanical Engineering Design (2015), section 8-2 (power screws: raising, lowering,
+self-locking); Moreau, Numerical aspects of the sweeping process (1999) (implicit friction).
 """
 
 from __future__ import annotations

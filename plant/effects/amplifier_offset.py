@@ -8,7 +8,7 @@ Symbols: i command current (A), offset (A), > 0 extends.
 Limits: constant; the drift of the zero with temperature is not in it.
 In a log: the current that holds the stroke still is -offset; without a current the rod creeps at w_rated offset /
 i_rated (1 mA: 3.75 mm/s). In closed loop the integrator hides it: only the mean of i_cmd shows it.
-Source: Krishnan, Electric Motor Drives (2001), ch. 4, offset of an analogue speed demand.
+Source: definition; the offset that the maker of an analogue amplifier lets one trim.
 """
 
 from __future__ import annotations

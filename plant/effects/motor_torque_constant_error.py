@@ -8,7 +8,7 @@ Symbols: K_t torque constant (N m/A), K_e voltage constant (V s/rad), factor (-)
 Limits: one factor at all temperatures and currents; no saturation of the iron.
 In a log: the speed loop is slower in proportion, so that x_lvdt trails i_cmd by more after each change, and a reversal
 against friction takes longer. i_motor rises, but is seldom logged. Steady motion does not change.
-Source: Krishnan, Electric Motor Drives (2001), ch. 4; demagnetisation of permanent magnets, ch. 9.
+Source: Krishnan, Electric Motor Drives (2001), ch. 2, K_t and K_e of a direct-current machine.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ Symbols: w_rated motor speed at rated command (rad/s), T temperature of the actu
 Limits: linear; the actuator's temperature stands for the tachometer's. Kept above 5 % of w_rated.
 In a log: the speed for a given i_cmd drifts with t_oil, both ways alike. Without a change of t_oil it is a
 recalibration of the rated speed.
-Source: temperature coefficient of direct-current tachometers, 0.01 to 0.2 % per kelvin: Krishnan, Electric Motor
-Drives (2001), section 4.6.
+Source: data sheets of direct-current tachometers give a temperature coefficient: some 0.02 % per kelvin compensated,
+0.2 % with plain ferrite magnets.
 """
 
 from __future__ import annotations

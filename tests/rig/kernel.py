@@ -179,6 +179,7 @@ class P(IntEnum):
     motor_play = 138  # m, total
     pitch_error = 139  # m
     pitch_phase = 140  # rad
+    rod_friction = 141  # N, of the vanes' stems and the linkage
 
 
 N_P = len(P)
@@ -466,7 +467,8 @@ def servo_motor(s, p, i, t_oil, n, h, steps):
         rub = sigma0 * z_new + sigma1 * (z_new - z) / h
         z = z_new
         w = (w + h / inertia * (torque * a - lead * pull - rub)) / (1.0 + h / inertia * p[P.motor_viscous])
-        f, b = pull - force, 300.0  # N/(m/s): the vanes' own damping holds the rod within the play
+        # the vanes' stems rub, below 0.1 mm/s as a viscous drag: they hold the rod while the motor crosses the play
+        f, b = pull - force, p[P.rod_friction] / max(abs(v), 1e-4)
         if x > high:
             f -= p[P.stop_stiffness] * (x - high)
             b += p[P.stop_damping]

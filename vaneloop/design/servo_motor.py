@@ -6,7 +6,7 @@ From current to speed (symbols of `plant.electromechanical`), with the speed loo
 
 Friction, limits and load are left out there; the simulation in time has them, for it steps the plant itself.
 
-Source: Krishnan, Electric Motor Drives (2001), ch. 4.
+Source: Krishnan, Electric Motor Drives (2001), ch. 3.
 """
 
 from __future__ import annotations
