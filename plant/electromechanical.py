@@ -8,19 +8,19 @@ What is known before a step, and the step; in the form of `plant.drive`. Equatio
     cut: |i| <= i_peak,   |R i + K_e w| <= V,   K_e = K_t             peak current; bus voltage less back-EMF
     J dw/dt = K_t i - B w - F r - T_f sgn(w)                          motor, gear and screw
     T_f = r (f + |F| (1/eta - 1))                                     friction; at rest it holds up to T_f
-    dx/dt = r w,   r = lead / (2 pi ratio),   0 <= x <= stroke        rod
+    x = r (angle of the motor) - F / k,   0 <= x <= stroke            rod on a screw of stiffness k
 
 Symbols: w motor speed (rad/s, > 0 extends), i motor current (A), I integral part (A), F load against extension (N), f
 Coulomb friction seen at the rod (N), eta efficiency of the screw when it lifts the load, x stroke (m), J inertia of
-rotor, gear and rod (kg m2), r way of the rod for an angle of the motor (m/rad).
+rotor, gear and rod (kg m2), r = lead / (2 pi ratio) way of the rod for an angle of the motor (m/rad).
 
 A screw loses a share of its load. Written as friction this gives the efficiency eta where the motor drives the load and
 2 - 1/eta where the load drives the motor; a screw with eta <= 1/2 locks itself. That is what lead angle l and friction
 angle q give while q is small: eta = tan l / tan(l + q) = 1 / (1 + q/l), back-driven tan(l - q) / tan l = 1 - q/l.
 
-The motor is the direct-current one that is equivalent to a machine with sinusoidal currents. Rod and screw are stiff.
-The end stops take the speed away (inelastic) and the current goes on to its limit. The step of the current is exact;
-that of the friction is implicit, so that it stops a motor and never turns it back.
+The motor is the direct-current one that is equivalent to a machine with sinusoidal currents. The screw bends under the
+outer load without delay. The end stops take the speed away (inelastic) and the current goes on to its limit. The step
+of the current is exact; that of the friction is implicit, so that it stops a motor and never turns it back.
 
 Sources: Krishnan, Electric Motor Drives (2001), ch. 3 (current and speed controllers of a direct-current drive);
 Budynas and Nisbett, Shigley's Mechanical Engineering Design (2015), section 8-2 (power screws: raising, lowering,
@@ -62,6 +62,7 @@ from plant.parameters import (
     SCREW_FRICTION,
     SCREW_LEAD,
     SCREW_MASS,
+    SCREW_STIFFNESS,
     SCREW_VISCOUS,
     SPEED_GAIN,
     SPEED_TIME,
@@ -73,6 +74,7 @@ from plant.places import (
     AHEAD,
     AMPLIFIER_DEAD_BAND,
     AMPLIFIER_OFFSET,
+    BENT,
     DEMANDED,
     END_STOP_SHIFT,
     GEAR_BACKLASH,
@@ -102,6 +104,7 @@ class MotorState(NamedTuple):
     w           rad/s, motor speed
     speed       m/s, of the nut
     ahead       m, by which the motor is ahead of the rod in the play
+    bent        m, by which the load bends screw and bearings
     x, x_lvdt   m, stroke, and behind the LVDT's lag
     reading     m, stroke behind both lags of the LVDT
     """
@@ -112,6 +115,7 @@ class MotorState(NamedTuple):
     w: float
     speed: float
     ahead: float
+    bent: float
     x: float
     x_lvdt: float
     reading: float
@@ -127,6 +131,7 @@ class Motor(NamedTuple):
     torque                          N m/A, also V s/rad
     inertia, viscous                kg m2, N m s/rad
     r, friction, loss               m/rad, N, 1/eta - 1
+    per_stiffness                   m/(N m), of the load's torque
     play, lead, amplitude, phase    m, m, m, rad
     low, high                       m, end stops
     lvdt_factor, lvdt_share         shares of the way that the LVDT's lags go in a plant step
@@ -149,6 +154,7 @@ class Motor(NamedTuple):
     r: float
     friction: float
     loss: float
+    per_stiffness: float
     play: float
     lead: float
     amplitude: float
@@ -182,6 +188,7 @@ def prepare(p: np.ndarray, j: int, temperature: float) -> Motor:
         r,
         screw_friction.step(p[SCREW_FRICTION, j], p[SCREW_FRICTION_ERROR, j]),
         1.0 / p[SCREW_EFFICIENCY, j] - 1.0,
+        1.0 / (p[SCREW_STIFFNESS, j] * r),
         p[GEAR_BACKLASH, j],
         p[SCREW_LEAD, j],
         p[SCREW_PITCH_ERROR, j],
@@ -203,6 +210,7 @@ def taken(s: np.ndarray, j: int) -> MotorState:
         s[MOTOR_SPEED, j],
         s[SPEED, j],
         s[AHEAD, j],
+        s[BENT, j],
         s[X, j],
         s[X_LVDT, j],
         s[READING, j],
@@ -213,7 +221,8 @@ def taken(s: np.ndarray, j: int) -> MotorState:
 def stored(s: np.ndarray, j: int, z: MotorState) -> None:
     """Put the state of lane ``j`` back."""
     s[DEMANDED, j], s[SPEED_INTEGRAL, j], s[I_MOTOR, j], s[MOTOR_SPEED, j] = z.demanded, z.integral, z.i, z.w
-    s[SPEED, j], s[AHEAD, j], s[X, j], s[X_LVDT, j], s[READING, j] = z.speed, z.ahead, z.x, z.x_lvdt, z.reading
+    s[SPEED, j], s[AHEAD, j], s[BENT, j] = z.speed, z.ahead, z.bent
+    s[X, j], s[X_LVDT, j], s[READING, j] = z.x, z.x_lvdt, z.reading
 
 
 @inlined
@@ -242,6 +251,7 @@ def rest(p: np.ndarray, s: np.ndarray, j: int, i_cmd: float, force: float, tempe
     torque = load + d.viscous * w + (friction if w > 0.0 else -friction if w < 0.0 else 0.0)
     i = min(max(torque / d.torque, -d.peak), d.peak)
     s[DEMANDED, j], s[SPEED_INTEGRAL, j], s[I_MOTOR, j], s[MOTOR_SPEED, j], s[SPEED, j] = read, i, i, w, d.r * w
+    s[BENT, j] = load * d.per_stiffness
     s[AHEAD, j] = 0.5 * d.play if w > 0.0 else -0.5 * d.play if w < 0.0 else 0.0
 
 
@@ -268,10 +278,11 @@ def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h:
     ahead, way = gear_backlash.step(z.ahead, 0.5 * (z.w + w) * d.r * h, d.play)
     if swaying:
         way = screw_pitch_error.step(z.x, way, d.lead, d.amplitude, d.phase)
-    free = z.x + way
+    bent = load * d.per_stiffness
+    free = z.x + (way - (bent - z.bent))
     x = min(max(free, d.low), d.high)
     w = w if free == x else 0.0
-    return MotorState(demanded, integral, i, w, d.r * w, ahead, x, z.x_lvdt, z.reading)
+    return MotorState(demanded, integral, i, w, d.r * w, ahead, bent, x, z.x_lvdt, z.reading)
 
 
 @inlined
@@ -279,4 +290,4 @@ def sense(z: MotorState, d: Motor) -> MotorState:
     """The LVDT's step, at the end of a plant step."""
     x_lvdt = z.x_lvdt + d.lvdt_factor * (z.x - z.x_lvdt)
     reading = lvdt_lag.step(z.reading, x_lvdt, d.lvdt_share)
-    return MotorState(z.demanded, z.integral, z.i, z.w, z.speed, z.ahead, z.x, x_lvdt, reading)
+    return MotorState(z.demanded, z.integral, z.i, z.w, z.speed, z.ahead, z.bent, z.x, x_lvdt, reading)

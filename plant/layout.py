@@ -118,10 +118,12 @@ MOTOR_NAMES = (
     "screw.friction",
     "screw.viscous",
     "screw.mass",
+    "screw.stiffness",
     "supply.voltage",
 )
 MOTOR_STATE = (
     "i_motor",  # A
     "speed_integral",  # A, integral part of the speed loop
     "motor_speed",  # rad/s
+    "bent",  # m, by which the load bends screw and bearings
 )

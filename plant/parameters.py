@@ -85,6 +85,7 @@ __all__ = [
     "SCREW_FRICTION",
     "SCREW_LEAD",
     "SCREW_MASS",
+    "SCREW_STIFFNESS",
     "SCREW_VISCOUS",
     "SPEED_GAIN",
     "SPEED_TIME",
@@ -135,13 +136,14 @@ KIND = MOTOR  # number in `KINDS`
     SCREW_FRICTION,  # N
     SCREW_VISCOUS,  # N m s/rad
     SCREW_MASS,  # kg
+    SCREW_STIFFNESS,  # N/m
     VOLTAGE,  # V
 ) = range(KIND + 1, KIND + 1 + len(MOTOR_NAMES))
 CURRENT_SHARE = VOLTAGE + 1  # share of the way that current loop and amplifier_lag go in a motor's step
 AMPLIFIER_SHARE = VOLTAGE + 2
 MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
 
-_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "deg": math.pi / 180.0}
+_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0}
 
 
 class Engine(Bounded):
@@ -240,6 +242,7 @@ class Screw(Bounded):
     friction: Annotated[Quantity, Bound("N", 0.0, 20000.0)]
     viscous: Annotated[Quantity, Bound("N m s/rad", 0.0, 1.0)]
     mass: Annotated[Quantity, Bound("kg", 0.0, 100.0)]
+    stiffness: Annotated[Quantity, Bound("N/um", 1.0, 10000.0)]
 
 
 class Bus(Bounded):

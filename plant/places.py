@@ -67,4 +67,4 @@ BRISTLE = STATE_ROW["linkage_friction"]  # three of -1..1
 DRIVEN = BRISTLE + 3  # rad, three rings at the last tick, as friction saw them
 DEMANDED = STATE_ROW["amplifier_lag"]  # A, command behind the amplifier's lag
 AHEAD = STATE_ROW["gear_backlash"]  # m, motor ahead of the rod
-I_MOTOR, SPEED_INTEGRAL, MOTOR_SPEED = range(MOTOR_AT, MOTOR_AT + len(MOTOR_STATE))
+I_MOTOR, SPEED_INTEGRAL, MOTOR_SPEED, BENT = range(MOTOR_AT, MOTOR_AT + len(MOTOR_STATE))

@@ -177,6 +177,17 @@ def test_a_slow_command_sticks_without_chatter_until_the_integral_breaks_it_loos
     assert np.all(w >= 0.0)
 
 
+def test_a_load_pushes_the_resting_rod_by_the_screws_bend_and_by_what_the_integral_needs() -> None:
+    machine = with_rows(SCREW_FRICTION=0.0, SCREW_EFFICIENCY=1.0)
+    loaded = Model(effects={"aero_load": {"force": 8000.0}}).plant(machine)
+    s = loaded.start(0.024, 0.0)
+    for _ in range(1000):
+        chain.drive_step(s, loaded.p, 0, 0.0, 100.0, 0.0, 40.0)
+    held = 8000.0 * R / P[rows.TORQUE_CONSTANT]  # A
+    pushed = 8000.0 / P[rows.SCREW_STIFFNESS] + R * held / RATE
+    assert 0.024 - s[places.X, 0] == pytest.approx(pushed, rel=1e-3)
+
+
 # ---- what it may never do --------------------------------------------------------------------------------------------
 
 
