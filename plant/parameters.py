@@ -344,7 +344,8 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
     ``tick`` (s).
     """
     for j in range(p.shape[1]):
-        p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
+        if p[KIND, j] == 0.0:  # a motor has no valve
+            p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
         p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
         p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
         p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)

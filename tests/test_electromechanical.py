@@ -316,6 +316,10 @@ def test_the_firmware_reaches_run_and_tracks_and_the_run_repeats_bit_for_bit() -
     assert 0.1 < np.max(np.abs(c["i_motor"])) < P[rows.PEAK_CURRENT]
 
 
+def test_every_number_of_the_machine_is_finite() -> None:
+    assert np.all(np.isfinite(P))
+
+
 def test_each_machine_is_fingerprinted_by_the_states_it_has() -> None:
     hydraulic = [STATE[r] for r in build_plant().rows]
     electric = [STATE[r] for r in MACHINE.rows]
