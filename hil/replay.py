@@ -89,12 +89,11 @@ def replay(
     held = {
         name: _hold(log.channels[name], frames) for name in ("n_dem", "n_r", "p_s", "t_oil") if name in log.channels
     }
-    supply = machine.table.supply
     stimulus = Stimulus.of(
         held["n_dem"],
         held.get("n_r"),
-        held["p_s"] * 1e6 if "p_s" in held else supply.pressure.value * 1e6,
-        held.get("t_oil", supply.temperature.value),
+        held["p_s"] * 1e6 if "p_s" in held else machine.usual["p_s"] * 1e6,
+        held.get("t_oil", machine.usual["t_oil"]),
     )
     angles = tuple(
         np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in ("vigv", "vgv1", "vgv2")
@@ -114,6 +113,8 @@ def replay(
 
     t, model = run.t, {name: run.columns[name] for name in UNITS}
     model["n_r"] = run.columns["n_engine"]
+    if "i_motor" in run.columns:
+        model["i_motor"] = run.columns["i_motor"]
     speed = run.columns["n_r"]
     target = dict(zip(("vigv", "vgv1", "vgv2"), np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
     notes, known = list(log.notes), dict(floors or {})

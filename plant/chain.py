@@ -4,7 +4,8 @@ real time, diagnosis.
 State ``s`` and parameters ``p`` are float64[n, lanes]; lane ``j`` is one plant, so that many parameter sets run side by
 side. Units: SI.
 
-Valve, piston and LVDT with their effects are `plant.drive`, a vane stage with its effects `plant.stem`. To add an
+Valve, piston and LVDT with their effects are `plant.drive`, an electromechanical actuator `plant.electromechanical`:
+`drive_step` takes the one that the machine has. A vane stage with its effects is `plant.stem`. To add an
 effect: its file in `plant.effects`, its name in `plant.places`, one call where it acts. Where all effects of a part are
 neutral, the part takes a short way that holds the nominal equations only; both ways give the same bits then, which a
 test checks.
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plant import drive, stem
+from plant import drive, electromechanical, stem
 from plant.actuator import speed_factor, stroke_step
 from plant.effect import T_REF
 from plant.effects import (
@@ -58,6 +59,7 @@ from plant.parameters import (
     DRIVE_LOADED,
     FLOW_GAIN,
     GEOMETRY,
+    KIND,
     LAG,
     LVDT_FACTOR,
     LVDT_STEP,
@@ -73,6 +75,7 @@ from plant.parameters import (
     VALVE_A21,
     VALVE_A22,
     VANE_EFFECTS,
+    motor_steps,
 )
 from plant.places import (
     ACCELERATION_LIMIT_ERROR,
@@ -149,12 +152,15 @@ def drive_step(
     dt: float = TICK,
     substeps: int = SUBSTEPS,
 ) -> None:
-    """Valve, actuator and LVDT: one step ``dt`` (s) under the current ``i_cmd`` (A), at ``n_r`` (%), ``p_s`` (Pa),
-    ``t_oil`` (degC).
+    """Actuator and LVDT: one step ``dt`` (s) under the current ``i_cmd`` (A), at ``n_r`` (%), ``p_s`` (Pa; of a
+    hydraulic actuator), ``t_oil`` (degC, the actuator's temperature).
 
     The derived rows of ``p`` must be those of dt/substeps.
     """
     if p[DRIVE_EFFECTS, j] != 0.0:
+        if p[KIND, j] != 0.0:
+            _motor_step(s, p, j, i_cmd, n_r, t_oil, dt, substeps)
+            return
         _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps)
         return
     target = i_cmd / p[RATED_CURRENT, j]
@@ -188,6 +194,22 @@ def _drive_step(
         z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True)
     drive.stored(s, j, z)
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
+
+
+@in_place
+def _motor_step(
+    s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, t_oil: float, dt: float, substeps: int
+) -> None:
+    """`drive_step` of an electromechanical actuator."""
+    d, z = electromechanical.prepare(p, j, t_oil), electromechanical.taken(s, j)
+    load, friction = electromechanical.load_torques(d, aero_load.step(n_r, p[AERO_LOAD, j]))
+    many = motor_steps(dt / substeps)
+    h = dt / (substeps * many)
+    for _ in range(substeps):
+        for _ in range(many):
+            z = electromechanical.step(z, d, i_cmd, load, friction, h, True)
+        z = electromechanical.sense(z, d)
+    electromechanical.stored(s, j, z)
 
 
 @in_place

@@ -11,11 +11,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-__all__ = ["DEG", "SITES", "STAGES", "T_REF", "UNITS", "Effect", "Parameter", "per_vane_stage"]
+__all__ = [
+    "DEG",
+    "HYDRAULIC",
+    "KINDS",
+    "MOTOR",
+    "SITES",
+    "STAGES",
+    "T_REF",
+    "UNITS",
+    "Effect",
+    "Parameter",
+    "per_vane_stage",
+]
 
 DEG = math.pi / 180.0
 T_REF = 40.0  # degC: oil temperature at which what grows with temperature is nil
-SITES = ("demand", "engine", "valve", "supply", "actuator", "lvdt", "linkage", "pot")
+SITES = ("demand", "engine", "valve", "supply", "amplifier", "motor", "screw", "actuator", "lvdt", "linkage", "pot")
+KINDS = ("hydraulic", "electromechanical")  # of actuators, by their number in `plant.layout.KIND`
+HYDRAULIC, MOTOR = KINDS[:1], KINDS[1:]
 STAGES = ("demand", "servo", "engine", "actuator", "linkage")
 VANE_STAGES = ("vigv", "vgv1", "vgv2")
 
@@ -82,6 +96,7 @@ class Effect:
     states      names of what it remembers, in the order of the plant's rows
     summary     one line for lists
     excites     what a log must hold for it to show, in words
+    kinds       of actuators, of `KINDS`, that can have it
     """
 
     name: str
@@ -91,12 +106,15 @@ class Effect:
     states: tuple[str, ...]
     summary: str
     excites: str
+    kinds: tuple[str, ...] = KINDS
 
     def __post_init__(self) -> None:
         if self.site not in SITES:
             raise ValueError(f"{self.name}: site (={self.site!r}) must be one of {', '.join(SITES)}")
         if not self.stages or not set(self.stages) <= set(STAGES):
             raise ValueError(f"{self.name}: stages (={self.stages!r}) must be of {', '.join(STAGES)}")
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ValueError(f"{self.name}: kinds (={self.kinds!r}) must be of {', '.join(KINDS)}")
         if len({p.name for p in self.parameters}) != len(self.parameters) or not self.parameters:
             raise ValueError(f"{self.name}: parameters must be there and have different names")
 

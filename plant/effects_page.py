@@ -9,7 +9,7 @@ import importlib
 import re
 import textwrap
 
-from plant.effect import Effect, Parameter
+from plant.effect import KINDS, SITES, Effect, Parameter
 from plant.effects import EFFECTS
 
 __all__ = ["page"]
@@ -18,27 +18,31 @@ HEAD = """# Effects
 
 Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral
 values the machine is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop
-diagnose` looks for them in a log.
+diagnose` looks for them in a log. The column "actuator" names the kind of actuator that an effect belongs to
+([machines](machines.md)).
 
 This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
 (docs/architecture.md); inside the code everything is SI.
 
-| effect | site | shows in | what | parameters |
-|---|---|---|---|---|
+| effect | site | actuator | shows in | what | parameters |
+|---|---|---|---|---|---|
 """
 
 
 def page() -> str:
     """Return the page, Markdown."""
-    sites = dict.fromkeys(("demand", "engine", "valve", "supply", "actuator", "lvdt", "linkage", "pot"))
-    effects = [e for site in sites for e in EFFECTS.values() if e.site == site]
+    effects = [e for site in SITES for e in EFFECTS.values() if e.site == site]
     rows = [
-        f"| [`{e.name}`](#{e.name}) | {e.site} | {', '.join(e.stages)} | {e.summary} | "
+        f"| [`{e.name}`](#{e.name}) | {e.site} | {_kinds(e)} | {', '.join(e.stages)} | {e.summary} | "
         + ", ".join(f"`{p.name}` {p.unit}" for p in e.parameters)
         + " |\n"
         for e in effects
     ]
     return HEAD + "".join(rows) + "".join(_section(e) for e in effects)
+
+
+def _kinds(e: Effect) -> str:
+    return "any" if e.kinds == KINDS else e.kinds[0]
 
 
 def _section(e: Effect) -> str:

@@ -20,6 +20,8 @@ __all__ = [
     "LVDT_FACTOR",
     "LVDT_LAG",
     "LVDT_STEP",
+    "MOTOR_NAMES",
+    "MOTOR_STATE",
     "NAMES",
     "NOMINAL_STATE",
     "N_NOMINAL",
@@ -97,4 +99,31 @@ NOMINAL_STATE = (
     "pot_vigv",  # rad, vane angle after the potentiometer's lag
     "pot_vgv1",
     "pot_vgv2",
+)
+
+# ---- electromechanical actuator: its rows stand behind all others (`plant.effects`)
+MOTOR_NAMES = (
+    "drive.rated_speed",
+    "drive.speed_gain",
+    "drive.speed_time",
+    "drive.peak_current",
+    "drive.current_bandwidth",
+    "motor.torque_constant",
+    "motor.resistance",
+    "motor.inertia",
+    "gear.ratio",
+    "gear.inertia",
+    "screw.lead",
+    "screw.efficiency",
+    "screw.friction",
+    "screw.viscous",
+    "screw.mass",
+    "screw.stiffness",
+    "supply.voltage",
+)
+MOTOR_STATE = (
+    "i_motor",  # A
+    "speed_integral",  # A, integral part of the speed loop
+    "motor_speed",  # rad/s
+    "bent",  # m, by which the load bends screw and bearings
 )

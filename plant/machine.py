@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plant import chain, places
-from plant.effect import T_REF
-from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain
+from plant import chain, electromechanical, places
+from plant.effect import KINDS, T_REF
+from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import (
     G_L,
@@ -25,7 +26,7 @@ from plant.linkage import (
     ring_angle_of_vane,
     vane_angle,
 )
-from plant.parameters import GEOMETRY, PLAY, POT_BIAS, PlantTable, derive, load_plant
+from plant.parameters import GEOMETRY, PLAY, POT_BIAS, AnyPlantTable, Supply, derive, load_plant
 
 if TYPE_CHECKING:
     from plant.model import Model
@@ -42,11 +43,28 @@ class Plant:
     sigma  float64[5]: rms noise of LVDT (m), three potentiometers (rad), speed (%)
     """
 
-    table: PlantTable
+    table: AnyPlantTable
     geometry: Geometry
     schedules: Schedules
     p: np.ndarray
     sigma: np.ndarray
+
+    @property
+    def kind(self) -> str:
+        """Kind of its actuator, one of `plant.effect.KINDS`."""
+        return self.table.actuator.kind
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Rows of the state that this machine has, in their order: what its fingerprint covers."""
+        return np.array(states_of(self.kind))
+
+    @property
+    def usual(self) -> dict[str, float]:
+        """Value of a channel that a log may lack, in border units: of what feeds the actuator."""
+        supply = self.table.supply
+        pressure = supply.pressure.value if isinstance(supply, Supply) else 0.0  # a motor needs no oil
+        return {"p_s": pressure, "t_oil": supply.temperature.value}
 
     def start(self, stroke: float, n_r: float, t_oil: float = T_REF) -> np.ndarray:
         """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of
@@ -59,6 +77,8 @@ class Plant:
         load = aero_load.step(n_r, p[places.AERO_LOAD])
         s[places.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[places.OIL_COMPRESSIBILITY :][:2])
         s[places.CURRENT : places.CURRENT + 4, 0] = s[places.LAGGED, 0] = p[places.VALVE_NULL_BIAS]
+        if self.kind != KINDS[0]:
+            electromechanical.rest(self.p, s, 0, 0.0, load, t_oil)
         for k, ring in enumerate(self._rings(stroke, n_r, t_oil)):
             s[places.RING + k, 0] = s[places.DRIVEN + k, 0] = ring
             s[places.POT + k, 0] = self._reading(ring, k)

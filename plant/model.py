@@ -32,7 +32,7 @@ from plant.geometry import Stage
 from plant.layout import PLAY
 from plant.linkage import STAGES
 from plant.machine import Plant, build_plant
-from plant.parameters import PlantTable, derive, nominal
+from plant.parameters import derive, nominal
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Finite, Table, read
 
@@ -77,7 +77,7 @@ class Model(Table):
                 raise InputError(
                     f"{source}: parameters: {name!r} is unknown{_meant(name, known)}; allowed: {', '.join(known)}"
                 )
-            n, bound = known[name], _bound(name)
+            n, bound = known[name], _bound(plant, name)
             low, high = bound.low, bound.high
             if n.tolerance > 0.0:
                 low, high = max(low, n.value - FAR * n.tolerance), min(high, n.value + FAR * n.tolerance)
@@ -86,6 +86,11 @@ class Model(Table):
             if effect not in EFFECTS:
                 raise InputError(
                     f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
+                )
+            if plant.kind not in EFFECTS[effect].kinds:
+                kinds = ", ".join(EFFECTS[effect].kinds)
+                raise InputError(
+                    f"{source}: effects: {effect!r} is of an actuator of kind {kinds}; this machine's is {plant.kind}"
                 )
             allowed = [p.name for p in EFFECTS[effect].parameters]
             for key, value in values.items():
@@ -168,12 +173,12 @@ def _within(value: float, low: float, high: float, unit: str, what: str) -> None
         raise InputError(f"{what} (={value:g} {unit}) must be in [{low:g}, {high:g}]")
 
 
-def _bound(name: str) -> Bound:
+def _bound(plant: Plant, name: str) -> Bound:
     """Physical bounds of a nominal parameter, in its table's unit."""
     section, key = name.split(".")
     if section == "linkage":
         fields: Any = Stage.model_fields["hysteresis" if key.endswith("_play") else key.split("_", 1)[1]]
     else:
-        table: Any = PlantTable.model_fields[section].annotation
+        table: Any = type(plant.table).model_fields[section].annotation
         fields = table.model_fields["pot_bias" if key.endswith("_bias") else key]
     return next(m for m in fields.metadata if isinstance(m, Bound))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from plant.effects import DERIVED, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
+from plant.effect import KINDS
+from plant.effects import DERIVED, MOTOR, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
 from plant.geometry import Geometry, length_tolerances, load_geometry
 from plant.layout import (
     ACCELERATION,
@@ -23,6 +24,7 @@ from plant.layout import (
     LVDT_FACTOR,
     LVDT_LAG,
     LVDT_STEP,
+    MOTOR_NAMES,
     N_NOMINAL,
     NAMES,
     P_REF,
@@ -40,26 +42,36 @@ from plant.layout import (
 from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
-from vaneloop.base.tables import Bound, Bounded, Quantity, Table, read
+from vaneloop.base.compiled import compiled
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, load_toml, read
 
 __all__ = [
     "ACCELERATION",
+    "AMPLIFIER_SHARE",
     "AREA",
     "BANDWIDTH",
+    "CURRENT_BANDWIDTH",
+    "CURRENT_SHARE",
     "DAMPING",
     "DECELERATION",
     "DRIVE_EFFECTS",
     "DRIVE_LOADED",
     "FLOW_GAIN",
+    "GEAR_INERTIA",
+    "GEAR_RATIO",
     "GEOMETRY",
+    "KIND",
     "LAG",
     "LVDT_FACTOR",
     "LVDT_LAG",
     "LVDT_SHARE",
     "LVDT_STEP",
+    "MOTOR_INERTIA",
     "NAMES",
     "N_NOMINAL",
     "N_PARAMETERS",
+    "PEAK_CURRENT",
     "PLAY",
     "POT_BIAS",
     "POT_FACTOR",
@@ -67,18 +79,35 @@ __all__ = [
     "POT_SHARE",
     "P_REF",
     "RATED_CURRENT",
+    "RATED_SPEED",
+    "RESISTANCE",
+    "SCREW_EFFICIENCY",
+    "SCREW_FRICTION",
+    "SCREW_LEAD",
+    "SCREW_MASS",
+    "SCREW_STIFFNESS",
+    "SCREW_VISCOUS",
+    "SPEED_GAIN",
+    "SPEED_TIME",
     "STROKE",
+    "TORQUE_CONSTANT",
     "VALVE_A11",
     "VALVE_A12",
     "VALVE_A21",
     "VALVE_A22",
     "VALVE_SHARE",
     "VANE_EFFECTS",
+    "VOLTAGE",
+    "AnyPlantTable",
+    "ElectromechanicalTable",
     "Nominal",
     "PlantTable",
     "derive",
     "load_plant",
+    "motor_steps",
+    "names_of",
     "nominal",
+    "read_plant",
 ]
 
 # rows of p that `derive` works out from the effects' parameters
@@ -89,7 +118,32 @@ VALVE_SHARE = DERIVED + 3  # valve_lag and lvdt_lag: share of the way in one pla
 LVDT_SHARE = DERIVED + 4
 POT_SHARE = DERIVED + 5  # three rows: the potentiometers' share in one tick, pot_lag included
 
-_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "deg": math.pi / 180.0}
+# rows of an electromechanical actuator
+KIND = MOTOR  # number in `KINDS`
+(
+    RATED_SPEED,  # m/s
+    SPEED_GAIN,  # A s/rad
+    SPEED_TIME,  # s
+    PEAK_CURRENT,  # A
+    CURRENT_BANDWIDTH,  # Hz
+    TORQUE_CONSTANT,  # N m/A
+    RESISTANCE,  # Ohm
+    MOTOR_INERTIA,  # kg m2
+    GEAR_RATIO,  # -
+    GEAR_INERTIA,  # kg m2
+    SCREW_LEAD,  # m
+    SCREW_EFFICIENCY,  # -
+    SCREW_FRICTION,  # N
+    SCREW_VISCOUS,  # N m s/rad
+    SCREW_MASS,  # kg
+    SCREW_STIFFNESS,  # N/m
+    VOLTAGE,  # V
+) = range(KIND + 1, KIND + 1 + len(MOTOR_NAMES))
+CURRENT_SHARE = VOLTAGE + 1  # share of the way that current loop and amplifier_lag go in a motor's step
+AMPLIFIER_SHARE = VOLTAGE + 2
+MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
+
+_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0}
 
 
 class Engine(Bounded):
@@ -111,6 +165,7 @@ class Valve(Bounded):
 class Actuator(Bounded):
     """Two pistons in parallel, as one."""
 
+    kind: Literal["hydraulic"] = "hydraulic"
     flow_gain: Annotated[Quantity, Bound("m/s", 1e-3, 10.0)]
     area: Annotated[Quantity, Bound("m2", 1e-6, 1.0)]
     stroke: Annotated[Quantity, Bound("mm", 1.0, 1000.0)]
@@ -137,13 +192,96 @@ class Sensors(Bounded):
 
 
 class PlantTable(Table):
-    """``plant.toml``."""
+    """``plant.toml``: the machine with the hydraulic actuator."""
 
     engine: Engine
     valve: Valve
     actuator: Actuator
     supply: Supply
     sensors: Sensors
+
+
+class MotorActuator(Bounded):
+    """Rod on a ball screw."""
+
+    kind: Literal["electromechanical"]
+    stroke: Annotated[Quantity, Bound("mm", 1.0, 1000.0)]
+
+
+class Amplifier(Bounded):
+    """Servo amplifier: speed loop and current loop."""
+
+    rated_current: Annotated[Quantity, Bound("mA", 0.1, 1000.0)]
+    rated_speed: Annotated[Quantity, Bound("m/s", 1e-3, 10.0)]
+    speed_gain: Annotated[Quantity, Bound("A s/rad", 1e-4, 100.0)]
+    speed_time: Annotated[Quantity, Bound("ms", 1.0, 10000.0)]
+    peak_current: Annotated[Quantity, Bound("A", 0.1, 1000.0)]
+    current_bandwidth: Annotated[Quantity, Bound("Hz", 50.0, 5000.0)]
+
+
+class ServoMotor(Bounded):
+    """Servo motor, as the equivalent direct-current one."""
+
+    torque_constant: Annotated[Quantity, Bound("N m/A", 1e-3, 10.0)]
+    resistance: Annotated[Quantity, Bound("Ohm", 1e-3, 100.0)]
+    inertia: Annotated[Quantity, Bound("kg m2", 1e-7, 0.1)]
+
+
+class Gear(Bounded):
+    """Reduction gear between motor and screw."""
+
+    ratio: Annotated[Quantity, Bound("-", 0.1, 100.0)]
+    inertia: Annotated[Quantity, Bound("kg m2", 0.0, 0.1)]
+
+
+class Screw(Bounded):
+    """Ball screw with rod."""
+
+    lead: Annotated[Quantity, Bound("mm", 0.5, 50.0)]
+    efficiency: Annotated[Quantity, Bound("-", 0.1, 1.0)]
+    friction: Annotated[Quantity, Bound("N", 0.0, 20000.0)]
+    viscous: Annotated[Quantity, Bound("N m s/rad", 0.0, 1.0)]
+    mass: Annotated[Quantity, Bound("kg", 0.0, 100.0)]
+    stiffness: Annotated[Quantity, Bound("N/um", 1.0, 10000.0)]
+
+
+class Bus(Bounded):
+    """Direct-current bus of the amplifier; the actuator's usual temperature."""
+
+    voltage: Annotated[Quantity, Bound("V", 1.0, 2000.0)]
+    temperature: Annotated[Quantity, Bound("degC", -60.0, 200.0)]
+
+
+class ElectromechanicalTable(Table):
+    """``plant_electromechanical.toml``: the machine with the electromechanical actuator."""
+
+    engine: Engine
+    actuator: MotorActuator
+    drive: Amplifier
+    motor: ServoMotor
+    gear: Gear
+    screw: Screw
+    supply: Bus
+    sensors: Sensors
+
+
+AnyPlantTable = PlantTable | ElectromechanicalTable  # told apart by [actuator] kind
+_TABLES: dict[str, type[PlantTable] | type[ElectromechanicalTable]] = dict(
+    zip(KINDS, (PlantTable, ElectromechanicalTable), strict=True)
+)
+
+
+def read_plant(source: str | Path = "plant.toml") -> AnyPlantTable:
+    """Read a plant table of the kind that its ``[actuator] kind`` names (hydraulic where it names none).
+
+    Raises InputError with file, key, value and what is allowed.
+    """
+    file = file_of(source)
+    actuator: Any = load_toml(file).get("actuator")
+    kind = actuator.get("kind", KINDS[0]) if isinstance(actuator, dict) else KINDS[0]
+    if not isinstance(kind, str) or kind not in _TABLES:
+        raise InputError(f"{file}: actuator.kind (={kind!r}) must be one of {', '.join(KINDS)}")
+    return read(file, _TABLES[kind])
 
 
 @dataclass(frozen=True)
@@ -160,13 +298,24 @@ class Nominal:
     row: int
 
 
-def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
-    """Return every named parameter: those of `NAMES` in their order, then each stage's link ``lc`` and lever arm ``l``.
+def names_of(kind: str) -> dict[str, int]:
+    """Return the row of p of each named parameter that a machine with an actuator of this ``kind`` has."""
+    rows = {name: row for row, name in enumerate(NAMES)}
+    if kind == "hydraulic":
+        return rows
+    hydraulic = ("valve.", "supply.", "actuator.flow_gain", "actuator.area")
+    own = {"drive.rated_current": RATED_CURRENT} | {n: KIND + 1 + i for i, n in enumerate(MOTOR_NAMES)}
+    return {n: row for n, row in rows.items() if not n.startswith(hydraulic)} | own
+
+
+def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
+    """Return every named parameter: those of `names_of` in their order, then each stage's link ``lc`` and lever arm
+    ``l``.
 
     These two stand for all lengths of the linkage, and so does their tolerance (`plant.geometry.length_tolerances`).
     """
     out = []
-    for row, name in enumerate(NAMES):
+    for name, row in names_of(table.actuator.kind).items():
         section, key = name.split(".")
         if section == "linkage":
             q = getattr(geometry, key.removesuffix("_play")).hysteresis
@@ -195,28 +344,41 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
     ``tick`` (s).
     """
     for j in range(p.shape[1]):
-        p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
+        if p[KIND, j] == 0.0:  # a motor has no valve
+            p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
         p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
         p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
         p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)
         p[LVDT_SHARE, j] = lag_factor(p[ROW["lvdt_lag"], j], dt)
         for k in range(3):
             p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[ROW["pot_lag"] + k, j]), tick)
+        if p[KIND, j] != 0.0:
+            h = dt / motor_steps(dt)
+            p[CURRENT_SHARE, j] = lag_factor(1.0 / (2.0 * math.pi * p[CURRENT_BANDWIDTH, j]), h)
+            p[AMPLIFIER_SHARE, j] = lag_factor(p[ROW["amplifier_lag"], j], h)
     for flag, rows in ((DRIVE_EFFECTS, _DRIVE_ROWS), (DRIVE_LOADED, _LOAD_ROWS), (VANE_EFFECTS, _VANE_ROWS)):
         p[flag] = np.any(p[rows] != _NEUTRAL[rows], axis=0)
+    p[DRIVE_EFFECTS] = np.where(p[KIND] != 0.0, 1.0, p[DRIVE_EFFECTS])  # a motor has no short way
+
+
+@compiled
+def motor_steps(dt: float) -> int:
+    """Into how many steps a motor divides a plant step ``dt`` (s)."""
+    return max(1, math.ceil(dt / MOTOR_STEP - 1e-6))
 
 
 def load_plant(
     source: str | Path = "plant.toml", geometry: str | Path = "geometry.toml"
-) -> tuple[PlantTable, Geometry, np.ndarray]:
+) -> tuple[AnyPlantTable, Geometry, np.ndarray]:
     """Read, check and flatten the plant's tables.
 
     Returns the two tables and p, float64[N_PARAMETERS, 1] in SI, without the derived rows (`derive`).
     The play's width at the ring is the published width at the vane over the lever's ratio Ld'/L at mid-stroke.
     Raises InputError with file, key, value and what is allowed.
     """
-    table, geo = read(source, PlantTable), load_geometry(geometry)
+    table, geo = read_plant(source), load_geometry(geometry)
     p = np.zeros((N_PARAMETERS, 1))
+    p[KIND, 0] = KINDS.index(table.actuator.kind)
     g = geo.arrays()
     p[GEOMETRY : GEOMETRY + N_GEOMETRY, 0] = g
     for n in nominal(table, geo):

@@ -5,8 +5,8 @@ The nominal parameters' rows are in `plant.layout`.
 
 from __future__ import annotations
 
-from plant.effects import ROW, STATE_ROW
-from plant.layout import NOMINAL_STATE
+from plant.effects import MOTOR_AT, ROW, STATE_ROW
+from plant.layout import MOTOR_STATE, NOMINAL_STATE
 
 (N_R, SPOOL, SPOOL_RATE, SPEED, X, X_LVDT, RING, _, _, POT, _, _) = range(len(NOMINAL_STATE))
 
@@ -31,6 +31,14 @@ INTERNAL_LEAKAGE = ROW["internal_leakage"]
 PISTON_STICTION = ROW["piston_stiction"]  # excess, speed
 PISTON_FRICTION = ROW["piston_friction"]
 OIL_COMPRESSIBILITY = ROW["oil_compressibility"]  # compliance, drag
+AMPLIFIER_OFFSET = ROW["amplifier_offset"]
+AMPLIFIER_LAG = ROW["amplifier_lag"]  # used through AMPLIFIER_SHARE
+AMPLIFIER_DEAD_BAND = ROW["amplifier_dead_band"]
+TACHO_THERMAL_DRIFT = ROW["tacho_thermal_drift"]
+MOTOR_TORQUE_CONSTANT_ERROR = ROW["motor_torque_constant_error"]
+SCREW_FRICTION_ERROR = ROW["screw_friction"]
+GEAR_BACKLASH = ROW["gear_backlash"]
+SCREW_PITCH_ERROR = ROW["screw_pitch_error"]  # amplitude, phase
 END_STOP_SHIFT = ROW["end_stop_shift"]
 LVDT_LAG_ERROR = ROW["lvdt_lag"]  # used through LVDT_SHARE
 LVDT_NONLINEARITY = ROW["lvdt_nonlinearity"]  # amplitude, cubic
@@ -57,3 +65,6 @@ GIVE = STATE_ROW["oil_compressibility"]  # m
 READING = STATE_ROW["lvdt_lag"]  # m, stroke behind both lags of the LVDT
 BRISTLE = STATE_ROW["linkage_friction"]  # three of -1..1
 DRIVEN = BRISTLE + 3  # rad, three rings at the last tick, as friction saw them
+DEMANDED = STATE_ROW["amplifier_lag"]  # A, command behind the amplifier's lag
+AHEAD = STATE_ROW["gear_backlash"]  # m, motor ahead of the rod
+I_MOTOR, SPEED_INTEGRAL, MOTOR_SPEED, BENT = range(MOTOR_AT, MOTOR_AT + len(MOTOR_STATE))

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import chain, drive, lanes, places, stem
+from plant import chain, drive, electromechanical, lanes, places, stem
 from plant.actuator import speed_factor
 from plant.chain import measured_stroke, true_stroke
 from plant.effects import (
@@ -47,6 +47,7 @@ from plant.parameters import (
     DRIVE_LOADED,
     FLOW_GAIN,
     GEOMETRY,
+    KIND,
     LAG,
     LVDT_FACTOR,
     LVDT_LAG,
@@ -55,6 +56,7 @@ from plant.parameters import (
     POT_LAG,
     STROKE,
     VALVE_SHARE,
+    motor_steps,
 )
 from plant.places import (
     AERO_LOAD,
@@ -74,7 +76,9 @@ from plant.places import (
     POT,
     POT_LAG_ERROR,
     READING,
+    SCREW_PITCH_ERROR,
     SUPPLY_PRESSURE_DROOP,
+    TACHO_THERMAL_DRIFT,
     VALVE_FLOW_SATURATION,
     VALVE_GAIN_ASYMMETRY,
     VALVE_HYSTERESIS,
@@ -94,10 +98,10 @@ WIDE = 32  # lanes in a block of the linkage: its short loops over fewer would b
 SOME = 5  # so few lanes or fewer are quicker one by one there
 # effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
 ACTUATOR_BLOCKS = (
-    "aero_load", "end_stop_shift", "internal_leakage", "oil_compressibility", "oil_viscosity", "piston_friction",
-    "piston_stiction",
-    "supply_pressure_droop", "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry", "valve_hysteresis",
-    "valve_lag",
+    "aero_load", "amplifier_dead_band", "amplifier_lag", "amplifier_offset", "end_stop_shift", "gear_backlash",
+    "internal_leakage", "motor_torque_constant_error", "oil_compressibility", "oil_viscosity", "piston_friction",
+    "piston_stiction", "screw_friction", "screw_pitch_error", "supply_pressure_droop", "tacho_thermal_drift",
+    "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry", "valve_hysteresis", "valve_lag",
     "valve_null_bias",
 )  # fmt: skip
 LINKAGE_BLOCKS = (
@@ -164,22 +168,34 @@ def actuator_run(
         raise ValueError(f"window (={window}) needs x_lvdt")
     x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
     if window:
-        _rest(p, s, current[0, 0], n_r[0])
+        _rest(p, s, current[0, 0], n_r[0], t_oil[0])
     h = dt / current.shape[1]
     for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
-    alone = _elsewhere(p, ("valve", "supply", "actuator"), ACTUATOR_BLOCKS)
+    alone = _elsewhere(p, ("valve", "supply", "amplifier", "motor", "screw", "actuator"), ACTUATOR_BLOCKS)
+    motor = p[KIND, 0] != 0.0  # all lanes are of one machine
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
-    order = np.lexsort((p[VALVE_HYSTERESIS] != 0.0, p[PISTON_STICTION] != 0.0, lossy, p[DRIVE_LOADED] != 0.0, alone))
+    order = np.lexsort(
+        (
+            p[VALVE_HYSTERESIS] != 0.0,
+            p[PISTON_STICTION] != 0.0,
+            lossy,
+            p[DRIVE_LOADED] != 0.0,
+            p[SCREW_PITCH_ERROR] != 0.0,
+            alone,
+        )
+    )
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
     work = [range(j, min(j + W, wide)) for j in range(0, wide, W)]
-    if wide < p.shape[1]:
-        work.append(range(wide, p.shape[1]))
+    each = max(1, -(-(p.shape[1] - wide) // (os.cpu_count() or 1)))
+    work += [range(j, min(j + each, p.shape[1])) for j in range(wide, p.shape[1], each)]
 
     def run(part: range) -> None:
         some = order[part.start : part.stop]
-        if part.start < wide:
+        if part.start < wide and motor:
+            _motor_blocks(current, n_r, t_oil, dt, p, s, out.T, x, window, some, np.empty(1, _MOTOR))
+        elif part.start < wide:
             _actuator_blocks(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, np.empty(1, _ACTUATOR))
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some)
@@ -279,13 +295,17 @@ def _elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -
 
 
 @compiled_free
-def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float) -> None:
-    """Valve and oil at rest under the current ``i`` (A) at ``n_r`` (%)."""
+def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float, t_oil: float) -> None:
+    """Valve and oil at rest, a motor at its steady speed, under the current ``i`` (A) at ``n_r`` (%) and ``t_oil``
+    (degC).
+    """
     for j in range(p.shape[1]):
         current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
         s[CURRENT : CURRENT + 4, j] = s[LAGGED, j] = current
         load = aero_load.step(n_r, p[AERO_LOAD, j])
         s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+        if p[KIND, j] != 0.0:
+            electromechanical.rest(p, s, j, i, load, t_oil)
 
 
 # ---- engine ----------------------------------------------------------------------------------------------------------
@@ -519,6 +539,84 @@ def _block_substep(
         z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky)
         _put_state(b, j, z)
         b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+
+
+_MOTOR = lanes.block(
+    W, electromechanical.MotorState, electromechanical.Motor, more=("aero", "torque_of_load", "most", "logged")
+)
+_motor_state, _put_motor_state = (
+    lanes.getter(electromechanical.MotorState),
+    lanes.putter(electromechanical.MotorState),
+)
+_motor, _put_motor = lanes.getter(electromechanical.Motor), lanes.putter(electromechanical.Motor)
+
+
+@compiled_free
+def _motor_blocks(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray,
+    window: int,
+    order: np.ndarray,
+    block: np.ndarray,
+) -> None:
+    """`_actuator_blocks` of an electromechanical actuator. ``block``: memory for one record `_MOTOR`."""
+    n, substeps = current.shape
+    many = motor_steps(dt / substeps)
+    h = dt / (substeps * many)
+    b = block[0]
+    for j0 in range(0, len(order), W):
+        last = min(W, len(order) - j0)
+        swaying = drifting = False
+        for j in range(W):
+            q = order[j0 + min(j, last - 1)]
+            swaying |= p[SCREW_PITCH_ERROR, q] != 0.0
+            drifting |= p[TACHO_THERMAL_DRIFT, q] != 0.0
+            b.aero[j] = p[AERO_LOAD, q]
+            _put_motor_state(b, j, electromechanical.taken(s, q))
+            _put_motor(b, j, electromechanical.prepare(p, q, t_oil[0]))
+        for k in range(n):
+            if k > 0:
+                speed, warm = _between(n_r, k), _between(t_oil, k)
+                if drifting:
+                    for j in range(last):
+                        _put_motor(b, j, electromechanical.prepare(p, order[j0 + j], warm))
+                for j in range(W):
+                    force = aero_load.step(speed, b.aero[j])
+                    b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
+                if swaying:
+                    for m in range(substeps):
+                        _motor_substep(b, current[k, m], many, h, True)
+                else:
+                    for m in range(substeps):
+                        _motor_substep(b, current[k, m], many, h, False)
+            if window > 0 and k % window == 0:
+                for j in range(last):
+                    x = true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k])
+                    shift = x - b.reading[j]
+                    b.x[j] = x if k == 0 else b.x[j] + shift
+                    b.x_lvdt[j] = x if k == 0 else b.x_lvdt[j] + shift
+                    b.reading[j] = x if k == 0 else b.reading[j] + shift
+            for j in range(last):
+                out[order[j0 + j], k] = measured_stroke(b.reading[j], p, order[j0 + j], t_oil[k])
+        for j in range(last):
+            electromechanical.stored(s, order[j0 + j], _motor_state(b, j))
+
+
+@inlined
+def _motor_substep(b: Any, i_cmd: float, many: int, h: float, swaying: bool) -> None:
+    """One plant step of every lane of the block, in ``many`` steps of the motor."""
+    for _ in range(many):
+        for j in range(W):
+            z, d = _motor_state(b, j), _motor(b, j)
+            _put_motor_state(b, j, electromechanical.step(z, d, i_cmd, b.torque_of_load[j], b.most[j], h, swaying))
+    for j in range(W):
+        _put_motor_state(b, j, electromechanical.sense(_motor_state(b, j), _motor(b, j)))
 
 
 # ---- linkage ---------------------------------------------------------------------------------------------------------

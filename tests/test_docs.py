@@ -92,6 +92,9 @@ NOT_RUN: dict[str, str] = {
 
 # the beginning of a step that takes long -> the quick test that covers what it does
 LONG: dict[str, str] = {
+    "vaneloop diagnose worn.log": "tests/test_electromechanical.py",
+    "vaneloop design --plant": "tests/test_electromechanical.py",
+    "vaneloop engine-test --plant": "tests/test_electromechanical.py",
     "vaneloop strategies --report": "tests/test_strategies.py",
     "vaneloop design --report": "tests/test_design.py",
     "vaneloop inject --all": "tests/test_inject.py",

@@ -19,15 +19,19 @@ from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.tick import flashed
 from plant import Model, build_plant, chain, load_model, places, stages, write_model
 from plant import effects as library
-from plant.effect import DEG, STAGES
+from plant.effect import DEG, KINDS, MOTOR, STAGES
 from plant.effects import (
     EFFECTS,
     ROW,
+    amplifier_dead_band,
+    amplifier_lag,
+    amplifier_offset,
     can_delay,
     controller_gain_error,
     crank_length_error,
     end_stop_shift,
     frame_hold,
+    gear_backlash,
     internal_leakage,
     link_length_error,
     linkage_backlash,
@@ -39,6 +43,7 @@ from plant.effects import (
     lvdt_lag,
     lvdt_nonlinearity,
     lvdt_thermal_drift,
+    motor_torque_constant_error,
     oil_compressibility,
     oil_viscosity,
     piston_friction,
@@ -49,7 +54,10 @@ from plant.effects import (
     ring_eccentricity,
     rotor_lag_error,
     schedule_error,
+    screw_friction,
+    screw_pitch_error,
     supply_pressure_droop,
+    tacho_thermal_drift,
     thermal_growth,
     trend_threshold_error,
     valve_dead_band,
@@ -90,6 +98,8 @@ PROMISED = {
     *("lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag", "lvdt_thermal_drift"),
     *("linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "thermal_growth"),
     *("crank_length_error", "link_length_error", "ring_eccentricity"),
+    *("amplifier_offset", "amplifier_dead_band", "amplifier_lag", "tacho_thermal_drift"),
+    *("motor_torque_constant_error", "screw_friction", "gear_backlash", "screw_pitch_error"),
     *("pot_bias", "pot_gain", "pot_lag"),
 }
 
@@ -132,7 +142,28 @@ SIZES: dict[str, dict[str, float]] = {
     "pot_bias": {"vgv1": 0.5},
     "pot_gain": {"vgv1": 1.03},
     "pot_lag": {"vgv1": 0.05},
+    "amplifier_offset": {"offset": 1.0},
+    "amplifier_dead_band": {"half_width": 1.2},
+    "amplifier_lag": {"time_constant": 0.01},
+    "tacho_thermal_drift": {"coefficient": -0.004},
+    "motor_torque_constant_error": {"factor": 0.6},
+    "screw_friction": {"force": 1000.0},
+    "gear_backlash": {"width": 0.1},
+    "screw_pitch_error": {"amplitude": 0.05, "phase": 30.0},
 }
+ELECTRIC = [n for n in NAMES if EFFECTS[n].kinds == MOTOR]
+
+
+def base_of(*names: str):
+    """The nominal machine that can have these effects."""
+    electric = any(EFFECTS[n].kinds == MOTOR for n in names)
+    return build_plant("plant_electromechanical.toml" if electric else "plant.toml")
+
+
+def library_of(kind: str):
+    """Effects that a machine with an actuator of this kind can have."""
+    return [e for e in EFFECTS.values() if kind in e.kinds]
+
 
 number = st.floats(-50.0, 50.0, allow_subnormal=False)
 positive = st.floats(1e-3, 50.0)
@@ -144,7 +175,7 @@ def si(name: str, key: str, value: float) -> float:
 
 def machine_with(base=None, **sizes):
     """The nominal machine (or ``base``) with effects, {name: {parameter: value in its unit}}."""
-    return Model(effects=sizes).plant(base)
+    return Model(effects=sizes).plant(base or base_of(*sizes))
 
 
 def drive(machine, current, ticks, *, n_r=100.0, p_s=21e6, t_oil=40.0, stroke=0.024):
@@ -229,6 +260,14 @@ IDENTITIES = {
     "pot_bias": lambda n, a, b, c: (pot_bias.step(a, n[0]), a),
     "pot_gain": lambda n, a, b, c: (pot_gain.step(a, n[0]), a),
     "pot_lag": lambda n, a, b, c: (pot_lag.step(c, n[0]), c),
+    "amplifier_offset": lambda n, a, b, c: (amplifier_offset.step(a, *n), a),
+    "amplifier_dead_band": lambda n, a, b, c: (amplifier_dead_band.step(a, *n), a),
+    "amplifier_lag": lambda n, a, b, c: (amplifier_lag.step(b, a, 1.0), a),
+    "tacho_thermal_drift": lambda n, a, b, c: (tacho_thermal_drift.step(a, b, *n), a),
+    "motor_torque_constant_error": lambda n, a, b, c: (motor_torque_constant_error.step(c, *n), c),
+    "screw_friction": lambda n, a, b, c: (screw_friction.step(c, *n), c),
+    "gear_backlash": lambda n, a, b, c: (gear_backlash.step(0.0, a, *n), (0.0, a)),
+    "screw_pitch_error": lambda n, a, b, c: (screw_pitch_error.step(b, a, c, *n), a),
 }
 
 
@@ -357,38 +396,42 @@ def servo_of(machine):
 
 @pytest.fixture(scope="module")
 def stage_outputs():
-    """{effect: {stage: output}} of every effect alone, None for the machine without it. A load is on the piston in all
+    """{effect: {stage: output}} of every effect alone, and of the machine of either kind without it (whether it is
+    electric). A load is on the piston in all
     of them.
     """
-    base = machine_with(aero_load={"force": 2000.0})
-    sets = [{}, *({name: SIZES[name]} for name in NAMES)]
-    wide = {
-        "actuator": actuator_lanes(sets, base)[0],
-        "linkage": linkage_lanes(sets, base)[0],
-        "engine": engine_lanes(sets, base),
-    }
     out = {}
-    for j, effects in enumerate(sets):
-        machine = machine_with(base, **effects)
-        alone = {"demand": demand_of(machine), "servo": servo_of(machine)}
-        out[next(iter(effects), None)] = alone | {k: v[..., j] for k, v in wide.items()}
+    for electric in (False, True):
+        base = machine_with(base_of(*ELECTRIC[: int(electric)]), aero_load={"force": 2000.0})
+        sets = [{}, *({name: SIZES[name]} for name in NAMES if (name in ELECTRIC) == electric)]
+        wide = {
+            "actuator": actuator_lanes(sets, base)[0],
+            "linkage": linkage_lanes(sets, base)[0],
+            "engine": engine_lanes(sets, base),
+        }
+        for j, effects in enumerate(sets):
+            machine = machine_with(base, **effects)
+            alone = {"demand": demand_of(machine), "servo": servo_of(machine)}
+            out[next(iter(effects), electric)] = alone | {k: v[..., j] for k, v in wide.items()}
     return out
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_effect_shows_in_every_stage_it_declares_and_in_no_other(name: str, stage_outputs) -> None:
-    with_it, without = stage_outputs[name], stage_outputs[None]
+    with_it, without = stage_outputs[name], stage_outputs[name in ELECTRIC]
     # blocks of lanes and single ones differ by rounding
     changed = {stage for stage in STAGES if np.max(np.abs(with_it[stage] - without[stage])) > 1e-12}
     assert changed == set(EFFECTS[name].stages)
     assert all(np.isfinite(v).all() for v in with_it.values())
 
 
-def test_any_parameters_within_their_bounds_keep_every_stage_finite() -> None:
-    base = machine_with(aero_load={"force": 2000.0})
-    sets = [{e.name: {p.name: v}} for e in EFFECTS.values() for p in e.parameters for v in (p.low, p.high)]
-    everything_low = {e.name: {p.name: p.low for p in e.parameters} for e in EFFECTS.values()}
-    everything_high = {e.name: {p.name: p.high for p in e.parameters} for e in EFFECTS.values()}
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_parameters_within_their_bounds_keep_every_stage_finite(kind: str) -> None:
+    base = machine_with(base_of(*(ELECTRIC if kind == MOTOR[0] else ())), aero_load={"force": 2000.0})
+    effects = library_of(kind)
+    sets = [{e.name: {p.name: v}} for e in effects for p in e.parameters for v in (p.low, p.high)]
+    everything_low = {e.name: {p.name: p.low for p in e.parameters} for e in effects}
+    everything_high = {e.name: {p.name: p.high for p in e.parameters} for e in effects}
     sets += [everything_low, everything_high]
     x, s = actuator_lanes(sets, base)
     vanes, _ = linkage_lanes(sets, base)
@@ -405,7 +448,7 @@ def test_any_parameters_within_their_bounds_keep_every_stage_finite() -> None:
 def test_effect_changes_the_closed_loop_and_keeps_it_finite(name: str) -> None:
     load = {} if name == "aero_load" else {"aero_load": {"force": 2000.0}}
     stimulus = Stimulus.of(log()["n_dem"], t_oil=log()["t_oil"])
-    machines = (machine_with(**load, **effects) for effects in ({name: SIZES[name]}, {}))
+    machines = (machine_with(base_of(name), **load, **effects) for effects in ({name: SIZES[name]}, {}))
     run, without = (lockstep(stimulus, plant=machine, hashed=False).columns for machine in machines)
     assert all(np.isfinite(v).all() for v in run.values())
     if name == "end_stop_shift":  # this run stays 4 mm off the stops
@@ -413,22 +456,23 @@ def test_effect_changes_the_closed_loop_and_keeps_it_finite(name: str) -> None:
     assert any(not np.array_equal(run[c], without[c]) for c in run)
 
 
-def everything_on():
-    """The machine with every effect at a fiftieth of its range."""
+def everything_on(kind="hydraulic"):
+    """The machine with every effect of its kind at a fiftieth of its range."""
 
     def small(p):
         return p.neutral + 0.02 * ((p.high - p.neutral) or (p.low - p.neutral))
 
-    return machine_with(**{e.name: {p.name: small(p) for p in e.parameters} for e in EFFECTS.values()})
+    return machine_with(**{e.name: {p.name: small(p) for p in e.parameters} for e in library_of(kind)})
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lanes", [2, W, W + 2, SOME + 3, 40])
-def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
-    base = everything_on()
+def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int, kind: str) -> None:
+    base, electric = everything_on(kind), kind == MOTOR[0]
     singles = [
         {},
-        {"valve_null_bias": {"bias": -0.5}},
-        {"piston_friction": {"force": 900.0}},
+        {"amplifier_offset": {"offset": -0.5}} if electric else {"valve_null_bias": {"bias": -0.5}},
+        {"screw_friction": {"force": 900.0}} if electric else {"piston_friction": {"force": 900.0}},
         {"linkage_backlash": {"vigv": 0.4}},
     ]
     sets = [singles[j % 4] for j in range(lanes)]
@@ -441,7 +485,7 @@ def test_lanes_side_by_side_give_the_bits_of_each_alone(lanes: int) -> None:
 
 
 # what a block of the actuator's lanes leaves out, by the effects that its lanes have
-KINDS = {
+BLOCKS = {
     "nothing": (
         {},
         {"valve_dead_band": {"half_width": 0.5}},
@@ -459,19 +503,19 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BLOCKS)
 def test_a_block_that_leaves_out_what_its_lanes_lack_gives_the_bits_of_the_whole(kind: str) -> None:
     loads = kind in ("load", "losses", "stiction")
     base = machine_with(aero_load={"force": 2000.0}) if loads else build_plant()
-    sets = [KINDS[kind][j % len(KINDS[kind])] for j in range(W)]
+    sets = [BLOCKS[kind][j % len(BLOCKS[kind])] for j in range(W)]
     x, s = actuator_lanes(sets, base, 600)
     for j, effects in enumerate(sets):
         alone, state = actuator_lanes([effects], base, 600)
         assert np.array_equal(alone[:, 0], x[:, j])
         # where no effect acts, the short way of a lane alone leaves the effects' own state as it was
         assert np.array_equal(state[: places.X_LVDT + 1, 0], s[: places.X_LVDT + 1, j])
-    everything = {name: sizes for k in KINDS.values() for effects in k for name, sizes in effects.items()}
-    whole, _ = actuator_lanes([*sets[:-1], everything if loads else KINDS["hysteresis"][0]], base, 600)
+    everything = {name: sizes for k in BLOCKS.values() for effects in k for name, sizes in effects.items()}
+    whole, _ = actuator_lanes([*sets[:-1], everything if loads else BLOCKS["hysteresis"][0]], base, 600)
     assert np.array_equal(whole[:, :-1], x[:, :-1])
 
 

@@ -20,6 +20,7 @@ from hil.loop.node import replay as repeat
 from hil.loop.tick import arrive, new_loop
 from hil.replay import replay
 from plant import Model, Plant, build_plant
+from plant.effect import MOTOR
 from plant.effects import EFFECTS
 
 # a gross size of each effect, in declared units
@@ -61,7 +62,23 @@ GROSS: dict[str, dict[str, float]] = {
     "pot_bias": {"vgv1": 1.0},
     "pot_gain": {"vgv1": 1.1},
     "pot_lag": {"vgv1": 0.1},
+    "amplifier_offset": {"offset": 4.0},
+    "amplifier_dead_band": {"half_width": 4.0},
+    "amplifier_lag": {"time_constant": 0.03},
+    "tacho_thermal_drift": {"coefficient": -0.015},
+    "motor_torque_constant_error": {"factor": 0.2},
+    "screw_friction": {"force": 5000.0},
+    "gear_backlash": {"width": 0.4},
+    "screw_pitch_error": {"amplitude": 0.3, "phase": 30.0},
 }
+ELECTRIC = {name for name, e in EFFECTS.items() if e.kinds == MOTOR}
+
+
+def nominal(*names: str) -> Plant:
+    """The nominal machine that can have these effects."""
+    return build_plant("plant_electromechanical.toml" if ELECTRIC & set(names) else "plant.toml")
+
+
 LOADED = ("piston_stiction", "internal_leakage", "oil_compressibility")  # show under a load only
 T_OIL = 80.0  # degC, so that what grows with heat shows
 POINTS = [
@@ -85,7 +102,7 @@ Curves = dict[str, np.ndarray]
 
 def machine(*names: str) -> Plant:
     """The nominal machine with these effects at their gross sizes."""
-    return Model(effects={name: GROSS[name] for name in names}).plant() if names else build_plant()
+    return Model(effects={name: GROSS[name] for name in names}).plant(nominal(*names)) if names else build_plant()
 
 
 def in_lockstep(plant: Plant, names: tuple[str, ...]) -> tuple[str, Curves]:
@@ -122,7 +139,8 @@ def injected(plant: Plant, names: tuple[str, ...]) -> tuple[str, Curves]:
     """The nominal machine, which an action of a scenario changes at power-on."""
     actions = [Machine(effect=name, parameters=GROSS[name]) for name in names]
     outcome = inject.run(
-        Scenario(title="made", duration=SECONDS, demand=POINTS, seed=3, inject=[Machine(t_oil=T_OIL), *actions])
+        Scenario(title="made", duration=SECONDS, demand=POINTS, seed=3, inject=[Machine(t_oil=T_OIL), *actions]),
+        plant=nominal(*names) if names else plant,
     )
     return str(outcome.state_hash), {s: outcome.trace.signals[s] for s in SHOWN}
 
@@ -134,15 +152,16 @@ WAYS = {"lockstep": in_lockstep, "node": on_the_bus, "replay": replayed, "inject
 def way(request: pytest.FixtureRequest):
     """A way to run the loop, and its runs without an effect and under load alone."""
     run = WAYS[request.param]
-    return request.param, run, run(machine(), ()), run(machine("aero_load"), ("aero_load",))
+    electric = run(nominal(*ELECTRIC), ())
+    return request.param, run, run(machine(), ()), run(machine("aero_load"), ("aero_load",)), electric
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_acts_in_lockstep_node_replay_and_injection_alike(way, name: str) -> None:
-    called, run, plain, loaded = way
+    called, run, plain, loaded, electric = way
     under = ("aero_load",) if name in LOADED else ()
     state_hash, curves = run(machine(*under, name), (*under, name))
-    without = loaded if under else plain
+    without = loaded if under else electric if name in ELECTRIC else plain
     assert state_hash != without[0], f"{name} changes nothing in {called}"
     moved = {s: float(np.abs(curves[s] - without[1][s]).max()) for s in SHOWN}
     assert any(moved[s] > LEAST[s] for s in SHOWN), f"{name} moves nothing in {called}: {moved}"
@@ -176,8 +195,8 @@ def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name
 @pytest.mark.parametrize("name", [n for n in EFFECTS if n not in LOADED])
 def test_an_effect_injected_at_power_on_is_the_effect_in_the_machine(name: str) -> None:
     made = machine(name)
-    fixed, changed = Node(made, n_r=60.0, t_oil=T_OIL), Node(n_r=60.0, t_oil=T_OIL)
-    engines = Ecu(made), Ecu()
+    fixed, changed = Node(made, n_r=60.0, t_oil=T_OIL), Node(nominal(name), n_r=60.0, t_oil=T_OIL)
+    engines = Ecu(made), Ecu(nominal(name))
     change = inject.MachineChange(Machine(effect=name, parameters=GROSS[name]), changed, engines[1])
     change.tick(0)
     assert np.array_equal(changed.loop.p, fixed.loop.p) and np.array_equal(engines[1].arrays.p, engines[0].arrays.p)
@@ -208,7 +227,10 @@ def test_an_effect_with_a_memory_that_begins_later_makes_no_jump(name: str) -> N
     sizes = {q: v * 1e-9 for q, v in GROSS[name].items()}  # next to nothing: what jumps is not the effect
     action = Machine(effect=name, parameters=sizes, start=2.5)
     made = {"duration": 2.6, "demand": [[0.0, 60.0], [1.0, 90.0], [2.6, 90.0]], "seed": 3}
-    one, other = (inject.run(Scenario(title="made", inject=actions, **made)).trace for actions in ([], [action]))
+    one, other = (
+        inject.run(Scenario(title="made", inject=actions, **made), plant=nominal(name)).trace
+        for actions in ([], [action])
+    )
     assert one.signals["x_lvdt"][-1] - one.signals["x_lvdt"][0] > 8.0
     for s in SHOWN:
         assert np.abs(one.signals[s] - other.signals[s]).max() < 1e-3, s

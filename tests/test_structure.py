@@ -103,6 +103,8 @@ EXPORTS: dict[str, list[str]] = {
     "plant.effects": [
         "DERIVED",
         "EFFECTS",
+        "MOTOR",
+        "MOTOR_AT",
         "NEUTRAL",
         "N_PARAMETERS",
         "N_STATE",
@@ -110,6 +112,7 @@ EXPORTS: dict[str, list[str]] = {
         "STATE",
         "STATE_ROW",
         "rows_at",
+        "states_of",
     ],
     "vaneloop": [
         *(

@@ -21,7 +21,7 @@ from controller.calibration import AngleTable, CalibrationTable, StrokeTable
 from hil.engine_test import EngineTestTable
 from plant import build_plant
 from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
-from plant.parameters import PlantTable, load_plant
+from plant.parameters import ElectromechanicalTable, PlantTable, load_plant
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Quantity, path, read
 from vaneloop.design.schedule_files import write_stroke_tables, write_vane_angles
@@ -32,6 +32,7 @@ MODELS = {
     "engine_test.toml": EngineTestTable,
     "geometry.toml": Geometry,
     "plant.toml": PlantTable,
+    "plant_electromechanical.toml": ElectromechanicalTable,
     "schedules.toml": Schedules,
     "stroke_tables.toml": StrokeTable,
     "vane_angles.toml": AngleTable,
@@ -42,6 +43,7 @@ LOADERS = {
     "engine_test.toml": lambda f: read(f, EngineTestTable),
     "geometry.toml": lambda f: load_plant(geometry=f),
     "plant.toml": load_plant,
+    "plant_electromechanical.toml": load_plant,
     "schedules.toml": load_schedules,
     "stroke_tables.toml": lambda f: load_calibration(strokes=f),
     "vane_angles.toml": lambda f: load_calibration(angles=f),

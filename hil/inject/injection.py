@@ -170,6 +170,8 @@ def _lockstep(
     from hil.loop.node import Ecu, Node
     from plant import places
 
+    if plant is not None and (why := lacks(scenario, plant)):
+        raise InputError(f"{name}: {why}")
     started = time.perf_counter()
     points = np.array(scenario.demand)
     node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
@@ -316,6 +318,19 @@ def cannot(scenario: Scenario) -> str:
     """Return why an outsider cannot do what the scenario asks for; empty if it can."""
     inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})
     return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
+
+
+def lacks(scenario: Scenario, plant: Plant) -> str:
+    """Return what the scenario does to an actuator that this machine does not have; empty if there is no such thing."""
+    from plant.effects import EFFECTS
+
+    for a in scenario.inject:
+        if isinstance(a, Machine):
+            if a.p_s is not None and plant.kind != "hydraulic":
+                return f"machine: p_s: the {plant.kind} actuator takes no oil"
+            if a.effect is not None and plant.kind not in EFFECTS[a.effect].kinds:
+                return f"machine: effect {a.effect}: not of an actuator of kind {plant.kind}"
+    return ""
 
 
 def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float], None] | None) -> Outcome:

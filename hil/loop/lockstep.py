@@ -31,8 +31,12 @@ __all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
 
 CHUNK = 10_000  # ticks between two calls of the progress function
 WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller reaches RUN and the servo settles
-COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state", "n_engine")
-_BORDER = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3, 1e-6, 1.0, *[180.0 / np.pi] * 3, 1.0, 1.0])  # SI -> border units
+COLUMNS = (
+    "t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state", "n_engine",
+    "i_motor",
+)  # fmt: skip
+# i_motor: A, only of a machine that has a motor
+_BORDER = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3, 1e-6, 1.0, *[180.0 / np.pi] * 3, 1.0, 1.0, 1.0])  # SI -> border units
 _BORDER.setflags(write=False)
 
 # columns of a stimulus
@@ -41,7 +45,7 @@ S_N_DEM, S_N_R, S_P_S, S_T_OIL, S_FRESH, S_REJECTED, S_MODE_REQUEST, N_STIMULUS 
 
 @dataclass(frozen=True)
 class Stimulus:
-    """What the ECU sends and the hydraulic supply gives, one row every 10 ms.
+    """What the ECU sends and the supply gives, one row every 10 ms.
 
     n_dem   %, float64[n]
     n_r     %, float64[n]; NaN where the plant's own engine supplies it
@@ -106,13 +110,13 @@ def advance(
     """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
 
     noise      float64[ticks or 1, 5] standard normal numbers (LVDT, three potentiometers, speed)
-    out        float64[rows or 0, 13] in SI, a row every ``every`` ticks
-    snapshots  float64[ticks or 0, n] copies of the whole state at each tick
+    out        float64[rows or 0, 14] in SI, a row every ``every`` ticks
+    snapshots  float64[ticks or 0, n] copies of the whole state that the machine has, at each tick
     """
-    z, s, inputs, given = a.z, a.s, as_inputs(a.inputs), as_outputs(a.outputs)
+    z, s, rows, inputs, given = a.z, a.s, a.rows, as_inputs(a.inputs), as_outputs(a.outputs)
     noisy = noise.shape[0] > 1
     keep = snapshots.shape[0] > 0
-    n_z, n_s = z.shape[0], s.shape[0]
+    n_z, n_s = z.shape[0], rows.shape[0]
     last_frame = stimulus.shape[0] - 1
     n_dem = n_r = 0.0
     for i in range(ticks):
@@ -147,11 +151,12 @@ def advance(
             out[r, 8], out[r, 9], out[r, 10] = a.angles[0], a.angles[1], a.angles[2]
             out[r, 11] = given.mode
             out[r, 12] = s[places.N_R, 0]
+            out[r, 13] = s[places.I_MOTOR, 0]
         if keep:
             for q in range(n_z):
                 snapshots[i, q] = z[q]
             for q in range(n_s):
-                snapshots[i, n_z + q] = s[q, 0]
+                snapshots[i, n_z + q] = s[rows[q], 0]
         move(k, a, n_dem, n_r, p_s, t_oil)
 
 
@@ -214,7 +219,7 @@ def lockstep(
         machine.place_rings(s, angles, n0, t_oil)
 
     out = np.empty((-(-ticks // every), len(COLUMNS)))
-    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.z) + len(s))) for _ in range(2)]
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.z) + len(loop.rows))) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()
     with ThreadPoolExecutor(1) as pool:
@@ -234,6 +239,8 @@ def lockstep(
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
     columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
+    if machine.kind != "electromechanical":
+        del columns["i_motor"]
     return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))
 
 

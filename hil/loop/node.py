@@ -238,7 +238,7 @@ class Node:
         """Return the SHA-256 of the whole state: firmware, plant, receiver, counters."""
         digest = hashlib.sha256()
         a = self.arrays
-        for part in (a.loop.z, a.loop.s, a.loop.mean, a.receiver, a.counter):
+        for part in (a.loop.z, a.loop.s[a.loop.rows], a.loop.mean, a.receiver, a.counter):
             digest.update(part.tobytes())
         return digest.hexdigest()
 

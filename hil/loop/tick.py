@@ -47,6 +47,7 @@ class Loop(NamedTuple):
     angles       float64[3] rad, the potentiometers' readings at this tick
     pots         float64[frames or 0, 6] what the controller gets of each reading: share of it and offset (rad; NaN =
                  not fitted), stage by stage, a row every 10 ms, the last one held
+    rows         int64[n], rows of ``s`` that this machine has (`plant.Plant.rows`): what a fingerprint covers
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
     """
@@ -63,6 +64,7 @@ class Loop(NamedTuple):
     mean: np.ndarray
     angles: np.ndarray
     pots: np.ndarray
+    rows: np.ndarray
     sent: np.ndarray
 
     @property
@@ -109,6 +111,7 @@ def new_loop(
         np.zeros(2),
         np.zeros(3),
         np.empty((0, 6)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
+        plant.rows,
         np.full((KEPT, 4), np.nan),
     )
 

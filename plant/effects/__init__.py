@@ -1,7 +1,8 @@
 """The library of effects: one file each, found by itself.
 
 An effect's parameters follow the nominal plant's in p, its states the nominal ones in s, in the alphabetical order of
-the files. A new file shifts the rows behind it; nothing else in the plant has numbers of rows in it.
+the files. A new file shifts the rows behind it; nothing else in the plant has numbers of rows in it. Behind them all
+stands what only an electromechanical actuator has.
 """
 
 from __future__ import annotations
@@ -10,9 +11,12 @@ import importlib
 import pkgutil
 
 from plant.effect import Effect
-from plant.layout import N_NOMINAL, NOMINAL_STATE
+from plant.layout import MOTOR_NAMES, MOTOR_STATE, N_NOMINAL, NOMINAL_STATE
 
-__all__ = ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"]
+__all__ = [
+    "DERIVED", "EFFECTS", "MOTOR", "MOTOR_AT", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW",
+    "rows_at", "states_of",
+]  # fmt: skip
 
 
 def _found() -> dict[str, Effect]:
@@ -39,11 +43,21 @@ for _name, _effect in EFFECTS.items():
     _states += [f"{_name}.{state}" for state in _effect.states]
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
-N_PARAMETERS = DERIVED + 8
-STATE: tuple[str, ...] = tuple(_states)
+MOTOR = DERIVED + 8  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
+N_PARAMETERS = MOTOR + 1 + len(MOTOR_NAMES) + 2
+MOTOR_AT = len(_states)  # first row of `MOTOR_STATE` in s
+STATE: tuple[str, ...] = (*_states, *MOTOR_STATE)
 N_STATE = len(STATE)
 
 
 def rows_at(*sites: str) -> list[int]:
     """Return the rows of p with the parameters of all effects that act at these sites."""
     return [ROW[e.name] + i for e in EFFECTS.values() if e.site in sites for i in range(len(e.parameters))]
+
+
+def states_of(kind: str) -> list[int]:
+    """Return the rows of s that a machine with an actuator of this ``kind`` has, in their order."""
+    hydraulic = kind == "hydraulic"
+    absent = set(MOTOR_STATE) if hydraulic else {"spool", "spool_rate"}
+    absent |= {f"{e.name}.{state}" for e in EFFECTS.values() if kind not in e.kinds for state in e.states}
+    return [row for row, name in enumerate(STATE) if name not in absent]

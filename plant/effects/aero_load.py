@@ -6,7 +6,7 @@ Equation::
 
 Symbols: F against extension (N), force at 100 % (N; negative helps extension), n_r rotor speed (%).
 Limits: one force whatever the vane angle and inlet conditions. It enters the orifice equation (p_L = F / A) and
-compresses the nominal oil.
+compresses the nominal oil; a screw hands it to the motor and rubs the more for it (plant/electromechanical.py).
 In a log: extension is slower than retraction for the same current, the more so at high n_r (4 kN at 100 %: 8 % each
 way); the null does not move.
 Source: dynamic pressure; orifice equation under load, Merritt (1967), section 5-3.

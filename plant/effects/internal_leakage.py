@@ -15,7 +15,7 @@ Source: Merritt (1967), section 6-1, leakage coefficient.
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -28,6 +28,7 @@ EFFECT = Effect(
     (),
     "oil slips past the loaded piston",
     "a load on the piston: friction or air forces, held for seconds",
+    HYDRAULIC,
 )
 
 

@@ -17,7 +17,7 @@ Source: Merritt (1967), section 6-2, hydraulic stiffness 4 B A^2 / V.
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["DEAD", "EFFECT", "NOMINAL", "step"]
@@ -33,6 +33,7 @@ EFFECT = Effect(
     ("give",),
     "the oil columns give way under load",
     "a load that changes, or fast motion",
+    HYDRAULIC,
 )
 
 DEAD = 0.05  # of the stroke: length of the dead volume at either end

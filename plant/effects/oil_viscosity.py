@@ -14,7 +14,7 @@ Source: Merritt (1967), ch. 3, discharge coefficient at low Reynolds number.
 
 from __future__ import annotations
 
-from plant.effect import T_REF, Effect, Parameter
+from plant.effect import HYDRAULIC, T_REF, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -27,6 +27,7 @@ EFFECT = Effect(
     (),
     "the flow gain changes with oil temperature",
     "moving strokes while the oil warms up by 10 K or more",
+    HYDRAULIC,
 )
 
 

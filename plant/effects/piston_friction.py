@@ -21,7 +21,7 @@ Source: Coulomb friction on an elastic support (Prandtl), Armstrong-Helouvry, Du
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from plant.effects.oil_compressibility import DEAD
 from vaneloop.base.compiled import compiled
 
@@ -35,6 +35,7 @@ EFFECT = Effect(
     ("force", "off_centre"),
     "seals hold the piston back",
     "reversals, and fast motion",
+    HYDRAULIC,
 )
 
 

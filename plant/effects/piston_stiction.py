@@ -18,7 +18,7 @@ and 3.
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -34,6 +34,7 @@ EFFECT = Effect(
     (),
     "seals hold the resting piston more than the moving one",
     "slow reversals beside fast motion",
+    HYDRAULIC,
 )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -28,6 +28,7 @@ EFFECT = Effect(
     (),
     "the supply pressure falls at the valve when oil flows",
     "fast and slow motion",
+    HYDRAULIC,
 )
 
 

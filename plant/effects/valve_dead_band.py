@@ -15,7 +15,7 @@ Source: Merritt, Hydraulic Control Systems (1967), section 5-7, closed-centre va
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -28,6 +28,7 @@ EFFECT = Effect(
     (),
     "small currents move no oil",
     "small currents: slow motion, reversals",
+    HYDRAULIC,
 )
 
 

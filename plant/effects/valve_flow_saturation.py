@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "corner", "step"]
@@ -34,6 +34,7 @@ EFFECT = Effect(
     (),
     "the flow stops rising before the spool is fully open",
     "motion faster than the limit: slams",
+    HYDRAULIC,
 )
 
 OFF = 1.0  # m/s, the neutral limit

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -29,6 +29,7 @@ EFFECT = Effect(
     (),
     "extending is faster than retracting, or slower",
     "fast motion both ways",
+    HYDRAULIC,
 )
 
 

@@ -18,7 +18,7 @@ Hysteresis (1989), section 2; 2 to 4 % of rated current are usual (Moog type 30 
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "mean", "step"]
@@ -34,6 +34,7 @@ EFFECT = Effect(
     ("current_1", "current_2", "current_3", "current_4"),
     "the valve remembers where its current came from",
     "reversals of the current",
+    HYDRAULIC,
 )
 
 

@@ -14,7 +14,7 @@ Source: coil inductance and first stage, Merritt, Hydraulic Control Systems (196
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -27,6 +27,7 @@ EFFECT = Effect(
     ("current",),
     "the current reaches the spool late",
     "quick reversals or steps of the current",
+    HYDRAULIC,
 )
 
 

@@ -14,7 +14,7 @@ Source: Moog, Electrohydraulic Valves: A Technical Look (null bias, null shift).
 
 from __future__ import annotations
 
-from plant.effect import Effect, Parameter
+from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
 __all__ = ["EFFECT", "step"]
@@ -27,6 +27,7 @@ EFFECT = Effect(
     (),
     "the valve is open at zero current",
     "any run of some seconds",
+    HYDRAULIC,
 )
 
 

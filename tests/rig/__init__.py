@@ -3,7 +3,7 @@ See docs/rig.md.
 """
 
 from .controller import AsObject, Compiled, Controller, playback, stand_in
-from .effects import CATALOGUE, EFFECTS, OUTSIDE, Effect, Hidden, draw, neutral
+from .effects import CATALOGUE, EFFECTS, MOTOR_EFFECTS, OUTSIDE, WITH_MOTOR, Effect, Hidden, draw, neutral
 from .geometry import Geometry
 from .geometry import load as load_geometry
 from .manoeuvre import MANOEUVRES, Manoeuvre, manoeuvre, slow_ramps, small_moves, steady
@@ -13,7 +13,9 @@ __all__ = [
     "CATALOGUE",
     "EFFECTS",
     "MANOEUVRES",
+    "MOTOR_EFFECTS",
     "OUTSIDE",
+    "WITH_MOTOR",
     "AsObject",
     "Compiled",
     "Controller",

@@ -261,7 +261,112 @@ OUTSIDE = _table(
 )
 # fmt: on
 
-CATALOGUE: Mapping[str, Effect] = MappingProxyType({**EFFECTS, **OUTSIDE})
+MOTOR_EFFECTS = _table(  # of an electromechanical actuator only
+    _one(
+        "amplifier_offset",
+        "actuator",
+        "valve",
+        "offset",
+        P.amp_offset,
+        "A",
+        0.0,
+        "current that the amplifier adds to its command",
+        (1e-6, 5e-6, 3e-5, 2e-4, 1e-3),
+        signed=True,
+    ),
+    _one(
+        "amplifier_dead_band",
+        "actuator",
+        "valve",
+        "half_width",
+        P.amp_dead_band,
+        "A",
+        0.0,
+        "command that the amplifier takes for none",
+        (3e-6, 1e-5, 5e-5, 3e-4, 1.5e-3),
+    ),
+    _one(
+        "amplifier_lag",
+        "actuator",
+        "valve",
+        "time_constant",
+        P.amp_lag,
+        "s",
+        0.0,
+        "first-order lag before the speed loop",
+        (5e-5, 5e-4, 3e-3, 0.01, 0.03),
+    ),
+    _one(
+        "tacho_thermal_drift",
+        "actuator",
+        "valve",
+        "coefficient",
+        P.tacho_drift,
+        "1/K",
+        0.0,
+        "relative speed per kelvin above 40 degC",
+        (1e-5, 1e-4, 1e-3, 3e-3, 8e-3),
+        signed=True,
+    ),
+    _one(
+        "motor_torque_constant_error",
+        "actuator",
+        "actuator",
+        "factor",
+        P.torque_factor,
+        "-",
+        1.0,
+        "torque for a current over nominal",
+        (0.999, 0.98, 0.8, 0.5, 0.3),
+    ),
+    _one(
+        "screw_friction",
+        "actuator",
+        "actuator",
+        "force",
+        P.extra_friction,
+        "N",
+        0.0,
+        "Coulomb friction at the rod beyond nominal",
+        (10.0, 100.0, 500.0, 1500.0, 4000.0),
+    ),
+    _one(
+        "gear_backlash",
+        "actuator",
+        "actuator",
+        "width",
+        P.motor_play,
+        "m",
+        0.0,
+        "total play between motor and rod",
+        (5e-7, 5e-6, 3e-5, 6e-5, 1.2e-4),
+    ),
+    _one(
+        "screw_pitch_error",
+        "actuator",
+        "actuator",
+        "amplitude",
+        P.pitch_error,
+        "m",
+        0.0,
+        "sine of one screw turn in the stroke",
+        (5e-7, 5e-6, 3e-5, 8e-5, 2e-4),
+        more={"phase": Parameter(P.pitch_phase, "rad", 0.0, "its phase at the retracted stop")},
+        others={"phase": 1.0},
+    ),
+)
+WITH_MOTOR = MappingProxyType(
+    {  # what can be hidden in a machine that has one
+        **{
+            k: e
+            for k, e in EFFECTS.items()
+            if e.stage != "actuator" or k in ("aero_load", "end_stop_shift", "lvdt_lag")
+        },
+        **MOTOR_EFFECTS,
+    }
+)
+
+CATALOGUE: Mapping[str, Effect] = MappingProxyType({**EFFECTS, **OUTSIDE, **MOTOR_EFFECTS})
 
 
 def draw(name: str, size: int, rng: np.random.Generator, onset: float = 0.0) -> Hidden:

@@ -150,6 +150,36 @@ class P(IntEnum):
     t_ref = 111  # degC
     lvdt_cubic = 112  # m, at the ends of the stroke
     flow_exponent = 113  # -, 2: an orifice in series, 20: nearly a corner
+    # electromechanical actuator in place of valve and pistons
+    motor = 114  # 1: it has one
+    motor_rated = 115  # rad/s at i_rated
+    motor_gain = 116  # A s/rad of the speed loop
+    motor_time = 117  # s, its integral time
+    motor_peak = 118  # A
+    motor_band = 119  # rad/s of the current loop
+    motor_torque = 120  # N m/A
+    motor_ohm = 121  # Ohm
+    motor_henry = 122  # H
+    motor_inertia = 123  # kg m2, rotor and gear
+    motor_viscous = 124  # N m s/rad
+    screw_r = 125  # m/rad
+    screw_loss = 126  # share of the load that friction takes
+    screw_friction = 127  # N at the rod
+    screw_lead = 128  # m
+    screw_stiffness = 129  # N/m of screw and bearings
+    screw_damping = 130  # N/(m/s)
+    bus_voltage = 131  # V
+    # ---- and its hidden effects
+    amp_offset = 132  # A
+    amp_dead_band = 133  # A half width
+    amp_lag = 134  # s
+    tacho_drift = 135  # 1/K
+    torque_factor = 136  # -
+    extra_friction = 137  # N at the rod
+    motor_play = 138  # m, total
+    pitch_error = 139  # m
+    pitch_phase = 140  # rad
+    rod_friction = 141  # N, of the vanes' stems and the linkage
 
 
 N_P = len(P)
@@ -185,9 +215,16 @@ class S(IntEnum):
     pot_0 = 50  # rad
     silted = 53
     friction = 54  # N
+    i_motor = 55  # A
+    volt_integral = 56  # V of the current loop
+    speed_integral = 57  # A of the speed loop
+    turn = 58  # rad of the motor
+    turn_speed = 59  # rad/s
+    turn_bristle = 60  # rad, LuGre deflection of the motor's friction
+    demanded = 61  # A behind the amplifier's lag
 
 
-N_S = 55
+N_S = 62
 
 
 @njit(cache=True, error_model="numpy")
@@ -379,6 +416,77 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
 
 
 @njit(cache=True, error_model="numpy")
+def servo_motor(s, p, i, t_oil, n, h, steps):
+    """Amplifier, motor, screw and rod over ``steps`` steps of ``h`` (s).
+
+    The winding has its inductance and a PI current loop that sets the voltage; motor and rod are two masses on the
+    screw's spring, with the play between them; both rub (LuGre at the motor); the stops are springs with dampers.
+    Currents implicitly, then speeds, then ways (symplectic order).
+    """
+    lag_share = approach(p[P.amp_lag], h)
+    rated = p[P.motor_rated] * (1.0 + p[P.tacho_drift] * (t_oil - p[P.t_ref]))
+    torque = p[P.motor_torque] * p[P.torque_factor]
+    ohm, henry, band = p[P.motor_ohm], p[P.motor_henry], p[P.motor_band]
+    r, mass, inertia = p[P.screw_r], p[P.mass], p[P.motor_inertia]
+    stiff, damping = p[P.screw_stiffness], p[P.screw_damping]
+    force = p[P.aero_force] * (n * 0.01) ** 2
+    level = r * (p[P.screw_friction] + p[P.extra_friction] + abs(force) * p[P.screw_loss])
+    sigma0 = level / 2e-3  # breaks away after 2 mrad of the motor, 0.8 um of the rod
+    sigma1 = 0.5 * math.sqrt(sigma0 * inertia)
+    half = 0.5 * p[P.motor_play]
+    k = 2.0 * math.pi / p[P.screw_lead]
+    low, high = max(0.0, p[P.stop_shift]), p[P.stroke] + min(0.0, p[P.stop_shift])
+    lvdt_share, lvdt_share_2 = approach(p[P.lvdt_tau], h), approach(p[P.lvdt_lag], h)
+    a, volt, whole = s[S.i_motor], s[S.volt_integral], s[S.speed_integral]
+    turn, w, z = s[S.turn], s[S.turn_speed], s[S.turn_bristle]
+    x, v, xs, xs2 = s[S.x], s[S.v], s[S.x_sensor], s[S.x_sensor_2]
+    demanded = s[S.demanded]
+    for _ in range(steps):
+        demanded += lag_share * (i + p[P.amp_offset] - demanded)
+        target = rated * dead_zone(demanded, p[P.amp_dead_band]) / p[P.i_rated]
+        # speed loop: its integral is wound back by what the limit cuts off
+        wanted = p[P.motor_gain] * (target - w) + whole
+        asked = clip(wanted, -p[P.motor_peak], p[P.motor_peak])
+        whole += h * p[P.motor_gain] / p[P.motor_time] * (target - w) + (asked - wanted) * h / 5e-3
+        # current loop: PI whose zero is the winding's pole; the bus limits its voltage
+        want_u = band * henry * (asked - a) + volt + torque * w
+        u = clip(want_u, -p[P.bus_voltage], p[P.bus_voltage])
+        volt += h * band * ohm * (asked - a) + (u - want_u) * 0.1
+        a = (a + h * (u - torque * w) / henry) / (1.0 + h * ohm / henry)
+        # the screw's way for the motor's turn, and the spring between nut and rod
+        way = r * turn
+        nut = way + p[P.pitch_error] * math.sin(k * way + p[P.pitch_phase])
+        lead = r * (1.0 + k * p[P.pitch_error] * math.cos(k * way + p[P.pitch_phase]))
+        bent = dead_zone(nut - x, half)
+        pull = stiff * bent + damping * (lead * w - v) if bent != 0.0 or half == 0.0 else 0.0
+        rate = sigma0 * abs(w) / (level + 1e-6)
+        share = rate * h
+        decay = math.exp(-share)
+        gain_z = h * (1.0 - 0.5 * share) if share < 1e-6 else (1.0 - decay) / rate
+        z_new = z * decay + w * gain_z
+        rub = sigma0 * z_new + sigma1 * (z_new - z) / h
+        z = z_new
+        w = (w + h / inertia * (torque * a - lead * pull - rub)) / (1.0 + h / inertia * p[P.motor_viscous])
+        # the vanes' stems rub, below 0.1 mm/s as a viscous drag: they hold the rod while the motor crosses the play
+        f, b = pull - force, p[P.rod_friction] / max(abs(v), 1e-4)
+        if x > high:
+            f -= p[P.stop_stiffness] * (x - high)
+            b += p[P.stop_damping]
+        elif x < low:
+            f += p[P.stop_stiffness] * (low - x)
+            b += p[P.stop_damping]
+        v = (v + h * f / mass) / (1.0 + h * b / mass)
+        turn += h * w
+        x += h * v
+        xs += lvdt_share * (x - 0.5 * h * v - xs)
+        xs2 += lvdt_share_2 * (xs - xs2)
+    s[S.i_motor], s[S.volt_integral], s[S.speed_integral] = a, volt, whole
+    s[S.turn], s[S.turn_speed], s[S.turn_bristle] = turn, w, z
+    s[S.x], s[S.v], s[S.x_sensor], s[S.x_sensor_2] = x, v, xs, xs2
+    s[S.demanded] = demanded
+
+
+@njit(cache=True, error_model="numpy")
 def linkage(s, p, ring_table, n, t_oil, t, h):
     """Rings, vanes and potentiometers over one step ``h`` (s): kinematics, then what bends or loosens the way to the
     vane.
@@ -461,7 +569,10 @@ def advance(s, p, ring_table, i_cmd, n_dem, p_s, t_oil, t, steps):
     h = TICK / steps
     each = steps // LINKS
     for k in range(LINKS):
-        hydraulics(s, p, p_s, t_oil, n, h, each)
+        if p[P.motor] != 0.0:
+            servo_motor(s, p, i_cmd, t_oil, n, h, each)
+        else:
+            hydraulics(s, p, p_s, t_oil, n, h, each)
         linkage(s, p, ring_table, n, t_oil, t + (k + 1) * TICK / LINKS, TICK / LINKS)
     engine(s, p, n_dem)
 
@@ -505,6 +616,8 @@ def start(s, p, ring_table, x, n, p_s):
     s[S.x] = s[S.x_sensor] = s[S.x_sensor_2] = x
     s[S.p1] = s[S.p2] = 0.5 * p_s
     s[S.p_valve] = p_s
+    if p[P.motor] != 0.0:
+        s[S.turn] = x / p[P.screw_r]
     cell = int(clip((x - X_LOW) / X_STEP, 0.0, X_LAST - 1.0))
     for k in range(3):
         ring = ring_table[k, cell]

@@ -66,14 +66,47 @@ def _nominal() -> np.ndarray:
         P.dither_frequency: 11.0,
         P.rumble_speed: 70.0,
         P.t_ref: 40.0,
+        P.torque_factor: 1.0,
     }
     for slot, value in values.items():
         p[slot] = value
     return p
 
 
+R = 5e-3 / (2.0 * np.pi * 2.0)  # m/rad: lead of 5 mm, gear of 2
+MOTOR = {  # electromechanical actuator: what differs from the hydraulic one
+    P.motor: 1.0,
+    P.motor_rated: 0.150 / R,
+    P.motor_gain: 0.19,
+    P.motor_time: 50e-3,
+    P.motor_peak: 20.0,
+    P.motor_band: 2.0 * np.pi * 800.0,
+    P.motor_torque: 0.6,
+    P.motor_ohm: 1.5,
+    P.motor_henry: 6e-3,
+    P.motor_inertia: 4.5e-4,
+    P.motor_viscous: 1e-3,
+    P.screw_r: R,
+    P.screw_loss: 1.0 / 0.9 - 1.0,
+    P.screw_friction: 350.0,
+    P.rod_friction: 150.0,
+    P.screw_lead: 5e-3,
+    P.screw_stiffness: 2e8,
+    P.screw_damping: 2e4,
+    P.bus_voltage: 270.0,
+    P.stop_stiffness: 1e9,
+}
+
 NOMINAL = _nominal()
 NOMINAL.setflags(write=False)
+
+
+def with_motor(p: np.ndarray) -> np.ndarray:
+    """Return the parameters of the machine with the electromechanical actuator in place of valve and pistons."""
+    out = p.copy()
+    for slot, value in MOTOR.items():
+        out[slot] = value
+    return out
 
 
 @dataclass(frozen=True)
@@ -101,13 +134,23 @@ TOLERANCES = (
 )
 
 
+MOTOR_TOLERANCES = (
+    Tolerance(P.motor_rated, 0.03, True),
+    Tolerance(P.motor_gain, 0.10, True),
+    Tolerance(P.motor_time, 0.10, True),
+    Tolerance(P.motor_inertia, 0.05, True),
+    Tolerance(P.motor_torque, 0.05, True),
+    Tolerance(P.screw_friction, 0.25, True),
+)
+
+
 def specimen(nominal: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
     """Return parameters of one machine: the nominal ones, or (with ``rng``) each drawn uniformly within its
     tolerance.
     """
     p = nominal.copy()
     if rng is not None:
-        for t in TOLERANCES:
+        for t in (*TOLERANCES, *(MOTOR_TOLERANCES if p[P.motor] else ())):
             d = rng.uniform(-t.half_width, t.half_width)
             p[t.slot] += p[t.slot] * d if t.relative else d
     return p

@@ -15,7 +15,7 @@ from .effects import CATALOGUE, Hidden, apply
 from .geometry import Geometry, load, ring_tables, schedule, vane_angle
 from .kernel import FRAME, TICK, P, S
 from .manoeuvre import Manoeuvre
-from .parameters import NOMINAL, specimen
+from .parameters import NOMINAL, specimen, with_motor
 
 RATES = (10, 100, 1000)  # Hz
 UNITS = {
@@ -95,6 +95,7 @@ def simulate(
     x0: float | None = None,
     mean_through: bool = True,
     parameters: np.ndarray | None = None,
+    motor: bool = False,
     geometry: Geometry | None = None,
     spells: Sequence[Spell] = (),
     gaps: Sequence[tuple[float, float]] = (),
@@ -116,6 +117,7 @@ def simulate(
     mean_through  i_cmd is the mean of the ticks since the last row, the one at the row included (as a frame sent after
                   the tick); False: of the ticks before the row, which is the current that acted between the two rows
     parameters    array in the order of `kernel.P` in place of the drawn specimen
+    motor         the machine has the electromechanical actuator
     geometry      links of this machine; None: those of the table (`geometry.load` draws some within their tolerance)
     spells        seconds in which the controller is asked to stand by, or hears nothing and takes care of itself
     gaps          (start, length), s: stretches whose rows the logger lost; time stamps go on
@@ -131,11 +133,8 @@ def simulate(
         name: np.random.default_rng([seed, k])
         for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
     }
-    p = (
-        specimen(machine(geometry), streams["specimen"] if randomised else None)
-        if parameters is None
-        else parameters.copy()
-    )
+    nominal = with_motor(machine(geometry)) if motor else machine(geometry)
+    p = specimen(nominal, streams["specimen"] if randomised else None) if parameters is None else parameters.copy()
 
     # segments between onsets, each with its parameters and ring tables
     warm = round(run_up / TICK / FRAME) * FRAME
@@ -229,7 +228,7 @@ def simulate(
             }
             for h in hidden
         ],
-        "specimen": {slot.name: float(p[slot]) for slot in P if p[slot] != machine(geometry)[slot]},
+        "specimen": {slot.name: float(p[slot]) for slot in P if p[slot] != nominal[slot]},
     }
     return Run(out, true, p, tuple(hidden), record)
 

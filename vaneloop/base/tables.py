@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from vaneloop.base.errors import InputError
 
-__all__ = ["Axis", "Bound", "Bounded", "Quantity", "Table", "load_toml", "path", "read"]
+__all__ = ["Axis", "Bound", "Bounded", "Quantity", "Table", "file_of", "load_toml", "path", "read"]
 
 _ROOM = Path(__file__).parent.parent
 MOST_BYTES = (
@@ -117,6 +117,17 @@ def load_toml(file: str | Path) -> dict[str, Any]:
         raise _refusal(file, f"not a TOML table ({e})") from None
 
 
+def file_of(source: str | Path) -> Path:
+    """Return the file that ``source`` names: a path, or the name of a shipped table such as ``plant.toml``."""
+    file = Path(source)
+    try:
+        if not file.is_file() and path(str(source)).is_file():
+            file = path(str(source))
+    except (OSError, ValueError) as e:  # a name with a null byte in it
+        raise _refusal(source, f"cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    return file
+
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -126,12 +137,7 @@ def read(source: str | Path, model: type[M]) -> M:
     source: a file's path, or the name of a shipped table such as ``plant.toml``.
     Raises InputError, in one line, naming file, key, value and what is allowed.
     """
-    file = Path(source)
-    try:
-        if not file.is_file() and path(str(source)).is_file():
-            file = path(str(source))
-    except (OSError, ValueError) as e:  # a name with a null byte in it
-        raise _refusal(source, f"cannot be read ({getattr(e, 'strerror', None) or e})") from None
+    file = file_of(source)
     data = load_toml(file)
     try:
         return model.model_validate(data)

@@ -6,6 +6,7 @@ import argparse
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.cli.options import add_plant_option
 from vaneloop.design.servo_design import evaluate, summary
 from vaneloop.pages.design import design_page
 
@@ -30,6 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--backlash-inside", type=float, metavar="MM", help="play between piston and LVDT to examine, mm"
     )
+    add_plant_option(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
@@ -40,7 +42,9 @@ def command(args: argparse.Namespace) -> int:
         value = getattr(args, name)
         if value is not None and not 0.0 <= value <= 1e6:
             raise InputError(f"--{name} (={value:g}) must be in [0, 1e6]")
-    result, code = evaluate(kp=args.kp, ki=args.ki, kff=args.kff, backlash_inside=args.backlash_inside)
+    result, code = evaluate(
+        kp=args.kp, ki=args.ki, kff=args.kff, backlash_inside=args.backlash_inside, plant=args.plant or "plant.toml"
+    )
     for line in summary(result):
         terminal.say(args, line)
     terminal.write_json(args, {"schema": 1, **result.to_dict()})

@@ -65,6 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", metavar="M.toml", help="model file: changed parameters and added effects of the engine"
     )
+    options.add_plant_option(parser)
     parser.add_argument(
         "--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)"
     )

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.inject.injection import cannot, run
+from hil.inject.injection import cannot, lacks, run
 from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -39,6 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the scenarios that ship, and stop")
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
+    options.add_plant_option(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
 
@@ -60,10 +62,13 @@ def command(args: argparse.Namespace) -> int:
         from hil.loop.lockstep import warm_up
 
         warm_up(lambda text: terminal.say(args, text))
+    if args.plant is not None and args.bus != "lockstep":
+        raise InputError(f"--plant is for --bus lockstep; on {args.bus} the machine is vaneloop run's: give it there")
+    plant = options.machine_of(args).plant if args.plant is not None else None
     outcomes, skipped = [], []
     with terminal.progress_bar(args, "injecting") as progress:
         for i, (name, scenario) in enumerate(made):
-            why = cannot(scenario) if args.bus != "lockstep" else ""
+            why = cannot(scenario) if args.bus != "lockstep" else lacks(scenario, plant) if plant is not None else ""
             if why and len(made) > 1:
                 skipped.append((name, scenario.title, why))
                 continue
@@ -72,7 +77,8 @@ def command(args: argparse.Namespace) -> int:
                 if progress is not None:
                     progress((i + fraction) / len(made))
 
-            outcomes.append(run(scenario, bus=args.bus, name=name, progress=share if progress is not None else None))
+            shown = share if progress is not None else None
+            outcomes.append(run(scenario, bus=args.bus, plant=plant, name=name, progress=shown))
     _report(args, outcomes, skipped)
     return 0 if all(o.held for o in outcomes) else 1
 

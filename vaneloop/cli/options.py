@@ -17,6 +17,7 @@ __all__ = [
     "CAN_SUFFIXES",
     "add_log_options",
     "add_model_option",
+    "add_plant_option",
     "add_reading_options",
     "add_tables_option",
     "chain_of",
@@ -30,12 +31,13 @@ __all__ = [
 
 
 def add_model_option(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--model``."""
+    """Declare ``--model`` and ``--plant``."""
     parser.add_argument(
         "--model",
         metavar="M.toml",
         help="model file: changed parameters and added effects (written by vaneloop extend)",
     )
+    add_plant_option(parser)
 
 
 def tell_search(say: Callable[[str], None]) -> None:
@@ -96,12 +98,22 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
 
 
 def add_tables_option(group: Any) -> None:
-    """Declare ``--tables``."""
+    """Declare ``--tables`` and ``--plant``."""
     group.add_argument(
         "--tables",
         metavar="DIR",
         help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule "
         f"--out writes one",
+    )
+    add_plant_option(group)
+
+
+def add_plant_option(group: Any) -> None:
+    """Declare ``--plant``."""
+    group.add_argument(
+        "--plant",
+        metavar="F.toml",
+        help="plant table of another machine: a file, or plant_electromechanical.toml, which ships (docs/machines.md)",
     )
 
 
@@ -109,18 +121,22 @@ def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
     """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says
     which.
     """
-    tables = getattr(args, "tables", None)
-    files = files_of(tables)
+    tables, plant = getattr(args, "tables", None), getattr(args, "plant", None)
+    files = files_of(tables, plant)
     if tell and tables is not None:
         own = [name for name, file in files.items() if file != f"{name}.toml"]
         terminal.say(args, f"tables from {Path(tables)}: {', '.join(own)}")
+    if tell and plant is not None:
+        terminal.say(args, f"plant: {plant}")
     return files
 
 
 def machine_of(args: argparse.Namespace, model: Any = None, strategy: str | None = None) -> Machine:
     """The machine that ``--tables`` and ``model`` (default: ``--model``) describe."""
     named = getattr(args, "model", None) or None
-    return Machine(getattr(args, "tables", None), named if model is None else model, strategy)
+    return Machine(
+        getattr(args, "tables", None), named if model is None else model, strategy, getattr(args, "plant", None)
+    )
 
 
 def _mapping(options: list[str]) -> dict[str, str]:

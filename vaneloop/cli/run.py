@@ -58,6 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", metavar="M.toml", help="model file: changed parameters and added effects of the machine"
     )
+    options.add_plant_option(parser)
     parser.add_argument(
         "--start-speed",
         metavar="N",

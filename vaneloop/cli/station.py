@@ -112,10 +112,10 @@ def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[A
 
 
 def machine_of(args: argparse.Namespace) -> Any:
-    """Return the plant that ``--model`` describes, or the nominal one."""
-    from plant import build_plant, load_model
+    """Return the plant that ``--plant`` and ``--model`` describe, or the nominal one."""
+    from vaneloop.cli import options
 
-    return build_plant(model=load_model(args.model) if args.model else None)
+    return options.machine_of(args).plant
 
 
 def warm_nodes(args: argparse.Namespace) -> None:

@@ -23,7 +23,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,13 +100,24 @@ class ServoPlant:
 
     @classmethod
     def from_tables(cls, plant: str | Path = "plant.toml") -> ServoPlant:
-        """Read ``plant.toml``; the current limit comes from ``calibration.toml``."""
+        """Read a plant table, whatever the kind of its actuator; the current limit comes from ``calibration.toml``."""
         from controller.calibration import CalibrationTable
-        from plant.parameters import PlantTable
+        from plant.parameters import ElectromechanicalTable, read_plant
         from vaneloop.base.tables import read
+        from vaneloop.design.servo_motor import MotorServoPlant
 
-        t = read(plant, PlantTable)
+        t = read_plant(plant)
         limit = read("calibration.toml", CalibrationTable).servo.current_limit.value
+        if isinstance(t, ElectromechanicalTable):
+            return MotorServoPlant.of(
+                t,
+                plant,
+                stroke=t.actuator.stroke.value * 1e-3,
+                lvdt_lag=t.sensors.lvdt_lag.value * 1e-3,
+                lvdt_noise=t.sensors.lvdt_noise.value * 1e-3,
+                lvdt_step=t.sensors.lvdt_range.value * 1e-3 / 2.0**t.sensors.lvdt_bits.value,
+                current_limit=limit * 1e-3,
+            )
         return cls(
             rated_current=t.valve.rated_current.value * 1e-3,
             bandwidth=t.valve.bandwidth.value,
@@ -123,6 +136,59 @@ class ServoPlant:
         """Steady speed of the piston for a current, (m/s)/A, at the present supply pressure."""
         return self.flow_gain * math.sqrt(self.pressure / self.p_ref) / self.rated_current
 
+    @property
+    def hysteretic(self) -> bool:
+        """Whether what reads the current remembers where it came from: a valve does."""
+        return True
+
+    def dynamics(self) -> tuple[ArrayLike, ArrayLike]:
+        """Numerator and denominator, powers of s falling, from steady to present speed: the valve."""
+        w = 2.0 * math.pi * self.bandwidth
+        return [w * w], [1.0, 2.0 * self.damping * w, w * w]
+
+    def response(self, s: Complex) -> Complex:
+        """The same at the complex frequencies ``s`` (rad/s)."""
+        w = 2.0 * math.pi * self.bandwidth
+        return np.asarray(w * w / (s * s + 2.0 * self.damping * w * s + w * w))
+
+    def corners(self) -> list[tuple[Callable[[Margins], Corner], ServoPlant]]:
+        """Flow 5 %, valve bandwidth and damping 15 %, 19 to 22 MPa, 0 or 1 tick of computation delay."""
+        out: list[tuple[Callable[[Margins], Corner], ServoPlant]] = []
+        for flow, band, damp, mpa, delay in itertools.product(
+            (0.95, 1.05), (0.85, 1.15), (0.85, 1.15), (19.0, 22.0), (0, 1)
+        ):
+            p = replace(
+                self,
+                flow_gain=self.flow_gain * flow,
+                bandwidth=self.bandwidth * band,
+                damping=min(self.damping * damp, 0.99),
+                pressure=mpa * 1e6,
+                delay=delay,
+            )
+            out.append((partial(Corner, flow, band, damp, mpa, delay), p))
+        return out
+
+    def stepper(self, x: float, substeps: int) -> Callable[[float], float]:
+        """Return the plant's own step of a tick's ``substeps``-th part, from rest at the stroke ``x`` (m): from current
+        (A) to stroke (m).
+        """
+        from plant.actuator import speed_factor, stroke_step
+        from plant.valve import valve_matrix, valve_step
+
+        dt = self.tick / substeps
+        matrix = valve_matrix(self.bandwidth, self.damping, dt)
+        speed = self.flow_gain * speed_factor(self.pressure, 0.0, self.p_ref)
+        u, du = 0.0, 0.0
+
+        def step(i: float) -> float:
+            nonlocal u, du, x
+            before = u
+            u, du = valve_step(u, du, i / self.rated_current, *matrix)
+            x = stroke_step(x, speed * before, speed * u, self.stroke, dt)
+            return x
+
+        return step
+
 
 def default_gains() -> Gains:
     """The gains in ``calibration.toml``."""
@@ -140,8 +206,7 @@ def _s_plant(plant: ServoPlant) -> control.TransferFunction:
     """From current (A) to measured stroke (m)."""
     import control as ct
 
-    w = 2.0 * math.pi * plant.bandwidth
-    valve = ct.tf([w * w], [1.0, 2.0 * plant.damping * w, w * w])
+    valve = ct.tf(*plant.dynamics())
     actuator = ct.tf([plant.speed_per_ampere], [1.0, 0.0])
     lvdt = ct.tf([1.0], [plant.lvdt_lag, 1.0])
     return valve * actuator * lvdt
@@ -161,9 +226,7 @@ def continuous_loop(gains: Gains, plant: ServoPlant, order: int = 4) -> control.
 def continuous_response(gains: Gains, plant: ServoPlant, omega: ArrayLike) -> Complex:
     """L(j omega) in closed form, delay exact; omega in rad/s."""
     s = 1j * np.asarray(omega, dtype=float)
-    w = 2.0 * math.pi * plant.bandwidth
-    valve = w * w / (s * s + 2.0 * plant.damping * w * s + w * w)
-    path = valve * plant.speed_per_ampere / s / (plant.lvdt_lag * s + 1.0)
+    path = plant.response(s) * plant.speed_per_ampere / s / (plant.lvdt_lag * s + 1.0)
     return np.asarray((gains.kp + gains.ki / s) * path * np.exp(-s * plant.tick * (0.5 + plant.delay)))
 
 
@@ -296,24 +359,9 @@ class Corner:
 
 
 def _corners(gains: Gains, plant: ServoPlant) -> list[Corner]:
-    """Margins at every corner: flow 5 %, valve bandwidth and damping 15 %, 19 to 22 MPa, 0 or 1 tick of computation
-    delay.
-    """
-    out = []
+    """Margins at every corner of the plant's tolerances."""
     omega = frequency_grid(plant, 500)
-    for flow, band, damp, mpa, delay in itertools.product(
-        (0.95, 1.05), (0.85, 1.15), (0.85, 1.15), (19.0, 22.0), (0, 1)
-    ):
-        p = replace(
-            plant,
-            flow_gain=plant.flow_gain * flow,
-            bandwidth=plant.bandwidth * band,
-            damping=min(plant.damping * damp, 0.99),
-            pressure=mpa * 1e6,
-            delay=delay,
-        )
-        out.append(Corner(flow, band, damp, mpa, delay, margins(gains, p, omega)))
-    return out
+    return [corner(margins(gains, p, omega)) for corner, p in plant.corners()]
 
 
 def analyse(gains: Gains, plant: ServoPlant) -> tuple[Margins, list[Corner]]:

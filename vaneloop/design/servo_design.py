@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from vaneloop.base.errors import InputError
 from vaneloop.design.limit_cycles import LimitCycle, Play, harmonic_balance, limit_cycles
 from vaneloop.design.servo import (
-    Corner,
     Gains,
     Margins,
     ServoPlant,
@@ -111,7 +111,7 @@ class DesignResult:
     nominal: Margins
     worst: dict[str, float]
     worst_at: dict[str, str]
-    corners: list[Corner]
+    corners: list[Any]  # `Corner`, or what the plant has in its place
     noise_current_ma: float
     step: dict[str, float]
     ramp: dict[str, float]
@@ -330,11 +330,10 @@ def design(
     bias = _bias_figures(gains, plant)
     rest = _rest_figures(gains, plant)
     predicted = _predict(gains, plant)
-    play = [
-        _play_figures(gains, plant, p, predicted, curves)
-        for p in (Play("lvdt", backlash_inside), Play("valve", valve_hysteresis), Play("vanes", backlash_outside))
-    ]
+    sites = [Play("lvdt", backlash_inside), Play("valve", valve_hysteresis), Play("vanes", backlash_outside)]
+    play = [_play_figures(gains, plant, p, predicted, curves) for p in sites if p.site != "valve" or plant.hysteretic]
     hunting = max(play[0].predicted_amplitude or 0.0, play[0].simulated_amplitude or 0.0)
+    by_valve = [p.simulated_lvdt_mm for p in play if p.site == "valve"]
     checks = [
         *(
             Check(name, worst[key], limit, unit, worst[key] >= limit, worst_at[key])
@@ -354,11 +353,15 @@ def design(
                 ("1 mA of null bias settled", bias["settled_s"], limits.bias_settled_s, "s"),
                 ("hunting by the converter's steps", rest["quantised_codes"], limits.hunting_at_rest_codes, "codes"),
                 ("hunting by play at the LVDT", hunting, limits.hunting_mm, "mm"),
-                ("hunting by the valve's hysteresis", play[1].simulated_lvdt_mm, limits.hunting_mm, "mm"),
+                *(("hunting by the valve's hysteresis", v, limits.hunting_mm, "mm") for v in by_valve),
             )
         ),
         Check(
-            "hunting by play outside the loop", play[2].simulated_lvdt_mm, 1e-4, "mm", play[2].simulated_lvdt_mm <= 1e-4
+            "hunting by play outside the loop",
+            play[-1].simulated_lvdt_mm,
+            1e-4,
+            "mm",
+            play[-1].simulated_lvdt_mm <= 1e-4,
         ),
     ]
     ok = all(c.ok for c in checks)
@@ -368,10 +371,15 @@ def design(
 
 
 def evaluate(
-    *, kp: float | None = None, ki: float | None = None, kff: float | None = None, backlash_inside: float | None = None
+    *,
+    kp: float | None = None,
+    ki: float | None = None,
+    kff: float | None = None,
+    backlash_inside: float | None = None,
+    plant: str | Path = "plant.toml",
 ) -> tuple[DesignResult, int]:
     """``vaneloop design``: the calibrated gains with overrides (kp A/m, ki A/(m s), kff A/(m/s)), play inside the loop
-    in mm.
+    in mm, around the actuator of the table ``plant``.
 
     Returns the result and the exit code: 0 all stated limits hold, 1 not. Raises InputError for a value outside its
     range.
@@ -380,7 +388,8 @@ def evaluate(
     gains = Gains(base.kp if kp is None else kp, base.ki if ki is None else ki, base.kff if kff is None else kff)
     if backlash_inside is not None and not 0.0 <= backlash_inside <= 10.0:
         raise InputError(f"backlash_inside (={backlash_inside:g} mm) must be in [0, 10]")
-    result = design(gains, backlash_inside=BACKLASH_INSIDE if backlash_inside is None else backlash_inside * 1e-3)
+    inside = BACKLASH_INSIDE if backlash_inside is None else backlash_inside * 1e-3
+    result = design(gains, ServoPlant.from_tables(plant), backlash_inside=inside)
     return result, 0 if result.ok else 1
 
 

@@ -72,27 +72,23 @@ def simulate(
     from controller import new_state
     from controller.records import SCALAR_FIELDS, as_state, record
     from controller.servo import servo_step
-    from plant.actuator import speed_factor, stroke_step
     from plant.play import play_step
     from plant.sensors import lag_factor, quantise
-    from plant.valve import valve_matrix, valve_step
 
     ref = np.asarray(x_ref, dtype=float)
     rate = np.zeros_like(ref) if dx_ref is None else np.asarray(dx_ref, dtype=float)
     z, k = as_state(new_state()), record(SCALAR_FIELDS)
     k.kp, k.ki, k.kff, k.current_limit = gains.kp, gains.ki, gains.kff, plant.current_limit
     z.integral = integral
-    dt = plant.tick / substeps
-    matrix = valve_matrix(plant.bandwidth, plant.damping, dt)
-    lag = lag_factor(plant.lvdt_lag, dt)
-    speed = plant.flow_gain * speed_factor(plant.pressure, 0.0, plant.p_ref)
+    lag = lag_factor(plant.lvdt_lag, plant.tick / substeps)
     site, gap = (play.site, play.gap) if play else ("", 0.0)
     noise = np.zeros(ref.size)
     if noise_seed is not None:
         noise = plant.lvdt_noise * np.random.default_rng(noise_seed).standard_normal(ref.size)
     x = float(ref[0] if start is None else start)
     rod = x - 0.5 * gap if site == "lvdt" else x
-    x_lvdt, vane, spool_i, u, du = rod, x - 0.5 * outside, 0.0, 0.0, 0.0
+    x_lvdt, vane, spool_i = rod, x - 0.5 * outside, 0.0
+    step = plant.stepper(x, substeps)
     pending = [0.0] * plant.delay
     out: Array = np.empty((6, ref.size), dtype=np.float64)
     for n in range(ref.size):
@@ -108,9 +104,7 @@ def simulate(
             drive = i
         out[:, n] = x, z.x_meas, vane, z.i_cmd, x if site != "valve" else i, rod
         for _ in range(substeps):
-            before = u
-            u, du = valve_step(u, du, drive / plant.rated_current, *matrix)
-            x = stroke_step(x, speed * before, speed * u, plant.stroke, dt)
+            x = step(drive)
             rod = play_step(rod, x, gap) if site == "lvdt" else x
             x_lvdt += lag * (rod - x_lvdt)
         vane = play_step(vane, x, outside)

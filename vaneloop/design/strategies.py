@@ -137,19 +137,20 @@ def _motions(x: np.ndarray, least: float, total: np.ndarray, start: np.ndarray) 
 class _Recorder:
     """Keeps of every tick's states what the figures need."""
 
-    KEPT = (
-        *(len(STATE) + row for row in (places.N_R, *range(places.RING, places.RING + 3))),
-        *map(STATE.index, ("x_dem",)),
-    )
+    KEPT = tuple(map(STATE.index, ("x_dem",)))
     LEARNED = tuple(map(STATE.index, ("offset_in_use", "width_in_use", "crossing")))
 
-    def __init__(self) -> None:
+    def __init__(self, plant: Plant) -> None:
+        # where the plant's states stand behind the firmware's
+        at = {int(row): len(STATE) + i for i, row in enumerate(plant.rows)}
+        self.kept = [*(at[row] for row in (places.N_R, *range(places.RING, places.RING + 3))), *self.KEPT]
+        self.stroke = at[places.X]
         self.rows: list[Array] = []
         self.total, self.start, self.square, self.ticks = np.zeros(2), np.full(3, np.nan), 0.0, 0
 
     def __call__(self, states: Array) -> None:
-        self.rows.append(states[::EVERY, [*self.KEPT, *self.LEARNED]])
-        x, i = np.ascontiguousarray(states[:, len(STATE) + places.X]), states[:, STATE.index("i_cmd")]
+        self.rows.append(states[::EVERY, [*self.kept, *self.LEARNED]])
+        x, i = np.ascontiguousarray(states[:, self.stroke]), states[:, STATE.index("i_cmd")]
         if np.isnan(self.start[0]):
             self.start[:] = x[0], x[0], 0.0
         _motions(x, MOVE, self.total, self.start)
@@ -200,7 +201,8 @@ def run(
     pots   as `hil.loop.lockstep.lockstep` takes them, rad
     base   the machine as built; default: the shipped tables
     """
-    plant, recorder = machine(scenario, base or build_plant()), _Recorder()
+    plant = machine(scenario, base or build_plant())
+    recorder = _Recorder(plant)
     stimulus = Stimulus.of(dithered(n_dem, scenario.dither), t_oil=casing(n_dem))
     done = lockstep(
         stimulus, calibration=calibration, plant=plant, seed=seed, every=100, hashed=False, pots=pots, watch=recorder

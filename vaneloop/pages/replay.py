@@ -81,6 +81,9 @@ def replay_page(result: Result, command: str = "", title: str | None = None) -> 
                     half=True,
                 )
 
+    if "i_motor" in result.model:
+        page.section("Motor current", "What the actuator's motor takes in the simulated run. It is not on the bus.")
+        page.plot(overlay([Panel(axis_title("i_motor"), [Line("model", result.t, result.model["i_motor"])])]))
     vanes = [v for v in VANES if v in result.model]
     if vanes:
         _hysteresis_section(page, result, vanes)

@@ -41,6 +41,7 @@ NAMES = {
     "vgv1": ("VGV1 angle", "deg"),
     "vgv2": ("VGV2 angle", "deg"),
     "state": ("controller mode", ""),
+    "i_motor": ("motor current", "A"),
 }
 ZOOM = "Drag across a plot to zoom, double-click to return; click a name in the legend to hide its curve."
 

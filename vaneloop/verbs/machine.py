@@ -20,9 +20,13 @@ __all__ = ["TABLES", "Machine", "files_of"]
 TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
 
 
-def files_of(tables: str | Path | None) -> dict[str, str]:
-    """File of each table, by name without suffix: from the folder ``tables`` or the shipped one."""
+def files_of(tables: str | Path | None, plant: str | Path | None = None) -> dict[str, str]:
+    """File of each table, by name without suffix: from the folder ``tables`` or the shipped one; the plant's from the
+    file ``plant``.
+    """
     shipped = {name: f"{name}.toml" for name in TABLES}
+    if plant is not None:
+        return {**files_of(tables), "plant": str(plant)}
     if tables is None:
         return shipped
     folder = Path(tables)
@@ -41,6 +45,7 @@ class Machine:
     tables    folder whose TOML files replace the shipped ones; None: the shipped ones
     model     model file (or `plant.Model`) with recalibrated parameters and effects beyond the nominal machine
     strategy  control strategy, one of `controller.STRATEGIES`; None: the calibration's
+    table     plant table in place of that of ``tables``, such as plant_electromechanical.toml
 
     A wrong folder, table or model raises InputError when the machine is made.
     """
@@ -48,6 +53,7 @@ class Machine:
     tables: str | Path | None = None
     model: str | Path | Model | None = None
     strategy: str | None = None
+    table: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Read what is named, so that a wrong name is refused here."""
@@ -56,7 +62,7 @@ class Machine:
     @cached_property
     def files(self) -> dict[str, str]:
         """File of each table, by name without suffix."""
-        return files_of(self.tables)
+        return files_of(self.tables, self.table)
 
     @cached_property
     def added(self) -> Model:

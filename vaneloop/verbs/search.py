@@ -280,7 +280,7 @@ def extend(
         return _extended(*_logs(log, model, test, added), effects, added)
     machine = model or Machine()
     known(effects)
-    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy))
+    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy, machine.table))
     return extended(chain, effects, machine.added, name)
 
 
@@ -331,6 +331,8 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     by_stage: dict[str, list[str]] = {}
     effects: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys([*before.effects, *wanted]):
+        if (kind := chain.plant.kind) not in EFFECTS[name].kinds:
+            raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
         stage = next((s for s in EFFECTS[name].stages if any(s == c.name for c in chain.stages)), None)
         if stage is not None:
             by_stage.setdefault(stage, []).append(name)
@@ -362,7 +364,7 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
     if not isinstance(model, Diagnosed):
         chain, name = _chain(log, model or Machine())
         model = diagnosed(chain, name)
-    return Experiment(model, recommend(model.diagnosis, progress), model.log)
+    return Experiment(model, recommend(model.diagnosis, progress, model.chain.plant), model.log)
 
 
 def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:

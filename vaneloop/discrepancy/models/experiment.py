@@ -65,12 +65,14 @@ def divergence(
     named: str,
     beside: tuple[str, ...] = (),
     seed: int = 1,
+    plant: Any = None,
 ) -> tuple[float, float]:
     """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this
     profile.
 
     truth   effects of the simulated machine with their parameters (border units)
     beside  other effects of the stage, refitted together with either
+    plant   the machine that has them (`plant.Plant`); default: the shipped tables
 
     Returns (nats, spreads), the two measures by which the diagnosis decides.
     """
@@ -85,11 +87,12 @@ def divergence(
 
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
-    run = lockstep(
-        Stimulus.of(profile, t_oil=warm), plant=build_plant(model=Model(effects=truth)), seed=seed, hashed=False
+    machine = plant or build_plant()
+    run = lockstep(Stimulus.of(profile, t_oil=warm), plant=Model(effects=truth).plant(machine), seed=seed, hashed=False)
+    log = Log(
+        "simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine", "i_motor")}
     )
-    log = Log("simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")})
-    chain = build_chain(log)
+    chain = build_chain(log, machine)
     if all(s.name != stage for s in chain.stages):
         return 0.0, 0.0
     s = chain.stage(stage)
@@ -119,9 +122,10 @@ def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
     return out
 
 
-def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
+def recommend(d: Any, progress: Any = None, plant: Any = None) -> dict[str, Any] | None:
     """Return the best profile for the rivals in a diagnosis, or None when there is nothing to separate.
 
+    plant: the machine that the log was held against; default: the shipped tables.
     ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
     from plant.effects import EFFECTS
@@ -139,7 +143,7 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
         truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
     for i, ((name, profile), (s, f, rival)) in enumerate(jobs):
         beside = tuple(o.effect for o in s.effects if o.effect not in (f.effect, rival))
-        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside))
+        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside, plant=plant))
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():

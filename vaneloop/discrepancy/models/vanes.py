@@ -120,13 +120,14 @@ def build_chain(
             notes.append(
                 f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
             )
-    supply = machine.table.supply
-    filled = {"p_s": supply.pressure.value, "t_oil": supply.temperature.value}
+    filled = machine.usual
     have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
     have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
     for name, value in filled.items():
         if name not in have:
             have[name] = np.full(len(t), value)
+            if name == "p_s" and machine.kind != "hydraulic":
+                continue  # a motor needs no oil
             notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
     if {"x_lvdt", "i_cmd"} <= columns.keys():
         smooth = without_noise(t, have, machine)

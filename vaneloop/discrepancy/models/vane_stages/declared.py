@@ -15,11 +15,20 @@ from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
 __all__ = ["FREE", "SHAPES", "declared", "lanes"]
 
-FREE = {  # nominal parameters that a stage refits within their tolerance
+FREE = {  # nominal parameters that a stage refits within their tolerance, those of them that the machine has
     "demand": (),
     "servo": (),
     "engine": ("engine.lag", "engine.acceleration", "engine.deceleration"),
-    "actuator": ("actuator.flow_gain", "valve.bandwidth", "valve.damping", "sensors.lvdt_lag"),
+    "actuator": (
+        "actuator.flow_gain",
+        "valve.bandwidth",
+        "valve.damping",  # of a hydraulic one
+        "drive.rated_speed",
+        "drive.speed_gain",
+        "drive.speed_time",
+        "screw.friction",  # of an electromechanical one
+        "sensors.lvdt_lag",
+    ),
     "linkage": (
         *(f"linkage.{s}_play" for s in STAGES),
         *(f"sensors.{s}_bias" for s in STAGES),
@@ -59,7 +68,7 @@ def declared(
         rows.append(n.row)
     effects = []
     for e in EFFECTS.values():
-        if stage not in e.stages or e.name in present:
+        if stage not in e.stages or e.name in present or machine.kind not in e.kinds:
             continue
         ps = tuple(
             Parameter(
