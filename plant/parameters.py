@@ -36,11 +36,13 @@ from plant.layout import (
     VALVE_A12,
     VALVE_A21,
     VALVE_A22,
+    VANE_COUNT,
 )
-from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
+from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_PER_STAGE
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from vaneloop.base.tables import Bound, Bounded, Quantity, Table, read
+from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = [
     "ACCELERATION",
@@ -73,6 +75,7 @@ __all__ = [
     "VALVE_A21",
     "VALVE_A22",
     "VALVE_SHARE",
+    "VANE_COUNT",
     "VANE_EFFECTS",
     "Nominal",
     "PlantTable",
@@ -87,7 +90,7 @@ DRIVE_LOADED = DERIVED + 1  # 0 where neither a load nor the oil's pressure chan
 VANE_EFFECTS = DERIVED + 2  # as the first, from linkage to potentiometers
 VALVE_SHARE = DERIVED + 3  # valve_lag and lvdt_lag: share of the way in one plant step
 LVDT_SHARE = DERIVED + 4
-POT_SHARE = DERIVED + 5  # three rows: the potentiometers' share in one tick, pot_lag included
+POT_SHARE = DERIVED + 5  # a row a stage: the potentiometers' share in one tick, pot_lag included
 
 _SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "deg": math.pi / 180.0}
 
@@ -161,15 +164,17 @@ class Nominal:
 
 
 def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
-    """Return every named parameter: those of `NAMES` in their order, then each stage's link ``lc`` and lever arm ``l``.
+    """Return every named parameter of the machine: those of `NAMES` in their order, then each stage's link ``lc`` and
+    lever arm ``l``.
 
     These two stand for all lengths of the linkage, and so does their tolerance (`plant.geometry.length_tolerances`).
     """
     out = []
-    for row, name in enumerate(NAMES):
+    for row in own_rows(NAMES, geometry.vanes):
+        name = NAMES[row]
         section, key = name.split(".")
         if section == "linkage":
-            q = getattr(geometry, key.removesuffix("_play")).hysteresis
+            q = geometry.stage(key.removesuffix("_play")).hysteresis
         elif key.endswith("_bias"):
             q = table.sensors.pot_bias
         else:
@@ -177,8 +182,8 @@ def nominal(table: PlantTable, geometry: Geometry) -> list[Nominal]:
         out.append(Nominal(name, q.value, q.tolerance, q.unit, _SI.get(q.unit, 1.0), row))
     for name, tolerance in length_tolerances(geometry).items():
         stage, key = name.split("_", 1)
-        q = getattr(getattr(geometry, stage), key)
-        row = GEOMETRY + N_CRANK + STAGES.index(stage) * N_PER_STAGE + {"lc": G_LC, "l": G_L}[key]
+        q = getattr(geometry.stage(stage), key)
+        row = GEOMETRY + N_CRANK + VANES.index(stage) * N_PER_STAGE + {"lc": G_LC, "l": G_L}[key]
         out.append(Nominal(f"linkage.{name}", q.value, tolerance, q.unit, _SI[q.unit], row))
     return out
 
@@ -200,7 +205,7 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
         p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
         p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)
         p[LVDT_SHARE, j] = lag_factor(p[ROW["lvdt_lag"], j], dt)
-        for k in range(3):
+        for k in range(int(p[VANE_COUNT, j])):
             p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[ROW["pot_lag"] + k, j]), tick)
     for flag, rows in ((DRIVE_EFFECTS, _DRIVE_ROWS), (DRIVE_LOADED, _LOAD_ROWS), (VANE_EFFECTS, _VANE_ROWS)):
         p[flag] = np.any(p[rows] != _NEUTRAL[rows], axis=0)
@@ -218,10 +223,11 @@ def load_plant(
     table, geo = read(source, PlantTable), load_geometry(geometry)
     p = np.zeros((N_PARAMETERS, 1))
     g = geo.arrays()
-    p[GEOMETRY : GEOMETRY + N_GEOMETRY, 0] = g
+    p[GEOMETRY : GEOMETRY + len(g), 0] = g
+    p[VANE_COUNT] = len(geo.vanes)
     for n in nominal(table, geo):
         p[n.row, 0] = n.value * n.si
-    for k in range(len(STAGES)):
+    for k in range(len(geo.vanes)):
         o = N_CRANK + k * N_PER_STAGE
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
     p[N_NOMINAL:DERIVED, 0] = NEUTRAL

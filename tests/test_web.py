@@ -318,7 +318,7 @@ def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page
     step(page, "Stroke for the VIGV")
     page.reload()  # a reload in the middle keeps what was done
     page.get_by_role("heading", name="Step 2: Stroke for the VIGV").wait_for()
-    step(page, "Links of VGV1 and VGV2")
+    step(page, "Links of the other stages")
     step(page, "Measured loop")
     step(page, "Tables")
     with page.expect_download() as download:
@@ -880,7 +880,9 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
     from vaneloop.cli.main import main
     from vaneloop.web.guard import Guard
 
-    def serve(sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any) -> None:
+    def serve(
+        sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any, tables: str | None = None
+    ) -> None:
         nonlocal guard
         guard = Guard(None, token, 8765, most, loopback=loopback)  # type: ignore[arg-type]
         ready(guard.ticket())

@@ -11,6 +11,7 @@ import pkgutil
 
 from plant.effect import Effect
 from plant.layout import N_NOMINAL, NOMINAL_STATE
+from vaneloop.base.vanes import MOST
 
 __all__ = ["DERIVED", "EFFECTS", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW", "rows_at"]
 
@@ -39,7 +40,7 @@ for _name, _effect in EFFECTS.items():
     _states += [f"{_name}.{state}" for state in _effect.states]
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
-N_PARAMETERS = DERIVED + 8
+N_PARAMETERS = DERIVED + 5 + MOST
 STATE: tuple[str, ...] = tuple(_states)
 N_STATE = len(STATE)
 

@@ -63,7 +63,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import load_geometry
-    from plant.linkage import STAGES
     from plant.spatial import Clearances
     from vaneloop.base.errors import InputError
 
@@ -74,8 +73,9 @@ def command(args: argparse.Namespace) -> int:
     if not -360.0 <= args.vane <= 360.0:
         raise InputError(f"--vane (={args.vane:g} deg) must be in [-360, 360]")
     geometry = load_geometry(args.geometry)
-    widths = {s: getattr(geometry, s).hysteresis.value for s in STAGES}
-    for stage, text in terminal.pairs(args.width, "width", lambda k: k in STAGES, ", ".join(STAGES)).items():
+    vanes = geometry.vanes
+    widths = {s: geometry.stage(s).hysteresis.value for s in vanes}
+    for stage, text in terminal.pairs(args.width, "width", lambda k: k in vanes, ", ".join(vanes)).items():
         try:
             widths[stage] = float(text)
         except ValueError:
@@ -84,10 +84,10 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(f"--width {stage}={text}: must be a number in [0, 10] deg")
     studies = []
     with terminal.progress_bar(args, "crossing the clearances") as progress:
-        for i, s in enumerate(STAGES):
+        for i, s in enumerate(vanes):
             studies.append(clearance_study(geometry, s, widths[s], fits, args.vane, args.ring))
             if progress is not None:
-                progress((i + 1) / len(STAGES))
+                progress((i + 1) / len(vanes))
     rows = study_rows(studies)
     rows.append(["together", *(t for s in studies for t in ("", f"{s.made:.3f}", ""))])
     columns = ["joint", *(f"{s.stage} {w}" for s in studies for w in ("mm", "deg", "alone, mm"))]
@@ -97,7 +97,7 @@ def command(args: argparse.Namespace) -> int:
     )
     rows = [[name.replace("_", " "), *(f"{s.freedoms[name]:.4f}" for s in studies)] for name in studies[0].freedoms]
     title = "the ring's four freedoms: change of the vane angle, deg for 1 mm, largest over the stroke"
-    terminal.print_table(args, title, ["freedom", *STAGES], rows)
+    terminal.print_table(args, title, ["freedom", *vanes], rows)
     unit = {"clearance": "mm", "width": "deg"}
     terminal.write_json(args, {"schema": 1, "unit": unit, "vane": args.vane, "stages": [asdict(s) for s in studies]})
     if args.report:

@@ -10,6 +10,7 @@ from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -39,6 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the scenarios that ship, and stop")
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
+    options.add_machine_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
 
@@ -56,6 +58,7 @@ def command(args: argparse.Namespace) -> int:
     made = [(Path(n).stem, load_scenario(n)) for n in named]
     if args.seed is not None:
         made = [(n, s.model_copy(update={"seed": args.seed})) for n, s in made]
+    machine = options.machine_of(args)
     if args.bus == "lockstep":
         from hil.loop.lockstep import warm_up
 
@@ -72,7 +75,17 @@ def command(args: argparse.Namespace) -> int:
                 if progress is not None:
                     progress((i + fraction) / len(made))
 
-            outcomes.append(run(scenario, bus=args.bus, name=name, progress=share if progress is not None else None))
+            told = share if progress is not None else None
+            outcomes.append(
+                run(
+                    scenario,
+                    bus=args.bus,
+                    plant=machine.plant,
+                    calibration=machine.calibration,
+                    name=name,
+                    progress=told,
+                )
+            )
     _report(args, outcomes, skipped)
     return 0 if all(o.held for o in outcomes) else 1
 

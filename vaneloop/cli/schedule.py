@@ -14,10 +14,10 @@ from vaneloop.cli import options
 __all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
 DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links
-of VGV1 and VGV2 that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves, made
-into stroke tables.
+of the other stages that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves,
+made into stroke tables.
 
-The log needs x_lvdt and vigv (vgv1, vgv2 where they were measured), the machine as built (lb of the geometry) driven
+The log needs x_lvdt and vigv (vgv1, ... where they were measured), the machine as built (lb of the geometry) driven
 there and back: any format that replay reads. Without a log the play is the geometry's own.
 
 examples:
@@ -48,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         help="measured stroke-angle loop: candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet",
     )
-    group = parser.add_argument_group("adjusting VGV1 and VGV2")
+    group = parser.add_argument_group("adjusting the stages but the VIGV")
     group.add_argument(
         "--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)"
     )
@@ -135,7 +135,7 @@ def command(args: argparse.Namespace) -> int:
         ]
         for i in pick
     ]
-    errors = [f"{s} {w}" for s in ("vgv1", "vgv2") for w in ("first", "as is", "adjusted")]
+    errors = [f"{s} {w}" for s in geometry.vanes[1:] for w in ("first", "as is", "adjusted")]
     columns = ["speed, %", "extension, mm", "retraction", "mean", *errors]
     terminal.print_table(args, "stroke tables, and errors over speed, deg (all speeds: --json)", columns, rows)
     if result.loops:

@@ -5,9 +5,13 @@ profiles.
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from plant import Plant
 
 __all__ = ["MARGIN", "MOST_REPEATS", "PROFILES", "divergence", "recommend"]
 
@@ -65,18 +69,21 @@ def divergence(
     named: str,
     beside: tuple[str, ...] = (),
     seed: int = 1,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
 ) -> tuple[float, float]:
     """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this
     profile.
 
     truth   effects of the simulated machine with their parameters (border units)
     beside  other effects of the stage, refitted together with either
+    plant, calibration  the machine without these effects; default: the shipped tables
 
     Returns (nats, spreads), the two measures by which the diagnosis decides.
     """
     from hil.logs import Channel, Log
     from hil.loop.lockstep import Stimulus, lockstep
-    from plant import Model, build_plant
+    from plant import Model
     from vaneloop.discrepancy.diagnose import Search, correlation_of, gain
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.models.vanes import build_chain
@@ -85,10 +92,14 @@ def divergence(
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
     run = lockstep(
-        Stimulus.of(profile, t_oil=warm), plant=build_plant(model=Model(effects=truth)), seed=seed, hashed=False
+        Stimulus.of(profile, t_oil=warm),
+        calibration=calibration,
+        plant=Model(effects=truth).plant(plant),
+        seed=seed,
+        hashed=False,
     )
     log = Log("simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")})
-    chain = build_chain(log)
+    chain = build_chain(log, plant, calibration)
     if all(s.name != stage for s in chain.stages):
         return 0.0, 0.0
     s = chain.stage(stage)
@@ -118,8 +129,10 @@ def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
     return out
 
 
-def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
+def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any] | None:
     """Return the best profile for the rivals in a diagnosis, or None when there is nothing to separate.
+
+    chain  the log's stages (`vaneloop.discrepancy.models.vanes.Chain`), for their machine; default: the shipped tables
 
     ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
@@ -129,6 +142,7 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
     pairs = [(s, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
     if not pairs:
         return None
+    machine = {} if chain is None else {"plant": chain.plant, "calibration": chain.built}
     table: list[dict[str, Any]] = []
     jobs = list(itertools.product(PROFILES.items(), pairs))
     scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
@@ -138,7 +152,7 @@ def recommend(d: Any, progress: Any = None) -> dict[str, Any] | None:
         truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
     for i, ((name, profile), (s, f, rival)) in enumerate(jobs):
         beside = tuple(o.effect for o in s.effects if o.effect not in (f.effect, rival))
-        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside))
+        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside, **machine))
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():
