@@ -359,18 +359,9 @@ class EcuArrays(NamedTuple):
 
 
 ECU_VALUES = (
-    "x_dem",
-    "x_lvdt",
-    "state",
-    "i_cmd",
-    "faults",
-    *VANES[:IN_FRAME],
-    "p_s",
-    "t_oil",
-    "frames_lost",
-    "frames_rejected",
+    "x_dem", "x_lvdt", "state", "i_cmd", "faults", *VANES[:IN_FRAME], "p_s", "t_oil", "frames_lost", "frames_rejected",
     *VANES[IN_FRAME:],
-)
+)  # fmt: skip
 
 
 @in_place
@@ -489,13 +480,9 @@ class Ecu:
         """Return the names of the controller's frames that are late: none for five periods, or of this machine's none
         ever.
         """
-        return [
-            frames.NAMES[r[frames.R_IDENT]]
-            for r in self.arrays.receiver
-            if r[frames.R_SILENT] > 0
-            or (
-                r[frames.R_LAST] < 0
-                and r[frames.R_IDENT] <= self._last
-                and self.k >= frames.MISSED * r[frames.R_PERIOD]
-            )
-        ]
+
+        def late(r: np.ndarray) -> bool:
+            never = r[frames.R_LAST] < 0 and r[frames.R_IDENT] <= self._last
+            return bool(r[frames.R_SILENT] > 0 or (never and self.k >= frames.MISSED * r[frames.R_PERIOD]))
+
+        return [frames.NAMES[int(r[frames.R_IDENT])] for r in self.arrays.receiver if late(r)]
