@@ -24,6 +24,8 @@ examples:
 
 exit codes: 0 good, 2 bad input"""
 
+SIDE_BY_SIDE = 3  # stages in a table: more do not fit a terminal
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -88,13 +90,15 @@ def command(args: argparse.Namespace) -> int:
             studies.append(clearance_study(geometry, s, widths[s], fits, args.vane, args.ring))
             if progress is not None:
                 progress((i + 1) / len(vanes))
-    rows = study_rows(studies)
-    rows.append(["together", *(t for s in studies for t in ("", f"{s.made:.3f}", ""))])
-    columns = ["joint", *(f"{s.stage} {w}" for s in studies for w in ("mm", "deg", "alone, mm"))]
     where = f"at the vane {args.vane:g} deg from the right clevis"
-    terminal.print_table(
-        args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows
-    )
+    for i in range(0, len(studies), SIDE_BY_SIDE):
+        some = studies[i : i + SIDE_BY_SIDE]
+        rows = study_rows(some)
+        rows.append(["together", *(t for s in some for t in ("", f"{s.made:.3f}", ""))])
+        columns = ["joint", *(f"{s.stage} {w}" for s in some for w in ("mm", "deg", "alone, mm"))]
+        terminal.print_table(
+            args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows
+        )
     rows = [[name.replace("_", " "), *(f"{s.freedoms[name]:.4f}" for s in studies)] for name in studies[0].freedoms]
     title = "the ring's four freedoms: change of the vane angle, deg for 1 mm, largest over the stroke"
     terminal.print_table(args, title, ["freedom", *vanes], rows)

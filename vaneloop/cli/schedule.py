@@ -30,6 +30,8 @@ exit codes: 0 good, 2 bad input (a mechanism that cannot be assembled, a schedul
 loop)
 """
 
+SIDE_BY_SIDE = 2  # stages in the table of errors: more do not fit a terminal
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -127,17 +129,19 @@ def command(args: argparse.Namespace) -> int:
         args, "links, and what remains (target minus angle; rms and max over 40 to 102 % speed)", columns, rows
     )
     pick = [i for i, n in enumerate(result.speed) if n % 10 == 0 or n >= 95 or i == len(result.speed) - 1]
-    rows = [
-        [
-            f"{result.speed[i]:g}",
-            *(f"{v:.2f}" for v in result.table[1:, i]),
-            *(f"{e[i]:.2f}" for s in result.links[1:] for e in (s.error_initial, s.error_built, s.error)),
+    for k in range(0, max(len(result.links) - 1, 1), SIDE_BY_SIDE):
+        some = result.links[1 + k : 1 + k + SIDE_BY_SIDE]
+        rows = [
+            [
+                f"{result.speed[i]:g}",
+                *(f"{v:.2f}" for v in result.table[1:, i]),
+                *(f"{e[i]:.2f}" for s in some for e in (s.error_initial, s.error_built, s.error)),
+            ]
+            for i in pick
         ]
-        for i in pick
-    ]
-    errors = [f"{s} {w}" for s in geometry.vanes[1:] for w in ("first", "as is", "adjusted")]
-    columns = ["speed, %", "extension, mm", "retraction", "mean", *errors]
-    terminal.print_table(args, "stroke tables, and errors over speed, deg (all speeds: --json)", columns, rows)
+        errors = [f"{s.stage} {w}" for s in some for w in ("first", "as is", "adjusted")]
+        columns = ["speed, %", "extension, mm", "retraction", "mean", *errors]
+        terminal.print_table(args, "stroke tables, and errors over speed, deg (all speeds: --json)", columns, rows)
     if result.loops:
         rows = [
             [
