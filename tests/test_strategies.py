@@ -13,7 +13,7 @@ import pytest
 from controller import load_calibration
 from controller.calibration import STRATEGIES
 from hil.engine_test import load_profile
-from hil.loop.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep, snapshot_names
 from plant import build_plant
 from tests import columns as fw
 from vaneloop.base.vanes import VANES
@@ -195,7 +195,7 @@ def test_a_potentiometer_is_believed_only_after_it_followed_the_linkage() -> Non
         pots=shifted,
         watch=lambda s: kept.append(s.copy()),
     )
-    learned = np.rad2deg(np.vstack(kept)[:, fw.OFFSET])
+    learned = np.rad2deg(np.vstack(kept)[:, snapshot_names(plant.vanes).index("offset_vigv")])
     assert np.abs(learned[:40_000]).max() == 0.0
     assert learned[-1] > 0.1
 
