@@ -412,15 +412,8 @@ class _Page:
             for name, words in (("initial", "as first built"), ("built", "as entered"), ("adjusted", "adjusted")):
                 lb = {"initial": s.lb_initial, "built": s.lb_built, "adjusted": s.lb}[name]
                 lc = s.lc if name == "adjusted" else s.lc_built
-                rows.append(
-                    [
-                        NAMES[s.stage],
-                        words,
-                        f"{lb:g}",
-                        f"{lc:g}",
-                        *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name])),
-                    ]
-                )
+                figures = (f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))
+                rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *figures])
         with ui.element("div").classes("half"):
             table(["stage", "", "Lb, mm", "Lc, mm", "at 100 %, deg", "rms", "max"], rows, numbers=(2, 3, 4, 5, 6))
             lines = []
@@ -434,16 +427,8 @@ class _Page:
     def _loop(self, r: Any) -> None:
         rows = []
         for name, m in r.loops.items():
-            rows.append(
-                [
-                    NAMES[name],
-                    f"{m.width:.3f} ± {m.width_sigma:.3f}",
-                    f"{m.offset:.3f}",
-                    f"{m.lb:.2f}",
-                    f"{m.lc:.2f}",
-                    f"{m.noise:.3f}",
-                ]
-            )
+            width = f"{m.width:.3f} ± {m.width_sigma:.3f}"
+            rows.append([NAMES[name], width, f"{m.offset:.3f}", f"{m.lb:.2f}", f"{m.lc:.2f}", f"{m.noise:.3f}"])
         table(
             ["loop", "width, deg", "offset, deg", "Lb equivalent, mm", "Lc equivalent, mm", "noise, deg"],
             rows,
@@ -469,10 +454,6 @@ class _Page:
                 for trace, line in zip(f["data"][: len(dots)], dots, strict=True):
                     trace |= {
                         "mode": "markers",
-                        "x": np.round(np.asarray(line.x), 4).tolist(),
-                        "y": np.round(np.asarray(line.y), 4).tolist(),
-                    }
-                    trace |= {
                         "x": np.round(np.asarray(line.x), 4).tolist(),
                         "y": np.round(np.asarray(line.y), 4).tolist(),
                     }
