@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.ours import COLUMNS, Setup
 from plant import parameters as par
-from plant.linkage import N_GEOMETRY
+from plant.linkage import N_CRANK, N_PER_STAGE
 
 __all__ = ["BITWISE", "FAST", "CLoop", "build"]
 
@@ -35,7 +35,7 @@ _PARAMETERS = [
         par.STROKE,
     ),
     *(par.P_REF, par.LVDT_LAG, par.POT_LAG, *range(par.PLAY, par.PLAY + 3), *range(par.POT_BIAS, par.POT_BIAS + 3)),
-    *range(par.GEOMETRY, par.GEOMETRY + N_GEOMETRY),
+    *range(par.GEOMETRY, par.GEOMETRY + N_CRANK + 3 * N_PER_STAGE),
     *(par.LVDT_STEP, par.VALVE_A11, par.VALVE_A12, par.VALVE_A21, par.VALVE_A22, par.LVDT_FACTOR, par.POT_FACTOR),
 ]
 _Doubles = ctypes.POINTER(ctypes.c_double)

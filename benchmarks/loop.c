@@ -31,7 +31,7 @@ typedef struct {
     double lvdt_low, lvdt_high, lvdt_rate, lvdt_debounce, lvdt_heal;
     double stuck_current, stuck_motion, stuck_time, stuck_margin;
     double tracking_limit, tracking_time, saturated_time;
-    double inverse_and_adaptive[23]; /* strategies that are not written here */
+    double inverse_and_adaptive[29]; /* strategies that are not written here */
 } Calibration;
 
 typedef struct {

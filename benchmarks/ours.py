@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from controller import Calibration, load_calibration
-from hil.loop.lockstep import COLUMNS, WARM_UP, Stimulus, advance
+from hil.loop.lockstep import WARM_UP, Stimulus, advance, columns_of
 from hil.loop.tick import new_loop
 from plant import Plant, build_plant
+from vaneloop.base.vanes import VANES
 
 __all__ = ["COLUMNS", "OurLoop", "Setup", "profile", "troubled"]
 
+COLUMNS = columns_of(VANES[:3])
 _SILENT, _NO_SNAPSHOTS = np.zeros((1, 5)), np.empty((0, 0))
 
 

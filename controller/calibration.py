@@ -22,6 +22,7 @@ from controller.records import (
 )
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
+from vaneloop.base.vanes import VANES, Staged, vane_in
 
 __all__ = ["Calibration", "load_calibration", "new_inputs", "new_outputs", "new_state"]
 
@@ -40,12 +41,17 @@ class Calibration(NamedTuple):
 
     k       float64[n] of `records.SCALARS`, SI; ``scalars``: their record
     table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
-    angles  float64[4, m]: stroke (m), then the angle (rad) of VIGV, VGV1, VGV2 at it in the middle of the play
+    angles  float64[1 + stages, m]: stroke (m), then the angle (rad) of each stage at it in the middle of the play
     """
 
     k: np.ndarray
     table: np.ndarray
     angles: np.ndarray
+
+    @property
+    def vanes(self) -> tuple[str, ...]:
+        """Stages of the machine that it is for, in order."""
+        return VANES[: len(self.angles) - 1]
 
     @property
     def scalars(self) -> Record:
@@ -272,23 +278,36 @@ class StrokeTable(Bounded):
         return self
 
 
-class AngleTable(Bounded):
+class AngleTable(Staged, Bounded):
     """``vane_angles.toml``: vane angles against stroke in the middle of the play, and the total play at the vane."""
 
     play_vigv: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
-    play_vgv1: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
-    play_vgv2: Annotated[Quantity, Bound("deg", 0.0, 10.0)]
+    play_vgv1: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv2: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv3: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv4: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv5: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv6: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
+    play_vgv7: Annotated[Quantity | None, Bound("deg", 0.0, 10.0)] = None
 
     stroke: Annotated[Axis, Bound("mm", -10.0, 100.0)]
     vigv: Annotated[Axis, Bound("deg", -90.0, 90.0)]
-    vgv1: Annotated[Axis, Bound("deg", -90.0, 90.0)]
-    vgv2: Annotated[Axis, Bound("deg", -90.0, 90.0)]
+    vgv1: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv2: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv3: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv4: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv5: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv6: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
+    vgv7: Annotated[Axis | None, Bound("deg", -90.0, 90.0)] = None
 
     @model_validator(mode="after")
     def _axes(self) -> AngleTable:
         self.stroke.increasing("stroke")
         n = len(self.stroke.values)
-        for key in ("vigv", "vgv1", "vgv2"):
+        for key in VANES:
+            if (getattr(self, key) is None) != (getattr(self, f"play_{key}") is None):
+                raise ValueError(f"{key} and play_{key} belong together: only one of them is there")
+        for key in self.vanes:
             axis = getattr(self, key).increasing(key)
             if len(axis.values) != n:
                 raise ValueError(f"{key}.values has {len(axis.values)} numbers; stroke has {n}")
@@ -319,16 +338,14 @@ def load_calibration(
         for key, q in getattr(cal, section):
             if isinstance(q, Quantity):
                 values[key] = q.value * _SI.get(q.unit, 1.0)
-    values |= {name: getattr(angle, name).value * _DEG for name in ("play_vigv", "play_vgv1", "play_vgv2")}
-    k = np.array([values[name] for name in SCALARS])
+    values |= {f"play_{v}": getattr(angle, f"play_{v}").value * _DEG for v in angle.vanes}
+    values["stages"] = float(len(angle.vanes))
+    k = np.array([values.get(name, 0.0) if vane_in(name) else values[name] for name in SCALARS])
     table = np.array(
         [stroke.speed.values]
         + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]
     )
-    vanes = [
-        np.array(angle.stroke.values) * 1e-3,
-        *(np.deg2rad(getattr(angle, s).values) for s in ("vigv", "vgv1", "vgv2")),
-    ]
+    vanes = [np.array(angle.stroke.values) * 1e-3, *(np.deg2rad(getattr(angle, s).values) for s in angle.vanes)]
     return Calibration(k, table, np.array(vanes))
 
 

@@ -3,25 +3,29 @@
 Every record is a row of float64 in the order below, so its memory is also a C struct of doubles. As a `record` its
 fields are attributes, in compiled code and in Python: ``state.x_dem``, ``state.width[stage]``. `as_state` and its like
 show numbers as a record, `flat` a record as numbers: the same memory. The firmware takes either. Units: SI, speeds %.
+
+What each vane stage has stands in an array of eight; a controller works on the first ``stages`` of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 from numba.extending import overload
 
+from vaneloop.base.vanes import VANES, own_rows
+
 __all__ = [
     "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OUTPUTS", "OUTPUT_FIELDS", "SCALARS", "SCALAR_FIELDS",
     "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs", "as_scalars", "as_state",
-    "flat", "flat_names", "kind", "record",
+    "flat", "flat_names", "kind", "record", "state_rows",
 ]  # fmt: skip
 
 Record = Any  # a numpy.record: its fields are attributes, which the types of numpy do not know
-VANES = ("vigv", "vgv1", "vgv2")
 TICK = 1e-3  # s, servo rate 1 kHz
 SLOW = 10  # ticks: demand, trend and schedule run every 10 ms
 SLOW_TICK = 1e-2  # s
@@ -145,6 +149,7 @@ SCALAR_FIELDS = (
     Field("apply_rate", "rad/s", "fastest change of the compensation in use"),
     Field("offset_limit", "rad", "greatest offset that is learned"),
     Field("width_limit", "rad", "farthest from the play as built"),
+    Field("stages", "-", "vane stages of the machine, 1 to 8"),
 )
 
 STATE_FIELDS = (
@@ -214,6 +219,14 @@ def flat_names(fields: tuple[Field, ...]) -> tuple[str, ...]:
 
 
 INPUTS, OUTPUTS, SCALARS, STATE = map(flat_names, (INPUT_FIELDS, OUTPUT_FIELDS, SCALAR_FIELDS, STATE_FIELDS))
+
+
+@lru_cache
+def state_rows(stages: int) -> np.ndarray:
+    """Numbers of the state, int64, that a machine with so many vane stages has."""
+    rows = np.array(own_rows(STATE, VANES[:stages]))
+    rows.setflags(write=False)
+    return rows
 
 
 def kind(fields: tuple[Field, ...]) -> np.dtype[np.void]:

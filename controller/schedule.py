@@ -11,7 +11,7 @@ __all__ = ["look_up", "move_demand", "schedule_step"]
 
 ROW_SPEED, ROW_EXTENSION, ROW_RETRACTION, ROW_SINGLE = range(4)
 
-ANGLE_STROKE, ANGLE_VIGV = 0, 1  # rows of the angle table; VGV1 and VGV2 follow
+ANGLE_STROKE, ANGLE_VIGV = 0, 1  # rows of the angle table; the other stages follow
 
 
 @inlined

@@ -106,7 +106,7 @@ def inverse_step(z: Record, k: Record, table: np.ndarray, angles: np.ndarray) ->
     """
     observe_speed(z, k)
     stroke = z.x_dem + max(z.x_slow - z.x_dem - OVERSHOT, 0.0) + min(z.x_slow - z.x_dem + OVERSHOT, 0.0)
-    for stage in range(3):
+    for stage in range(int(k.stages)):
         drive = angle_at(ANGLE_STROKE, ANGLE_VIGV + stage, angles, stroke)
         extra = z.width_in_use if stage == 0 else z.width[stage]
         follow_play(z, stage, drive, max(k.play[stage] + extra, 0.0))
@@ -138,7 +138,7 @@ def filter_pots(z: Record, k: Record, inputs: Record) -> None:
     """Take the potentiometers' readings: one tick of 1 ms. A reading out of range, NaN included, is not used and counts
     against it.
     """
-    for stage in range(3):
+    for stage in range(int(k.stages)):
         y = inputs.pots[stage]
         if k.pot_low <= y <= k.pot_high:
             if z.pot_seen[stage] == 0.0:
@@ -194,7 +194,7 @@ def learn(z: Record, k: Record) -> None:
     """
     quiet = z.mode == RUN and abs(z.x_dem - z.x_from) < QUIET_MOTION and abs(z.x_dem - z.x_meas) < QUIET_ERROR
     z.quiet = min(z.quiet + SLOW_TICK, 1.0) if quiet else 0.0
-    for stage in range(3):
+    for stage in range(int(k.stages)):
         side = z.engaged[stage]
         play = k.play[stage]
         expected = z.farthest[stage] + z.offset[stage] - 0.5 * side * max(play + z.width[stage], 0.0)

@@ -95,7 +95,7 @@ def engine_test(
         progress=progress,
     )
     speed = run.columns["n_r"]
-    target = dict(zip(("vigv", "vgv1", "vgv2"), np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
+    target = dict(zip(machine.vanes, np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
     noise = machine.table.sensors.pot_noise.value
     signals = [
         error_figures(name, "linkage", "deg", "schedule", run.t, run.columns[name], values, speed, noise)

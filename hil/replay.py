@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vaneloop.base.vanes import VANES
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -21,15 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ReplayResult", "replay", "replay_json"]
 
-STAGE = {
-    "n_r": "engine",
-    "x_dem": "demand",
-    "i_cmd": "servo",
-    "x_lvdt": "actuator",
-    "vigv": "linkage",
-    "vgv1": "linkage",
-    "vgv2": "linkage",
-}
+STAGE = {"n_r": "engine", "x_dem": "demand", "i_cmd": "servo", "x_lvdt": "actuator", **dict.fromkeys(VANES, "linkage")}
 STATISTICS = ("rms", "mean_abs", "max_abs", "mean_abs_99_100")
 
 
@@ -95,9 +89,7 @@ def replay(
         held["p_s"] * 1e6 if "p_s" in held else machine.usual["p_s"] * 1e6,
         held.get("t_oil", machine.usual["t_oil"]),
     )
-    angles = tuple(
-        np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in ("vigv", "vgv1", "vgv2")
-    )
+    angles = tuple(np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in machine.vanes)
     start = float(log.channels["x_dem"].values[0]) * 1e-3 if "x_dem" in log.channels else None
     outputs = [log.channels[s] for s in STAGE if s in log.channels]
     fine = min((float(np.median(np.diff(c.t))) for c in outputs if len(c.t) > 1), default=1e-2) < 5e-3
@@ -111,12 +103,12 @@ def replay(
         progress=progress,
     )
 
-    t, model = run.t, {name: run.columns[name] for name in UNITS}
+    t, model = run.t, {name: run.columns[name] for name in UNITS if name in run.columns}
     model["n_r"] = run.columns["n_engine"]
     if "i_motor" in run.columns:
         model["i_motor"] = run.columns["i_motor"]
     speed = run.columns["n_r"]
-    target = dict(zip(("vigv", "vgv1", "vgv2"), np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
+    target = dict(zip(machine.vanes, np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
     notes, known = list(log.notes), dict(floors or {})
     gap = max(0.5, 5.0 * raster)
     holes = np.diff(demand.t) > gap
@@ -127,7 +119,9 @@ def replay(
         )
     signals = []
     for name, stage in STAGE.items():
-        if name in log.channels:
+        if name in log.channels and name not in model:
+            notes.append(f"{name}: this machine has no such stage (geometry); not compared")
+        elif name in log.channels:
             c = log.channels[name]
             use = (c.t <= end + 1e-9) & ~_in_hole(c.t, demand.t, gap)
             if use.any():

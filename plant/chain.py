@@ -74,6 +74,7 @@ from plant.parameters import (
     VALVE_A12,
     VALVE_A21,
     VALVE_A22,
+    VANE_COUNT,
     VANE_EFFECTS,
     motor_steps,
 )
@@ -223,7 +224,7 @@ def wake(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float) -> None:
         for q in range(4):
             s[CURRENT + q, j] = i_cmd
         s[LAGGED, j], s[FRICTION, j], s[FRICTION + 1, j], s[GIVE, j], s[READING, j] = i_cmd, 0.0, 0.0, 0.0, s[X_LVDT, j]
-    for k in range(3):
+    for k in range(int(p[VANE_COUNT, j])):
         if p[LINKAGE_FRICTION + k, j] == 0.0:
             s[BRISTLE + k, j], s[DRIVEN + k, j] = 0.0, s[RING + k, j]
 
@@ -297,14 +298,14 @@ def vane_step(s: np.ndarray, p: np.ndarray, j: int, n_r: float, t_oil: float, t:
 
     How long the step is stands in the derived rows of ``p`` (`plant.parameters.derive`, its tick).
     """
-    g = GEOMETRY
+    g, n = GEOMETRY, int(p[VANE_COUNT, j])
     c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     if p[VANE_EFFECTS, j] != 0.0:
-        for k in range(3):
+        for k in range(n):
             vane = stem_angle(s, p, j, k, c, d, n_r, t_oil, t)
             s[POT + k, j] += p[POT_SHARE + k, j] * (vane - s[POT + k, j])
         return
-    for k in range(3):
+    for k in range(n):
         o = g + N_CRANK + k * N_PER_STAGE
         drive = ring_angle(c, d, p[o + G_AX, j], p[o + G_AY, j], p[o + G_LB, j], p[o + G_LC, j], p[o + G_LD, j])
         s[RING + k, j] = play_step(s[RING + k, j], drive, p[PLAY + k, j])

@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from vaneloop.base.vanes import VANES
+
 __all__ = [
     "DEG",
     "HYDRAULIC",
@@ -31,7 +33,6 @@ SITES = ("demand", "engine", "valve", "supply", "amplifier", "motor", "screw", "
 KINDS = ("hydraulic", "electromechanical")  # of actuators, by their number in `plant.layout.KIND`
 HYDRAULIC, MOTOR = KINDS[:1], KINDS[1:]
 STAGES = ("demand", "servo", "engine", "actuator", "linkage")
-VANE_STAGES = ("vigv", "vgv1", "vgv2")
 
 UNITS = {  # border unit -> factor into SI (speeds stay in %, temperatures in degC)
     "-": 1.0,
@@ -58,7 +59,8 @@ class Parameter:
     """One number of an effect, in ``unit``: its neutral value, physical bounds and meaning. ``si`` turns it into SI.
 
     ``period``: after which it repeats itself, as an angle does; from ``low`` to ``high`` is then one turn. 0: it does
-    not.
+    not. ``vane``: the stage whose number it is; "": the machine's. ``beyond``: the stage's number in geometry.toml that
+    it adds to; their sum is never negative.
     """
 
     name: str
@@ -68,6 +70,8 @@ class Parameter:
     high: float
     meaning: str
     period: float = 0.0
+    vane: str = ""
+    beyond: str = ""
 
     def __post_init__(self) -> None:
         if self.unit not in UNITS:
@@ -127,8 +131,7 @@ class Effect:
 
 
 def per_vane_stage(
-    unit: str, neutral: float, low: float | tuple[float, float, float], high: float, meaning: str
+    unit: str, neutral: float, low: float, high: float, meaning: str, beyond: str = ""
 ) -> tuple[Parameter, ...]:
-    """Return the same parameter for VIGV, VGV1 and VGV2, fitted jointly; ``low`` may differ."""
-    lows = low if isinstance(low, tuple) else (low, low, low)
-    return tuple(Parameter(name, unit, neutral, a, high, meaning) for name, a in zip(VANE_STAGES, lows, strict=True))
+    """Return the same parameter for every stage that a machine can have, fitted jointly for those that it has."""
+    return tuple(Parameter(v, unit, neutral, low, high, meaning, vane=v, beyond=beyond) for v in VANES)

@@ -11,6 +11,7 @@ import textwrap
 
 from plant.effect import KINDS, SITES, Effect, Parameter
 from plant.effects import EFFECTS
+from vaneloop.base.vanes import VANES
 
 __all__ = ["page"]
 
@@ -18,8 +19,8 @@ HEAD = """# Effects
 
 Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral
 values the machine is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop
-diagnose` looks for them in a log. The column "actuator" names the kind of actuator that an effect belongs to
-([machines](machines.md)).
+diagnose` looks for them in a log. A parameter `vigv`, `vgv1`, ... is one of each stage that the machine has. The column
+"actuator" names the kind of actuator that an effect belongs to ([machines](machines.md)).
 
 This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
 (docs/architecture.md); inside the code everything is SI.
@@ -34,7 +35,7 @@ def page() -> str:
     effects = [e for site in SITES for e in EFFECTS.values() if e.site == site]
     rows = [
         f"| [`{e.name}`](#{e.name}) | {e.site} | {_kinds(e)} | {', '.join(e.stages)} | {e.summary} | "
-        + ", ".join(f"`{p.name}` {p.unit}" for p in e.parameters)
+        + ", ".join(f"{_name(p)} {p.unit}" for p in _told(e))
         + " |\n"
         for e in effects
     ]
@@ -45,6 +46,15 @@ def _kinds(e: Effect) -> str:
     return "any" if e.kinds == KINDS else e.kinds[0]
 
 
+def _told(e: Effect) -> list[Parameter]:
+    """The effect's parameters; of those that every vane stage has, the first."""
+    return [p for p in e.parameters if p.vane in ("", VANES[0])]
+
+
+def _name(p: Parameter) -> str:
+    return f"`{p.name}`, `{VANES[1]}`, ..." if p.vane else f"`{p.name}`"
+
+
 def _section(e: Effect) -> str:
     doc = importlib.import_module(f"plant.effects.{e.name}").__doc__ or ""
     what, rest = doc.strip().split("\n\n", 1)
@@ -52,7 +62,7 @@ def _section(e: Effect) -> str:
     equation = re.sub(r"::\n\n", ":\n\n", parts[0]).strip()
     words = {label: _sentence(text) for label, text in zip(parts[1::2], parts[2::2], strict=True)}
     table = "| parameter | unit | neutral | from | to | meaning |\n|---|---|---|---|---|---|\n"
-    table += "".join(map(_row, e.parameters))
+    table += "".join(map(_row, _told(e)))
     sentences = {
         "In a log.": words["In a log"],
         "What excites it.": _sentence(e.excites) + ".",
@@ -77,7 +87,7 @@ def _filled(text: str) -> str:
 
 
 def _row(p: Parameter) -> str:
-    return f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} | {p.high:g} | {p.meaning} |\n"
+    return f"| {_name(p)} | {p.unit} | {p.neutral:g} | {p.low:g} | {p.high:g} | {p.meaning} |\n"
 
 
 if __name__ == "__main__":

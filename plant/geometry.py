@@ -28,9 +28,7 @@ from plant.linkage import (
     G_X1,
     G_Y1,
     N_CRANK,
-    N_GEOMETRY,
     N_PER_STAGE,
-    STAGES,
     STROKE_HIGH,
     STROKE_LOW,
     check_assembly,
@@ -39,6 +37,7 @@ from plant.linkage import (
 )
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
+from vaneloop.base.vanes import Staged
 
 __all__ = [
     "STANDS_FOR",
@@ -82,17 +81,27 @@ class Stage(Bounded):
     hysteresis: Annotated[Quantity, Bound("deg", 0, 10)]  # total width at the vane
 
 
-class Geometry(Table):
-    """The linkage of the three stages."""
+class Geometry(Staged, Table):
+    """The linkage of the machine's stages."""
 
     crank: Crank
     vigv: Stage
-    vgv1: Stage
-    vgv2: Stage
+    vgv1: Stage | None = None
+    vgv2: Stage | None = None
+    vgv3: Stage | None = None
+    vgv4: Stage | None = None
+    vgv5: Stage | None = None
+    vgv6: Stage | None = None
+    vgv7: Stage | None = None
 
-    def stages(self) -> tuple[Stage, Stage, Stage]:
+    def stages(self) -> tuple[Stage, ...]:
         """Stages in the order of every array."""
-        return self.vigv, self.vgv1, self.vgv2
+        return tuple(self.stage(v) for v in self.vanes)
+
+    def stage(self, vane: str) -> Stage:
+        """The stage of that name, one of ``vanes``."""
+        stage: Stage = getattr(self, vane)
+        return stage
 
     def arrays(self, initial: bool = False) -> NDArray[np.float64]:
         """Flat geometry of `plant.linkage`, SI: the crank, then each stage. ``initial`` takes the lower arms as first
@@ -101,7 +110,7 @@ class Geometry(Table):
         Layout: [Lx0, x1, y1, Le], then for each stage [Lb, Lc, Ld, Ld', L, Ax, Ay, hysteresis] with A = La exp(i (3
         pi/2 + th6)).
         """
-        g = np.zeros(N_GEOMETRY)
+        g = np.zeros(N_CRANK + len(self.vanes) * N_PER_STAGE)
         c = self.crank
         g[G_LX0], g[G_X1], g[G_Y1], g[G_LE] = (q.value * MM for q in (c.lx0, c.x1, c.y1, c.le))
         for k, s in enumerate(self.stages()):
@@ -128,19 +137,24 @@ class Geometry(Table):
         return self
 
 
-class Schedules(Bounded):
+class Schedules(Staged, Bounded):
     """Target vane angles over rotor speed, linear between the breakpoints."""
 
     speed: Annotated[Axis, Bound("%", 0, 120)]
     vigv: Annotated[Axis, Bound("deg", -90, 90)]
-    vgv1: Annotated[Axis, Bound("deg", -90, 90)]
-    vgv2: Annotated[Axis, Bound("deg", -90, 90)]
+    vgv1: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv2: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv3: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv4: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv5: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv6: Annotated[Axis | None, Bound("deg", -90, 90)] = None
+    vgv7: Annotated[Axis | None, Bound("deg", -90, 90)] = None
 
     @model_validator(mode="after")
     def _rises(self) -> Schedules:
         n = self.speed.increasing("speed").values
-        for key in STAGES:
-            a = getattr(self, key).values
+        for key in self.vanes:
+            a = self.target(key).values
             if len(a) != len(n):
                 raise ValueError(f"{key}.values has {len(a)} numbers, speed.values has {len(n)}: they must be as many")
             for i in range(1, len(a)):
@@ -151,16 +165,21 @@ class Schedules(Bounded):
                     )
         return self
 
+    def target(self, vane: str) -> Axis:
+        """Target angles of a stage, one of ``vanes``, deg."""
+        axis: Axis = getattr(self, vane)
+        return axis
+
     def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Breakpoints of rotor speed (n), %, and target angles (n, 3), rad."""
-        angles = np.column_stack([np.array(getattr(self, k).values) for k in STAGES]) * DEG
+        """Breakpoints of rotor speed (n), %, and target angles (n, stages), rad."""
+        angles = np.column_stack([np.array(self.target(k).values) for k in self.vanes]) * DEG
         return np.array(self.speed.values), angles
 
     def targets(self, speed: ArrayLike) -> NDArray[np.float64]:
-        """Target angles (n, 3), rad, at rotor speeds (n), %; held beyond the ends."""
+        """Target angles (n, stages), rad, at rotor speeds (n), %; held beyond the ends."""
         n, a = self.arrays()
         s = np.atleast_1d(np.asarray(speed, dtype=float))
-        return np.column_stack([np.interp(s, n, a[:, k]) for k in range(3)])
+        return np.column_stack([np.interp(s, n, a[:, k]) for k in range(a.shape[1])])
 
 
 def load_geometry(source: str | Path = "geometry.toml") -> Geometry:
@@ -193,7 +212,7 @@ def length_tolerances(geometry: Geometry) -> dict[str, float]:
     stroke = np.linspace(0.0, 48e-3, 25)
     here = vane_angles(stroke, geometry)
     out = {}
-    for k, stage in enumerate(STAGES):
+    for k, stage in enumerate(geometry.vanes):
         shapes = {}
         for part in ("crank", stage):
             for key, q in getattr(geometry, part):
@@ -220,10 +239,11 @@ def _flat(geometry: Geometry | NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def vane_angles(stroke: ArrayLike, geometry: Geometry | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vane angles (n, 3), rad, at strokes (n), m, without play. ``geometry`` may be the flat array."""
+    """Vane angles (n, stages), rad, at strokes (n), m, without play. ``geometry`` may be the flat array."""
     x = np.ascontiguousarray(np.atleast_1d(np.asarray(stroke, dtype=float)))
-    out = np.empty((x.size, 3))
-    vane_angle_table(x, _flat(geometry), out)
+    g = _flat(geometry)
+    out = np.empty((x.size, (len(g) - N_CRANK) // N_PER_STAGE))
+    vane_angle_table(x, g, out)
     return out
 
 

@@ -1,12 +1,14 @@
 """Where every number of the nominal plant stands in its two flat arrays: parameters p[row, lane] and state s[row,
 lane], SI.
 
-The rows of the effects follow behind (`plant.effects`).
+What a stage has stands in `MOST` rows side by side, those of the machine's own stages first. The rows of the effects
+follow behind (`plant.effects`).
 """
 
 from __future__ import annotations
 
 from plant.linkage import N_GEOMETRY
+from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
     "ACCELERATION",
@@ -36,6 +38,7 @@ __all__ = [
     "VALVE_A12",
     "VALVE_A21",
     "VALVE_A22",
+    "VANE_COUNT",
 ]
 
 # ---- parameters: named rows first, they are what an engineer can recalibrate
@@ -52,12 +55,8 @@ NAMES = (
     "supply.pressure",
     "sensors.lvdt_lag",
     "sensors.pot_lag",
-    "linkage.vigv_play",
-    "linkage.vgv1_play",
-    "linkage.vgv2_play",
-    "sensors.vigv_bias",
-    "sensors.vgv1_bias",
-    "sensors.vgv2_bias",
+    *(f"linkage.{v}_play" for v in VANES),
+    *(f"sensors.{v}_bias" for v in VANES),
 )
 (
     LAG,
@@ -72,17 +71,14 @@ NAMES = (
     P_REF,
     LVDT_LAG,
     POT_LAG,
-    PLAY,  # three rows: total width at the ring, rad
-    _,
-    _,
-    POT_BIAS,  # three rows, rad
-    _,
-    _,
-) = range(len(NAMES))
+    PLAY,  # a row a stage: total width at the ring, rad
+) = range(len(NAMES) - 2 * MOST + 1)
+POT_BIAS = PLAY + MOST  # a row a stage, rad
 GEOMETRY = len(NAMES)  # N_GEOMETRY rows, see plant.linkage
+VANE_COUNT = GEOMETRY + N_GEOMETRY  # -, stages that the machine has; rows of stages that it lacks are not used
 # rows worked out from the others by `plant.parameters.derive`
 (LVDT_STEP, VALVE_A11, VALVE_A12, VALVE_A21, VALVE_A22, LVDT_FACTOR, POT_FACTOR, N_NOMINAL) = range(
-    GEOMETRY + N_GEOMETRY, GEOMETRY + N_GEOMETRY + 8
+    VANE_COUNT + 1, VANE_COUNT + 9
 )
 
 # ---- state
@@ -93,12 +89,8 @@ NOMINAL_STATE = (
     "speed",  # m/s
     "x",  # m, stroke
     "x_lvdt",  # m, LVDT after its lag
-    "ring_vigv",  # rad, ring angle behind its play
-    "ring_vgv1",
-    "ring_vgv2",
-    "pot_vigv",  # rad, vane angle after the potentiometer's lag
-    "pot_vgv1",
-    "pot_vgv2",
+    *(f"ring_{v}" for v in VANES),  # rad, ring angle behind its play
+    *(f"pot_{v}" for v in VANES),  # rad, vane angle after the potentiometer's lag
 )
 
 # ---- electromechanical actuator: its rows stand behind all others (`plant.effects`)

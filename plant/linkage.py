@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
     "G_AX",
@@ -50,7 +51,6 @@ __all__ = [
     "N_CRANK",
     "N_GEOMETRY",
     "N_PER_STAGE",
-    "STAGES",
     "STROKE_HIGH",
     "STROKE_LOW",
     "assembly_range",
@@ -68,7 +68,6 @@ __all__ = [
     "paper_vane",
     "ring_angle",
     "ring_angle_of_vane",
-    "ring_angles",
     "ring_tangent",
     "stage_ring_angle",
     "stage_vane_angle",
@@ -78,13 +77,11 @@ __all__ = [
     "vane_slope",
 ]
 
-STAGES = ("vigv", "vgv1", "vgv2")  # order of the stages in every array
-
 STROKE_LOW = -2e-3  # m; the linkage is used a little beyond the stops (0 and 48 mm): play and end-stop effects
 STROKE_HIGH = 50e-3  # m
 
-# Flat geometry: float64[N_GEOMETRY], SI. Four numbers of the crank, then N_PER_STAGE for each stage at N_CRANK + k *
-# N_PER_STAGE.
+# Flat geometry: float64[N_CRANK + n N_PER_STAGE], SI. Four numbers of the crank, then N_PER_STAGE for each of the n
+# stages at N_CRANK + k N_PER_STAGE.
 G_LX0, G_X1, G_Y1, G_LE = 0, 1, 2, 3
 N_CRANK = 4
 G_LB = 0  # lower arm
@@ -96,7 +93,7 @@ G_AX = 5  # real part of A
 G_AY = 6  # imaginary part of A
 G_HYSTERESIS = 7  # rad at the vane, total width
 N_PER_STAGE = 8
-N_GEOMETRY = N_CRANK + 3 * N_PER_STAGE
+N_GEOMETRY = N_CRANK + MOST * N_PER_STAGE  # room in the plant's parameters
 
 
 # --- runtime form -----------------------------------------------------------------------------------------------------
@@ -223,19 +220,6 @@ def stage_ring_angle(stroke: float, g: np.ndarray, k: int) -> float:
 
 
 @compiled
-def ring_angles(stroke: float, g: np.ndarray) -> tuple[float, float, float]:
-    """Ring rotations th5 of the three stages, rad: the crank is solved once for all of them."""
-    c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
-    o = N_CRANK
-    a = ring_angle(c, s, g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD])
-    o = N_CRANK + N_PER_STAGE
-    b = ring_angle(c, s, g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD])
-    o = N_CRANK + 2 * N_PER_STAGE
-    d = ring_angle(c, s, g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD])
-    return a, b, d
-
-
-@compiled
 def stage_vane_angle(stroke: float, g: np.ndarray, k: int) -> float:
     """Vane angle thl of stage k, rad, from stroke in m: no play."""
     o = N_CRANK + k * N_PER_STAGE
@@ -275,15 +259,13 @@ def vane_slope(stroke: float, g: np.ndarray, k: int) -> float:
 
 @compiled
 def vane_angle_table(stroke: np.ndarray, g: np.ndarray, out: np.ndarray) -> None:
-    """Fill out (n, 3) with the vane angles, rad, of the strokes (n), m."""
+    """Fill out (n, stages) with the vane angles, rad, of the strokes (n), m."""
     for i in range(stroke.shape[0]):
-        a, b, d = ring_angles(stroke[i], g)
-        o = N_CRANK
-        out[i, 0] = vane_angle(a, g[o + G_LDP], g[o + G_L])
-        o += N_PER_STAGE
-        out[i, 1] = vane_angle(b, g[o + G_LDP], g[o + G_L])
-        o += N_PER_STAGE
-        out[i, 2] = vane_angle(d, g[o + G_LDP], g[o + G_L])
+        c, s = crank(stroke[i], g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
+        for k in range(out.shape[1]):
+            o = N_CRANK + k * N_PER_STAGE
+            ring = ring_angle(c, s, g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD])
+            out[i, k] = vane_angle(ring, g[o + G_LDP], g[o + G_L])
 
 
 # --- documentary form: equations (6) to (16) as printed ---------------------------------------------------------------
@@ -441,7 +423,7 @@ def check_assembly(
     Raises InputError naming stage, stroke, the quantity, its value and what is allowed there. Strokes are tried every
     ``step``.
     """
-    for k, stage in enumerate(STAGES):
+    for k, stage in enumerate(VANES[: (len(g) - N_CRANK) // N_PER_STAGE]):
         for stroke in np.linspace(low, high, max(2, int(round((high - low) / step)) + 1)):
             code, value, least, most = _fault(float(stroke), g, k)
             if code != _OK:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plant import chain, electromechanical, places
-from plant.effect import KINDS, T_REF
-from plant.effects import aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain, states_of
+from plant.effect import KINDS, T_REF, Parameter
+from plant.effects import EFFECTS, ROW, aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import (
     G_L,
@@ -27,6 +27,7 @@ from plant.linkage import (
     vane_angle,
 )
 from plant.parameters import GEOMETRY, PLAY, POT_BIAS, AnyPlantTable, Supply, derive, load_plant
+from vaneloop.base.vanes import own_rows, same_stages
 
 if TYPE_CHECKING:
     from plant.model import Model
@@ -40,7 +41,7 @@ class Plant:
 
     table, geometry, schedules  the tables it came from
     p      float64[N_PARAMETERS, 1], SI, derived rows included
-    sigma  float64[5]: rms noise of LVDT (m), three potentiometers (rad), speed (%)
+    sigma  float64[2 + stages]: rms noise of LVDT (m), each potentiometer (rad), speed (%)
     """
 
     table: AnyPlantTable
@@ -54,17 +55,38 @@ class Plant:
         """Kind of its actuator, one of `plant.effect.KINDS`."""
         return self.table.actuator.kind
 
-    @cached_property
-    def rows(self) -> np.ndarray:
-        """Rows of the state that this machine has, in their order: what its fingerprint covers."""
-        return np.array(states_of(self.kind))
-
     @property
     def usual(self) -> dict[str, float]:
         """Value of a channel that a log may lack, in border units: of what feeds the actuator."""
         supply = self.table.supply
         pressure = supply.pressure.value if isinstance(supply, Supply) else 0.0  # a motor needs no oil
         return {"p_s": pressure, "t_oil": supply.temperature.value}
+
+    @property
+    def vanes(self) -> tuple[str, ...]:
+        """The machine's stages, in order."""
+        return self.geometry.vanes
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """int64: rows of the state s that the machine has, which its fingerprint covers; the others are of stages that
+        it lacks, and of another kind of actuator.
+        """
+        own = set(own_rows(chain.STATE, self.vanes))
+        rows = np.array([row for row in states_of(self.kind) if row in own])
+        rows.setflags(write=False)
+        return rows
+
+    def parameters_of(self, effect: str) -> dict[int, Parameter]:
+        """Parameters of an effect, by their rows of p, that this machine has: none of stages it lacks, and no less play
+        than all of a stage's.
+        """
+        own = {}
+        for row, q in enumerate(EFFECTS[effect].parameters, ROW[effect]):
+            if q.vane in ("", *self.vanes):
+                nominal = getattr(self.geometry.stage(q.vane), q.beyond).value if q.beyond else np.inf
+                own[row] = replace(q, low=max(q.low, -nominal))
+        return own
 
     def start(self, stroke: float, n_r: float, t_oil: float = T_REF) -> np.ndarray:
         """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of
@@ -99,7 +121,7 @@ class Plant:
     def _rings(self, stroke: float, n_r: float, t_oil: float) -> list[float]:
         g = self.p[GEOMETRY:, 0]
         c, d = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
-        return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(3)]
+        return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(len(self.vanes))]
 
     def _reading(self, ring: float, k: int) -> float:
         vane = pot_gain.step(vane_angle(ring, *self.lever(k)), self.p[places.POT_GAIN + k, 0])
@@ -124,6 +146,10 @@ def build_plant(
     derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
     deg = np.pi / 180.0
     sensors = table.sensors
-    sigma = np.array([sensors.lvdt_noise.value * 1e-3, *[sensors.pot_noise.value * deg] * 3, sensors.speed_noise.value])
-    plant = Plant(table, geo, load_schedules(schedules), p, sigma)
+    sigma = np.array(
+        [sensors.lvdt_noise.value * 1e-3, *[sensors.pot_noise.value * deg] * len(geo.vanes), sensors.speed_noise.value]
+    )
+    targets = load_schedules(schedules)
+    same_stages(**{str(geometry): geo.vanes, str(schedules): targets.vanes})
+    plant = Plant(table, geo, targets, p, sigma)
     return model.plant(plant) if model is not None else plant

@@ -27,14 +27,14 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from plant import chain
-from plant.effects import EFFECTS, ROW
+from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import PLAY
-from plant.linkage import STAGES
 from plant.machine import Plant, build_plant
 from plant.parameters import derive, nominal
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Finite, Table, read
+from vaneloop.base.vanes import MOST, vane_in
 
 __all__ = ["Model", "load_model", "write_model"]
 
@@ -75,7 +75,7 @@ class Model(Table):
         for name, value in self.parameters.items():
             if name not in known:
                 raise InputError(
-                    f"{source}: parameters: {name!r} is unknown{_meant(name, known)}; allowed: {', '.join(known)}"
+                    f"{source}: parameters: {name!r} is {_not(name, plant, known)}; allowed: {', '.join(known)}"
                 )
             n, bound = known[name], _bound(plant, name)
             low, high = bound.low, bound.high
@@ -92,14 +92,14 @@ class Model(Table):
                 raise InputError(
                     f"{source}: effects: {effect!r} is of an actuator of kind {kinds}; this machine's is {plant.kind}"
                 )
-            allowed = [p.name for p in EFFECTS[effect].parameters]
+            allowed = {p.name: p for p in plant.parameters_of(effect).values()}
             for key, value in values.items():
                 if key not in allowed:
                     raise InputError(
-                        f"{source}: effects.{effect}: {key!r} is unknown{_meant(key, allowed)}; allowed: "
+                        f"{source}: effects.{effect}: {key!r} is {_not(key, plant, allowed)}; allowed: "
                         f"{', '.join(allowed)}"
                     )
-                p = EFFECTS[effect][key]
+                p = allowed[key]
                 _within(value, p.low, p.high, p.unit, f"{source}: effects.{effect}.{key}")
 
     def plant(self, base: Plant | None = None) -> Plant:
@@ -114,12 +114,12 @@ class Model(Table):
         for name, value in self.parameters.items():
             row = known[name].row
             p[row] = value * known[name].si
-            if PLAY <= row < PLAY + len(STAGES):  # declared at the vane, used at the ring
+            if PLAY <= row < PLAY + MOST:  # declared at the vane, used at the ring
                 ldp, lever = machine.lever(row - PLAY)
                 p[row] *= lever / ldp
         for effect, values in self.effects.items():
-            for i, parameter in enumerate(EFFECTS[effect].parameters):
-                p[ROW[effect] + i] = values.get(parameter.name, parameter.neutral) * parameter.si
+            for row, parameter in machine.parameters_of(effect).items():
+                p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
         derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
         return replace(machine, p=p)
 
@@ -161,6 +161,14 @@ def _key(name: str) -> str:
         if name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
         else json.dumps(name, ensure_ascii=False)
     )
+
+
+def _not(name: str, plant: Plant, known: Iterable[str]) -> str:
+    """Why a name cannot be: of a stage that the machine lacks, or unknown."""
+    vane = vane_in(name)
+    if vane is not None and vane not in plant.vanes:
+        return f"of a stage that this machine lacks ({vane})"
+    return f"unknown{_meant(name, known)}"
 
 
 def _meant(name: str, known: Iterable[str]) -> str:

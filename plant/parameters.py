@@ -38,13 +38,15 @@ from plant.layout import (
     VALVE_A12,
     VALVE_A21,
     VALVE_A22,
+    VANE_COUNT,
 )
-from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_GEOMETRY, N_PER_STAGE, STAGES
+from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_PER_STAGE
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, load_toml, read
+from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = [
     "ACCELERATION",
@@ -96,6 +98,7 @@ __all__ = [
     "VALVE_A21",
     "VALVE_A22",
     "VALVE_SHARE",
+    "VANE_COUNT",
     "VANE_EFFECTS",
     "VOLTAGE",
     "AnyPlantTable",
@@ -116,7 +119,7 @@ DRIVE_LOADED = DERIVED + 1  # 0 where neither a load nor the oil's pressure chan
 VANE_EFFECTS = DERIVED + 2  # as the first, from linkage to potentiometers
 VALVE_SHARE = DERIVED + 3  # valve_lag and lvdt_lag: share of the way in one plant step
 LVDT_SHARE = DERIVED + 4
-POT_SHARE = DERIVED + 5  # three rows: the potentiometers' share in one tick, pot_lag included
+POT_SHARE = DERIVED + 5  # a row a stage: the potentiometers' share in one tick, pot_lag included
 
 # rows of an electromechanical actuator
 KIND = MOTOR  # number in `KINDS`
@@ -298,9 +301,11 @@ class Nominal:
     row: int
 
 
-def names_of(kind: str) -> dict[str, int]:
-    """Return the row of p of each named parameter that a machine with an actuator of this ``kind`` has."""
-    rows = {name: row for row, name in enumerate(NAMES)}
+def names_of(kind: str, vanes: tuple[str, ...]) -> dict[str, int]:
+    """Return the row of p of each named parameter that a machine with an actuator of this ``kind`` and these stages
+    has.
+    """
+    rows = {NAMES[row]: row for row in own_rows(NAMES, vanes)}
     if kind == "hydraulic":
         return rows
     hydraulic = ("valve.", "supply.", "actuator.flow_gain", "actuator.area")
@@ -309,16 +314,16 @@ def names_of(kind: str) -> dict[str, int]:
 
 
 def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
-    """Return every named parameter: those of `names_of` in their order, then each stage's link ``lc`` and lever arm
-    ``l``.
+    """Return every named parameter of the machine: those of `names_of` in their order, then each stage's link ``lc``
+    and lever arm ``l``.
 
     These two stand for all lengths of the linkage, and so does their tolerance (`plant.geometry.length_tolerances`).
     """
     out = []
-    for name, row in names_of(table.actuator.kind).items():
+    for name, row in names_of(table.actuator.kind, geometry.vanes).items():
         section, key = name.split(".")
         if section == "linkage":
-            q = getattr(geometry, key.removesuffix("_play")).hysteresis
+            q = geometry.stage(key.removesuffix("_play")).hysteresis
         elif key.endswith("_bias"):
             q = table.sensors.pot_bias
         else:
@@ -326,8 +331,8 @@ def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
         out.append(Nominal(name, q.value, q.tolerance, q.unit, _SI.get(q.unit, 1.0), row))
     for name, tolerance in length_tolerances(geometry).items():
         stage, key = name.split("_", 1)
-        q = getattr(getattr(geometry, stage), key)
-        row = GEOMETRY + N_CRANK + STAGES.index(stage) * N_PER_STAGE + {"lc": G_LC, "l": G_L}[key]
+        q = getattr(geometry.stage(stage), key)
+        row = GEOMETRY + N_CRANK + VANES.index(stage) * N_PER_STAGE + {"lc": G_LC, "l": G_L}[key]
         out.append(Nominal(f"linkage.{name}", q.value, tolerance, q.unit, _SI[q.unit], row))
     return out
 
@@ -350,7 +355,7 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
         p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
         p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)
         p[LVDT_SHARE, j] = lag_factor(p[ROW["lvdt_lag"], j], dt)
-        for k in range(3):
+        for k in range(int(p[VANE_COUNT, j])):
             p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[ROW["pot_lag"] + k, j]), tick)
         if p[KIND, j] != 0.0:
             h = dt / motor_steps(dt)
@@ -380,10 +385,11 @@ def load_plant(
     p = np.zeros((N_PARAMETERS, 1))
     p[KIND, 0] = KINDS.index(table.actuator.kind)
     g = geo.arrays()
-    p[GEOMETRY : GEOMETRY + N_GEOMETRY, 0] = g
+    p[GEOMETRY : GEOMETRY + len(g), 0] = g
+    p[VANE_COUNT] = len(geo.vanes)
     for n in nominal(table, geo):
         p[n.row, 0] = n.value * n.si
-    for k in range(len(STAGES)):
+    for k in range(len(geo.vanes)):
         o = N_CRANK + k * N_PER_STAGE
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
     p[N_NOMINAL:DERIVED, 0] = NEUTRAL

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from plant.effects import MOTOR_AT, ROW, STATE_ROW
 from plant.layout import MOTOR_STATE, NOMINAL_STATE
+from vaneloop.base.vanes import MOST
 
-(N_R, SPOOL, SPOOL_RATE, SPEED, X, X_LVDT, RING, _, _, POT, _, _) = range(len(NOMINAL_STATE))
+(N_R, SPOOL, SPOOL_RATE, SPEED, X, X_LVDT, RING) = range(len(NOMINAL_STATE) - 2 * MOST + 1)
+POT = RING + MOST
 
 # ---- the effects' first rows in p, in the order of the signal flow
 CAN_DELAY = ROW["can_delay"]
@@ -45,14 +47,14 @@ LVDT_NONLINEARITY = ROW["lvdt_nonlinearity"]  # amplitude, cubic
 LVDT_GAIN = ROW["lvdt_gain"]
 LVDT_THERMAL_DRIFT = ROW["lvdt_thermal_drift"]
 LVDT_BIAS = ROW["lvdt_bias"]
-CRANK_LENGTH_ERROR = ROW["crank_length_error"]  # here and below: one row a vane stage
+CRANK_LENGTH_ERROR = ROW["crank_length_error"]  # here and below: MOST rows, one a vane stage
 LINK_LENGTH_ERROR = ROW["link_length_error"]
-RING_ECCENTRICITY = ROW["ring_eccentricity"]  # three amplitudes, phase
+RING_ECCENTRICITY = ROW["ring_eccentricity"]  # amplitudes, then one phase
 THERMAL_GROWTH = ROW["thermal_growth"]
 LINKAGE_COMPLIANCE = ROW["linkage_compliance"]  # one row for all
 LINKAGE_BACKLASH = ROW["linkage_backlash"]
 LINKAGE_WEAR = ROW["linkage_wear"]
-LINKAGE_FRICTION = ROW["linkage_friction"]  # three widths, distance
+LINKAGE_FRICTION = ROW["linkage_friction"]  # widths, then one distance
 POT_GAIN = ROW["pot_gain"]
 POT_LAG_ERROR = ROW["pot_lag"]  # used through POT_SHARE
 POT_BIAS_ERROR = ROW["pot_bias"]
@@ -63,8 +65,8 @@ LAGGED = STATE_ROW["valve_lag"]  # A, behind the valve's lag
 FRICTION = STATE_ROW["piston_friction"]  # N: force, off centre
 GIVE = STATE_ROW["oil_compressibility"]  # m
 READING = STATE_ROW["lvdt_lag"]  # m, stroke behind both lags of the LVDT
-BRISTLE = STATE_ROW["linkage_friction"]  # three of -1..1
-DRIVEN = BRISTLE + 3  # rad, three rings at the last tick, as friction saw them
+BRISTLE = STATE_ROW["linkage_friction"]  # -1..1, of each stage
+DRIVEN = BRISTLE + MOST  # rad, each ring at the last tick, as friction saw it
 DEMANDED = STATE_ROW["amplifier_lag"]  # A, command behind the amplifier's lag
 AHEAD = STATE_ROW["gear_backlash"]  # m, motor ahead of the rod
 I_MOTOR, SPEED_INTEGRAL, MOTOR_SPEED, BENT = range(MOTOR_AT, MOTOR_AT + len(MOTOR_STATE))

@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from plant.geometry import DEG, MM, Geometry
-from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, STAGES, crank, stage_ring_angle
+from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, stage_ring_angle
 from vaneloop.base.errors import InputError
 
 __all__ = [
@@ -56,7 +56,7 @@ def plane_joints(geometry: Geometry, stage: str, stroke: float) -> dict[str, com
 
     The angle between the crank's arms is theta6 less the inclination of the line from J2 to J5 (docs/linkage.md).
     """
-    k = STAGES.index(stage)
+    k = geometry.vanes.index(stage)
     g, s = geometry.arrays(), geometry.stages()[k]
     dx, dy = s.dx.value * MM, s.dy.value * MM
     between = s.theta6.value * DEG - math.atan2(dx, -dy)
@@ -115,7 +115,7 @@ class _Loop:
 
     @classmethod
     def of(cls, geometry: Geometry, stage: str, offset: float) -> _Loop:
-        s, c = geometry.stages()[STAGES.index(stage)], geometry.crank
+        s, c = geometry.stages()[geometry.vanes.index(stage)], geometry.crank
         dx, dy = s.dx.value * MM, s.dy.value * MM
         turn = cmath.exp(-1j * (s.theta6.value * DEG - math.atan2(dx, -dy)))
         j2 = complex(c.x1.value, c.y1.value) * MM
@@ -296,7 +296,7 @@ def clearance_width(
     """Width of the loop, deg, mean over the stroke: the ring's, times Ld'/L, as `hysteresis` in geometry.toml
     means it.
     """
-    s = geometry.stages()[STAGES.index(stage)]
+    s = geometry.stages()[geometry.vanes.index(stage)]
     ratio = s.l.value / s.ld_prime.value
     loop = clearance_loop(geometry, stage, np.linspace(0.0, 48.0, 13), clearances, vane, offset)
     at_ring = [np.arctan(ratio * np.sin(a * DEG)) for a in loop]

@@ -15,6 +15,7 @@ import math
 import os
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -221,7 +222,7 @@ def linkage_run(
     ``s`` is moved on.
 
     x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading
-             moves all three stages
+             moves all stages
     n_r, t_oil, t   %, degC, s from the start of the log
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
@@ -237,7 +238,7 @@ def linkage_run(
     order = np.argsort(alone, kind="stable")
     wide = _in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     if wide:
-        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _LINKAGE))
+        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _linkage(out.shape[1])))
     if wide < p.shape[1]:
         _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
 
@@ -647,15 +648,15 @@ def _linkage_lanes(
     lanes: np.ndarray,
 ) -> None:
     """These ``lanes``, one after the other."""
-    g = GEOMETRY
-    before = np.empty(3)
+    g, stages = GEOMETRY, out.shape[1]
+    before = np.empty(stages)
     for j in lanes:
         late = max(p[LVDT_LAG, j], 0.0) + p[LVDT_LAG_ERROR, j]
         for m in range(len(x_lvdt)):
             x = true_stroke(x_lvdt[m] + late * speed[m], p, j, t_oil[m])
             s[X, j] = x
             c, d = crank(x, p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
-            for k in range(3):
+            for k in range(stages):
                 vane = chain.stem_angle(s, p, j, k, c, d, n_r[m], t_oil[m], t[m])
                 if m > 0:
                     e, b = _ramp_lag(pot_lag.step(p[POT_LAG, j], p[POT_LAG_ERROR + k, j]), dt)
@@ -674,12 +675,15 @@ class _Crank(NamedTuple):
     late: float
 
 
-_LINKAGE = lanes.block(
-    WIDE,
-    _Crank,
-    more=("stroke", "c", "d"),
-    each=(3, (stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever")),
-)
+_OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever"))
+
+
+@lru_cache
+def _linkage(stages: int) -> np.dtype[np.void]:
+    """Block for that many stages: the compiler knows how often its loops over them go."""
+    return lanes.block(WIDE, _Crank, more=("stroke", "c", "d"), each=(stages, *_OF_STAGE))
+
+
 _stem, _put_stem = lanes.getter(stem.Stem, "k"), lanes.putter(stem.Stem, "k")
 _stem_state, _put_stem_state = lanes.getter(stem.StemState, "k"), lanes.putter(stem.StemState, "k")
 
@@ -698,7 +702,7 @@ def _linkage_blocks(
     order: np.ndarray,
     block: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, `WIDE` at a time. ``block``: memory for one record `_LINKAGE`."""
+    """The lanes of ``order``, `WIDE` at a time. ``block``: memory for one record `_linkage`."""
     g = GEOMETRY
     b = block[0]
     for j0 in range(0, len(order), WIDE):
@@ -708,7 +712,7 @@ def _linkage_blocks(
             q = order[j0 + min(j, last - 1)]
             b.lx0[j], b.x1[j], b.y1[j], b.le[j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
             b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
-            for k in range(3):
+            for k in range(b.pot.shape[0]):
                 d = stem.prepare(p, q, k)
                 _put_stem(b, k, j, d)
                 _put_stem_state(b, k, j, stem.taken(s, q, k))
@@ -722,7 +726,7 @@ def _linkage_blocks(
                 b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
             for j in range(WIDE):
                 b.c[j], b.d[j] = _crank(b.stroke[j], b.lx0[j], b.x1[j], b.y1[j], b.le[j])
-            for k in range(3):
+            for k in range(b.pot.shape[0]):
                 for j in range(WIDE):
                     b.theta[k, j] = _ring(b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.lc[k, j], b.ld[k, j])
                 if eccentric:
@@ -754,7 +758,7 @@ def _linkage_blocks(
         for j in range(last):
             q = order[j0 + j]
             s[X, q] = b.stroke[j]
-            for k in range(3):
+            for k in range(b.pot.shape[0]):
                 stem.stored(s, q, k, _stem_state(b, k, j))
                 s[POT + k, q] = b.pot[k, j]
 

@@ -41,6 +41,7 @@ from plant.places import (
 )
 from plant.play import play_step
 from vaneloop.base.compiled import inlined
+from vaneloop.base.vanes import MOST
 
 __all__ = ["Stem", "StemState", "drive", "follow", "prepare", "reading", "stored", "taken"]
 
@@ -100,13 +101,13 @@ def prepare(p: np.ndarray, j: int, k: int) -> Stem:
         p[o + G_L, j],
         ratio,
         p[RING_ECCENTRICITY + k, j],
-        p[RING_ECCENTRICITY + 3, j],
+        p[RING_ECCENTRICITY + MOST, j],
         p[THERMAL_GROWTH + k, j],
         p[LINKAGE_COMPLIANCE, j],
         linkage_backlash.step(p[PLAY + k, j], p[LINKAGE_BACKLASH + k, j], ratio),
         p[LINKAGE_WEAR + k, j],
         p[LINKAGE_FRICTION + k, j],
-        p[LINKAGE_FRICTION + 3, j],
+        p[LINKAGE_FRICTION + MOST, j],
         p[POT_GAIN + k, j],
         pot_bias.step(p[POT_BIAS + k, j], p[POT_BIAS_ERROR + k, j]),
     )

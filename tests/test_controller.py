@@ -36,6 +36,7 @@ from tests.columns import (
     tick,
     trend_step,
 )
+from vaneloop.base.vanes import VANES
 
 CAL = load_calibration()
 SINGLE = load_calibration(strategy="single")
@@ -1069,7 +1070,7 @@ def test_names_and_indices_of_inputs_scalars_states_and_faults_belong_together()
     for i, name in enumerate(fw.STATE):
         stem, _, stage = name.rpartition("_")
         if stage in fw.INPUTS:  # one row a stage
-            assert getattr(fw, stem.upper()) + ("vigv", "vgv1", "vgv2").index(stage) == i
+            assert getattr(fw, stem.upper()) + VANES.index(stage) == i
         else:
             assert getattr(fw, "FAULT_BITS" if name == "faults" else name.upper()) == i
     assert [fw.STATE[fw.T_STALE + bit] for bit in range(fw.N_FAULTS)] == [  # timers in the order of the bits

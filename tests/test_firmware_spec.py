@@ -13,7 +13,7 @@ import random
 import numpy as np
 import pytest
 
-from controller import FAULTS, MODES
+from controller import FAULTS, MODES, new_inputs
 from tests import columns as fw
 from tests.columns import load_calibration, new_state, tick
 from tests.reference_controller import Reference, clip, numbers
@@ -58,7 +58,7 @@ class Machine:
         for i, r in enumerate(inputs):
             x = r[5] + (self.x if r[6] else 0.0)
             row[[fw.IN_N_DEM, fw.IN_N_R, fw.IN_FRESH, fw.IN_REJECTED, fw.IN_MODE_REQUEST]] = r[:5]
-            row[fw.IN_X_LVDT], row[fw.IN_VIGV :] = x, r[8:]
+            row[fw.IN_X_LVDT], row[fw.IN_VIGV : fw.IN_VIGV + 3], row[fw.IN_PAUSE] = x, r[8:11], r[11]
             tick(row, self.z, self.cal)
             out[i] = self.z
             if self.beside is not None:
@@ -186,7 +186,8 @@ def test_bad_days_are_those_of_the_page(seed):
 def held(machine: Machine, n: int, x: float | np.ndarray, current: float) -> np.ndarray:
     """``n`` ticks with the LVDT at ``x`` and, before each, ``current`` as the last current commanded."""
     out = np.empty((n, fw.N_STATE))
-    row = np.array([80.0, 80.0, 0.0, 0.0, 1.0, 0.0, np.nan, np.nan, np.nan, 0.0])
+    row = new_inputs()
+    row[[fw.IN_N_DEM, fw.IN_N_R]] = 80.0
     for i in range(n):
         machine.z[fw.I_CMD] = current
         row[fw.IN_FRESH] = i % 10 == 0

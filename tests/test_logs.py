@@ -28,6 +28,7 @@ from hil.logs.signals import cut_signal, e2e_crc, encode, select
 from hil.logs.trc import read_trc
 from vaneloop.base import tables
 from vaneloop.base.signals import UNITS
+from vaneloop.base.vanes import VANES
 
 DBC = tables.path("vgv.dbc")
 DATA = Path(os.environ.get("VANELOOP_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -35,7 +36,7 @@ TABLES = (".csv", ".parquet")
 BUSES = (".log", ".asc", ".blf", ".trc")
 RESOLUTION = {
     "n_dem": 0.002, "n_r": 0.002, "x_dem": 0.001, "x_lvdt": 0.001, "i_cmd": 0.002, "p_s": 0.001, "t_oil": 0.01,
-    "vigv": 0.002, "vgv1": 0.002, "vgv2": 0.002, "state": 1.0,
+    **dict.fromkeys(VANES, 0.002), "state": 1.0,
 }  # fmt: skip
 # id, name, period ms, DataID of the frames that DESIGN section 7 fixes
 FRAMES = {
@@ -43,6 +44,7 @@ FRAMES = {
     0x0B0: ("VGV_STATUS", 10, ("x_dem", "x_lvdt", "state")),
     0x0B1: ("VGV_SERVO", 10, ("i_cmd",)), 0x0B2: ("VGV_ANGLES", 10, ("vigv", "vgv1", "vgv2")),
     0x0B3: ("VGV_HEALTH", 100, ("p_s", "t_oil")),
+    0x0B4: ("VGV_ANGLES_2", 10, ("vgv3", "vgv4", "vgv5")), 0x0B5: ("VGV_ANGLES_3", 10, ("vgv6", "vgv7")),
 }  # fmt: skip
 FAULTS = (
     "fault_demand_stale", "fault_demand_rejected", "fault_lvdt_range", "fault_lvdt_rate", "fault_lvdt_stuck",
@@ -105,14 +107,14 @@ def db() -> Any:
     return cantools.database.load_file(DBC, strict=True)
 
 
-def test_dbc_has_the_five_frames_at_their_identifiers_and_periods(db: Any) -> None:
+def test_dbc_has_the_seven_frames_at_their_identifiers_and_periods(db: Any) -> None:
     assert {m.frame_id for m in db.messages} == set(FRAMES)
     for m in db.messages:
         name, period, signals = FRAMES[m.frame_id]
         assert (m.name, m.cycle_time, m.length, m.is_extended_frame) == (name, period, 8, False)
         assert set(signals) <= {s.name for s in m.signals}
         assert m.comment and all(s.comment for s in m.signals)
-    assert len({m.dbc.attributes["DataID"].value for m in db.messages}) == 5
+    assert len({m.dbc.attributes["DataID"].value for m in db.messages}) == len(FRAMES)
 
 
 def test_dbc_signals_do_not_overlap_and_leave_the_protection_its_place(db: Any) -> None:
@@ -348,7 +350,7 @@ def test_what_we_write_python_can_and_asammdf_read(tmp_path: Path) -> None:
     sent = run(100)
     for suffix in (*BUSES, ".mf4"):
         write_log(tmp_path / f"a{suffix}", sent, dbc=DBC)
-        assert sum(1 for _ in can.LogReader(tmp_path / f"a{suffix}")) == 4 * 100 + 10
+        assert sum(1 for _ in can.LogReader(tmp_path / f"a{suffix}")) == 6 * 100 + 10
     with asammdf.MDF(tmp_path / "a.mf4") as raw:
         signals = raw.extract_bus_logging({"CAN": [(str(DBC), 0)]})
         np.testing.assert_allclose(signals.get("x_lvdt").samples, sent["x_lvdt"].values, atol=0.0005001)

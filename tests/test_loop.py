@@ -14,7 +14,7 @@ from hil.bus.lockstep_bus import run_lockstep
 from hil.inject import Machine, Scenario
 from hil.inject import injection as inject
 from hil.logs import Channel, Log
-from hil.loop.lockstep import COLUMNS, Stimulus, advance, lockstep
+from hil.loop.lockstep import Stimulus, advance, columns_of, lockstep
 from hil.loop.node import Ecu, Node
 from hil.loop.node import replay as repeat
 from hil.loop.tick import arrive, new_loop
@@ -22,6 +22,7 @@ from hil.replay import replay
 from plant import Model, Plant, build_plant
 from plant.effect import MOTOR
 from plant.effects import EFFECTS
+from vaneloop.base.vanes import VANES
 
 # a gross size of each effect, in declared units
 GROSS: dict[str, dict[str, float]] = {
@@ -181,7 +182,7 @@ def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name
     ticks = 10 * len(demand)
     noise = np.random.Generator(np.random.PCG64(4)).standard_normal((ticks, 5))
     loop = new_loop(plant, load_calibration(), n_engine=demand[0], n_r=demand[0], t_oil=T_OIL, noisy=True)
-    advance(0, ticks, stimulus.rows, noise, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
+    advance(0, ticks, stimulus.rows, noise, loop, 10, np.empty((0, len(columns_of(VANES[:3])))), np.empty((0, 0)))
     node = Node(plant, n_r=demand[0], t_oil=T_OIL, seed=4)
     at = np.arange(0, ticks, 10)
     rows = np.array(

@@ -82,7 +82,7 @@ def test_extend_writes_no_model_that_is_no_better(after, written, monkeypatch, t
         steps=[("nominal", 151.0), ("+ internal_leakage", after)],
         excess=after,
     )
-    chain = Chain(stage.t, [stage], {}, {}, None, None)  # type: ignore[arg-type]
+    chain = Chain(stage.t, [stage], {}, {}, None, None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(extend, "chain_of", lambda args, model: chain)
     monkeypatch.setattr(verbs, "extend_stage", lambda stage, effects: ended)
     parser = argparse.ArgumentParser()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hil.bus import frames
-from hil.bus.frames import ECU_DEMAND, ERROR, PAUSE, VGV_ANGLES, VGV_HEALTH, VGV_SERVO, VGV_STATUS
+from hil.bus.frames import ECU_DEMAND, ERROR, PAUSE, VGV_ANGLES, VGV_ANGLES_3, VGV_HEALTH, VGV_SERVO, VGV_STATUS
 from hil.loop.node import Ecu, Node, replay
 from plant import places
 
@@ -275,7 +275,7 @@ def test_the_ecu_keeps_the_last_good_values_of_each_frame() -> None:
         ecu.tick(rows(*[(int(frames.word0(i)), int(given[i](*v, counter))) for i, v in values.items()]))
     assert list(ecu.values.values()) == pytest.approx([float(i) for i in range(1, 13)])
     data = int(frames.encode_status(9.0, 9.0, 4, 2))
-    for ident in (VGV_STATUS - 1, VGV_HEALTH + 1):
+    for ident in (VGV_STATUS - 1, VGV_ANGLES_3 + 1):
         ecu.tick(rows((int(frames.word0(ident)), data)))
     ecu.tick(rows((int(frames.word0(VGV_STATUS)), data ^ 1 << 20)))
     assert list(ecu.values.values()) == pytest.approx([float(i) for i in range(1, 13)])
@@ -304,11 +304,12 @@ def test_the_controller_gets_of_each_potentiometer_what_is_left_of_it() -> None:
     vgv = started()
     at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.tick(NONE)
-    assert np.allclose(vgv.loop.fed.pots, at, atol=1e-12)  # all of it, at first
+    assert np.allclose(vgv.loop.fed.pots[:3], at, atol=1e-12)  # all of it, at first
+    assert np.isnan(vgv.loop.fed.pots[3:]).all()  # stages that the machine lacks
     at = vgv.loop.s[places.POT : places.POT + 3, 0].copy()
     vgv.loop.pots[0] = 0.5, 0.1, 1.0, 0.0, 0.0, np.nan
     vgv.tick(NONE)
-    assert np.allclose(vgv.loop.fed.pots, [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
+    assert np.allclose(vgv.loop.fed.pots[:3], [0.5 * at[0] + 0.1, at[1], np.nan], atol=1e-12, equal_nan=True)
 
 
 def test_a_frame_with_counter_0_is_heard_like_any_other() -> None:

@@ -15,11 +15,12 @@ from controller import load_calibration
 from hil.engine_test import engine_test, load_profile
 from hil.logs import Channel, Log, LogError, write_log
 from plant import Geometry, build_plant, load_geometry, load_schedules
-from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, STAGES, stage_ring_angle, vane_angle
+from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, stage_ring_angle, vane_angle
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, Manoeuvre, simulate
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
+from vaneloop.base.vanes import VANES
 from vaneloop.cli.main import main
 from vaneloop.design.links import LinkChange, ScheduleOptions, geometry_with
 from vaneloop.design.measured_loop import MeasuredLoop, measure_loop
@@ -27,6 +28,7 @@ from vaneloop.design.schedule_files import write_tables
 from vaneloop.design.scheduling import schedule
 from vaneloop.design.stroke_tables import table_speeds
 
+STAGES = VANES[:3]
 GEOMETRY = load_geometry()
 SCHEDULES = load_schedules()
 OTHER = geometry_with(  # another engine: lengths and play beyond what the geometry table says

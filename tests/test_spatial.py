@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from plant import load_geometry
 from plant.geometry import vane_angles
-from plant.linkage import STAGES, clevis_axial, stage_ring_angle
+from plant.linkage import clevis_axial, stage_ring_angle
 from plant.spatial import (
     Clearances,
     clearance_for,
@@ -27,11 +27,13 @@ from plant.spatial import (
 )
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
+from vaneloop.base.vanes import VANES
 from vaneloop.cli.main import main
 from vaneloop.design.clearance import FITS, clearance_study
 from vaneloop.design.links import geometry_with
 from vaneloop.design.multibody import multibody_angles
 
+STAGES = VANES[:3]
 GEOMETRY = load_geometry()
 STROKE = np.linspace(0.0, 48.0, 25)
 PINS = Clearances(**FITS)

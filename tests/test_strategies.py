@@ -13,9 +13,10 @@ import pytest
 from controller import load_calibration
 from controller.calibration import STRATEGIES
 from hil.engine_test import load_profile
-from hil.loop.lockstep import Stimulus, lockstep
+from hil.loop.lockstep import Stimulus, lockstep, snapshot_names
 from plant import build_plant
 from tests import columns as fw
+from vaneloop.base.vanes import VANES
 from vaneloop.cli.main import main
 from vaneloop.design import strategies as st
 
@@ -61,7 +62,7 @@ def test_with_everything_wrong_adaptive_is_three_times_better_than_dual(seed: in
     assert mine.travel <= dual.travel
 
 
-def failed(failure: str, during: str, stages: tuple[str, ...] = st.STAGES) -> tuple[st.Failure, st.Outcome]:
+def failed(failure: str, during: str, stages: tuple[str, ...] = VANES[:3]) -> tuple[st.Failure, st.Outcome]:
     row = ROWS["all together"]
     healthy, dual = (outcome(row.name, s) for s in ("adaptive", "dual"))
     return st.failing(failure, during, healthy, dual, row, profile(), CALIBRATIONS["adaptive"], stages=stages)
@@ -194,7 +195,7 @@ def test_a_potentiometer_is_believed_only_after_it_followed_the_linkage() -> Non
         pots=shifted,
         watch=lambda s: kept.append(s.copy()),
     )
-    learned = np.rad2deg(np.vstack(kept)[:, fw.OFFSET])
+    learned = np.rad2deg(np.vstack(kept)[:, snapshot_names(plant).index("offset_vigv")])
     assert np.abs(learned[:40_000]).max() == 0.0
     assert learned[-1] > 0.1
 
@@ -214,7 +215,7 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     assert {f["during"] for f in j["failures"]} == {"in motion"} and "never rests at 99 % or more for 15 s" in out
     assert all(g["held"] for g in j["goals"])
     row = next(r for r in j["rows"] if r["scenario"] == "all together" and r["strategy"] == "dual")
-    assert {"travel_mm", "demand_travel_mm", "reversals", "current_rms_ma", "faults", *st.STAGES} <= set(row)
+    assert {"travel_mm", "demand_travel_mm", "reversals", "current_rms_ma", "faults", *VANES[:3]} <= set(row)
     again = st.run(ROWS["all together"], load_profile(dwells=0.1), CALIBRATIONS["dual"])
     assert row["vigv"]["mean_abs"] == pytest.approx(again.figures["vigv"]["mean_abs"], rel=1e-9)
     text = page.read_text(encoding="utf-8")

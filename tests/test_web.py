@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -318,7 +319,7 @@ def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page
     step(page, "Stroke for the VIGV")
     page.reload()  # a reload in the middle keeps what was done
     page.get_by_role("heading", name="Step 2: Stroke for the VIGV").wait_for()
-    step(page, "Links of VGV1 and VGV2")
+    step(page, "Links of the other stages")
     step(page, "Measured loop")
     step(page, "Tables")
     with page.expect_download() as download:
@@ -880,7 +881,9 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
     from vaneloop.cli.main import main
     from vaneloop.web.guard import Guard
 
-    def serve(sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any) -> None:
+    def serve(
+        sock: Any, folder: Path, token: str, most: int, loopback: bool, ready: Any, tables: str | None = None
+    ) -> None:
         nonlocal guard
         guard = Guard(None, token, 8765, most, loopback=loopback)  # type: ignore[arg-type]
         ready(guard.ticket())
@@ -1000,3 +1003,36 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
     x, drawn = np.frombuffer(body, "<f8", n, at), np.frombuffer(body, "<f8", n, at + 8 * n)
     assert n <= 2 * 1200 + 2 and drawn[x == t[123_456]].tolist() == [9.0]
     assert np.isnan(drawn).any() and np.nanmin(drawn) == np.nanmin(y)
+
+
+def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path) -> None:
+    from vaneloop.web.run import Loop
+    from vaneloop.web.schedule import Plan
+    from vaneloop.web.session import LogFile, Session
+
+    folder = str(ROOT / "examples" / "four_stages")
+    s = Session("x", tmp_path / "0123456789abcdef", [], folder)
+    s.choice.file = LogFile(tmp_path / "run.csv", "run.csv", "run.csv")
+    for real in (False, True):
+        assert s.choice.words(real)[-2:] == ["--tables", folder]
+    assert all(words[-2:] == ["--tables", folder] for _, words in Loop(s).commands())
+    plan = Plan.of(s)
+    assert plan.geometry.vanes == plan.schedules.vanes == ("vigv", "vgv1", "vgv2", "vgv3")
+
+
+def test_the_live_loop_runs_another_machine(tmp_path: Path) -> None:
+    from vaneloop.base.vanes import VANES
+    from vaneloop.web import loop
+
+    told: list[dict[str, Any]] = []
+
+    def progress(share: float | None, content: Any) -> None:
+        if isinstance(content, dict):
+            told.append(content)
+            loop.INBOX.put({"stop": True})
+
+    folder = str(ROOT / "examples" / "four_stages")
+    loop.lockstep(progress, 70.0, 0.0, None, 1, None, folder)
+    rows = np.concatenate([c["rows"] for c in told])
+    known = {v for v in VANES if np.isfinite(rows[-1, loop.COLUMNS.index(v)])}
+    assert known == set(VANES[:4])

@@ -23,12 +23,14 @@ import numpy as np
 
 from hil.logs.signals import crc_table
 from vaneloop.base.compiled import in_place
+from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES", "VGV_HEALTH",
+    "ANGLES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES",
+    "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
     "VGV_SERVO",
     "VGV_STATUS",
     "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes",
@@ -43,9 +45,16 @@ IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
 CLASSIC = LENGTH << 32  # word 0 without its identifier
 
-ECU_DEMAND, VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH = 0x0A0, 0x0B0, 0x0B1, 0x0B2, 0x0B3
-NAMES = {0x0A0: "ECU_DEMAND", 0x0B0: "VGV_STATUS", 0x0B1: "VGV_SERVO", 0x0B2: "VGV_ANGLES", 0x0B3: "VGV_HEALTH"}
-PERIOD = {ECU_DEMAND: 10, VGV_STATUS: 10, VGV_SERVO: 10, VGV_ANGLES: 10, VGV_HEALTH: 100}  # ticks of 1 ms
+NAMES = {
+    0x0A0: "ECU_DEMAND", 0x0B0: "VGV_STATUS", 0x0B1: "VGV_SERVO", 0x0B2: "VGV_ANGLES", 0x0B3: "VGV_HEALTH",
+    0x0B4: "VGV_ANGLES_2", 0x0B5: "VGV_ANGLES_3",
+}  # fmt: skip
+ECU_DEMAND, VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH, VGV_ANGLES_2, VGV_ANGLES_3 = NAMES
+PERIOD = {ident: 100 if ident == VGV_HEALTH else 10 for ident in NAMES}  # ticks of 1 ms
+IN_FRAME = 3  # angles of a frame
+ANGLES = {  # identifier -> the stages whose angles it carries; sent by a machine that has the first of them
+    ident: VANES[IN_FRAME * q : IN_FRAME * (q + 1)] for q, ident in enumerate((VGV_ANGLES, VGV_ANGLES_2, VGV_ANGLES_3))
+}
 DATA_ID = 0x5600  # plus the identifier
 
 _CRC = crc_table().astype(np.int64)
@@ -158,18 +167,26 @@ def decode_servo(data: int) -> tuple[float, int]:
 
 
 @in_place
-def encode_angles(vigv: float, vgv1: float, vgv2: float, counter: int) -> int:
-    """Return word 1 of VGV_ANGLES: degrees."""
-    data = _at(_raw(vigv, 0.002, 0.0, -60.0, 60.0, -32768), 16)
-    data |= _at(_raw(vgv1, 0.002, 0.0, -60.0, 60.0, -32768), 32)
-    data |= _at(_raw(vgv2, 0.002, 0.0, -60.0, 60.0, -32768), 48)
-    return protect(VGV_ANGLES, data, counter)
+def encode_angles(first: float, second: float, third: float, counter: int, ident: int = VGV_ANGLES) -> int:
+    """Return word 1 of VGV_ANGLES, or of VGV_ANGLES_2 or VGV_ANGLES_3: degrees; NaN for a stage that is not there."""
+    if ident == VGV_ANGLES_3:  # two stages; the rest of the frame is no signal's
+        third = 0.0
+    data = _at(_raw(first, 0.002, 0.0, -60.0, 60.0, -32768), 16)
+    data |= _at(_raw(second, 0.002, 0.0, -60.0, 60.0, -32768), 32)
+    data |= _at(_raw(third, 0.002, 0.0, -60.0, 60.0, -32768), 48)
+    return protect(ident, data, counter)
+
+
+@in_place
+def _angle(data: int, at: int) -> float:
+    raw = s16(data, at)
+    return np.nan if raw == -32768 else raw * 0.002
 
 
 @in_place
 def decode_angles(data: int) -> tuple[float, float, float]:
-    """Return vigv, vgv1, vgv2 (deg) of word 1 of VGV_ANGLES."""
-    return s16(data, 16) * 0.002, s16(data, 32) * 0.002, s16(data, 48) * 0.002
+    """Return the three angles (deg) of word 1 of VGV_ANGLES or its like; NaN for one that is not available."""
+    return _angle(data, 16), _angle(data, 32), _angle(data, 48)
 
 
 @in_place
@@ -320,8 +337,8 @@ FRAMES: dict[int, tuple[Any, tuple[str, ...]]] = {
     ECU_DEMAND: (decode_demand, ("n_dem", "n_r", "mode_request")),
     VGV_STATUS: (decode_status, ("x_dem", "x_lvdt", "state")),
     VGV_SERVO: (decode_servo, ("i_cmd", "faults")),
-    VGV_ANGLES: (decode_angles, ("vigv", "vgv1", "vgv2")),
     VGV_HEALTH: (decode_health, ("p_s", "t_oil", "frames_lost", "frames_rejected")),
+    **{ident: (decode_angles, vanes) for ident, vanes in ANGLES.items()},
 }
 
 
@@ -330,7 +347,7 @@ def decode(head: int, data: int) -> dict[str, float]:
     if head & (EXTENDED | REMOTE | ERROR | FD) or (head >> 32) & 0xFF != LENGTH or head & IDENT_MASK not in FRAMES:
         return {}
     decoder, names = FRAMES[head & IDENT_MASK]
-    return dict(zip(names, decoder(data), strict=True))
+    return dict(zip(names, decoder(data), strict=False))  # VGV_ANGLES_3 has two angles
 
 
 def from_bytes(raw: bytes) -> np.ndarray:

@@ -25,11 +25,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller import load_calibration
 from controller.records import DEGRADED, FAIL_SAFE, INIT, RUN, STANDBY, as_outputs
 from hil.bus.frames import (
     ECU_DEMAND,
@@ -48,6 +47,10 @@ from hil.logs.signals import e2e_crc
 from hil.loop.node import MOST_SENT, Node, NodeArrays, node_tick
 from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from plant import Plant
 
 __all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack"]
 
@@ -299,12 +302,18 @@ def make_attack(rng: np.random.Generator, most: int = 10_000) -> tuple[Attack, n
 class Bench:
     """A node that episodes start from, watched."""
 
-    def __init__(self, limits: np.ndarray | None = None, recovery: int = RECOVERY):
-        self.node = Node(n_r=60.0, seed=0)
+    def __init__(
+        self,
+        limits: np.ndarray | None = None,
+        recovery: int = RECOVERY,
+        plant: Plant | None = None,
+        calibration: Calibration | None = None,
+    ):
+        self.node = Node(plant, calibration, n_r=60.0, seed=0)
         self.recovery = recovery
-        k = load_calibration().scalars
+        k = self.node.loop.built.scalars
         self.limits = np.array([k.current_limit, k.stroke_min, k.stroke_max]) if limits is None else limits
-        self.noise = np.random.Generator(np.random.PCG64(0)).standard_normal((NOISE_ROWS, 5))
+        self.noise = np.random.Generator(np.random.PCG64(0)).standard_normal((NOISE_ROWS, len(self.node.loop.sigma)))
         self.transitions, self.ticks_in = np.zeros((5, 5), np.int64), np.zeros(5, np.int64)
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
         self._cold = self._saved()
@@ -370,13 +379,16 @@ def fuzz(
     limits: np.ndarray | None = None,
     recovery: int = RECOVERY,
     progress: Callable[[float], None] | None = None,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
 ) -> Campaign:
     """Run a campaign of ``frames`` frames; it ends at the first failure.
 
     limits    float64[3] current (A), stroke demand (m) from, to; default the calibration's
     recovery  ticks of good frames within which RUN must be back
+    plant, calibration  the machine; default: the shipped tables
     """
-    bench = Bench(limits, recovery)
+    bench = Bench(limits, recovery, plant, calibration)
     out = Campaign(seed)
     started = time.perf_counter()
     while out.frames < frames and out.failure is None:
@@ -399,9 +411,15 @@ def fuzz(
     return out
 
 
-def run_attack(attack: Attack, limits: np.ndarray | None = None, recovery: int = RECOVERY) -> tuple[str, int, float]:
+def run_attack(
+    attack: Attack,
+    limits: np.ndarray | None = None,
+    recovery: int = RECOVERY,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
+) -> tuple[str, int, float]:
     """Run one attack by itself; return what held or did not, the tick, and the seconds that recovery took."""
-    failed, tick, took = Bench(limits, recovery).run(attack)
+    failed, tick, took = Bench(limits, recovery, plant, calibration).run(attack)
     return CLAIMS[failed], tick, took * 1e-3
 
 

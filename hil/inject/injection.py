@@ -58,6 +58,7 @@ from hil.inject.scenario import (
 from hil.inject.tamper import Gateway, Intruder, tick_of
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, judge, outcome_of
 from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
     from controller import Calibration
@@ -73,7 +74,7 @@ __all__ = [
 ]  # fmt: skip
 
 TICK = 1e-3  # s
-SENDER = {"ECU": ("ECU_DEMAND",), "VGV": ("VGV_STATUS", "VGV_SERVO", "VGV_ANGLES", "VGV_HEALTH")}
+SENDER = {"ECU": ("ECU_DEMAND",), "VGV": tuple(n for n in frames.NAMES.values() if n != "ECU_DEMAND")}
 
 # ---- lockstep: controller, ECU and bus in simulated time -------------------------------------------------------------
 
@@ -84,15 +85,17 @@ class MachineChange:
     """
 
     def __init__(self, action: Machine, node: Node, ecu: Ecu):
-        from plant.effects import EFFECTS, ROW
-
         self.loop, self.fed, self.engine = node.loop, node.arrays.supply, ecu.arrays
         self.first, self.end = tick_of(action.start), tick_of(action.end)
         self.new: dict[int, float] = {}
         if action.effect is not None:
-            for i, q in enumerate(EFFECTS[action.effect].parameters):
-                if q.name in action.parameters:
-                    self.new[ROW[action.effect] + i] = action.parameters[q.name] * q.si
+            own = {q.name: (row, q.si) for row, q in node.plant.parameters_of(action.effect).items()}
+            for name, value in action.parameters.items():
+                if name not in own:
+                    stages = ", ".join(node.plant.vanes)
+                    raise InputError(f"parameters.{name} of {action.effect}: this machine has the stages {stages}")
+                row, si = own[name]
+                self.new[row] = value * si
         self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
         if 0 in self.supply:
             self.supply[0] *= 1e6
@@ -157,6 +160,22 @@ def sender_of(action: Action) -> str:
     )
 
 
+def _sent_by(frame: str, plant: Plant) -> bool:
+    """Whether the machine sends the frame: not those of angles of stages that it lacks."""
+    vanes = frames.ANGLES.get(identifier(frame))
+    return vanes is None or vanes[0] in plant.vanes
+
+
+def _check_stages(name: str, scenario: Scenario, plant: Plant) -> None:
+    """Refuse a scenario that is about stages which the machine lacks: InputError."""
+    for claim in scenario.expect:
+        stage = claim.signal in VANES and claim.signal not in plant.vanes
+        if stage or (claim.late is not None and not _sent_by(claim.late, plant)):
+            raise InputError(
+                f"{name}: expect {claim.signal or claim.late}: this machine has the stages {', '.join(plant.vanes)}"
+            )
+
+
 def _lockstep(
     name: str,
     scenario: Scenario,
@@ -168,12 +187,14 @@ def _lockstep(
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
     from hil.loop.node import Ecu, Node
-    from plant import places
+    from plant import build_plant, places
 
     if plant is not None and (why := lacks(scenario, plant)):
         raise InputError(f"{name}: {why}")
     started = time.perf_counter()
     points = np.array(scenario.demand)
+    plant = plant or build_plant()
+    _check_stages(name, scenario, plant)
     node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
     ecu = Ecu(plant, n_dem=float(points[0, 1]), seed=scenario.seed + 1)
     ticks = round(scenario.duration * 1000.0)
@@ -197,10 +218,11 @@ def _lockstep(
 
     z, s, receiver = node.loop.state, node.loop.s, node.arrays.receiver
     mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
-    values = np.empty((ticks, 8))
+    stages, heard = len(plant.vanes), [n for n in SENDER["VGV"] if _sent_by(n, plant)]
+    values = np.empty((ticks, 5 + stages))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
-    late = np.zeros((ticks, 4), bool)
-    to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * 3)])
+    late = np.zeros((ticks, len(heard)), bool)
+    to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * stages)])
     for k in range(ticks):
         if k % 10 == 0:
             ecu.set_demand(float(np.interp(k * TICK, points[:, 0], points[:, 1])))
@@ -210,21 +232,12 @@ def _lockstep(
         from_ecu = ecu.tick(rows, take(wire, stations["ECU"], rows)).tolist()
         from_vgv = node.tick(rows, take(wire, stations["VGV"], rows)).tolist()
         mode[k], faults[k] = z.mode, z.faults
-        values[k] = (
-            z.x_dem,
-            z.x_meas,
-            z.i_cmd,
-            z.n_dem,
-            z.n_r_raw,
-            s[places.POT, 0],
-            s[places.POT + 1, 0],
-            s[places.POT + 2, 0],
-        )
+        values[k] = (z.x_dem, z.x_meas, z.i_cmd, z.n_dem, z.n_r_raw, *s[places.POT : places.POT + stages, 0])
         counts[k, :8] = receiver[:8]
         counts[k, 8] = frames.refused(receiver)
         if k % 10 == 0:
             missed = ecu.stale()
-            late[k : k + 10] = [n in missed for n in SENDER["VGV"]]
+            late[k : k + 10] = [n in missed for n in heard]
         for who, gateway, sent in zip(("ECU", "VGV"), gateways, (from_ecu, from_vgv), strict=True):
             for head, data in gateway.feed(k, sent):
                 put(wire, stations[who], head, data)
@@ -242,15 +255,9 @@ def _lockstep(
         np.arange(ticks) * TICK,
         mode,
         faults,
-        dict(
-            zip(
-                ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2"),
-                (values * to_border).T,
-                strict=True,
-            )
-        ),
+        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), (values * to_border).T, strict=True)),
         dict(zip(COUNTS, counts.T, strict=True)),
-        dict(zip(SENDER["VGV"], late.T, strict=True)),
+        dict(zip(heard, late.T, strict=True)),
         (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
         float(cal.current_limit) * 1e3,
     )
@@ -273,13 +280,11 @@ def _lockstep(
 class _Witness:
     """What the controller's frames say, as a trace grows from them."""
 
-    NAMES = ("x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2")
+    NAMES = ("x_dem", "x_lvdt", "i_cmd", *VANES)
+    NEEDED = ("x_dem", "x_lvdt", "i_cmd", "state", "faults")
 
     def __init__(self) -> None:
-        self.receivers = {
-            i: frames.new_receiver(i)
-            for i in (frames.VGV_STATUS, frames.VGV_SERVO, frames.VGV_ANGLES, frames.VGV_HEALTH)
-        }
+        self.receivers = {i: frames.new_receiver(i) for i in frames.NAMES if i != frames.ECU_DEMAND}
         self.now: dict[str, float] = {}
         self.rows: list[tuple[float, ...]] = []
 
@@ -290,8 +295,8 @@ class _Witness:
         if receiver is None or frames.receive(receiver, head, data, int(t * 1000.0)) != frames.GOOD:
             return
         self.now |= frames.decode(head, data)
-        if ident == frames.VGV_ANGLES and all(n in self.now for n in (*self.NAMES, "state", "faults")):
-            self.rows.append((t, self.now["state"], self.now["faults"], *(self.now[n] for n in self.NAMES)))
+        if ident == frames.VGV_ANGLES and all(n in self.now for n in self.NEEDED):
+            self.rows.append((t, self.now["state"], self.now["faults"], *(self.now.get(n, np.nan) for n in self.NAMES)))
 
     def trace(self, begin: float) -> Trace:
         """Return the samples from ``begin`` s on, with times from there."""
@@ -304,7 +309,7 @@ class _Witness:
             table[:, 0] - begin,
             table[:, 1].astype(int),
             table[:, 2].astype(np.int64),
-            dict(zip(self.NAMES, table[:, 3:].T, strict=True)),
+            {n: v for n, v in zip(self.NAMES, table[:, 3:].T, strict=True) if not np.isnan(v).all()},
             stroke=(float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
             current=float(cal.current_limit) * 1e3,
             exact=False,

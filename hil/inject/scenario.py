@@ -16,8 +16,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from controller import FAULTS, MODES
+from hil.bus import frames
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Table, read
+from vaneloop.base.vanes import VANES
 
 __all__ = [
     "ACTIONS", "COUNTS", "SIGNALS", "Action", "Babble", "BusOff", "Corrupt", "Delay", "Drop", "Duplicate",
@@ -32,10 +34,10 @@ Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: ne
 Seconds = Annotated[Number, Field(ge=0.0)]
 Positive = Annotated[Number, Field(gt=0.0)]
 Share = Annotated[Number, Field(gt=0.0, le=1.0)]
-IDENTIFIERS = {"ECU_DEMAND": 0x0A0, "VGV_STATUS": 0x0B0, "VGV_SERVO": 0x0B1, "VGV_ANGLES": 0x0B2, "VGV_HEALTH": 0x0B3}
+IDENTIFIERS = {name: ident for ident, name in frames.NAMES.items()}
 # what an expectation can be about, besides mode and faults: signals of the controller in border units, and what its
 # receiver counts
-SIGNALS = ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", "vigv", "vgv1", "vgv2")
+SIGNALS = ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *VANES)
 COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "refused")
 
 

@@ -148,7 +148,8 @@ def encode_channels(channels: dict[str, Channel], dbc: Path, path: Path) -> Fram
         data[at : at + len(p[2]), : p[2].shape[1]] = p[2]
         at += len(p[2])
     order = np.lexsort((ident & 0x1FFFFFFF, np.rint(t * 1e6)))  # the lower identifier wins arbitration
-    return Frames(t[order], ident[order], np.zeros(t.size, np.int32), length[order], data[order])
+    t = np.maximum.accumulate(t[order])  # periods differ in the last digit
+    return Frames(t, ident[order], np.zeros(t.size, np.int32), length[order], data[order])
 
 
 def _sample(c: Channel, t: np.ndarray, period: float, mean: bool) -> np.ndarray:

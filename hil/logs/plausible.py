@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vaneloop.base.vanes import VANES
+
 __all__ = [
     "FEW",
     "JUMP",
@@ -95,9 +97,7 @@ RANGES = {
         "degC", -80.0, 200.0, "no oil flows below -80 degC or lasts above 200 degC", 40.0,
         {"K": (1.0, -273.15), "degF": (1 / 1.8, -17.8)},
     ),
-    "vigv": _ANGLE,
-    "vgv1": _ANGLE,
-    "vgv2": _ANGLE,
+    **dict.fromkeys(VANES, _ANGLE),
     "state": Range("-", 0.0, 4.0, "the modes of vgv.dbc: INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE"),
 }  # fmt: skip
 
@@ -140,7 +140,7 @@ def proposed(signal: str, values: np.ndarray) -> str:
 
 
 # what shows that the machine moves, and how much at least: signal -> own unit
-_MOVES = {"n_dem": 10.0, "n_r": 10.0, "x_dem": 10.0, "x_lvdt": 10.0, "vigv": 10.0, "vgv1": 10.0, "vgv2": 10.0}
+_MOVES = dict.fromkeys(("n_dem", "n_r", "x_dem", "x_lvdt", *VANES), 10.0)
 _PUSHED = 5.0  # mm of stroke in a second: 1.3 mA at the nominal flow gain
 
 

@@ -21,23 +21,21 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller import Calibration, load_calibration
+from controller import STATE, Calibration, load_calibration
 from controller.records import SLOW, as_inputs, as_outputs
 from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
-from plant import Plant, build_plant, places
+from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free
+from vaneloop.base.vanes import own_rows
 
-__all__ = ["COLUMNS", "FRAME", "Run", "Stimulus", "lockstep", "warm_up"]
+__all__ = ["FRAME", "Run", "Stimulus", "columns_of", "lockstep", "snapshot_names", "warm_up"]
 
 CHUNK = 10_000  # ticks between two calls of the progress function
 WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller reaches RUN and the servo settles
-COLUMNS = (
-    "t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state", "n_engine",
-    "i_motor",
-)  # fmt: skip
-# i_motor: A, only of a machine that has a motor
-_BORDER = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3, 1e-6, 1.0, *[180.0 / np.pi] * 3, 1.0, 1.0, 1.0])  # SI -> border units
-_BORDER.setflags(write=False)
+_BORDER = {  # columns before those of the vanes -> factor from SI into border units
+    "t": 1.0, "n_dem": 1.0, "n_r": 1.0, "x_dem": 1e3, "x_lvdt": 1e3, "i_cmd": 1e3, "p_s": 1e-6, "t_oil": 1.0
+}  # fmt: skip
+VIGV = len(_BORDER)  # column of the first stage
 
 # columns of a stimulus
 S_N_DEM, S_N_R, S_P_S, S_T_OIL, S_FRESH, S_REJECTED, S_MODE_REQUEST, N_STIMULUS = range(8)
@@ -109,14 +107,14 @@ def advance(
 ) -> None:
     """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
 
-    noise      float64[ticks or 1, 5] standard normal numbers (LVDT, three potentiometers, speed)
-    out        float64[rows or 0, 14] in SI, a row every ``every`` ticks
-    snapshots  float64[ticks or 0, n] copies of the whole state that the machine has, at each tick
+    noise      float64[ticks or 1, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed)
+    out        float64[rows or 0, 11 + stages] in SI, a row every ``every`` ticks (`columns_of`)
+    snapshots  float64[ticks or 0, n] copies of the whole state that the machine has, at each tick (`snapshot_names`)
     """
-    z, s, rows, inputs, given = a.z, a.s, a.rows, as_inputs(a.inputs), as_outputs(a.outputs)
+    z, s, inputs, given = a.z, a.s, as_inputs(a.inputs), as_outputs(a.outputs)
     noisy = noise.shape[0] > 1
     keep = snapshots.shape[0] > 0
-    n_z, n_s = z.shape[0], rows.shape[0]
+    n_z, n_s, stages = a.z_rows.shape[0], a.s_rows.shape[0], a.angles.shape[0]
     last_frame = stimulus.shape[0] - 1
     n_dem = n_r = 0.0
     for i in range(ticks):
@@ -127,7 +125,7 @@ def advance(
             n_dem = stimulus[frame, S_N_DEM]
             n_r = stimulus[frame, S_N_R]
             if n_r != n_r:  # not logged: the plant's engine
-                n_r = s[places.N_R, 0] + a.sigma[4] * noise[m, 4]
+                n_r = s[places.N_R, 0] + a.sigma[1 + stages] * noise[m, 1 + stages]
             fresh = stimulus[frame, S_FRESH]
             inputs.demand_fresh = fresh
             inputs.demand_rejected = stimulus[frame, S_REJECTED]
@@ -148,16 +146,27 @@ def advance(
             out[r, 5] = mean_current(a)
             out[r, 6] = p_s
             out[r, 7] = t_oil
-            out[r, 8], out[r, 9], out[r, 10] = a.angles[0], a.angles[1], a.angles[2]
-            out[r, 11] = given.mode
-            out[r, 12] = s[places.N_R, 0]
-            out[r, 13] = s[places.I_MOTOR, 0]
+            for q in range(stages):
+                out[r, VIGV + q] = a.angles[q]
+            out[r, VIGV + stages] = given.mode
+            out[r, VIGV + stages + 1] = s[places.N_R, 0]
+            out[r, VIGV + stages + 2] = s[places.I_MOTOR, 0]
         if keep:
             for q in range(n_z):
-                snapshots[i, q] = z[q]
+                snapshots[i, q] = z[a.z_rows[q]]
             for q in range(n_s):
-                snapshots[i, n_z + q] = s[rows[q], 0]
+                snapshots[i, n_z + q] = s[a.s_rows[q], 0]
         move(k, a, n_dem, n_r, p_s, t_oil)
+
+
+def columns_of(vanes: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of a run's columns, of a machine with these stages; the motor's current only of one that has a motor."""
+    return (*_BORDER, *vanes, "state", "n_engine", "i_motor")
+
+
+def snapshot_names(plant: Plant) -> list[str]:
+    """Names of the numbers whose digest is the state hash: the firmware's, then the plant's, that this machine has."""
+    return [*(STATE[i] for i in own_rows(STATE, plant.vanes)), *(chain.STATE[row] for row in plant.rows)]
 
 
 @lru_cache(maxsize=1)
@@ -187,10 +196,11 @@ def lockstep(
     angles         rad, measured vane angles at t = 0, to start each stage's play where the machine's was
     stroke_demand  m, logged stroke demand at t = 0: the controller starts on the curve that is nearer to it
     duration       s, default the stimulus's length
-    pots           float64[frames, 6], what the controller gets of each stem potentiometer: share of its reading and
-                   offset (rad), stage by stage; share 0 = stuck, offset NaN = none. The log keeps the reading itself.
+    pots           float64[frames, 2 stages], what the controller gets of each stem potentiometer: share of its
+                   reading and offset (rad), stage by stage; share 0 = stuck, offset NaN = none. The log keeps the
+                   reading itself.
     watch          called with the states of the controller and the plant at each of the next up to 10,000 ticks, side
-                   by side
+                   by side (`snapshot_names`)
     progress       called with the fraction done
     """
     machine = plant or _nominal()
@@ -212,21 +222,23 @@ def lockstep(
     state, s = loop.state, loop.s
     state.direction, state.blend = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
-    silent = np.zeros((1, 5))
-    advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(COLUMNS))), np.empty((0, 0)))
+    names, sensors = columns_of(machine.vanes), len(machine.sigma)
+    silent = np.zeros((1, sensors))
+    advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(names))), np.empty((0, 0)))
     loop.mean[:] = 0.0
     if angles is not None:
         machine.place_rings(s, angles, n0, t_oil)
 
-    out = np.empty((-(-ticks // every), len(COLUMNS)))
-    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, len(loop.z) + len(loop.rows))) for _ in range(2)]
+    out = np.empty((-(-ticks // every), len(names)))
+    wide = len(loop.z_rows) + len(loop.s_rows)
+    buffers = [np.empty((CHUNK if hashed or watch is not None else 0, wide)) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()
     with ThreadPoolExecutor(1) as pool:
         pending = None
         for c, k0 in enumerate(range(0, ticks, CHUNK)):
             n = min(CHUNK, ticks - k0)
-            noise = silent if seed is None else generator.standard_normal((n, 5))
+            noise = silent if seed is None else generator.standard_normal((n, sensors))
             snap = buffers[c % 2][:n]
             advance(k0, n, rows, noise, loop, every, out[k0 // every :], snap)
             if pending is not None:
@@ -238,7 +250,8 @@ def lockstep(
             if progress is not None:
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
-    columns = {name: np.ascontiguousarray(out[:, i] * _BORDER[i]) for i, name in enumerate(COLUMNS)}
+    factor = {**_BORDER, **dict.fromkeys(machine.vanes, 180.0 / np.pi)}
+    columns = {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
     if machine.kind != "electromechanical":
         del columns["i_motor"]
     return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))

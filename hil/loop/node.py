@@ -8,7 +8,8 @@ One tick k of the VGV node, at t = k ms::
 
     judge the received frames in order of arrival; the values of the last good ECU_DEMAND count
     sample the sensors at t, run the firmware
-    every 10th tick   VGV_STATUS, VGV_SERVO (mean current since the last one), VGV_ANGLES;   every 100th   VGV_HEALTH
+    every 10th tick   VGV_STATUS, VGV_SERVO (mean current since the last one), VGV_ANGLES;   every 100th   VGV_HEALTH;
+                      every 10th   VGV_ANGLES_2 and VGV_ANGLES_3, where the machine has stages for them
     the plant moves on to t + 1 ms under the new current
 """
 
@@ -27,10 +28,13 @@ from hil.bus.frames import (
     ERROR,
     GOOD,
     IDENT_MASK,
+    IN_FRAME,
     N_RECEIVER,
     OTHER,
     PAUSE,
     VGV_ANGLES,
+    VGV_ANGLES_2,
+    VGV_ANGLES_3,
     VGV_HEALTH,
     VGV_SERVO,
     VGV_STATUS,
@@ -49,15 +53,16 @@ from hil.bus.frames import (
 from hil.loop.tick import Loop, arrive, control, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import in_place
+from vaneloop.base.vanes import VANES
 
 __all__ = ["Ecu", "EcuArrays", "Node", "NodeArrays", "ecu_tick", "node_tick", "replay", "run_ticks"]
 
-MOST_SENT = 4  # frames of one tick
+MOST_SENT = 6  # frames of one tick
 BLOCK = 100  # ticks of sensor noise drawn at a time
 DEGREES = 180.0 / np.pi
 
 # counters of a node: int64[N_COUNTER]
-(C_STATUS, C_SERVO, C_ANGLES, C_HEALTH, C_OTHER, C_OURS, C_ERROR_FRAMES, N_COUNTER) = range(8)
+(C_STATUS, C_SERVO, C_ANGLES, C_HEALTH, C_OTHER, C_OURS, C_ERROR_FRAMES, C_ANGLES_2, C_ANGLES_3, N_COUNTER) = range(10)
 
 
 class NodeArrays(NamedTuple):
@@ -67,8 +72,8 @@ class NodeArrays(NamedTuple):
     supply      float64[4] supply pressure (Pa), oil temperature (degC); demand and speed (%) of the machine: the last
                 plausible frame's
     receiver    int64, of ECU_DEMAND (`hil.bus.frames`)
-    counter     int64: E2E counters of the four frames sent; frames of other identifiers, under our own identifiers,
-                error frames
+    counter     int64: E2E counters of the frames sent; frames of other identifiers, under our own identifiers, error
+                frames
     """
 
     loop: Loop
@@ -100,7 +105,7 @@ def _take(a: NodeArrays, received: np.ndarray, n: int, k: int) -> None:
             ident = head & IDENT_MASK
             if head & ERROR:
                 a.counter[C_ERROR_FRAMES] += 1
-            elif VGV_STATUS <= ident <= VGV_HEALTH:
+            elif VGV_STATUS <= ident <= _last_ident(a.loop.angles.shape[0]):
                 a.counter[C_OURS] += 1
             else:
                 a.counter[C_OTHER] += 1
@@ -115,6 +120,25 @@ def _take(a: NodeArrays, received: np.ndarray, n: int, k: int) -> None:
     inputs.demand_fresh = fresh
     inputs.pause = pause
     inputs.demand_rejected = float(refused(a.receiver) - before)
+
+
+@in_place
+def _last_ident(stages: int) -> int:
+    """Return the last identifier under which a machine with so many stages sends; the first is VGV_STATUS."""
+    return VGV_HEALTH + (stages - 1) // IN_FRAME
+
+
+@in_place
+def _angle(angles: np.ndarray, k: int) -> float:
+    """Return the angle of stage ``k`` in deg; NaN where the machine has no such stage."""
+    return angles[k] * DEGREES if k < angles.shape[0] else np.nan
+
+
+@in_place
+def _put_angles(sent: np.ndarray, m: int, ident: int, angles: np.ndarray, k: int, counter: int) -> int:
+    """Put the frame with the angles of stages ``k`` to ``k`` + 2."""
+    data = encode_angles(_angle(angles, k), _angle(angles, k + 1), _angle(angles, k + 2), counter, ident)
+    return _put(sent, m, ident, data)
 
 
 @in_place
@@ -139,9 +163,9 @@ def node_tick(
     number.
 
     received  int64[>= n, 2] in order of arrival
-    noise     float64[:, 5] standard normal numbers, of this tick those in ``row``
+    noise     float64[:, 2 + stages] standard normal numbers, of this tick those in ``row``
     a         `NodeArrays`
-    sent      int64[4, 2]
+    sent      int64[MOST_SENT, 2]
     """
     _take(a, received, n, k)
     loop, p_s, t_oil = a.loop, a.supply[0], a.supply[1]
@@ -154,11 +178,15 @@ def node_tick(
             sent, m, VGV_STATUS, encode_status(out.x_dem * 1e3, fed.x_lvdt * 1e3, int(out.mode), _next(c, C_STATUS))
         )
         m = _put(sent, m, VGV_SERVO, encode_servo(mean_current(loop) * 1e3, int(out.faults), _next(c, C_SERVO)))
-        vigv, vgv1, vgv2 = loop.angles[0] * DEGREES, loop.angles[1] * DEGREES, loop.angles[2] * DEGREES
-        m = _put(sent, m, VGV_ANGLES, encode_angles(vigv, vgv1, vgv2, _next(c, C_ANGLES)))
+        angles = loop.angles
+        m = _put_angles(sent, m, VGV_ANGLES, angles, 0, _next(c, C_ANGLES))
         if k % (10 * SLOW) == 0:
             lost, rejected = a.receiver[frames.R_LOST], refused(a.receiver)
             m = _put(sent, m, VGV_HEALTH, encode_health(p_s * 1e-6, t_oil, lost, rejected, _next(c, C_HEALTH)))
+        if angles.shape[0] > IN_FRAME:
+            m = _put_angles(sent, m, VGV_ANGLES_2, angles, IN_FRAME, _next(c, C_ANGLES_2))
+        if angles.shape[0] > 2 * IN_FRAME:
+            m = _put_angles(sent, m, VGV_ANGLES_3, angles, 2 * IN_FRAME, _next(c, C_ANGLES_3))
     move(k, loop, a.supply[2], a.supply[3], p_s, t_oil)
     return m
 
@@ -171,6 +199,7 @@ class Node:
     p_s, t_oil  supply pressure (Pa) and oil temperature (degC); change ``arrays.supply`` later
     seed     of the sensors' noise; None = noise-free
     k        the next tick (1 ms each)
+    plant    the machine
     loop     what its tick works on: the firmware's inputs, state and calibration, the plant's state and parameters
     """
 
@@ -184,17 +213,17 @@ class Node:
         t_oil: float = 40.0,
         seed: int | None = None,
     ):
-        machine, cal = plant or build_plant(), calibration or load_calibration()
-        self.loop = new_loop(
-            machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=np.array([[1.0, 0.0] * 3])
-        )
+        self.plant = machine = plant or build_plant()
+        cal = calibration or load_calibration()
+        pots = np.array([[1.0, 0.0] * len(machine.vanes)])
+        self.loop = new_loop(machine, cal, n_engine=n_r, n_r=n_r, t_oil=t_oil, noisy=seed is not None, pots=pots)
         self.arrays = NodeArrays(
             self.loop, np.array([p_s, t_oil, n_r, n_r]), new_receiver(ECU_DEMAND), np.zeros(N_COUNTER, np.int64)
         )
         self.k = 0
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
         self._generator = np.random.Generator(np.random.PCG64(seed)) if seed is not None else None
-        self._noise = np.zeros((BLOCK, 5))
+        self._noise = np.zeros((BLOCK, len(machine.sigma)))
 
     def noise(self) -> tuple[np.ndarray, int]:
         """Return standard normal numbers and the row of the next tick in them."""
@@ -235,10 +264,11 @@ class Node:
         return out
 
     def fingerprint(self) -> str:
-        """Return the SHA-256 of the whole state: firmware, plant, receiver, counters."""
+        """Return the SHA-256 of the whole state that the machine has: firmware, plant, receiver, counters."""
         digest = hashlib.sha256()
-        a = self.arrays
-        for part in (a.loop.z, a.loop.s[a.loop.rows], a.loop.mean, a.receiver, a.counter):
+        a, loop = self.arrays, self.loop
+        counters = a.counter[: C_ANGLES_2 + (len(loop.angles) - 1) // IN_FRAME]
+        for part in (loop.z[loop.z_rows], loop.s[loop.s_rows], loop.mean, a.receiver, counters):
             digest.update(part.tobytes())
         return digest.hexdigest()
 
@@ -261,9 +291,9 @@ def run_ticks(
 
     at, received   int64[n] tick of each frame, in order, and int64[n, 2] the frames; ``first`` is the first row not yet
                    taken
-    noise, row     float64[:, 5] standard normal numbers, and the row of tick ``k0``
-    out, out_tick  int64[m, 2] and int64[m]: the frames sent and their ticks; m >= 4 per 10 ticks begun, rounded up
-    scratch        int64[4, 2]
+    noise, row     float64[:, 2 + stages] standard normal numbers, and the row of tick ``k0``
+    out, out_tick  int64[m, 2] and int64[m]: the frames sent and their ticks; m >= MOST_SENT for each 10 ticks begun
+    scratch        int64[MOST_SENT, 2]
 
     Returns how many frames were sent and the first row not taken.
     """
@@ -296,7 +326,8 @@ def replay(node: Node, at: np.ndarray, received: np.ndarray, ticks: int) -> tupl
     while node.k < end:
         n = min(BLOCK - node.k % BLOCK, end - node.k)
         noise, row = node.noise()
-        some, some_at = np.empty((4 * (n // SLOW + 1), 2), np.int64), np.empty(4 * (n // SLOW + 1), np.int64)
+        most = MOST_SENT * (n // SLOW + 1)
+        some, some_at = np.empty((most, 2), np.int64), np.empty(most, np.int64)
         m, first = run_ticks(node.k, n, at, received, first, noise, row, node.arrays, some, some_at, node._sent)
         node.k += n
         out.append(some[:m])
@@ -313,8 +344,8 @@ class EcuArrays(NamedTuple):
     s, p       the engine's state and parameters (`plant.chain`)
     demand     float64[3] n_dem (%), n_r (%; NaN = the engine model's), mode_request; set them before a tick
     sigma      float64[1] rms noise of the measured speed, %
-    receiver   int64[4, :] of VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH
-    values     float64[12] last good values, `ECU_VALUES`, in the units of the DBC
+    receiver   int64[6, :] of VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH, VGV_ANGLES_2, VGV_ANGLES_3
+    values     float64[17] last good values, `ECU_VALUES`, in the units of the DBC; NaN = not available
     counter    int64[1] E2E counter
     """
 
@@ -328,19 +359,9 @@ class EcuArrays(NamedTuple):
 
 
 ECU_VALUES = (
-    "x_dem",
-    "x_lvdt",
-    "state",
-    "i_cmd",
-    "faults",
-    "vigv",
-    "vgv1",
-    "vgv2",
-    "p_s",
-    "t_oil",
-    "frames_lost",
-    "frames_rejected",
-)
+    "x_dem", "x_lvdt", "state", "i_cmd", "faults", *VANES[:IN_FRAME], "p_s", "t_oil", "frames_lost", "frames_rejected",
+    *VANES[IN_FRAME:],
+)  # fmt: skip
 
 
 @in_place
@@ -349,11 +370,11 @@ def _listen(a: EcuArrays, head: int, data: int, k: int) -> None:
     new.
     """
     if head == PAUSE:
-        for row in range(4):
+        for row in range(a.receiver.shape[0]):
             stand_still(a.receiver[row])
         return
     ident = head & IDENT_MASK
-    if not VGV_STATUS <= ident <= VGV_HEALTH:
+    if not VGV_STATUS <= ident <= VGV_ANGLES_3:
         return
     row = ident - VGV_STATUS
     if receive(a.receiver[row], head, data, k) != GOOD:
@@ -365,8 +386,12 @@ def _listen(a: EcuArrays, head: int, data: int, k: int) -> None:
         v[3], v[4] = frames.decode_servo(data)
     elif row == 2:
         v[5], v[6], v[7] = frames.decode_angles(data)
-    else:
+    elif row == 3:
         v[8], v[9], v[10], v[11] = frames.decode_health(data)
+    elif row == 4:
+        v[12], v[13], v[14] = frames.decode_angles(data)
+    else:
+        v[15], v[16] = frames.decode_angles(data)[:2]
 
 
 @in_place
@@ -378,7 +403,7 @@ def ecu_tick(k: int, received: np.ndarray, n: int, noise: float, a: EcuArrays, s
     """
     for i in range(n):
         _listen(a, received[i, 0], received[i, 1], k)
-    for row in range(4):
+    for row in range(a.receiver.shape[0]):
         grow_old(a.receiver[row], k)
     m = 0
     n_dem, n_r, request = a.demand[0], a.demand[1], int(a.demand[2])
@@ -401,13 +426,15 @@ class Ecu:
         self, plant: Plant | None = None, *, n_dem: float = 60.0, mode_request: int = 1, seed: int | None = None
     ):
         machine = plant or build_plant()
-        receivers = np.stack([new_receiver(ident) for ident in (VGV_STATUS, VGV_SERVO, VGV_ANGLES, VGV_HEALTH)])
-        assert receivers.shape == (4, N_RECEIVER)
+        receivers = np.stack([new_receiver(ident) for ident in range(VGV_STATUS, VGV_ANGLES_3 + 1)])
+        assert receivers.shape == (6, N_RECEIVER)
+        self._last = _last_ident(len(machine.vanes))
+        self._others = set(VANES[IN_FRAME:]) - set(machine.vanes)
         self.arrays = EcuArrays(
             machine.start(stroke=0.0, n_r=n_dem),
             machine.p.copy(),
             np.array([n_dem, np.nan, float(mode_request)]),
-            np.array([machine.sigma[4] if seed is not None else 0.0]),
+            np.array([machine.sigma[-1] if seed is not None else 0.0]),
             receivers,
             np.full(len(ECU_VALUES), np.nan),
             np.zeros(1, np.int64),
@@ -443,13 +470,19 @@ class Ecu:
 
     @property
     def values(self) -> dict[str, float]:
-        """Last good values of the controller's signals, NaN before the first."""
-        return dict(zip(ECU_VALUES, self.arrays.values.tolist(), strict=True))
+        """Last good values of the controller's signals, NaN before the first; of stages beyond the third those that
+        this machine has or that were heard.
+        """
+        all_values = zip(ECU_VALUES, self.arrays.values.tolist(), strict=True)
+        return {name: v for name, v in all_values if name not in self._others or v == v}
 
     def stale(self) -> list[str]:
-        """Return the names of the controller's frames that are late: none for five periods, or none ever."""
-        return [
-            frames.NAMES[VGV_STATUS + row]
-            for row, r in enumerate(self.arrays.receiver)
-            if r[frames.R_SILENT] > 0 or (r[frames.R_LAST] < 0 and self.k >= frames.MISSED * r[frames.R_PERIOD])
-        ]
+        """Return the names of the controller's frames that are late: none for five periods, or of this machine's none
+        ever.
+        """
+
+        def late(r: np.ndarray) -> bool:
+            never = r[frames.R_LAST] < 0 and r[frames.R_IDENT] <= self._last
+            return bool(r[frames.R_SILENT] > 0 or (never and self.k >= frames.MISSED * r[frames.R_PERIOD]))
+
+        return [frames.NAMES[int(r[frames.R_IDENT])] for r in self.arrays.receiver if late(r)]

@@ -18,10 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from controller import Calibration, give, new_inputs, new_outputs, new_state, tick
-from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state
+from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state, state_rows
 from plant import Plant, chain, places
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place, inlined
+from vaneloop.base.vanes import same_stages
 
 __all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "move", "new_loop"]
 
@@ -42,12 +43,12 @@ class Loop(NamedTuple):
     calibration  the same as it is flashed: with the effects that change tables and gains
     flash        float64[3] those effects' parameters, as flashed
     s, p         the plant's state and parameters
-    sigma        float64[5] rms noise of the sensors, SI (LVDT, three potentiometers, speed); zeros = noise-free
+    z_rows, s_rows  int64: numbers of z and rows of s that this machine has; the others are of stages it lacks
+    sigma        float64[2 + stages] rms noise of the sensors, SI (LVDT, each potentiometer, speed); zeros = noise-free
     mean         float64[2] sum and number of currents since the last one that was logged or sent
-    angles       float64[3] rad, the potentiometers' readings at this tick
-    pots         float64[frames or 0, 6] what the controller gets of each reading: share of it and offset (rad; NaN =
-                 not fitted), stage by stage, a row every 10 ms, the last one held
-    rows         int64[n], rows of ``s`` that this machine has (`plant.Plant.rows`): what a fingerprint covers
+    angles       float64[stages] rad, the potentiometers' readings at this tick
+    pots         float64[frames or 0, 2 stages] what the controller gets of each reading: share of it and offset
+                 (rad; NaN = not fitted), stage by stage, a row every 10 ms, the last one held
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
     """
@@ -60,11 +61,12 @@ class Loop(NamedTuple):
     flash: np.ndarray
     s: np.ndarray
     p: np.ndarray
+    z_rows: np.ndarray
+    s_rows: np.ndarray
     sigma: np.ndarray
     mean: np.ndarray
     angles: np.ndarray
     pots: np.ndarray
-    rows: np.ndarray
     sent: np.ndarray
 
     @property
@@ -94,8 +96,10 @@ def new_loop(
     pots: np.ndarray | None = None,
 ) -> Loop:
     """Return a loop at rest: its engine at ``n_engine`` (%), its stroke where the mean curve has it at the measured
-    speed ``n_r`` (%).
+    speed ``n_r`` (%). Raises InputError for a controller and a plant with different stages.
     """
+    same_stages(geometry=plant.vanes, vane_angles=calibration.vanes)
+    stages = len(plant.vanes)
     cal = flashed(calibration, plant)
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
     return Loop(
@@ -107,11 +111,12 @@ def new_loop(
         plant.p[list(CHANGED_BY), 0],
         plant.start(stroke=stroke, n_r=n_engine, t_oil=t_oil),
         plant.p.copy(),
-        plant.sigma.copy() if noisy else np.zeros(5),
-        np.zeros(2),
-        np.zeros(3),
-        np.empty((0, 6)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
+        state_rows(stages),
         plant.rows,
+        plant.sigma.copy() if noisy else np.zeros(2 + stages),
+        np.zeros(2),
+        np.zeros(stages),
+        np.empty((0, 2 * stages)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
         np.full((KEPT, 4), np.nan),
     )
 
@@ -179,7 +184,7 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
 def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     """Sample the sensors and run the firmware at tick ``k``.
 
-    noise  float64[:, 5] standard normal numbers (LVDT, three potentiometers, speed), of this tick those in ``row``
+    noise  float64[:, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed), this tick's in ``row``
     """
     s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
     if (
@@ -189,12 +194,12 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     ):
         _flash(a.built, a.calibration, a.flash, p)
     inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
-    for q in range(3):
+    for q in range(a.angles.shape[0]):
         a.angles[q] = s[places.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
         inputs.pots[q] = a.angles[q]
     if a.pots.shape[0] > 0:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
-        for q in range(3):
+        for q in range(a.angles.shape[0]):
             inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
     tick(a.inputs, a.z, a.calibration)
     give(a.z, a.outputs)

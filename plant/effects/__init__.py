@@ -12,6 +12,7 @@ import pkgutil
 
 from plant.effect import Effect
 from plant.layout import MOTOR_NAMES, MOTOR_STATE, N_NOMINAL, NOMINAL_STATE
+from vaneloop.base.vanes import MOST
 
 __all__ = [
     "DERIVED", "EFFECTS", "MOTOR", "MOTOR_AT", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW",
@@ -43,7 +44,7 @@ for _name, _effect in EFFECTS.items():
     _states += [f"{_name}.{state}" for state in _effect.states]
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
-MOTOR = DERIVED + 8  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
+MOTOR = DERIVED + 5 + MOST  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
 N_PARAMETERS = MOTOR + 1 + len(MOTOR_NAMES) + 2
 MOTOR_AT = len(_states)  # first row of `MOTOR_STATE` in s
 STATE: tuple[str, ...] = (*_states, *MOTOR_STATE)

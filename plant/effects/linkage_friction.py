@@ -18,6 +18,7 @@ import math
 
 from plant.effect import Effect, Parameter, per_vane_stage
 from vaneloop.base.compiled import compiled
+from vaneloop.base.vanes import VANES
 
 __all__ = ["EFFECT", "loop", "step"]
 
@@ -29,7 +30,7 @@ EFFECT = Effect(
         *per_vane_stage("deg", 0.0, 0.0, 5.0, "total width of the smooth loop at the vane"),
         Parameter("distance", "deg", 0.2, 0.01, 5.0, "ring travel over which the loop closes to 1/e"),
     ),
-    ("bristle_vigv", "bristle_vgv1", "bristle_vgv2", "ring_vigv", "ring_vgv1", "ring_vgv2"),
+    (*(f"bristle_{v}" for v in VANES), *(f"ring_{v}" for v in VANES)),
     "a smooth hysteresis loop beside the play",
     "reversals of the stroke, slow enough to see the vane start",
 )

@@ -7,7 +7,7 @@ Equation::
 Symbols: th ring angle before the play (rad), coefficient at the vane (rad/K), L / Ld' ratio of the lever at
 mid-stroke, T oil temperature (degC).
 Limits: linear and without thermal lag; the oil stands for the casing.
-In a log: one stage drifts with t_oil while the others do not (an LVDT that drifts moves all three).
+In a log: one stage drifts with t_oil while the others do not (an LVDT that drifts moves all).
 Source: linear expansion; 0.5 mm/m for 40 K of steel.
 """
 

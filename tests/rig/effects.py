@@ -21,7 +21,7 @@ ALL_STAGES = -1
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect: its slot in the kernel (the first of three where it belongs to one stage), unit, neutral
+    """One number of an effect: its slot in the kernel (the first of several where each stage has one), unit, neutral
     value, meaning.
     """
 
@@ -44,7 +44,7 @@ class Effect:
     ladder    five sizes of ``main``, from undetectable to gross
     others    values of the other parameters
     signed    the size may have either sign (for factors: may be f or 1/f)
-    stages    the effect belongs to one vane stage, given as the extra parameter ``stage`` (0, 1, 2; -1 = all)
+    stages    the effect belongs to one vane stage, given as the extra parameter ``stage`` (0, 1, ...; -1 = all)
     """
 
     name: str
@@ -369,9 +369,9 @@ WITH_MOTOR = MappingProxyType(
 CATALOGUE: Mapping[str, Effect] = MappingProxyType({**EFFECTS, **OUTSIDE, **MOTOR_EFFECTS})
 
 
-def draw(name: str, size: int, rng: np.random.Generator, onset: float = 0.0) -> Hidden:
+def draw(name: str, size: int, rng: np.random.Generator, onset: float = 0.0, stages: int = 3) -> Hidden:
     """Return the effect in rung ``size`` (0 undetectable .. 4 gross) of its ladder, up to 20 % off, with a random sign
-    and vane stage.
+    and vane stage of as many as the machine has.
     """
     e = CATALOGUE[name]
     p = e.parameters[e.main]
@@ -389,7 +389,7 @@ def draw(name: str, size: int, rng: np.random.Generator, onset: float = 0.0) -> 
         value = round(value, 2)  # the controller looks at frames every 10 ms: between two multiples nothing changes
     parameters = {e.main: value, **e.others}
     if e.stages:
-        parameters["stage"] = float(rng.integers(0, 3))
+        parameters["stage"] = float(rng.integers(0, stages))
     return Hidden(name, parameters, onset)
 
 
@@ -406,9 +406,10 @@ def apply(hidden: Hidden, p: np.ndarray, geometry: Geometry) -> tuple[np.ndarray
     effect = CATALOGUE[hidden.name]
     p = p.copy()
     which = int(hidden.parameters.get("stage", ALL_STAGES))
-    if which not in (ALL_STAGES, 0, 1, 2):
-        raise ValueError(f"{hidden.name}: stage (={which}) must be -1 (all), 0, 1 or 2")
-    stages = range(3) if which == ALL_STAGES else (which,)
+    own = range(len(geometry.stages))
+    if which != ALL_STAGES and which not in own:
+        raise ValueError(f"{hidden.name}: stage (={which}) must be -1 (all), or 0 to {own[-1]}")
+    stages = own if which == ALL_STAGES else (which,)
     for key, value in hidden.parameters.items():
         if key == "stage":
             continue

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .kernel import X_HIGH, X_LOW, X_STEP
+from .kernel import MOST, X_HIGH, X_LOW, X_STEP
 
-STAGES = ("vigv", "vgv1", "vgv2")
+STAGES = ("vigv", *(f"vgv{k}" for k in range(1, MOST)))  # as many as the table has, from the first on
 TABLES = Path(__file__).resolve().parents[2] / "tables"
 
 
@@ -46,7 +46,7 @@ class Geometry:
     y1: float
     Le: float
     length_0: float
-    stages: tuple[Stage, Stage, Stage]
+    stages: tuple[Stage, ...]
 
     def with_error(self, stage: int, *, crank: float = 0.0, link: float = 0.0) -> Geometry:
         """Return the geometry with one stage's lower arm or vertical link made longer by an error (m)."""
@@ -98,14 +98,14 @@ def ring_angle(g: Geometry, stage: int, strokes: np.ndarray, start: float = 24e-
 
 
 def ring_tables(g: Geometry) -> np.ndarray:
-    """Return float64[3, n]: ring angle (rad) on the strokes X_LOW, X_LOW + X_STEP, ..., X_HIGH (a spline through every
-    0.25 mm).
+    """Return float64[stages, n]: ring angle (rad) on the strokes X_LOW, X_LOW + X_STEP, ..., X_HIGH (a spline through
+    every 0.25 mm).
     """
     from scipy.interpolate import CubicSpline
 
     coarse = np.linspace(X_LOW, X_HIGH, 201)
     fine = X_LOW + X_STEP * np.arange(round((X_HIGH - X_LOW) / X_STEP) + 1)
-    return np.array([CubicSpline(coarse, ring_angle(g, k, coarse))(fine) for k in range(3)])
+    return np.array([CubicSpline(coarse, ring_angle(g, k, coarse))(fine) for k in range(len(g.stages))])
 
 
 def vane_angle(ring: np.ndarray, ratio: float) -> np.ndarray:
@@ -131,7 +131,7 @@ def load(folder: Path = TABLES, rng: np.random.Generator | None = None) -> Geome
         return drawn(part, key) * 1e-3
 
     stages = []
-    for name in STAGES:
+    for name in (name for name in STAGES if name in table):
         distance = float(np.hypot(mm(name, "dx"), mm(name, "dy")))
         direction = np.deg2rad(270.0 + drawn(name, "theta6"))
         stages.append(

@@ -17,6 +17,7 @@ from numba import njit
 TICK = 1e-3  # s, servo tick
 FRAME = 10  # ticks: the ECU sends every 10 ms
 LINKS = 10  # linkage steps in a tick: 0.1 ms against a contact of 0.3 ms
+MOST = 8  # vane stages that the arrays have room for; a run has as many as its ring tables
 PINS = 4  # pins in parallel a stage, each with its own gap
 PLAYS = 4  # Preisach elements of the torque motor's hysteresis
 PIN_OFFSET = np.array([-1.3416, -0.4472, 0.4472, 1.3416])  # zero mean, unit variance
@@ -27,7 +28,7 @@ HALF_STROKE = 0.024  # m
 
 
 class P(IntEnum):
-    """Slots of the kernel's parameter array. ``_0`` marks the first of three, one a stage."""
+    """Slots of the kernel's parameter array. ``_0`` marks the first of MOST, one a stage."""
 
     # engine
     engine_lag = 0  # s
@@ -64,122 +65,172 @@ class P(IntEnum):
     half_gap_0 = 27  # rad at the ring
     half_gap_1 = 28
     half_gap_2 = 29
-    vane_ratio_0 = 30  # - Ld'/L
-    vane_ratio_1 = 31
-    vane_ratio_2 = 32
-    pot_tau_0 = 33  # s
-    pot_tau_1 = 34
-    pot_tau_2 = 35
-    pot_bias_0 = 36  # rad
-    pot_bias_1 = 37
-    pot_bias_2 = 38
+    half_gap_3 = 30
+    half_gap_4 = 31
+    half_gap_5 = 32
+    half_gap_6 = 33
+    half_gap_7 = 34
+    vane_ratio_0 = 35  # - Ld'/L
+    vane_ratio_1 = 36
+    vane_ratio_2 = 37
+    vane_ratio_3 = 38
+    vane_ratio_4 = 39
+    vane_ratio_5 = 40
+    vane_ratio_6 = 41
+    vane_ratio_7 = 42
+    pot_tau_0 = 43  # s
+    pot_tau_1 = 44
+    pot_tau_2 = 45
+    pot_tau_3 = 46
+    pot_tau_4 = 47
+    pot_tau_5 = 48
+    pot_tau_6 = 49
+    pot_tau_7 = 50
+    pot_bias_0 = 51  # rad
+    pot_bias_1 = 52
+    pot_bias_2 = 53
+    pot_bias_3 = 54
+    pot_bias_4 = 55
+    pot_bias_5 = 56
+    pot_bias_6 = 57
+    pot_bias_7 = 58
     # ---- hidden effects of the library, at their neutral values
-    can_delay = 39  # s
-    frame_hold = 40  # s
-    schedule_offset = 41  # m
-    controller_gain = 42  # -
-    null_bias = 43  # A
-    dead_band = 44  # A half width
-    valve_hysteresis = 45  # A total width
-    flow_limit = 46  # m/s
-    valve_lag = 47  # s
-    asymmetry = 48  # -
-    droop = 49  # Pa/(m/s)
-    viscosity = 50  # 1/K
-    coulomb = 51  # N
-    stiction = 52  # N above Coulomb
-    stribeck_speed = 53  # m/s
-    leakage = 54  # m/s/Pa
-    compliance = 55  # m/N
-    aero_force = 56  # N at 100 %
-    stop_shift = 57  # m
-    lvdt_bias = 58  # m
-    lvdt_gain = 59  # -
-    lvdt_nonlinearity = 60  # m
-    lvdt_lag = 61  # s
-    lvdt_thermal = 62  # m/K
-    gap_change_0 = 63  # rad, total width
-    gap_change_1 = 64
-    gap_change_2 = 65
-    ring_compliance = 66  # rad at the aerodynamic load of 100 %
-    friction_width_0 = 67  # rad, total
-    friction_width_1 = 68
-    friction_width_2 = 69
-    friction_distance = 70  # rad
-    wear_0 = 71  # rad/s
-    wear_1 = 72
-    wear_2 = 73
-    thermal_growth_0 = 74  # rad/K
-    thermal_growth_1 = 75
-    thermal_growth_2 = 76
-    eccentricity_0 = 77  # rad
-    eccentricity_1 = 78
-    eccentricity_2 = 79
-    eccentricity_phase = 80  # rad
-    pot_gain_0 = 81  # -
-    pot_gain_1 = 82
-    pot_gain_2 = 83
+    can_delay = 59  # s
+    frame_hold = 60  # s
+    schedule_offset = 61  # m
+    controller_gain = 62  # -
+    null_bias = 63  # A
+    dead_band = 64  # A half width
+    valve_hysteresis = 65  # A total width
+    flow_limit = 66  # m/s
+    valve_lag = 67  # s
+    asymmetry = 68  # -
+    droop = 69  # Pa/(m/s)
+    viscosity = 70  # 1/K
+    coulomb = 71  # N
+    stiction = 72  # N above Coulomb
+    stribeck_speed = 73  # m/s
+    leakage = 74  # m/s/Pa
+    compliance = 75  # m/N
+    aero_force = 76  # N at 100 %
+    stop_shift = 77  # m
+    lvdt_bias = 78  # m
+    lvdt_gain = 79  # -
+    lvdt_nonlinearity = 80  # m
+    lvdt_lag = 81  # s
+    lvdt_thermal = 82  # m/K
+    gap_change_0 = 83  # rad, total width
+    gap_change_1 = 84
+    gap_change_2 = 85
+    gap_change_3 = 86
+    gap_change_4 = 87
+    gap_change_5 = 88
+    gap_change_6 = 89
+    gap_change_7 = 90
+    ring_compliance = 91  # rad at the aerodynamic load of 100 %
+    friction_width_0 = 92  # rad, total
+    friction_width_1 = 93
+    friction_width_2 = 94
+    friction_width_3 = 95
+    friction_width_4 = 96
+    friction_width_5 = 97
+    friction_width_6 = 98
+    friction_width_7 = 99
+    friction_distance = 100  # rad
+    wear_0 = 101  # rad/s
+    wear_1 = 102
+    wear_2 = 103
+    wear_3 = 104
+    wear_4 = 105
+    wear_5 = 106
+    wear_6 = 107
+    wear_7 = 108
+    thermal_growth_0 = 109  # rad/K
+    thermal_growth_1 = 110
+    thermal_growth_2 = 111
+    thermal_growth_3 = 112
+    thermal_growth_4 = 113
+    thermal_growth_5 = 114
+    thermal_growth_6 = 115
+    thermal_growth_7 = 116
+    eccentricity_0 = 117  # rad
+    eccentricity_1 = 118
+    eccentricity_2 = 119
+    eccentricity_3 = 120
+    eccentricity_4 = 121
+    eccentricity_5 = 122
+    eccentricity_6 = 123
+    eccentricity_7 = 124
+    eccentricity_phase = 125  # rad
+    pot_gain_0 = 126  # -
+    pot_gain_1 = 127
+    pot_gain_2 = 128
+    pot_gain_3 = 129
+    pot_gain_4 = 130
+    pot_gain_5 = 131
+    pot_gain_6 = 132
+    pot_gain_7 = 133
     # ---- hidden effects outside the library
-    ripple_amplitude = 84  # m
-    ripple_frequency = 85  # Hz
-    vibration_amplitude = 86  # rad at resonance
-    vibration_speed = 87  # % at resonance
-    gap_thermal = 88  # rad/K
-    area_growth = 89  # - relative area added at full stroke
-    dip_depth = 90  # Pa
-    dip_period = 91  # s
-    cross_talk = 92  # -
-    silt_time = 93  # s of rest after which the spool sticks
-    silt_current = 94  # A that frees it
-    creep = 95  # - share of a move that comes late
-    creep_tau = 96  # s
-    ring_frequency = 97  # Hz
-    ring_damping = 98  # -
-    track_angle = 99  # rad where the wiper's track is worn
-    track_width = 100  # rad
-    track_error = 101  # rad
-    dither_amplitude = 102  # A
-    dither_frequency = 103  # Hz
-    rumble_amplitude = 104  # rad
-    rumble_speed = 105  # %
-    cushion = 106  # N/(m/s)^2
-    lag_slope = 107  # 1/% relative change of the engine's lag with speed
-    lvdt_lost_step = 108  # m: resolution left after lost bits
-    snag_angle = 109  # rad of the VIGV ring where it catches
-    snag_depth = 110  # rad
-    t_ref = 111  # degC
-    lvdt_cubic = 112  # m, at the ends of the stroke
-    flow_exponent = 113  # -, 2: an orifice in series, 20: nearly a corner
+    ripple_amplitude = 134  # m
+    ripple_frequency = 135  # Hz
+    vibration_amplitude = 136  # rad at resonance
+    vibration_speed = 137  # % at resonance
+    gap_thermal = 138  # rad/K
+    area_growth = 139  # - relative area added at full stroke
+    dip_depth = 140  # Pa
+    dip_period = 141  # s
+    cross_talk = 142  # -
+    silt_time = 143  # s of rest after which the spool sticks
+    silt_current = 144  # A that frees it
+    creep = 145  # - share of a move that comes late
+    creep_tau = 146  # s
+    ring_frequency = 147  # Hz
+    ring_damping = 148  # -
+    track_angle = 149  # rad where the wiper's track is worn
+    track_width = 150  # rad
+    track_error = 151  # rad
+    dither_amplitude = 152  # A
+    dither_frequency = 153  # Hz
+    rumble_amplitude = 154  # rad
+    rumble_speed = 155  # %
+    cushion = 156  # N/(m/s)^2
+    lag_slope = 157  # 1/% relative change of the engine's lag with speed
+    lvdt_lost_step = 158  # m: resolution left after lost bits
+    snag_angle = 159  # rad of the VIGV ring where it catches
+    snag_depth = 160  # rad
+    t_ref = 161  # degC
+    lvdt_cubic = 162  # m, at the ends of the stroke
+    flow_exponent = 163  # -, 2: an orifice in series, 20: nearly a corner
     # electromechanical actuator in place of valve and pistons
-    motor = 114  # 1: it has one
-    motor_rated = 115  # rad/s at i_rated
-    motor_gain = 116  # A s/rad of the speed loop
-    motor_time = 117  # s, its integral time
-    motor_peak = 118  # A
-    motor_band = 119  # rad/s of the current loop
-    motor_torque = 120  # N m/A
-    motor_ohm = 121  # Ohm
-    motor_henry = 122  # H
-    motor_inertia = 123  # kg m2, rotor and gear
-    motor_viscous = 124  # N m s/rad
-    screw_r = 125  # m/rad
-    screw_loss = 126  # share of the load that friction takes
-    screw_friction = 127  # N at the rod
-    screw_lead = 128  # m
-    screw_stiffness = 129  # N/m of screw and bearings
-    screw_damping = 130  # N/(m/s)
-    bus_voltage = 131  # V
+    motor = 164  # 1: it has one
+    motor_rated = 165  # rad/s at i_rated
+    motor_gain = 166  # A s/rad of the speed loop
+    motor_time = 167  # s, its integral time
+    motor_peak = 168  # A
+    motor_band = 169  # rad/s of the current loop
+    motor_torque = 170  # N m/A
+    motor_ohm = 171  # Ohm
+    motor_henry = 172  # H
+    motor_inertia = 173  # kg m2, rotor and gear
+    motor_viscous = 174  # N m s/rad
+    screw_r = 175  # m/rad
+    screw_loss = 176  # share of the load that friction takes
+    screw_friction = 177  # N at the rod
+    screw_lead = 178  # m
+    screw_stiffness = 179  # N/m of screw and bearings
+    screw_damping = 180  # N/(m/s)
+    bus_voltage = 181  # V
     # ---- and its hidden effects
-    amp_offset = 132  # A
-    amp_dead_band = 133  # A half width
-    amp_lag = 134  # s
-    tacho_drift = 135  # 1/K
-    torque_factor = 136  # -
-    extra_friction = 137  # N at the rod
-    motor_play = 138  # m, total
-    pitch_error = 139  # m
-    pitch_phase = 140  # rad
-    rod_friction = 141  # N, of the vanes' stems and the linkage
+    amp_offset = 182  # A
+    amp_dead_band = 183  # A half width
+    amp_lag = 184  # s
+    tacho_drift = 185  # 1/K
+    torque_factor = 186  # -
+    extra_friction = 187  # N at the rod
+    motor_play = 188  # m, total
+    pitch_error = 189  # m
+    pitch_phase = 190  # rad
+    rod_friction = 191  # N, of the vanes' stems and the linkage
 
 
 N_P = len(P)
@@ -205,26 +256,26 @@ class S(IntEnum):
     rest = 14  # s since the piston last moved
     stuck_at = 15  # A at which the silted spool stands
     motor_0 = 16  # A, PLAYS outputs
-    pin_0 = 20  # rad, 3 x PINS
-    ring_0 = 32  # rad
-    ring_speed_0 = 35  # rad/s
-    ring_in_0 = 38  # rad
-    bristle_0 = 41  # - linkage friction
-    creep_0 = 44  # rad
-    vane_0 = 47  # rad
-    pot_0 = 50  # rad
-    silted = 53
-    friction = 54  # N
-    i_motor = 55  # A
-    volt_integral = 56  # V of the current loop
-    speed_integral = 57  # A of the speed loop
-    turn = 58  # rad of the motor
-    turn_speed = 59  # rad/s
-    turn_bristle = 60  # rad, LuGre deflection of the motor's friction
-    demanded = 61  # A behind the amplifier's lag
+    pin_0 = 20  # rad, MOST x PINS
+    ring_0 = 52  # rad
+    ring_speed_0 = 60  # rad/s
+    ring_in_0 = 68  # rad
+    bristle_0 = 76  # - linkage friction
+    creep_0 = 84  # rad
+    vane_0 = 92  # rad
+    pot_0 = 100  # rad
+    silted = 108
+    friction = 109  # N
+    i_motor = 110  # A
+    volt_integral = 111  # V of the current loop
+    speed_integral = 112  # A of the speed loop
+    turn = 113  # rad of the motor
+    turn_speed = 114  # rad/s
+    turn_bristle = 115  # rad, LuGre deflection of the motor's friction
+    demanded = 116  # A behind the amplifier's lag
 
 
-N_S = 62
+N_S = 117
 
 
 @njit(cache=True, error_model="numpy")
@@ -497,7 +548,7 @@ def linkage(s, p, ring_table, n, t_oil, t, h):
     load = (n * 0.01) ** 2
     warm = t_oil - p[P.t_ref]
     contact = approach(p[P.contact_tau], h)
-    for k in range(3):
+    for k in range(ring_table.shape[0]):
         ring_in = ring_table[k, cell] + part * (ring_table[k, cell + 1] - ring_table[k, cell])
         if p[P.eccentricity_0 + k] != 0.0:
             ring_in += p[P.eccentricity_0 + k] * math.sin(ring_in + p[P.eccentricity_phase])
@@ -619,7 +670,7 @@ def start(s, p, ring_table, x, n, p_s):
     if p[P.motor] != 0.0:
         s[S.turn] = x / p[P.screw_r]
     cell = int(clip((x - X_LOW) / X_STEP, 0.0, X_LAST - 1.0))
-    for k in range(3):
+    for k in range(ring_table.shape[0]):
         ring = ring_table[k, cell]
         for j in range(PINS):
             s[S.pin_0 + k * PINS + j] = ring
@@ -629,12 +680,18 @@ def start(s, p, ring_table, x, n, p_s):
 
 
 # ---- rows of the log and of the truth record -------------------------------------------------------------------------
-LOG = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2", "state")
 _ONES = ("x", "v", "u", "p1", "p2", "p_valve", "n", "i_valve", "friction", "work")
-TRUTH = (*_ONES, "ring_0", "ring_1", "ring_2", "vane_0", "vane_1", "vane_2")
-TRUTH_SLOTS = np.array(
-    [*(S[name] for name in _ONES), *(S.ring_0 + k for k in range(3)), *(S.vane_0 + k for k in range(3))]
-)
+ONES_SLOTS = np.array([S[name] for name in _ONES])
+
+
+def log_names(vanes):
+    """Columns of the log of a machine with these stages."""
+    return ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", *vanes, "state")
+
+
+def truth_names(stages):
+    """Columns of the truth record of a machine with so many stages."""
+    return (*_ONES, *(f"ring_{k}" for k in range(stages)), *(f"vane_{k}" for k in range(stages)))
 
 
 @njit(cache=True, error_model="numpy")
@@ -695,11 +752,16 @@ def write_row(row, k, warm, s, p, frames, view, x_dem, mode, i_mean, p_s, t_oil,
     log[row, 5] = math.floor(i_mean * 1e3 / 0.002 + 0.5) * 0.002
     log[row, 6] = math.floor(p_s * 1e-3 + 0.5) * 1e-3
     log[row, 7] = math.floor(t_oil * 100.0 + 0.5) * 0.01
-    for j in range(3):
+    stages = pot_noise.shape[1]
+    for j in range(stages):
         log[row, 8 + j] = math.floor(read_pot(s, p, j, pot_noise[row, j]) * (180.0 / math.pi) / 0.002 + 0.5) * 0.002
-    log[row, 11] = mode
-    for j in range(len(TRUTH_SLOTS)):
-        truth[row, j] = s[TRUTH_SLOTS[j]]
+    log[row, 8 + stages] = mode
+    ones = len(ONES_SLOTS)
+    for j in range(ones):
+        truth[row, j] = s[ONES_SLOTS[j]]
+    for j in range(stages):
+        truth[row, ones + j] = s[S.ring_0 + j]
+        truth[row, ones + stages + j] = s[S.vane_0 + j]
 
 
 @njit(error_model="numpy")
@@ -751,7 +813,7 @@ def run_compiled(
             sample = min(
                 max((k - warm) // every, 0), len(pot_noise) - 1
             )  # one number for all ticks of a row: noisier than a real one
-            for j in range(3):
+            for j in range(pot_noise.shape[1]):
                 inputs[slots[7] + j] = read_pot(s, p, j, pot_noise[sample, j])
         tick(inputs, state, calibration)
         i = current(state[slots[4]], p, limit)

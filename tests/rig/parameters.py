@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .kernel import N_P, P
+from .kernel import MOST, N_P, P
 
 DEG = np.pi / 180.0
 
@@ -44,9 +44,8 @@ def _nominal() -> np.ndarray:
         P.speed_noise: 0.02,
         P.contact_tau: 3e-4,
         P.spread: 0.02,
-        P.pot_tau_0: 5e-3,
-        P.pot_tau_1: 5e-3,
-        P.pot_tau_2: 5e-3,
+        **{P(P.pot_tau_0 + k): 5e-3 for k in range(MOST)},
+        **{P(P.pot_gain_0 + k): 1.0 for k in range(MOST)},
         P.controller_gain: 1.0,
         P.flow_limit: np.inf,
         P.flow_exponent: 20.0,
@@ -54,9 +53,6 @@ def _nominal() -> np.ndarray:
         P.stribeck_speed: 5e-3,
         P.lvdt_gain: 1.0,
         P.friction_distance: 1.0 * DEG,
-        P.pot_gain_0: 1.0,
-        P.pot_gain_1: 1.0,
-        P.pot_gain_2: 1.0,
         P.vibration_speed: 80.0,
         P.ripple_frequency: 7.3,
         P.dip_period: 20.0,
@@ -118,19 +114,13 @@ class Tolerance:
     relative: bool
 
 
-TOLERANCES = (
+TOLERANCES = (  # of the machine; `tolerances` adds the stages'
     Tolerance(P.engine_lag, 0.05, True),
     Tolerance(P.acceleration, 0.03, True),
     Tolerance(P.deceleration, 0.03, True),
     Tolerance(P.spool_omega, 0.15, True),
     Tolerance(P.spool_zeta, 0.10, True),
     Tolerance(P.flow_gain, 0.05, True),
-    Tolerance(P.half_gap_0, 0.05 / 1.6, True),  # 0.05 deg at the vane
-    Tolerance(P.half_gap_1, 0.05 / 1.1, True),
-    Tolerance(P.half_gap_2, 0.05, True),  # 0.04 deg at the vane
-    Tolerance(P.pot_bias_0, 0.1 * DEG, False),
-    Tolerance(P.pot_bias_1, 0.1 * DEG, False),
-    Tolerance(P.pot_bias_2, 0.1 * DEG, False),
 )
 
 
@@ -144,13 +134,24 @@ MOTOR_TOLERANCES = (
 )
 
 
-def specimen(nominal: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+def tolerances(stages: int, motor: bool = False) -> tuple[Tolerance, ...]:
+    """Return what a specimen with so many stages, and a motor or none, may stray by."""
+    gaps = (0.05 / 1.6, 0.05 / 1.1)  # 0.05 deg at the vane; the others 5 %
+    return (
+        *TOLERANCES,
+        *(Tolerance(P(P.half_gap_0 + k), gaps[k] if k < len(gaps) else 0.05, True) for k in range(stages)),
+        *(Tolerance(P(P.pot_bias_0 + k), 0.1 * DEG, False) for k in range(stages)),
+        *(MOTOR_TOLERANCES if motor else ()),
+    )
+
+
+def specimen(nominal: np.ndarray, rng: np.random.Generator | None, stages: int = 3) -> np.ndarray:
     """Return parameters of one machine: the nominal ones, or (with ``rng``) each drawn uniformly within its
     tolerance.
     """
     p = nominal.copy()
     if rng is not None:
-        for t in (*TOLERANCES, *(MOTOR_TOLERANCES if p[P.motor] else ())):
+        for t in tolerances(stages, bool(p[P.motor])):
             d = rng.uniform(-t.half_width, t.half_width)
             p[t.slot] += p[t.slot] * d if t.relative else d
     return p

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from .controller import Compiled
+from .geometry import STAGES as VANES
 from .geometry import load, ring_tables, vane_angle
 from .kernel import X_LOW, X_STEP, P
 from .simulate import Run
@@ -89,7 +90,7 @@ def by_window(d: np.ndarray, window: float, rate: int = 1000) -> np.ndarray:
 
 
 def linkage_residual(run: Run) -> np.ndarray:
-    """Measured minus nominal angles (deg), float64[rows, 3]: kinematics of the logged stroke, ideal play, sensor lag.
+    """Measured minus nominal angles (deg), float64[rows, stages]: kinematics of the logged stroke, ideal play, lag.
 
     The stroke is a centred mean over 21 ms: the noise of single samples would push an ideal play along by its extremes.
     Each play starts where in its gap it fits the first second best.
@@ -98,7 +99,7 @@ def linkage_residual(run: Run) -> np.ndarray:
     smooth = np.convolve(np.pad(run.log["x_lvdt"], 10, mode="edge"), np.full(21, 1.0 / 21.0), mode="valid")
     place = np.clip((smooth * 1e-3 - X_LOW) / X_STEP, 0, tables.shape[1] - 1)
     out = []
-    for k, name in enumerate(("vigv", "vgv1", "vgv2")):
+    for k, name in enumerate(VANES[: len(tables)]):
         drive = np.interp(place, np.arange(tables.shape[1]), tables[k])
         p = run.machine
         width = 2.0 * p[P.half_gap_0 + k]

@@ -12,7 +12,7 @@ import numpy as np
 from . import kernel
 from .controller import Compiled, Controller
 from .effects import CATALOGUE, Hidden, apply
-from .geometry import Geometry, load, ring_tables, schedule, vane_angle
+from .geometry import STAGES, Geometry, load, ring_tables, schedule, vane_angle
 from .kernel import FRAME, TICK, P, S
 from .manoeuvre import Manoeuvre
 from .parameters import NOMINAL, specimen, with_motor
@@ -27,9 +27,7 @@ UNITS = {
     "i_cmd": "mA",
     "p_s": "MPa",
     "t_oil": "degC",
-    "vigv": "deg",
-    "vgv1": "deg",
-    "vgv2": "deg",
+    **dict.fromkeys(STAGES, "deg"),
     "state": "-",
 }
 
@@ -56,7 +54,7 @@ class Run:
     """What a run leaves.
 
     log      channel -> values in border units (`UNITS`); ``t`` (s) is the logger's time
-    truth    quantity -> true values in SI on the same rows (`kernel.TRUTH`), ``t`` without jitter
+    truth    quantity -> true values in SI on the same rows (`kernel.truth_names`), ``t`` without jitter
     machine  the specimen's parameters (array in the order of `kernel.P`), before hidden effects
     hidden   the effects in it, in the order given
     record   everything that is needed to repeat the run or to judge an answer, ready for JSON
@@ -129,12 +127,18 @@ def simulate(
     if not 0.0 <= jitter < 1.0 / rate:
         raise ValueError(f"jitter (={jitter:g} s) must be in [0, {1.0 / rate:g})")
     geometry = geometry or load()
+    stages = len(geometry.stages)
+    columns, truths = kernel.log_names(STAGES[:stages]), kernel.truth_names(stages)
     streams = {
         name: np.random.default_rng([seed, k])
         for k, name in enumerate(("specimen", "speed", "lvdt", "pots", "jitter", "start"), start=10)
     }
     nominal = with_motor(machine(geometry)) if motor else machine(geometry)
-    p = specimen(nominal, streams["specimen"] if randomised else None) if parameters is None else parameters.copy()
+    p = (
+        specimen(nominal, streams["specimen"] if randomised else None, stages)
+        if parameters is None
+        else parameters.copy()
+    )
 
     # segments between onsets, each with its parameters and ring tables
     warm = round(run_up / TICK / FRAME) * FRAME
@@ -165,7 +169,7 @@ def simulate(
     level = 1.0 if noise else 0.0
     speed_noise = level * streams["speed"].standard_normal(n_frames)
     lvdt_noise = level * streams["lvdt"].standard_normal(n_ticks)
-    pot_noise = level * streams["pots"].standard_normal((rows, 3))
+    pot_noise = level * streams["pots"].standard_normal((rows, stages))
     frames = np.empty((n_frames, 4))
     frames[:, 2] = 1.0
     hears = np.ones(n_frames, dtype=bool)
@@ -176,7 +180,7 @@ def simulate(
         else:
             hears[during] = False
     frames[:, 3] = np.maximum.accumulate(np.where(hears, np.arange(n_frames), 0))
-    log, truth = np.empty((rows, len(kernel.LOG))), np.empty((rows, len(kernel.TRUTH)))
+    log, truth = np.empty((rows, len(columns))), np.empty((rows, len(truths)))
 
     s = np.zeros(kernel.N_S)
     if x0 is None:
@@ -199,8 +203,8 @@ def simulate(
     else:
         _run_object(controller, *common, mean_through, *feeds)
 
-    out = {name: np.ascontiguousarray(log[:, k]) for k, name in enumerate(kernel.LOG)}
-    true = {"t": out["t"].copy()} | {name: np.ascontiguousarray(truth[:, k]) for k, name in enumerate(kernel.TRUTH)}
+    out = {name: np.ascontiguousarray(log[:, k]) for k, name in enumerate(columns)}
+    true = {"t": out["t"].copy()} | {name: np.ascontiguousarray(truth[:, k]) for k, name in enumerate(truths)}
     out["t"] = out["t"] + streams["jitter"].uniform(0.0, jitter, rows)
     kept = np.ones(rows, dtype=bool)
     for start, length in gaps:

@@ -1,8 +1,10 @@
 """Names and units of the signals at every border: logs, CAN, tables, command line, plots (docs/architecture.md)."""
 
+from vaneloop.base.vanes import VANES
+
 __all__ = ["UNITS"]
 
 UNITS = {
     "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "p_s": "MPa", "t_oil": "degC",
-    "vigv": "deg", "vgv1": "deg", "vgv2": "deg", "state": "-",
+    **dict.fromkeys(VANES, "deg"), "state": "-",
 }  # fmt: skip

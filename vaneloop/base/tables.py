@@ -190,11 +190,17 @@ def _allowed(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
     return list(getattr(here, "model_fields", {}))
 
 
+def _there(kind: Any) -> Any:
+    """The type of what may be left out: X of ``X | None``."""
+    parts = [p for p in get_args(kind) if p is not type(None)]
+    return parts[0] if len(parts) == 1 < len(get_args(kind)) else kind
+
+
 def _inside(kind: Any, step: Any) -> Any:
     """Type of what is at ``step`` (a key, a position, the tag of a union's member) inside a value of type ``kind``."""
     if hasattr(kind, "model_fields"):
         field = kind.model_fields.get(step)
-        return kind if field is None else field.annotation
+        return kind if field is None else _there(field.annotation)
     parts = get_args(kind)
     if get_origin(kind) is Annotated:
         return _inside(parts[0], step)

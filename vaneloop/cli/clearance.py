@@ -24,6 +24,8 @@ examples:
 
 exit codes: 0 good, 2 bad input"""
 
+SIDE_BY_SIDE = 3  # stages in a table: more do not fit a terminal
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -63,7 +65,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import load_geometry
-    from plant.linkage import STAGES
     from plant.spatial import Clearances
     from vaneloop.base.errors import InputError
 
@@ -74,8 +75,9 @@ def command(args: argparse.Namespace) -> int:
     if not -360.0 <= args.vane <= 360.0:
         raise InputError(f"--vane (={args.vane:g} deg) must be in [-360, 360]")
     geometry = load_geometry(args.geometry)
-    widths = {s: getattr(geometry, s).hysteresis.value for s in STAGES}
-    for stage, text in terminal.pairs(args.width, "width", lambda k: k in STAGES, ", ".join(STAGES)).items():
+    vanes = geometry.vanes
+    widths = {s: geometry.stage(s).hysteresis.value for s in vanes}
+    for stage, text in terminal.pairs(args.width, "width", lambda k: k in vanes, ", ".join(vanes)).items():
         try:
             widths[stage] = float(text)
         except ValueError:
@@ -84,20 +86,22 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(f"--width {stage}={text}: must be a number in [0, 10] deg")
     studies = []
     with terminal.progress_bar(args, "crossing the clearances") as progress:
-        for i, s in enumerate(STAGES):
+        for i, s in enumerate(vanes):
             studies.append(clearance_study(geometry, s, widths[s], fits, args.vane, args.ring))
             if progress is not None:
-                progress((i + 1) / len(STAGES))
-    rows = study_rows(studies)
-    rows.append(["together", *(t for s in studies for t in ("", f"{s.made:.3f}", ""))])
-    columns = ["joint", *(f"{s.stage} {w}" for s in studies for w in ("mm", "deg", "alone, mm"))]
+                progress((i + 1) / len(vanes))
     where = f"at the vane {args.vane:g} deg from the right clevis"
-    terminal.print_table(
-        args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows
-    )
+    for i in range(0, len(studies), SIDE_BY_SIDE):
+        some = studies[i : i + SIDE_BY_SIDE]
+        rows = study_rows(some)
+        rows.append(["together", *(t for s in some for t in ("", f"{s.made:.3f}", ""))])
+        columns = ["joint", *(f"{s.stage} {w}" for s in some for w in ("mm", "deg", "alone, mm"))]
+        terminal.print_table(
+            args, f"clearance of each joint and the width of the loop that it makes, {where}", columns, rows
+        )
     rows = [[name.replace("_", " "), *(f"{s.freedoms[name]:.4f}" for s in studies)] for name in studies[0].freedoms]
     title = "the ring's four freedoms: change of the vane angle, deg for 1 mm, largest over the stroke"
-    terminal.print_table(args, title, ["freedom", *STAGES], rows)
+    terminal.print_table(args, title, ["freedom", *vanes], rows)
     unit = {"clearance": "mm", "width": "deg"}
     terminal.write_json(args, {"schema": 1, "unit": unit, "vane": args.vane, "stages": [asdict(s) for s in studies]})
     if args.report:

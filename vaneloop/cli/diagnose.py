@@ -8,7 +8,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model
-from vaneloop.cli.options import add_model_option, chain_of
+from vaneloop.cli.options import add_machine_options, chain_of
 
 __all__ = ["DESCRIPTION", "add_options", "command", "show"]
 
@@ -29,7 +29,7 @@ exit codes: 0 nothing is missing, 1 something is missing or unknown, 2 bad input
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
-    add_model_option(parser)
+    add_machine_options(parser)
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
     own_model.add_options(parser)
     terminal.add_output_options(parser)

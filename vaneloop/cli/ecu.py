@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.vanes import VANES
 from vaneloop.cli import options, station
 
 __all__ = ["DESCRIPTION", "add_options", "command", "demand_of"]
@@ -62,10 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mode", choices=("run", "standby"), default="run", help="mode asked for with a profile or log (default run)"
     )
-    parser.add_argument(
-        "--model", metavar="M.toml", help="model file: changed parameters and added effects of the engine"
-    )
-    options.add_plant_option(parser)
+    options.add_machine_options(parser)
     parser.add_argument(
         "--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)"
     )
@@ -129,7 +127,7 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(
             "--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own"
         )
-    machine = station.machine_of(args)
+    machine = options.machine_of(args).plant
     demand = demand_of(args)
     typed = Typed() if demand is None else None
     source: Any = typed if demand is None else demand
@@ -158,9 +156,10 @@ def command(args: argparse.Namespace) -> int:
             n_dem, n_r, _ = ecu.ecu.arrays.demand
             n_r = ecu.ecu.arrays.s[0, 0] if n_r != n_r else n_r
             note = typed.complaint if typed is not None else ""
+            angles = " ".join(f"{v[name]:6.2f}" for name in VANES if name in v)
             live.say(
                 f"{ecu.t:>6.0f} s  n_dem {n_dem:6.2f} %  n_r {n_r:6.2f} %  {state:<9}  x_dem {v['x_dem']:6.2f}  "
-                f"x_lvdt {v['x_lvdt']:6.2f} mm  vigv {v['vigv']:6.2f} deg  {faults}  {note}"
+                f"x_lvdt {v['x_lvdt']:6.2f} mm  vanes {angles} deg  {faults}  {note}"
             )
             if typed is not None:
                 typed.complaint = ""

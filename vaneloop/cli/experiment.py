@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vaneloop.base import terminal
 from vaneloop.cli import options
-from vaneloop.cli.options import add_model_option, chain_of
+from vaneloop.cli.options import add_machine_options, chain_of
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -25,7 +25,7 @@ exit codes: 0 a profile is recommended or nothing is to be separated, 1 no profi
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
-    add_model_option(parser)
+    add_machine_options(parser)
     parser.add_argument("--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem)")
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")

@@ -31,8 +31,7 @@ bring the model no nearer to the log (nothing is written then), 2 bad input"""
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
-    parser.add_argument("--model", metavar="M.toml", help="model file to extend (default: the nominal model)")
-    options.add_plant_option(parser)
+    options.add_machine_options(parser)
     parser.add_argument(
         "--effect", metavar="NAME", action="append", nargs="+", default=[], help="effect to add (docs/effects.md)"
     )

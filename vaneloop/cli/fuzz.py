@@ -8,10 +8,11 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from controller import MODES, load_calibration
+from controller import MODES
 from hil.inject.fuzz import CLAIMS, HELD, KINDS, RECOVERY, Campaign, fuzz, read_attack, run_attack, write_attack
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -54,6 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="s within which RUN must be back (default 2.5)",
     )
+    options.add_machine_options(parser)
     parser.epilog = """examples:
   vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
   vaneloop fuzz --replay fuzz_failure.log
@@ -70,7 +72,8 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--seed (={args.seed}) must be 0 to 2^63 - 1")
     if not 0.01 <= args.recovery <= 3600:
         raise InputError(f"--recovery (={args.recovery:g}) must be 0.01 to 3600 s")
-    k = load_calibration().scalars
+    machine = options.machine_of(args)
+    k = machine.calibration.scalars
     limits = np.array([k.current_limit, k.stroke_min, k.stroke_max])
     if args.current_limit is not None:
         if not 0 < args.current_limit <= 1000:
@@ -85,7 +88,7 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, "compiling the simulator for this machine (once, about 20 s) ...")
     if args.replay:
         attack = read_attack(args.replay)
-        claim, tick, took = run_attack(attack, limits, recovery)
+        claim, tick, took = run_attack(attack, limits, recovery, machine.plant, machine.calibration)
         held = claim == CLAIMS[HELD]
         said = (
             f"everything held; RUN {took:.3f} s after the last frame"
@@ -99,7 +102,10 @@ def command(args: argparse.Namespace) -> int:
         )
         return 0 if held else 1
     with terminal.progress_bar(args, "frames") as progress:
-        campaign = fuzz(args.frames, args.seed, limits=limits, recovery=recovery, progress=progress)
+        campaign = fuzz(
+            args.frames, args.seed, limits=limits, recovery=recovery, progress=progress,
+            plant=machine.plant, calibration=machine.calibration,
+        )  # fmt: skip
     _tell(args, campaign)
     if campaign.failure is not None:
         n = len(campaign.failure.attack.at)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.vanes import VANES
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -130,7 +131,7 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
             continue
         sizes = dict(h.parameters)
         which = int(sizes["stage"]) if "stage" in sizes else -1
-        key = ("vigv", "vgv1", "vgv2")[which] if which >= 0 else rig.EFFECTS[h.name].main
+        key = VANES[which] if which >= 0 else rig.EFFECTS[h.name].main
         declared = next((p for p in EFFECTS[h.name].parameters if p.name == key), None)
         if declared is not None:
             truth = sizes[rig.EFFECTS[h.name].main] / declared.si
@@ -241,13 +242,15 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     """Whether an effect was named improbable and without rival, or with a size on a bound that is not its neutral
     value.
     """
+    from plant import build_plant
     from plant.effects import EFFECTS
     from vaneloop.discrepancy.models.vane_stages.declared import SHAPES
 
     if effect["probability"] < LIKELY and not effect["rivals"]:
         return True
-    declared = EFFECTS[effect["effect"]].parameters if effect["effect"] in EFFECTS else ()
-    for p in declared:
+    if effect["effect"] not in EFFECTS:
+        return False
+    for p in build_plant().parameters_of(effect["effect"]).values():
         value = effect["parameters"].get(p.name, {}).get("value", p.neutral)
         near = 1e-6 * (p.high - p.low)
         if (

@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the scenarios that ship, and stop")
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
-    options.add_plant_option(parser)
+    options.add_machine_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
 
@@ -58,6 +58,7 @@ def command(args: argparse.Namespace) -> int:
     made = [(Path(n).stem, load_scenario(n)) for n in named]
     if args.seed is not None:
         made = [(n, s.model_copy(update={"seed": args.seed})) for n, s in made]
+    machine = options.machine_of(args)
     if args.bus == "lockstep":
         from hil.loop.lockstep import warm_up
 
@@ -77,8 +78,17 @@ def command(args: argparse.Namespace) -> int:
                 if progress is not None:
                     progress((i + fraction) / len(made))
 
-            shown = share if progress is not None else None
-            outcomes.append(run(scenario, bus=args.bus, plant=plant, name=name, progress=shown))
+            told = share if progress is not None else None
+            outcomes.append(
+                run(
+                    scenario,
+                    bus=args.bus,
+                    plant=machine.plant,
+                    calibration=machine.calibration,
+                    name=name,
+                    progress=told,
+                )
+            )
     _report(args, outcomes, skipped)
     return 0 if all(o.held for o in outcomes) else 1
 

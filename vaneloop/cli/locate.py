@@ -7,7 +7,7 @@ import sys
 
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model
-from vaneloop.cli.options import add_model_option, chain_of, say_located
+from vaneloop.cli.options import add_machine_options, chain_of, say_located
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -25,7 +25,7 @@ exit codes: 0 every stage agrees everywhere, 1 at least one fails, 2 bad input""
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
-    add_model_option(parser)
+    add_machine_options(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")

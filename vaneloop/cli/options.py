@@ -16,7 +16,7 @@ from vaneloop.verbs.machine import TABLES, Machine, files_of
 __all__ = [
     "CAN_SUFFIXES",
     "add_log_options",
-    "add_model_option",
+    "add_machine_options",
     "add_plant_option",
     "add_reading_options",
     "add_tables_option",
@@ -30,13 +30,14 @@ __all__ = [
 ]
 
 
-def add_model_option(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--model`` and ``--plant``."""
+def add_machine_options(parser: Any) -> None:
+    """Declare ``--model``, ``--tables`` and ``--plant``: the machine that a command is about (`machine_of`)."""
     parser.add_argument(
         "--model",
         metavar="M.toml",
         help="model file: changed parameters and added effects (written by vaneloop extend)",
     )
+    add_tables_option(parser)
     add_plant_option(parser)
 
 

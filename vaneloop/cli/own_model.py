@@ -39,7 +39,7 @@ def asked(args: argparse.Namespace) -> bool:
             if getattr(args, name):
                 raise InputError(f"--{name} needs --system MY.py")
         return False
-    for name in ("strategy", "tolerance", "out"):
+    for name in ("strategy", "tolerance", "tables", "out"):
         if getattr(args, name, None) and not (name == "out" and hasattr(args, "effect")):
             raise InputError(f"--{name} does not go with --system")
     return True

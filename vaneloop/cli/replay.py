@@ -37,10 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)",
     )
-    group.add_argument(
-        "--model", metavar="M.toml", help="a model file: recalibrated parameters and effects beyond the nominal machine"
-    )
-    options.add_tables_option(group)
+    options.add_machine_options(group)
     group.add_argument(
         "--tolerance",
         metavar="signal=value",

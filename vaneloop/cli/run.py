@@ -11,9 +11,9 @@ from vaneloop.cli import options, station
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Controller with its plant as a node on the CAN bus: it takes ECU_DEMAND and sends VGV_STATUS,
-VGV_SERVO, VGV_ANGLES and VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real time, until
---duration or Ctrl-C; at the end it says how late its ticks were. On lockstep in simulated time with an ECU of its own,
-or with the frames of a record (--inputs).
+VGV_SERVO, VGV_ANGLES (_2, _3) and VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real
+time, until --duration or Ctrl-C; at the end it says how late its ticks were. On lockstep in simulated time with an ECU
+of its own, or with the frames of a record (--inputs).
 
 examples:
   vaneloop run --bus vcan0                      (and in another terminal: vaneloop ecu --bus vcan0 --profile ramp)
@@ -55,10 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="per cent of ticks that may be later than --limit-late-us (default 0)",
     )
     parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
-    parser.add_argument(
-        "--model", metavar="M.toml", help="model file: changed parameters and added effects of the machine"
-    )
-    options.add_plant_option(parser)
+    options.add_machine_options(parser)
     parser.add_argument(
         "--start-speed",
         metavar="N",
@@ -117,9 +114,9 @@ def command(args: argparse.Namespace) -> int:
 def _node(args: argparse.Namespace, machine: Any = None) -> Any:
     from hil.loop.node import Node
 
-    machine = machine or station.machine_of(args)
+    machine = machine or options.machine_of(args)
     station.warm_nodes(args)
-    return Node(machine, n_r=args.start_speed, seed=args.seed)
+    return Node(machine.plant, machine.calibration, n_r=args.start_speed, seed=args.seed)
 
 
 def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
@@ -129,7 +126,7 @@ def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
     from plant.parameters import ACCELERATION, DECELERATION, LAG
 
     rows = [LAG, ACCELERATION, DECELERATION, *rows_at("engine")]
-    if args.model and (machine.p[rows] != build_plant().p[rows]).any():
+    if args.model and (machine.plant.p[rows] != build_plant().p[rows]).any():
         terminal.say(
             args, f"note: the engine of {args.model} runs in the ECU: vaneloop ecu --bus {bus} --model {args.model}"
         )
@@ -168,7 +165,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
     from hil.bus.port import Port
     from hil.loop.realtime import Ticker, run_realtime, stop_on_signals
 
-    machine = station.machine_of(args)
+    machine = options.machine_of(args)
     node = _node(args, machine)
     _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
@@ -262,9 +259,9 @@ def _in_lockstep(args: argparse.Namespace) -> int:
 
     demand = demand_of(args, default="ramp")
     profile = demand.per_frame()
-    machine = station.machine_of(args)
+    machine = options.machine_of(args)
     node = _node(args, machine)
-    ecu = Ecu(machine, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
+    ecu = Ecu(machine.plant, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
     with terminal.progress_bar(args, "lockstep") as progress:
         run = run_lockstep(
             profile[:, 0], profile[:, 1], vgv=node, ecu=ecu,
@@ -352,7 +349,7 @@ def _repeat(args: argparse.Namespace) -> int:
                 f"{int(row[1]).to_bytes(8, 'little', signed=True).hex().upper()}"
                 for tick, row in ((was_at[k], was[k]), (at[k], sent[k]))
             )
-            needed = "the same --seed, --model and --start-speed are needed"
+            needed = "the same --seed, --model, --tables and --start-speed are needed"
             exceeded.append(f"frame {k + 1:,} of {len(was):,}: {before} was sent, now {now}; {needed}")
         elif len(was) != len(sent):
             exceeded.append(f"{len(was):,} frames were sent, now {len(sent):,}")

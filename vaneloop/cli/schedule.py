@@ -14,10 +14,10 @@ from vaneloop.cli import options
 __all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
 DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links
-of VGV1 and VGV2 that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves, made
-into stroke tables.
+of the other stages that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves,
+made into stroke tables.
 
-The log needs x_lvdt and vigv (vgv1, vgv2 where they were measured), the machine as built (lb of the geometry) driven
+The log needs x_lvdt and vigv (vgv1, ... where they were measured), the machine as built (lb of the geometry) driven
 there and back: any format that replay reads. Without a log the play is the geometry's own.
 
 examples:
@@ -29,6 +29,8 @@ examples:
 exit codes: 0 good, 2 bad input (a mechanism that cannot be assembled, a schedule that no length meets, a log without a
 loop)
 """
+
+SIDE_BY_SIDE = 2  # stages in the table of errors: more do not fit a terminal
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         help="measured stroke-angle loop: candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet",
     )
-    group = parser.add_argument_group("adjusting VGV1 and VGV2")
+    group = parser.add_argument_group("adjusting the stages but the VIGV")
     group.add_argument(
         "--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)"
     )
@@ -127,17 +129,19 @@ def command(args: argparse.Namespace) -> int:
         args, "links, and what remains (target minus angle; rms and max over 40 to 102 % speed)", columns, rows
     )
     pick = [i for i, n in enumerate(result.speed) if n % 10 == 0 or n >= 95 or i == len(result.speed) - 1]
-    rows = [
-        [
-            f"{result.speed[i]:g}",
-            *(f"{v:.2f}" for v in result.table[1:, i]),
-            *(f"{e[i]:.2f}" for s in result.links[1:] for e in (s.error_initial, s.error_built, s.error)),
+    for k in range(0, max(len(result.links) - 1, 1), SIDE_BY_SIDE):
+        some = result.links[1 + k : 1 + k + SIDE_BY_SIDE]
+        rows = [
+            [
+                f"{result.speed[i]:g}",
+                *(f"{v:.2f}" for v in result.table[1:, i]),
+                *(f"{e[i]:.2f}" for s in some for e in (s.error_initial, s.error_built, s.error)),
+            ]
+            for i in pick
         ]
-        for i in pick
-    ]
-    errors = [f"{s} {w}" for s in ("vgv1", "vgv2") for w in ("first", "as is", "adjusted")]
-    columns = ["speed, %", "extension, mm", "retraction", "mean", *errors]
-    terminal.print_table(args, "stroke tables, and errors over speed, deg (all speeds: --json)", columns, rows)
+        errors = [f"{s.stage} {w}" for s in some for w in ("first", "as is", "adjusted")]
+        columns = ["speed, %", "extension, mm", "retraction", "mean", *errors]
+        terminal.print_table(args, "stroke tables, and errors over speed, deg (all speeds: --json)", columns, rows)
     if result.loops:
         rows = [
             [

@@ -48,7 +48,6 @@ def command(args: argparse.Namespace) -> int:
     import numpy as np
 
     from plant import load_geometry
-    from plant.linkage import STAGES
     from vaneloop.base.errors import InputError
 
     if not args.limit >= 0.0:
@@ -57,7 +56,7 @@ def command(args: argparse.Namespace) -> int:
     with terminal.progress_bar(args, "closing the loop in space") as progress:
         check = spatial_check(geometry, args.offset, args.points, progress)
     rows, stages = [], []
-    for s in STAGES:
+    for s in geometry.vanes:
         d = check.difference(s)
         worst = int(np.argmax(np.abs(d)))
         two = float(np.max(np.abs(check.multibody[s] - check.newton[s]))) if check.multibody else None

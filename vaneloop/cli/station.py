@@ -17,7 +17,7 @@ from vaneloop.base import terminal
 __all__ = [
     "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "bus_name", "check_realtime_options",
     "check_seconds", "joined",
-    "machine_of", "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
+    "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
 ]  # fmt: skip
 
 # both nodes' acceptance filter: 0x0A0 to 0x0BF, so that a flood of other identifiers costs a tick nothing
@@ -109,13 +109,6 @@ def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[A
         yield bus
     finally:
         bus.shutdown()
-
-
-def machine_of(args: argparse.Namespace) -> Any:
-    """Return the plant that ``--plant`` and ``--model`` describe, or the nominal one."""
-    from vaneloop.cli import options
-
-    return options.machine_of(args).plant
 
 
 def warm_nodes(args: argparse.Namespace) -> None:

@@ -19,7 +19,6 @@ from vaneloop.cli import options
 from vaneloop.design.strategies import (
     FAILURES,
     FIGURES,
-    STAGES,
     Array,
     Failure,
     Outcome,
@@ -151,8 +150,9 @@ def _print(
     args: argparse.Namespace, n_dem: Array, outcomes: Outcomes, failures: list[Failure], goals: list[dict[str, Any]]
 ) -> None:
     rows: list[list[str]] = []
+    stages = list(next(iter(outcomes.values())).figures)
     for (scenario, strategy), o in outcomes.items():
-        angles = [" ".join("-" if (v := o.figures[s][k]) is None else f"{v:.3f}" for k in FIGURES) for s in STAGES]
+        angles = [" ".join("-" if (v := o.figures[s][k]) is None else f"{v:.3f}" for k in FIGURES) for s in o.figures]
         first = scenario if strategy == STRATEGIES[0] else ""
         rows.append([first, strategy, *angles, f"{o.travel:,.0f}", f"{o.reversals:,}", f"{o.current:.2f}"])
     title = (
@@ -160,7 +160,7 @@ def _print(
         f"100 % speed"
     )
     terminal.print_table(
-        args, title, ["machine", "strategy", *STAGES, "travel mm", "reversals", "current mA rms"], rows
+        args, title, ["machine", "strategy", *stages, "travel mm", "reversals", "current mA rms"], rows
     )
     if failures:
         when = {f.during: f.at for f in failures}

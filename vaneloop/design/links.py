@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plant import Geometry, Schedules
 from plant.geometry import WORKING_SPEED, Stage, vane_angles
-from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE, STAGES, check_assembly
+from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE, check_assembly
 from vaneloop.base.errors import InputError
 from vaneloop.design.stroke_tables import schedules_at_design
 
@@ -38,8 +38,8 @@ class ScheduleOptions:
     lc_range   mm, largest change of a vertical link
     adjust     the lengths that may change, out of lb and lc
     criterion  rms or max of the error over the working speeds (40 to 102 %), or design: error at 100 % plus rms
-    limit      deg, largest error of VGV1 and VGV2 at a working speed; a schedule that no length brings below it is
-               refused
+    limit      deg, largest error of a stage but the VIGV at a working speed; a schedule that no length brings below it
+               is refused
     """
 
     step: float = 0.5
@@ -108,8 +108,8 @@ def geometry_with(
     not assemble.
     """
     stages: dict[str, Stage] = {}
-    for name in STAGES:
-        stage: Stage = getattr(geometry, name)
+    for name in geometry.vanes:
+        stage = geometry.stage(name)
         update = {}
         for key, value in changes.get(name, {}).items():
             q = getattr(stage, key)
@@ -138,8 +138,8 @@ def adjust_links(
     Returns the two changes and the remaining error (deg) at each speed. Raises InputError where no lengths meet the
     schedule.
     """
-    k = STAGES.index(stage)
-    built: Stage = getattr(geometry, stage)
+    k = geometry.vanes.index(stage)
+    built = geometry.stage(stage)
     target = np.rad2deg(schedules.targets(speed)[:, k])
     extra = correction(stroke) if correction is not None else np.zeros(stroke.size)
     works = (speed >= WORKING_SPEED[0]) & (speed <= WORKING_SPEED[1])

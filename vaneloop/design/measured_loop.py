@@ -24,7 +24,6 @@ from plant.linkage import (
     G_LDP,
     N_CRANK,
     N_PER_STAGE,
-    STAGES,
     STROKE_HIGH,
     STROKE_LOW,
     stage_ring_angle,
@@ -109,7 +108,7 @@ def measure_loop(
 
     Raises LogError: no motion, one branch only, a stage that moves the wrong way, too few samples.
     """
-    k = STAGES.index(stage)
+    k = geometry.vanes.index(stage)
     t, x, y = _aligned(stroke, angle, stage, source)
     travel = float(np.ptp(np.quantile(x, [0.001, 0.999])))
     if travel < LEAST_MOTION:

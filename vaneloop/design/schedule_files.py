@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Geometry, Schedules
-from plant.linkage import STAGES
 from vaneloop.base.errors import InputError
 from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.stroke_tables import vane_angle_table
@@ -55,7 +54,7 @@ def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
         raise InputError(f"{folder}: cannot be made ({e.strerror})") from None
     out = [folder / f"{name}.toml" for name in ("stroke_tables", "geometry", "schedules", "vane_angles")]
     write_stroke_tables(result.table, out[0], result.origin)
-    write_geometry(result.geometry, out[1], "Linkage of the three stages, as measured and adjusted: vaneloop schedule.")
+    write_geometry(result.geometry, out[1], "Linkage of the vane stages, as measured and adjusted: vaneloop schedule.")
     write_schedules(result.schedules, out[2])
     write_vane_angles(vane_angle_table(result.geometry), result.geometry, out[3], result.origin)
     return out
@@ -83,19 +82,19 @@ def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin
         "adaptive know.",
         "",
     ]
-    for stage in STAGES:
-        q = getattr(geometry, stage).hysteresis
+    for stage in geometry.vanes:
+        q = geometry.stage(stage).hysteresis
         lines.append(f'play_{stage} = {{ value = {q.value!r}, unit = "deg", origin = {_quoted(q.origin)} }}')
     lines.append("")
-    for name, unit, row in zip(("stroke", *STAGES), ("mm", "deg", "deg", "deg"), table, strict=True):
+    for name, unit, row in zip(("stroke", *geometry.vanes), ("mm", *["deg"] * len(geometry.vanes)), table, strict=True):
         lines += _axis(name, unit, origin, row)
     _write(path, "\n".join(lines))
 
 
-def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the three stages.") -> None:
+def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the vane stages.") -> None:
     """Write a geometry as `plant.load_geometry` reads it, each number with its origin."""
     lines = [f"# {words}", ""]
-    for name in ("crank", *STAGES):
+    for name in ("crank", *geometry.vanes):
         lines.append(f"[{name}]")
         for key, q in getattr(geometry, name):
             tolerance = f", tolerance = {q.tolerance!r}" if q.tolerance else ""
@@ -109,7 +108,8 @@ def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage o
 def write_schedules(schedules: Schedules, path: str | Path) -> None:
     """Write schedules as `plant.load_schedules` reads them."""
     lines = ["# Target vane angles over rotor speed.", ""]
-    for name, axis in schedules:
+    for name in ("speed", *schedules.vanes):
+        axis = getattr(schedules, name)
         lines += [
             f"[{name}]",
             f'unit = "{axis.unit}"',

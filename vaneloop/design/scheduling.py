@@ -1,4 +1,4 @@
-"""The stepwise scheduling method: mechanism -> VIGV strokes -> links of VGV1 and VGV2 -> measured loop -> two curves ->
+"""The stepwise scheduling method: mechanism -> VIGV strokes -> links of the others -> measured loop -> two curves ->
 tables.
 
 Source: Kim & Ki, Appl. Sci. 2020, 10, 6643, sections 4 and 5, figures 7 to 13. Pure functions: inputs in, a dataclass
@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 from hil.logs import Log, LogError
 from plant import Geometry, Schedules
-from plant.geometry import WORKING_SPEED, Stage, vane_angles
-from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE, STAGES, check_assembly, stage_ring_angle, vane_angle
+from plant.geometry import WORKING_SPEED, vane_angles
+from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE, check_assembly, stage_ring_angle, vane_angle
 from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import same_stages
 from vaneloop.design.links import LinkChange, ScheduleOptions, adjust_links, geometry_with
 from vaneloop.design.measured_loop import DEG, MeasuredLoop, measure_loop
 from vaneloop.design.stroke_tables import (
@@ -52,7 +53,7 @@ Array = NDArray[np.float64]
 class ScheduleResult:
     """What the method gives.
 
-    speed    %, raster of tables and errors; target float64[n, 3] deg
+    speed    %, raster of tables and errors; target float64[n, stages] deg
     table    float64[4, n]: speed, strokes (mm) for extension, retraction and the mean: what the controller loads
     links    one entry a stage
     loops    measured loops by stage; empty without a log
@@ -91,13 +92,15 @@ def schedule(
     """
     o = options or ScheduleOptions()
     o.check()
+    same_stages(geometry=geometry.vanes, schedules=schedules.vanes)
+    vanes = geometry.vanes
     notes: list[str] = list(log.notes) if log is not None else []
     loops: dict[str, MeasuredLoop] = {}
     if log is not None:
         if "x_lvdt" not in log.channels or "vigv" not in log.channels:
             missing = [n for n in ("x_lvdt", "vigv") if n not in log.channels]
             raise LogError(f"{log.path}: no {' and no '.join(missing)}; a loop needs stroke and angle")
-        for done, name in enumerate(STAGES):
+        for done, name in enumerate(vanes):
             if name in log.channels:
                 try:
                     loops[name] = measure_loop(log.channels["x_lvdt"], log.channels[name], geometry, name, log.path)
@@ -106,7 +109,7 @@ def schedule(
                         raise
                     notes.append(f"{name} is not measured, the geometry's own curves stand for it: {e}")
             if progress is not None:
-                progress(0.8 * (done + 1) / len(STAGES))
+                progress(0.8 * (done + 1) / len(vanes))
     said: dict[str, list[str]] = {}
     for name, measured in loops.items():
         for note in measured.notes:
@@ -133,8 +136,8 @@ def schedule(
 
     file = Path(log.path).name if log is not None else ""
     links, changes, origins = [], {}, {}
-    for k, name in enumerate(STAGES):
-        built: Stage = getattr(geometry, name)
+    for k, name in enumerate(vanes):
+        built = geometry.stage(name)
         loop = loops.get(name)
         correction = _correction(loop, geometry, k)
         initial = target[:, k] - np.rad2deg(
@@ -172,9 +175,9 @@ def schedule(
     try:
         check_assembly(machine.arrays(initial=True))
     except InputError:  # the arms as first built do not go with the new links
-        machine = geometry_with(machine, {n: {"lb_initial": getattr(machine, n).lb.value} for n in STAGES})
+        machine = geometry_with(machine, {n: {"lb_initial": machine.stage(n).lb.value} for n in vanes})
     both = [
-        _branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(STAGES)
+        _branch_errors(machine, geometry, k, table, target, loops.get(n), links[k][2:4]) for k, n in enumerate(vanes)
     ]
     out = []
     for (name, built, d_lb, d_lc, initial, as_built, error), (up, down) in zip(links, both, strict=True):
@@ -257,7 +260,7 @@ def _branch_errors(
             g = machine.arrays()
             o = N_CRANK + k * N_PER_STAGE
             ldp, lever = float(g[o + G_LDP]), float(g[o + G_L])
-            half = 0.5 * math.radians(getattr(machine, STAGES[k]).hysteresis.value) * lever / ldp
+            half = 0.5 * math.radians(machine.stages()[k].hysteresis.value) * lever / ldp
             angle = (
                 np.array([vane_angle(stage_ring_angle(x * 1e-3, g, k) + side * half, ldp, lever) for x in stroke]) * DEG
             )

@@ -35,7 +35,7 @@ class SpatialCheck:
 
 
 def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, progress: Any = None) -> SpatialCheck:
-    """Close the three stages in space over the stroke of 0 to 48 mm.
+    """Close every stage in space over the stroke of 0 to 48 mm.
 
     offset  mm along the engine's axis between the crank's plane and the clevis' where the vane angle is 0
     Raises InputError, naming stage and stroke, where a stage does not close.
@@ -45,7 +45,6 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     import numpy as np
 
     from plant.geometry import vane_angles
-    from plant.linkage import STAGES
     from plant.spatial import spatial_angles
     from vaneloop.base.errors import InputError
     from vaneloop.design.multibody import multibody_angles
@@ -55,16 +54,16 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     if not 2 <= points <= 10_000:
         raise InputError(f"--points (={points}) must be in [2, 10000]")
     stroke = np.linspace(0.0, 48.0, points)
-    planar = dict(zip(STAGES, np.rad2deg(vane_angles(stroke * 1e-3, geometry)).T, strict=True))
-    newton = {s: spatial_angles(geometry, s, stroke, offset) for s in STAGES}
+    planar = dict(zip(geometry.vanes, np.rad2deg(vane_angles(stroke * 1e-3, geometry)).T, strict=True))
+    newton = {s: spatial_angles(geometry, s, stroke, offset) for s in geometry.vanes}
     multibody, notes = {}, []
     if importlib.util.find_spec("exudyn") is None:
         notes.append(
             "exudyn is not installed (pip install 'vaneloop[multibody]'): constraint equations by Newton's method only"
         )
     else:
-        for i, s in enumerate(STAGES):
+        for i, s in enumerate(geometry.vanes):
             multibody[s] = multibody_angles(geometry, s, stroke, offset)
             if progress is not None:
-                progress((i + 1) / len(STAGES))
+                progress((i + 1) / len(geometry.vanes))
     return SpatialCheck(stroke, planar, newton, multibody, notes)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller import STATE, STRATEGIES, Calibration
-from hil.loop.lockstep import Stimulus, lockstep
-from plant import Model, Plant, build_plant, places
+from controller import STRATEGIES, Calibration
+from hil.loop.lockstep import Stimulus, lockstep, snapshot_names
+from plant import Model, Plant, build_plant
 from plant.effect import T_REF
 from vaneloop.base.compiled import compiled
 
@@ -24,7 +24,6 @@ __all__ = ["FAILURES", "Failure", "Outcome", "Scenario", "failing", "run", "scen
 
 Array = NDArray[np.float64]
 
-STAGES = ("vigv", "vgv1", "vgv2")
 FIGURES = ("mean_abs", "max_abs", "mean_abs_99_100")
 MOVE = 2e-5  # m: a shorter motion of the piston is not counted; four times the LVDT's noise
 HEATING = 120.0  # s: lag of the casing's temperature behind the engine's power
@@ -73,8 +72,8 @@ def scenarios(play: float = 2.4, growth: float = 0.5, noise: float = 3.0, dither
 class Outcome:
     """One run. Curves on the raster ``t`` (s, 10 ms).
 
-    errors   float64[n, 3], deg, vane angle minus schedule of VIGV, VGV1, VGV2
-    vanes    float64[n, 3], deg
+    errors   float64[n, stages], deg, vane angle minus schedule of each stage
+    vanes    float64[n, stages], deg
     stroke_demand  mm
     aim      deg, VIGV angle that the stroke demand stands for, the compensation taken off
     side     -1 .. 1, where in the gap the stroke demand is
@@ -137,20 +136,20 @@ def _motions(x: np.ndarray, least: float, total: np.ndarray, start: np.ndarray) 
 class _Recorder:
     """Keeps of every tick's states what the figures need."""
 
-    KEPT = tuple(map(STATE.index, ("x_dem",)))
-    LEARNED = tuple(map(STATE.index, ("offset_in_use", "width_in_use", "crossing")))
+    LEARNED = ("offset_in_use", "width_in_use", "crossing")
 
     def __init__(self, plant: Plant) -> None:
-        # where the plant's states stand behind the firmware's
-        at = {int(row): len(STATE) + i for i, row in enumerate(plant.rows)}
-        self.kept = [*(at[row] for row in (places.N_R, *range(places.RING, places.RING + 3))), *self.KEPT]
-        self.stroke = at[places.X]
+        names = snapshot_names(plant)
+        last = len(names) - 1 - names[::-1].index("n_r")  # the plant's; the firmware has its own
+        rings = [names.index(f"ring_{v}") for v in plant.vanes]
+        self.kept = [last, *rings, *map(names.index, ("x_dem", *self.LEARNED))]
+        self.x, self.current = names.index("x"), names.index("i_cmd")
         self.rows: list[Array] = []
         self.total, self.start, self.square, self.ticks = np.zeros(2), np.full(3, np.nan), 0.0, 0
 
     def __call__(self, states: Array) -> None:
-        self.rows.append(states[::EVERY, [*self.kept, *self.LEARNED]])
-        x, i = np.ascontiguousarray(states[:, self.stroke]), states[:, STATE.index("i_cmd")]
+        self.rows.append(states[::EVERY, self.kept])
+        x, i = np.ascontiguousarray(states[:, self.x]), states[:, self.current]
         if np.isnan(self.start[0]):
             self.start[:] = x[0], x[0], 0.0
         _motions(x, MOVE, self.total, self.start)
@@ -161,11 +160,11 @@ class _Recorder:
 def machine(scenario: Scenario, plant: Plant) -> Plant:
     """Return the machine of a scenario: ``plant`` with what is wrong with it."""
     effects: dict[str, dict[str, float]] = {}
-    built = {s: getattr(plant.geometry, s).hysteresis.value for s in STAGES}
+    built = {s: plant.geometry.stage(s).hysteresis.value for s in plant.vanes}
     if scenario.play is not None:
         effects["linkage_backlash"] = {s: v * (scenario.play / built["vigv"] - 1.0) for s, v in built.items()}
     if scenario.growth:
-        effects["thermal_growth"] = dict.fromkeys(STAGES, scenario.growth / HEAT)
+        effects["thermal_growth"] = dict.fromkeys(plant.vanes, scenario.growth / HEAT)
     plant = Model(effects=effects).plant(plant)
     return replace(plant, sigma=plant.sigma * scenario.noise)
 
@@ -202,21 +201,21 @@ def run(
     base   the machine as built; default: the shipped tables
     """
     plant = machine(scenario, base or build_plant())
-    recorder = _Recorder(plant)
+    recorder, stages = _Recorder(plant), len(plant.vanes)
     stimulus = Stimulus.of(dithered(n_dem, scenario.dither), t_oil=casing(n_dem))
     done = lockstep(
         stimulus, calibration=calibration, plant=plant, seed=seed, every=100, hashed=False, pots=pots, watch=recorder
     )
     a = np.vstack(recorder.rows)
-    n_r, x_dem = a[:, 0], a[:, 4]
-    vanes = np.empty((len(a), 3))
-    for k in range(3):
+    n_r, x_dem = a[:, 0], a[:, 1 + stages]
+    vanes = np.empty((len(a), stages))
+    for k in range(stages):
         ldp, lever = plant.lever(k)
         vanes[:, k] = np.rad2deg(np.arcsin(np.clip(ldp * np.tan(a[:, 1 + k]) / lever, -1.0, 1.0)))
     errors = vanes - np.rad2deg(plant.schedules.targets(n_r))
     travel, start = recorder.total, recorder.start
     angle = 180.0 / np.pi
-    offset, width, crossing = a[:, 5:8].T
+    offset, width, crossing = a[:, 2 + stages :].T
     drive = np.interp(x_dem, calibration.angles[0], calibration.angles[1])
     aim = drive + offset - 0.5 * crossing * (calibration.scalars.play[0] + width)
     return Outcome(
@@ -231,7 +230,7 @@ def run(
         crossing,
         offset * angle,
         width * angle,
-        {s: _figures(errors[:, k], n_r) for k, s in enumerate(STAGES)},
+        {s: _figures(errors[:, k], n_r) for k, s in enumerate(plant.vanes)},
         float(travel[0] + abs(start[1] - start[0])) * 1e3,
         float(np.abs(np.diff(x_dem)).sum()) * 1e3,
         int(travel[1]),
@@ -321,14 +320,18 @@ def failing(
     calibration: Calibration,
     seed: int = 1,
     base: Plant | None = None,
-    stages: tuple[str, ...] = STAGES,
+    stages: tuple[str, ...] | None = None,
 ) -> tuple[Failure, Outcome]:
-    """Run a scenario again with the potentiometers of ``stages`` failing ``during`` one of the `moments`."""
+    """Run a scenario again with the potentiometers of ``stages`` (default: all) failing ``during`` one of the
+    `moments`.
+    """
     at, lag = moments(n_dem)[during], int(STEP_TIME / 1e-2)
     share, offset, drift, noise = FAILURES[name]
-    pots = np.tile([1.0, 0.0], (len(n_dem), 3))
+    vanes = calibration.vanes
+    stages = vanes if stages is None else stages
+    pots = np.tile([1.0, 0.0], (len(n_dem), len(vanes)))
     t, rng = np.arange(len(n_dem) - at) * 1e-2, np.random.default_rng(seed)
-    for k in map(STAGES.index, stages):
+    for k in map(vanes.index, stages):
         wrong = healthy.vanes[at, k] if name == "stuck" else offset + drift * t + noise * rng.standard_normal(len(t))
         pots[at:, 2 * k], pots[at:, 2 * k + 1] = share, np.deg2rad(wrong)
     out = run(scenario, n_dem, calibration, seed, pots, base)

@@ -2,7 +2,7 @@
 stroke.
 
     stroke_tables(geometry, schedules) -> float64[4, n]             the controller's tables from the model's play
-    vane_angle_table(geometry) -> float64[4, n]                     what the strategies inverse and adaptive know of the
+    vane_angle_table(geometry) -> float64[1 + stages, n]            what the strategies inverse and adaptive know of the
                                                                     linkage
 """
 
@@ -92,7 +92,7 @@ def refuse_outside(speed: Array, target: Array, low: float, high: float) -> None
 
 
 def vane_angle_table(geometry: Geometry, stroke: Array | None = None) -> Array:
-    """Return float64[4, n]: stroke (mm; default 0 to 48 in steps of 1) and the angles (deg) of VIGV, VGV1, VGV2 in the
+    """Return float64[1 + stages, n]: stroke (mm; default 0 to 48 in steps of 1) and each stage's angle (deg) in the
     middle of the play.
 
     Between the strokes a straight line is off by at most 0.002 deg.

@@ -6,6 +6,7 @@ from typing import Any
 
 from vaneloop.design.clearance import WORDS, ClearanceStudy, study_rows
 from vaneloop.design.spatial import SpatialCheck
+from vaneloop.pages.style import STAGE_ROLES
 
 __all__ = ["clearance_page", "spatial_page"]
 
@@ -37,7 +38,7 @@ def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane:
         "Width of the loop that each joint's clearance makes by itself; together they add up. Clearance before the "
         "crank's lower arm counts with the stage's slope, clearance after it with 1.6 deg for each mm in every stage.",
     )
-    roles = ("measured", "model", "target")
+    roles = STAGE_ROLES[: len(names)]
     series: dict[str, list[float | None]] = {
         n: [round(s.parts[j], 4) for j in WORDS] for n, s in zip(names, studies, strict=True)
     }
@@ -81,19 +82,19 @@ def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
     """Write the page of `vaneloop spatial`; return its path."""
     import numpy as np
 
-    from plant.linkage import STAGES
     from vaneloop.pages.figures import Line, Panel, overlay
     from vaneloop.pages.page import Page
 
     by = "Exudyn, a general multibody library" if check.multibody else "Newton's method on the constraint equations"
-    worst = {s: float(np.max(np.abs(check.difference(s)))) for s in STAGES}
+    vanes = tuple(check.planar)
+    worst = {s: float(np.max(np.abs(check.difference(s)))) for s in vanes}
     page = Page(
         "Planar model against the mechanism in space",
-        f"Solved by {by}: " + ", ".join(f"{s.upper()} differs by at most {worst[s]:.3f} deg" for s in STAGES) + ".",
+        f"Solved by {by}: " + ", ".join(f"{s.upper()} differs by at most {worst[s]:.3f} deg" for s in vanes) + ".",
         subtitle="linkage",
         command=command,
     )
-    for s in STAGES:
+    for s in vanes:
         page.tile(f"{s.upper()} largest difference", round(worst[s], 4), "deg", "spatial minus planar, 0 to 48 mm")
     page.section(
         "Vane angle and difference over the stroke",
@@ -102,9 +103,9 @@ def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
         "leans by it and is shorter in the plane by that motion squared over twice its length: a few hundredths of a "
         "millimetre, at 1.6 deg for each millimetre.",
     )
-    roles = ("measured", "model", "target")
+    roles = STAGE_ROLES[: len(vanes)]
     lines, differences = [], []
-    for s, role in zip(STAGES, roles, strict=True):
+    for s, role in zip(vanes, roles, strict=True):
         lines.append(Line(f"{s.upper()} planar", check.stroke, check.planar[s], role, 1.4))
         lines.append(
             Line(f"{s.upper()} in space", check.stroke, (check.multibody or check.newton)[s], role, 4.0, "dot", 0.6)
@@ -117,6 +118,6 @@ def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
             "Two codes, one mechanism",
             "Exudyn's rigid bodies and joints against Newton's method on the loop's equations: rounding.",
         )
-        rows = [[s.upper(), f"{np.max(np.abs(check.multibody[s] - check.newton[s])):.1e}"] for s in STAGES]
+        rows = [[s.upper(), f"{np.max(np.abs(check.multibody[s] - check.newton[s])):.1e}"] for s in vanes]
         page.table(["stage", "largest difference [deg]"], rows)
     return page.write(path)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.figures import AGREES, SignalError
+from vaneloop.base.vanes import VANES
 from vaneloop.pages.figures import Line, Panel, histogram, overlay
 from vaneloop.pages.page import Page
 from vaneloop.pages.run import ZOOM, Result, against_speed, axis_title, loops, signal_name, speed_lines
@@ -21,7 +22,6 @@ __all__ = ["replay_page"]
 Array = NDArray[np.float64]
 
 DETAIL = 40.0  # s around the worst moment: a whole rise or fall of the engine
-VANES = ("vigv", "vgv1", "vgv2")
 
 
 def replay_page(result: Result, command: str = "", title: str | None = None) -> Page:

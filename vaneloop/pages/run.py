@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.figures import SignalError, noise_floor
+from vaneloop.base.vanes import VANES
 from vaneloop.pages.figures import Line, loop
 from vaneloop.pages.page import Page
 from vaneloop.pages.series import break_at_holes
@@ -37,9 +38,7 @@ NAMES = {
     "i_cmd": ("valve current", "mA"),
     "p_s": ("supply pressure", "MPa"),
     "t_oil": ("oil temperature", "degC"),
-    "vigv": ("VIGV angle", "deg"),
-    "vgv1": ("VGV1 angle", "deg"),
-    "vgv2": ("VGV2 angle", "deg"),
+    **{v: (f"{v.upper()} angle", "deg") for v in VANES},
     "state": ("controller mode", ""),
     "i_motor": ("motor current", "A"),
 }

@@ -11,27 +11,27 @@ import numpy as np
 
 from plant import Geometry
 from plant.geometry import vane_angles
-from plant.linkage import STAGES
 from plant.spatial import plane_joints
+from vaneloop.base.vanes import VANES
 from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.stroke_tables import DESIGN_SPEED, STROKE_LIMITS
 from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
+from vaneloop.pages.style import STAGE_ROLES
 
 __all__ = ["mechanism_figure", "schedule_page"]
 
-NAMES = {"vigv": "VIGV", "vgv1": "VGV1", "vgv2": "VGV2"}
-ROLES = ("measured", "model", "target")  # colours of three strokes, of three stages
+NAMES = {v: v.upper() for v in VANES}
 
 
 def mechanism_figure(geometry: Geometry, stage: str, strokes: tuple[float, ...]) -> dict[str, Any]:
     """One stage's mechanism, drawn to scale in its plane at some strokes (mm): actuator, crank, link, ring."""
     lines = []
-    for role, stroke in zip(ROLES, strokes, strict=False):
+    for role, stroke in zip(STAGE_ROLES, strokes, strict=False):
         j = {name: p * 1e3 for name, p in plane_joints(geometry, stage, stroke * 1e-3).items()}
         path = [j["J0"], j["J1"], j["J2"], j["J3"], j["J4"], j["J5"]]
         lines.append(Line(f"{stroke:g} mm of stroke", [p.real for p in path], [p.imag for p in path], role, 2.2))
-    ring = float(getattr(geometry, stage).ld.value)
+    ring = float(geometry.stage(stage).ld.value)
     centre = plane_joints(geometry, stage, 0.0)["J5"] * 1e3
     around = centre + ring * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 181))
     lines.append(Line("unison ring", around.real, around.imag, "muted", 1.0, "dot"))
@@ -46,17 +46,23 @@ def mechanism_figure(geometry: Geometry, stage: str, strokes: tuple[float, ...])
 
 def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -> Path:
     """Write the page; return its path. Raises InputError where it cannot be written."""
-    one, two = result.links[1], result.links[2]
+    others, vanes = result.links[1:], result.geometry.vanes
     design = int(np.argmin(np.abs(result.speed - DESIGN_SPEED)))
     verdict = "; ".join(
         f"{NAMES[s.stage]} with Lb {s.lb:g} mm and Lc {s.lc:g} mm: {s.rms['adjusted']:.2f} deg rms "
         f"({s.rms['built']:.2f} as it is, {s.rms['initial']:.2f} as first built), {s.at_design['adjusted']:.2f} deg at "
         f"100 % speed ({s.at_design['built']:.2f} as it is, {s.at_design['initial']:.2f} as first built)"
-        for s in (one, two)
+        for s in others
     )
-    page = Page("Stroke schedule and links", verdict + ".", subtitle="schedule", command=command, log=result.log)
+    page = Page(
+        "Stroke schedule and links",
+        (verdict or "One stage: its stroke is what meets the schedule") + ".",
+        subtitle="schedule",
+        command=command,
+        log=result.log,
+    )
     page.tile("stroke at 100 %", float(result.table[3, design]), "mm", "mean curve, VIGV on its schedule")
-    for s in (one, two):
+    for s in others:
         page.tile(
             f"{NAMES[s.stage]} worst error",
             s.largest["adjusted"],
@@ -75,9 +81,8 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
         "lengths as adjusted. A longer stroke turns crank, ring and vanes anticlockwise.",
     )
     strokes = (STROKE_LIMITS[0], 0.5 * sum(STROKE_LIMITS), STROKE_LIMITS[1])
-    page.plot(mechanism_figure(result.geometry, "vigv", strokes), "VIGV", half=True)
-    page.plot(mechanism_figure(result.geometry, "vgv1", strokes), "VGV1", half=True)
-    page.plot(mechanism_figure(result.geometry, "vgv2", strokes), "VGV2", half=True)
+    for name in vanes:
+        page.plot(mechanism_figure(result.geometry, name, strokes), NAMES[name], half=True)
 
     page.section(
         "Vane angle against stroke",
@@ -86,40 +91,43 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     )
     x = np.linspace(*STROKE_LIMITS, 193)
     after, before = (np.rad2deg(vane_angles(x * 1e-3, g)) for g in (result.geometry, result.built))
-    lines = [Line(NAMES[n], x, after[:, k], ROLES[k], 2.0) for k, n in enumerate(STAGES)]
-    lines += [Line(f"{NAMES[n]}, as entered", x, before[:, k], ROLES[k], 1.2, "dot") for k, n in enumerate(STAGES)]
+    lines = [Line(NAMES[n], x, after[:, k], STAGE_ROLES[k], 2.0) for k, n in enumerate(vanes)]
+    lines += [Line(f"{NAMES[n]}, as entered", x, before[:, k], STAGE_ROLES[k], 1.2, "dot") for k, n in enumerate(vanes)]
     page.plot(overlay([Panel("vane angle [deg]", lines)], "stroke [mm]", 460))
 
     page.section(
         "Schedule and result",
-        "One stroke serves three stages: it is scheduled for the VIGV; VGV1 and VGV2 follow as their lengths let them. "
+        "One stroke serves all stages: it is scheduled for the VIGV; the others follow as their lengths let them. "
         "Error is target minus angle.",
     )
     angle_lines, error_lines = [], []
     for k, s in enumerate(result.links):
         angle_lines.append(Line(f"{NAMES[s.stage]} target", result.speed, result.target[:, k], "text", 1.2, "dot"))
         angle_lines.append(
-            Line(f"{NAMES[s.stage]} adjusted", result.speed, result.target[:, k] - s.error, ROLES[k], 1.8)
+            Line(f"{NAMES[s.stage]} adjusted", result.speed, result.target[:, k] - s.error, STAGE_ROLES[k], 1.8)
         )
     for k, s in enumerate(result.links[1:], start=1):
         error_lines.append(
-            Line(f"{NAMES[s.stage]} as first built", result.speed, s.error_initial, ROLES[k], 1.2, "dot")
+            Line(f"{NAMES[s.stage]} as first built", result.speed, s.error_initial, STAGE_ROLES[k], 1.2, "dot")
         )
-        error_lines.append(Line(f"{NAMES[s.stage]} as it is", result.speed, s.error_built, ROLES[k], 1.4, "dash"))
-        error_lines.append(Line(f"{NAMES[s.stage]} adjusted", result.speed, s.error, ROLES[k], 2.2))
-    panels = [Panel("vane angle [deg]", angle_lines, height=1.3), Panel("error [deg]", error_lines, zero=True)]
+        error_lines.append(Line(f"{NAMES[s.stage]} as it is", result.speed, s.error_built, STAGE_ROLES[k], 1.4, "dash"))
+        error_lines.append(Line(f"{NAMES[s.stage]} adjusted", result.speed, s.error, STAGE_ROLES[k], 2.2))
+    panels = [Panel("vane angle [deg]", angle_lines, height=1.3)]
+    if others:
+        panels.append(Panel("error [deg]", error_lines, zero=True))
     page.plot(overlay(panels, "rotor speed [%]"))
-    page.plot(
-        bars(
-            [NAMES[s.stage] for s in (one, two)],
-            {
-                words: [round(abs(s.at_design[name]), 4) for s in (one, two)]
-                for name, words in (("initial", "as first built"), ("built", "as it is"), ("adjusted", "adjusted"))
-            },
-            "error at 100 % speed [deg]",
-            roles={"as first built": "bad", "as it is": "model", "adjusted": "good"},
+    if others:
+        page.plot(
+            bars(
+                [NAMES[s.stage] for s in others],
+                {
+                    words: [round(abs(s.at_design[name]), 4) for s in others]
+                    for name, words in (("initial", "as first built"), ("built", "as it is"), ("adjusted", "adjusted"))
+                },
+                "error at 100 % speed [deg]",
+                roles={"as first built": "bad", "as it is": "model", "adjusted": "good"},
+            )
         )
-    )
     columns = ["stage", "state", "Lb [mm]", "Lc [mm]", "at 100 % [deg]", "rms [deg]", "max [deg]"]
     rows: list[list[object]] = []
     for s in result.links:
@@ -147,7 +155,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
         sx, sy, side = m.samples
         pick = np.linspace(0, sx.size - 1, min(sx.size, 6000)).astype(int)
         sx, sy, side = sx[pick], sy[pick], side[pick]
-        base = np.rad2deg(vane_angles(m.stroke * 1e-3, result.built)[:, STAGES.index(name)])
+        base = np.rad2deg(vane_angles(m.stroke * 1e-3, result.built)[:, vanes.index(name)])
         inside = (m.stroke >= STROKE_LIMITS[0]) & (m.stroke <= STROKE_LIMITS[1])
         g = m.stroke[inside]
         points = [
@@ -177,11 +185,15 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
              (3, "mean", "text", "dot"))]  # fmt: skip
     page.plot(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]", 420))
     rows = [
-        [f"{c[0]:g}", *(f"{v:.3f}" for v in c[1:]), *(f"{s.error[i]:.3f}" for s in (one, two))]
+        [f"{c[0]:g}", *(f"{v:.3f}" for v in c[1:]), *(f"{s.error[i]:.3f}" for s in others)]
         for i, c in enumerate(result.table.T)
     ]
     page.table(
-        ["speed [%]", "extension [mm]", "retraction [mm]", "mean [mm]", "VGV1 error [deg]", "VGV2 error [deg]"], rows
+        [
+            *("speed [%]", "extension [mm]", "retraction [mm]", "mean [mm]"),
+            *(f"{NAMES[s.stage]} error [deg]" for s in others),
+        ],
+        rows,
     )
     if result.notes:
         page.section("Notes", "\n\n".join(result.notes))

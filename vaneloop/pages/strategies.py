@@ -10,7 +10,7 @@ import numpy as np
 from controller import STRATEGIES
 from plant import Plant
 from plant.effect import T_REF
-from vaneloop.design.strategies import FIGURES, HEAT, STAGES, STEP, Failure, Outcome, Outcomes, Scenario, casing
+from vaneloop.design.strategies import FIGURES, HEAT, STEP, Failure, Outcome, Outcomes, Scenario, casing
 
 __all__ = ["report"]
 
@@ -44,7 +44,7 @@ def report(
         f"{goals[0]['value']:.1f} times less, with {mine.travel / max(dual.travel, 1e-9):.2f} of the travel. "
         + (f"{len(missed)} of {len(goals)} goals are missed." if missed else f"All {len(goals)} goals are held."),
         tone="bad" if missed else "good",
-        subtitle="VIGV, VGV1, VGV2, closed loop of firmware and plant",
+        subtitle=f"{', '.join(v.upper() for v in plant.vanes)}, closed loop of firmware and plant",
         command=words,
     )
     page.tile(
@@ -67,16 +67,16 @@ def report(
     ):
         series = {s: [value(outcomes[r.name, s]) for r in rows] for s in STRATEGIES}
         page.plot(bars([r.name for r in rows], series, title, roles=roles), half=True)
-    figures = [f"{s.upper()} {word}" for s in STAGES for word in ("mean", "max", "99-100 %")]
+    figures = [f"{s.upper()} {word}" for s in plant.vanes for word in ("mean", "max", "99-100 %")]
     columns = ["machine", "strategy", *figures, "travel [mm]", "turns", "mA rms"]
     page.table(
         columns,
         [
-            [m, s, *(o.figures[v][k] for v in STAGES for k in FIGURES), o.travel, o.reversals, o.current]
+            [m, s, *(o.figures[v][k] for v in plant.vanes for k in FIGURES), o.travel, o.reversals, o.current]
             for (m, s), o in outcomes.items()
         ],
         "Errors in deg; 99-100 %: mean at these speeds; turns: reversals of the piston; mA rms: servo-valve current. "
-        "The stroke is scheduled for the VIGV; VGV1 and VGV2 follow through their links, whose own error stays in.",
+        "The stroke is scheduled for the VIGV; the others follow through their links, whose own error stays in.",
     )
     page.section(
         "The run, all together", f"Rotor speed, VIGV error under the dual curves and under {best}, and the stroke."
@@ -125,7 +125,7 @@ def report(
     if failures:
         page.section(
             "Potentiometers that fail",
-            "All three fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A "
+            "All fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A "
             "drift slower than what the casing may do cannot be told from growth: it is followed, slowly, up to the "
             "limit of the offset, and may leave more error than dual has. Step: what the failure changes within 1 s.",
         )

@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["THEMES", "TONE_OF", "Tone", "number", "painted"]
+__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "number", "painted"]
 
 Tone = Literal["neutral", "good", "bad"]
+# colours of the vane stages side by side, VIGV first
+STAGE_ROLES = ("measured", "model", "target", "error", "other", "bad", "noise", "text")
 TONE_OF: dict[str, Tone] = {"none": "good", "missing": "neutral", "unknown": "bad"}  # verdict of a diagnosis
 # Blue and orange stay apart for all common colour-vision deficiencies; both themes keep a contrast above 4.5 on their
 # background.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import same_stages
 
 if TYPE_CHECKING:
     from controller import Calibration
@@ -56,8 +57,9 @@ class Machine:
     table: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Read what is named, so that a wrong name is refused here."""
-        self.plant, self.calibration  # noqa: B018
+        """Read what is named, so that a wrong name, or tables of different stages, are refused here."""
+        f = self.files
+        same_stages(**{f["geometry"]: self.plant.vanes, f["vane_angles"]: self.calibration.vanes})
 
     @cached_property
     def files(self) -> dict[str, str]:

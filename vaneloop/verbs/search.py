@@ -364,7 +364,7 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
     if not isinstance(model, Diagnosed):
         chain, name = _chain(log, model or Machine())
         model = diagnosed(chain, name)
-    return Experiment(model, recommend(model.diagnosis, progress, cast("Chain", model.bound).plant), model.log)
+    return Experiment(model, recommend(model.diagnosis, progress, model.bound), model.log)
 
 
 def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:

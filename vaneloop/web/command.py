@@ -9,6 +9,7 @@ import socket
 import sys
 from pathlib import Path
 
+from vaneloop.cli.options import add_tables_option, machine_of
 from vaneloop.web.guard import is_loopback
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -27,6 +28,7 @@ Python models are taken on the command line only.
 examples:
   vaneloop web
   vaneloop web --port 9000 --folder examples --no-open
+  vaneloop web --tables engine7/
   vaneloop web --host 0.0.0.0
 
 exit codes: 0 ended, 2 bad input"""
@@ -49,6 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--upload-limit", metavar="MB", type=int, default=512, help="largest file that may be uploaded (default 512)"
     )
+    add_tables_option(parser)
     parser.add_argument("--no-open", action="store_true", help="do not open a browser, only print the link")
     parser.add_argument("--quiet", action="store_true", help="say nothing but the link")
 
@@ -64,6 +67,7 @@ def command(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     if not folder.is_dir():
         raise InputError(f"--folder {args.folder}: is not a folder")
+    machine_of(args)  # refuses wrong tables
     token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
     if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
         raise InputError(
@@ -93,7 +97,7 @@ def command(args: argparse.Namespace) -> int:
 
     from vaneloop.web.server import serve
 
-    serve(sock, folder, token, args.upload_limit << 20, is_loopback(args.host), ready)
+    serve(sock, folder, token, args.upload_limit << 20, is_loopback(args.host), ready, args.tables)
     return 0
 
 

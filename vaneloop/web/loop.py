@@ -18,11 +18,14 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base import terminal
+from vaneloop.base.vanes import VANES
+from vaneloop.verbs.machine import Machine
 from vaneloop.web.worker import INBOX, Progress, main
 
 __all__ = ["COLUMNS", "COMPILING", "TASKS"]
 
-COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "vigv", "vgv1", "vgv2", "p_s", "t_oil", "state", "faults")
+# of every machine; a stage that one lacks is NaN
+COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", *VANES, "p_s", "t_oil", "state", "faults")
 MOST_TRACE = 120  # frames of the trace sent at a time; the rest are counted only
 COMPILING = "loading the simulator (compiling it the first time takes about 20 s)"
 NEWS = 0.1  # s between two messages to the page
@@ -153,9 +156,18 @@ def ready(progress: Progress) -> None:
 
 
 def lockstep(
-    progress: Progress, demand: float, speed: float, record: str | None, seed: int | None, profile: str | None
+    progress: Progress,
+    demand: float,
+    speed: float,
+    record: str | None,
+    seed: int | None,
+    profile: str | None,
+    tables: str | None = None,
 ) -> dict[str, Any]:
-    """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop."""
+    """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop.
+
+    tables  folder of the machine's tables; None: the shipped ones
+    """
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
     from hil.logs.recorder import Recorder
@@ -166,8 +178,9 @@ def lockstep(
     typed = Typed(demand)
     progress(None, COMPILING)
     _compile()
-    node = Node(n_r=demand, seed=seed)
-    ecu = EcuStation(typed, ecu=Ecu(n_dem=demand, seed=None if seed is None else seed + 1))
+    machine = Machine(tables)
+    node = Node(machine.plant, machine.calibration, n_r=demand, seed=seed)
+    ecu = EcuStation(typed, ecu=Ecu(machine.plant, n_dem=demand, seed=None if seed is None else seed + 1))
     channel = Channel(seed=seed or 0)
     wire = channel.wire
     places = {"ECU": channel.join(), "VGV": channel.join()}
@@ -247,22 +260,27 @@ def lockstep(
     return {"simulated_s": k * 1e-3, "record": record, "state_hash": node.fingerprint(), "frames": heard.frames}
 
 
-def node(progress: Progress, bus: str, record: str | None, seed: int | None) -> dict[str, Any]:
+def node(
+    progress: Progress, bus: str, record: str | None, seed: int | None, tables: str | None = None
+) -> dict[str, Any]:
     """Controller and plant in real time, as ``vaneloop run`` does: lateness as it goes, until told to stop."""
     from hil.loop.node import Node
 
     progress(None, COMPILING)
-    made = Node(seed=seed)
+    machine = Machine(tables)
+    made = Node(machine.plant, machine.calibration, seed=seed)
     return _in_real_time(progress, bus, made, record, None)
 
 
-def ecu(progress: Progress, bus: str, demand: float, profile: str | None) -> dict[str, Any]:
+def ecu(progress: Progress, bus: str, demand: float, profile: str | None, tables: str | None = None) -> dict[str, Any]:
     """The ECU in real time, as ``vaneloop ecu`` does: the demand is told, until told to stop."""
     from hil.loop.ecu import EcuStation, Typed
     from hil.loop.node import Ecu
 
     typed = Typed(demand)
-    return _in_real_time(progress, bus, EcuStation(typed, ecu=Ecu(n_dem=demand)), None, (typed, profile))
+    return _in_real_time(
+        progress, bus, EcuStation(typed, ecu=Ecu(Machine(tables).plant, n_dem=demand)), None, (typed, profile)
+    )
 
 
 def _in_real_time(progress: Progress, name: str, station: Any, record: str | None, typed: Any) -> dict[str, Any]:

@@ -19,7 +19,9 @@ from controller import FAULTS, MODES
 from hil.bus.frames import IDENT_MASK, NAMES
 from hil.inject.scenario import library, load_scenario
 from hil.loop.ecu import BUILTIN
+from vaneloop.base.vanes import VANES
 from vaneloop.pages.figures import bars
+from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.web.charts import Chart, Curves, Panel, Trace
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
@@ -40,7 +42,7 @@ STRIPS: tuple[
     ("speed [%]", "%", 2.0, (("n_dem", "target"), ("n_r", "measured"))),
     ("stroke [mm]", "mm", 0.5, (("x_dem", "target"), ("x_lvdt", "measured"))),
     ("current [mA]", "mA", 2.0, (("i_cmd", "model"),)),
-    ("vanes [deg]", "deg", 1.0, (("vigv", "measured"), ("vgv1", "model"), ("vgv2", "target"))),
+    ("vanes [deg]", "deg", 1.0, tuple(zip(VANES, STAGE_ROLES, strict=True))),
 )
 
 
@@ -77,6 +79,7 @@ class Loop:
         seed = ["--seed", str(self.seed)] if self.seed is not None else []
         record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
         profile = ["--profile", self.profile] if self.profile else []
+        tables = self.tables_words()
         if self.bus == "lockstep":
             own = (
                 "The slider, the pace and the buttons are the page's own. "
@@ -92,9 +95,17 @@ class Loop:
                 f"{self.demand:g}",
                 *seed,
                 *record,
+                *tables,
             ]
             return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
-        return [("", ["run", "--bus", self.bus_name, *seed, *record]), ("", ["ecu", "--bus", self.bus_name, *profile])]
+        return [
+            ("", ["run", "--bus", self.bus_name, *seed, *record, *tables]),
+            ("", ["ecu", "--bus", self.bus_name, *profile, *tables]),
+        ]
+
+    def tables_words(self) -> list[str]:
+        """Options that name the machine."""
+        return ["--tables", self.session.tables] if self.session.tables is not None else []
 
     # ---- begin and end
 
@@ -141,6 +152,7 @@ class Loop:
                 record=record,
                 seed=self.seed,
                 profile=self.profile,
+                tables=self.session.tables,
             )
         finally:
             self._ended(record)
@@ -153,8 +165,10 @@ class Loop:
         listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
         calls = [
             listener.call("listen", "running", bus=bus),
-            controller.call("node", "running", bus=bus, record=record, seed=self.seed),
-            engine.call("ecu", "running", bus=bus, demand=self.demand, profile=self.profile),
+            controller.call("node", "running", bus=bus, record=record, seed=self.seed, tables=self.session.tables),
+            engine.call(
+                "ecu", "running", bus=bus, demand=self.demand, profile=self.profile, tables=self.session.tables
+            ),
         ]
         tasks = [asyncio.ensure_future(c) for c in calls]
         try:
@@ -208,7 +222,9 @@ class Loop:
         w = Worker()
         self.session.extra.setdefault("closers", []).append(w.stop)
         try:
-            answer = await w.call("command", f"injecting {name}", words=["inject", name, "--bus", bus])
+            answer = await w.call(
+                "command", f"injecting {name}", words=["inject", name, "--bus", bus, *self.tables_words()]
+            )
             self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
         finally:
             w.stop()
@@ -261,12 +277,13 @@ class Loop:
         keep = np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])
         rows = rows[keep]
         t = rows[:, 0]
+        unfitted = {v for v in VANES if np.isnan(rows[:, COLUMNS.index(v)]).all()}
         panels = [
             Panel(
                 title,
                 unit,
                 t,
-                [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines],
+                [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines if n not in unfitted],
                 height=120,
                 least=least,
             )

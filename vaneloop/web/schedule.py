@@ -15,12 +15,13 @@ from nicegui import events, ui
 from nicegui.element import Element
 
 from plant import Geometry, Schedules, load_geometry, load_schedules
-from plant.linkage import STAGES
 from vaneloop.design.links import CRITERIA
 from vaneloop.design.schedule_files import write_geometry, write_schedules
 from vaneloop.design.stroke_tables import STROKE_LIMITS
 from vaneloop.pages.figures import Line, Panel, loop, overlay
-from vaneloop.pages.schedule import NAMES, ROLES
+from vaneloop.pages.schedule import NAMES
+from vaneloop.pages.style import STAGE_ROLES
+from vaneloop.verbs.machine import files_of
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table
 from vaneloop.web.missing import receive, suffixes
 from vaneloop.web.session import LogFile, Session
@@ -28,7 +29,7 @@ from vaneloop.web.worker import STEPS
 
 __all__ = ["build"]
 
-TITLES = ("Mechanism", "Stroke for the VIGV", "Links of VGV1 and VGV2", "Measured loop", "Tables")
+TITLES = ("Mechanism", "Stroke for the VIGV", "Links of the other stages", "Measured loop", "Tables")
 
 
 @dataclass
@@ -46,6 +47,12 @@ class Plan:
     stage: str = "vigv"
     done: dict[str, Any] = field(default_factory=dict)
     loaded: int = 0  # times that a file has replaced numbers
+
+    @classmethod
+    def of(cls, session: Session) -> Plan:
+        """The machine that the workbench was started for."""
+        files = files_of(session.tables)
+        return cls(load_geometry(files["geometry"]), load_schedules(files["schedules"]))
 
     def words(self) -> list[str]:
         """Options of ``vaneloop schedule`` as the user would type them."""
@@ -87,7 +94,7 @@ class Editor(Element, component="editor.js"):
 def build(session: Session, most: int) -> None:
     """Draw the page."""
     if "plan" not in session.extra:
-        session.extra["plan"] = Plan(load_geometry(), load_schedules())
+        session.extra["plan"] = Plan.of(session)
     with frame(session, "/schedule"):
         live = Live(session)
         page = _Page(session, live, most)
@@ -158,10 +165,10 @@ class _Page:
         s, plan = self.s, self.plan
         with ui.element("div").classes("numbers").style("grid-template-columns:repeat(3,minmax(0,1fr))"):
             for key, label in (("lb", "Lb"), ("lc", "Lc"), ("hysteresis", "play")):
-                for stage in STAGES:
+                for stage in plan.geometry.vanes:
                     self._number(stage, key, f"{NAMES[stage]} {label}")
         with opened(s, "All lengths"):
-            for section in ("crank", *STAGES):
+            for section in ("crank", *plan.geometry.vanes):
                 ui.label("actuator and crank" if section == "crank" else NAMES[section]).classes("soft small")
                 with ui.element("div").classes("numbers"):
                     for key, q in getattr(plan.geometry, section):
@@ -187,7 +194,7 @@ class _Page:
         ).classes("w-full loop-log")
 
         def shipped() -> None:
-            s.extra["plan"] = Plan(load_geometry(), load_schedules())
+            s.extra["plan"] = Plan.of(s)
             s.errors.pop("schedule", None)
             s.touch("plan", "steps")
 
@@ -227,7 +234,7 @@ class _Page:
                 plan.stage = e.value
                 self.s.touch("curve")
 
-            ui.toggle({k: NAMES[k] for k in STAGES}, value=plan.stage, on_change=show).props(
+            ui.toggle({k: NAMES[k] for k in plan.schedules.vanes}, value=plan.stage, on_change=show).props(
                 "dense unelevated no-caps padding='2px 10px'"
             )
             ui.label("drag a point, or give numbers").classes("soft small")
@@ -383,7 +390,10 @@ class _Page:
     def _mechanism(self, r: dict[str, Any]) -> None:
         Mechanism(r)
         x = np.array(r["strokes"])
-        lines = [Line(NAMES[g["key"]], x, np.array(g["angles"]), ROLES[i], 2.0) for i, g in enumerate(r["stages"])]
+        lines = [
+            Line(NAMES[g["key"]], x, np.array(g["angles"]), role, 2.0)
+            for role, g in zip(STAGE_ROLES, r["stages"], strict=False)
+        ]
         figure_of(overlay([Panel("vane angle [deg]", lines)], "stroke [mm]"), dark(self.s), 270)
 
     def _stroke(self, r: dict[str, Any]) -> None:
@@ -402,38 +412,23 @@ class _Page:
             for name, words in (("initial", "as first built"), ("built", "as entered"), ("adjusted", "adjusted")):
                 lb = {"initial": s.lb_initial, "built": s.lb_built, "adjusted": s.lb}[name]
                 lc = s.lc if name == "adjusted" else s.lc_built
-                rows.append(
-                    [
-                        NAMES[s.stage],
-                        words,
-                        f"{lb:g}",
-                        f"{lc:g}",
-                        *(f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name])),
-                    ]
-                )
+                figures = (f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))
+                rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *figures])
         with ui.element("div").classes("half"):
             table(["stage", "", "Lb, mm", "Lc, mm", "at 100 %, deg", "rms", "max"], rows, numbers=(2, 3, 4, 5, 6))
             lines = []
             for k, s in enumerate(r.links[1:], start=1):
                 lines += [
-                    Line(f"{NAMES[s.stage]} as entered", r.speed, s.error_built, ROLES[k], 1.3, "dot"),
-                    Line(f"{NAMES[s.stage]} adjusted", r.speed, s.error, ROLES[k], 2.0),
+                    Line(f"{NAMES[s.stage]} as entered", r.speed, s.error_built, STAGE_ROLES[k], 1.3, "dot"),
+                    Line(f"{NAMES[s.stage]} adjusted", r.speed, s.error, STAGE_ROLES[k], 2.0),
                 ]
             figure_of(overlay([Panel("error [deg]", lines, zero=True)], "rotor speed [%]"), dark(self.s), 300)
 
     def _loop(self, r: Any) -> None:
         rows = []
         for name, m in r.loops.items():
-            rows.append(
-                [
-                    NAMES[name],
-                    f"{m.width:.3f} ± {m.width_sigma:.3f}",
-                    f"{m.offset:.3f}",
-                    f"{m.lb:.2f}",
-                    f"{m.lc:.2f}",
-                    f"{m.noise:.3f}",
-                ]
-            )
+            width = f"{m.width:.3f} ± {m.width_sigma:.3f}"
+            rows.append([NAMES[name], width, f"{m.offset:.3f}", f"{m.lb:.2f}", f"{m.lc:.2f}", f"{m.noise:.3f}"])
         table(
             ["loop", "width, deg", "offset, deg", "Lb equivalent, mm", "Lc equivalent, mm", "noise, deg"],
             rows,
@@ -462,10 +457,6 @@ class _Page:
                         "x": np.round(np.asarray(line.x), 4).tolist(),
                         "y": np.round(np.asarray(line.y), 4).tolist(),
                     }
-                    trace |= {
-                        "x": np.round(np.asarray(line.x), 4).tolist(),
-                        "y": np.round(np.asarray(line.y), 4).tolist(),
-                    }
                 trace["marker"] |= {"size": 3, "opacity": 0.45}
                 figure_of(f, dark(self.s), 380)
         for note in r.notes[:5]:
@@ -486,9 +477,15 @@ class _Page:
         ]
         with ui.element("div").classes("half"):
             table(
-                ["speed, %", "extension, mm", "retraction", "mean", "VGV1 error, deg", "VGV2 error"],
+                [
+                    "speed, %",
+                    "extension, mm",
+                    "retraction",
+                    "mean",
+                    *(f"{NAMES[x.stage]} error, deg" for x in r.links[1:]),
+                ],
                 rows,
-                numbers=range(6),
+                numbers=range(3 + len(r.links)),
             )
             lines = [
                 Line(n, r.speed, r.table[k], role)

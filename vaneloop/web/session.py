@@ -46,6 +46,7 @@ class Choice:
     mapping: dict[str, str] = field(default_factory=dict)  # signal -> name in the log
     units: dict[str, str] = field(default_factory=dict)  # signal -> unit in the log
     design_rpm: str = ""
+    tables: str | None = None
 
     def words(self, real: bool) -> list[str]:
         """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type
@@ -67,6 +68,8 @@ class Choice:
             out += ["--design-rpm", self.design_rpm.strip()]
         if self.model is not None:
             out += ["--model", place(self.model)]
+        if self.tables is not None:
+            out += ["--tables", self.tables]
         return out
 
 
@@ -83,8 +86,9 @@ class Fitted:
 class Session:
     """State of the pages of one browser. ``versions`` count what has changed, section by section."""
 
-    def __init__(self, number: str, folder: Path, files: list[LogFile]):
+    def __init__(self, number: str, folder: Path, files: list[LogFile], tables: str | None = None):
         self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
+        self.tables = tables  # folder of the machine's tables; None: the shipped ones
         folder.mkdir(mode=0o700, parents=True)
         self.versions: dict[str, int] = {}
         self.lookers: list[Callable[[], None]] = []  # pages that want to know
@@ -97,7 +101,7 @@ class Session:
         self.errors: dict[str, str] = {}
         self.curves: dict[str, Curves] = {}
         self.extra: dict[str, Any] = {}  # what other pages keep
-        self.choice = Choice()
+        self.choice = Choice(tables=tables)
         self.offered: list[str] = []
         self.saved: dict[str, Path] = {}
         self._clear_log()
@@ -190,7 +194,7 @@ class Session:
             self.choice.model = file
         else:
             dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
-            self.choice = Choice(file=file, dbc=dbc)
+            self.choice = Choice(file=file, dbc=dbc, tables=self.tables)
         if self.choice.file is not None:
             self.read()
         self.touch("log")
@@ -405,7 +409,10 @@ class Session:
         assert self.diagnosis is not None
         self.touch("experiment")
         self.experiment = await self.search.call(
-            "experiment", "trying demand profiles", diagnosis=self.diagnosis["diagnosis"]
+            "experiment",
+            "trying demand profiles",
+            words=self.choice.words(real=True),
+            diagnosis=self.diagnosis["diagnosis"],
         )
         self.experiment_done = True
         self.touch("experiment")

@@ -96,7 +96,6 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage and in the whole loop, failure maps, curves."""
     from hil.replay import replay
-    from plant import build_plant, load_model
     from vaneloop.base.errors import InputError
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.workflow import locate_stages
@@ -112,9 +111,12 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     loop: list[Any] = []
     why = ""
     try:
-        machine = build_plant(model=load_model(args.model)) if args.model else None
+        machine = options.machine_of(args)
         loop = replay(
-            options.read_log_of(args), plant=machine, floors={f.signal: f.noise_floor for f in figures}
+            options.read_log_of(args),
+            plant=machine.plant,
+            calibration=machine.calibration,
+            floors={f.signal: f.noise_floor for f in figures},
         ).signals
     except InputError as e:
         why = str(e)
@@ -208,11 +210,12 @@ def hand(
     return {"curves": curves, "rms": rms}
 
 
-def experiment(progress: Progress, diagnosis: Any) -> dict[str, Any] | None:
+def experiment(progress: Progress, words: list[str], diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
     from vaneloop.discrepancy.models.experiment import recommend
 
-    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"))
+    chain = chain_for(words, progress)
+    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), chain)
 
 
 def report(
@@ -272,7 +275,6 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
 
     from plant import load_geometry, load_schedules
     from plant.geometry import vane_angles
-    from plant.linkage import STAGES
     from plant.spatial import plane_joints
     from vaneloop.cli.schedule import log_of
     from vaneloop.design.links import ScheduleOptions
@@ -288,10 +290,10 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
         strokes = np.linspace(*STROKE_LIMITS, 97)
         angles = np.rad2deg(vane_angles(strokes * 1e-3, geometry))
         stages = []
-        for k, name in enumerate(STAGES):
+        for k, name in enumerate(geometry.vanes):
             joints = [list(plane_joints(geometry, name, x * 1e-3).values()) for x in strokes]
             places = [[[round(p.real * 1e3, 3), round(p.imag * 1e3, 3)] for p in j] for j in joints]
-            radius = float(getattr(geometry, name).ld.value)
+            radius = float(geometry.stage(name).ld.value)
             stages.append(
                 {"key": name, "name": NAMES[name], "joints": places, "radius": radius, "angles": angles[:, k].tolist()}
             )

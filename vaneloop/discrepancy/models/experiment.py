@@ -5,9 +5,13 @@ profiles.
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from controller import Calibration
+    from plant import Plant
 
 __all__ = ["MARGIN", "MOST_REPEATS", "PROFILES", "divergence", "recommend"]
 
@@ -65,14 +69,15 @@ def divergence(
     named: str,
     beside: tuple[str, ...] = (),
     seed: int = 1,
-    plant: Any = None,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
 ) -> tuple[float, float]:
     """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this
     profile.
 
     truth   effects of the simulated machine with their parameters (border units)
     beside  other effects of the stage, refitted together with either
-    plant   the machine that has them (`plant.Plant`); default: the shipped tables
+    plant, calibration  the machine without these effects; default: the shipped tables
 
     Returns (nats, spreads), the two measures by which the diagnosis decides.
     """
@@ -88,11 +93,17 @@ def divergence(
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
     machine = plant or build_plant()
-    run = lockstep(Stimulus.of(profile, t_oil=warm), plant=Model(effects=truth).plant(machine), seed=seed, hashed=False)
+    run = lockstep(
+        Stimulus.of(profile, t_oil=warm),
+        calibration=calibration,
+        plant=Model(effects=truth).plant(machine),
+        seed=seed,
+        hashed=False,
+    )
     log = Log(
         "simulated", {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine", "i_motor")}
     )
-    chain = build_chain(log, machine)
+    chain = build_chain(log, machine, calibration)
     if all(s.name != stage for s in chain.stages):
         return 0.0, 0.0
     s = chain.stage(stage)
@@ -122,10 +133,11 @@ def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
     return out
 
 
-def recommend(d: Any, progress: Any = None, plant: Any = None) -> dict[str, Any] | None:
+def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any] | None:
     """Return the best profile for the rivals in a diagnosis, or None when there is nothing to separate.
 
-    plant: the machine that the log was held against; default: the shipped tables.
+    chain  the log's stages (`vaneloop.discrepancy.models.vanes.Chain`), for their machine; default: the shipped tables
+
     ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
     from plant.effects import EFFECTS
@@ -134,6 +146,7 @@ def recommend(d: Any, progress: Any = None, plant: Any = None) -> dict[str, Any]
     pairs = [(s, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
     if not pairs:
         return None
+    machine = {} if chain is None else {"plant": chain.plant, "calibration": chain.built}
     table: list[dict[str, Any]] = []
     jobs = list(itertools.product(PROFILES.items(), pairs))
     scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
@@ -143,7 +156,7 @@ def recommend(d: Any, progress: Any = None, plant: Any = None) -> dict[str, Any]
         truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
     for i, ((name, profile), (s, f, rival)) in enumerate(jobs):
         beside = tuple(o.effect for o in s.effects if o.effect not in (f.effect, rival))
-        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside, plant=plant))
+        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside, **machine))
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():

@@ -6,7 +6,7 @@
 | servo    | x_dem, x_lvdt           | i_cmd                     | windows, integral free                            |
 | engine   | n_dem                   | n_r                       | free run                                          |
 | actuator | i_cmd, n_r, p_s, t_oil  | x_lvdt                    | windows, stroke free                              |
-| linkage  | x_lvdt, n_r, t_oil      | vigv, vgv1, vgv2, jointly | free run, play a state                            |
+| linkage  | x_lvdt, n_r, t_oil      | the vanes' angles, jointly | free run, play a state                            |
 
 All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are
 measured on the errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it
@@ -27,7 +27,7 @@ from hil.figures import noise_floor
 from hil.logs import Log, LogError
 from hil.loop.tick import flashed
 from plant import Plant, build_plant
-from plant.linkage import STAGES
+from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.discrepancy.models.vane_stages.actuator import actuator_stage
 from vaneloop.discrepancy.models.vane_stages.current import SAMPLED, between_rows, other_current, servo_law
 from vaneloop.discrepancy.models.vane_stages.demand import demand_stage
@@ -69,6 +69,7 @@ class Chain:
     stages        the stages that can be judged
     not_observed  stage -> what the log lacks
     columns       channel -> values on the common raster ``t`` (border units), for plots
+    plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
     """
 
     t: Array
@@ -76,6 +77,7 @@ class Chain:
     not_observed: dict[str, str]
     columns: dict[str, Array]
     plant: Plant
+    built: Calibration
     calibration: Calibration
     notes: list[str] = field(default_factory=list)
 
@@ -92,7 +94,9 @@ def build_chain(
     present  effects that the model already has: they are part of ``plant`` and not tried again
     """
     machine = plant or build_plant()
-    cal = flashed(calibration or load_calibration(), machine)
+    tables = calibration or load_calibration()
+    same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
+    cal = flashed(tables, machine)
     t, columns, fresh, lacking, notes = on_raster(log)
     if len(t) < 500:
         raise LogError(
@@ -120,6 +124,8 @@ def build_chain(
             notes.append(
                 f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
             )
+    foreign = [v for v in VANES if v in columns and v not in machine.vanes]
+    notes += [f"{v}: this machine has no such stage (geometry); not judged" for v in foreign]
     filled = machine.usual
     have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
     have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
@@ -157,7 +163,7 @@ def build_chain(
         "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
         "engine": (("n_dem",), ("n_r",), engine_stage),
         "actuator": (("i_cmd",), ("x_lvdt",), actuator_stage),
-        "linkage": (("x_lvdt",), STAGES, linkage_stage),
+        "linkage": (("x_lvdt",), machine.vanes, linkage_stage),
     }
     stages, absent = [], {}
     for name in STAGE_ORDER:
@@ -194,4 +200,4 @@ def build_chain(
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
-    return Chain(t, stages, absent, columns, machine, cal, notes)
+    return Chain(t, stages, absent, columns, machine, tables, cal, notes)

@@ -7,10 +7,10 @@ from __future__ import annotations
 import numpy as np
 
 from plant import Plant
-from plant.effects import EFFECTS, ROW
+from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
-from plant.linkage import STAGES
 from plant.parameters import nominal
+from vaneloop.base.vanes import VANES, vane_in
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
 __all__ = ["FREE", "SHAPES", "declared", "lanes"]
@@ -30,9 +30,9 @@ FREE = {  # nominal parameters that a stage refits within their tolerance, those
         "sensors.lvdt_lag",
     ),
     "linkage": (
-        *(f"linkage.{s}_play" for s in STAGES),
-        *(f"sensors.{s}_bias" for s in STAGES),
-        *(f"linkage.{s}_{length}" for s in STAGES for length in STANDS_FOR),
+        *(f"linkage.{s}_play" for s in VANES),
+        *(f"sensors.{s}_bias" for s in VANES),
+        *(f"linkage.{s}_{length}" for s in VANES for length in STANDS_FOR),
     ),
 }
 SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
@@ -60,16 +60,17 @@ def declared(
         if name.endswith("_play"):
             # the play is known at the vane and used at the ring
             factor = machine.p[n.row, 0] / (n.value * n.si)
-            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, _vane(name)))
+            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, vane_in(name)))
             si.append(n.si * factor)
         else:
-            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, _vane(name)))
+            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, vane_in(name)))
             si.append(n.si)
         rows.append(n.row)
     effects = []
     for e in EFFECTS.values():
         if stage not in e.stages or e.name in present or machine.kind not in e.kinds:
             continue
+        own = machine.parameters_of(e.name)
         ps = tuple(
             Parameter(
                 p.name,
@@ -78,21 +79,16 @@ def declared(
                 p.low,
                 p.high,
                 KNOWN.get(p.name, 0.0) * p.neutral,
-                _vane(p.name),
+                p.vane or None,
                 shape=p.name in SHAPES,
                 period=p.period,
             )
-            for p in e.parameters
+            for p in own.values()
         )
         effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
-        rows += list(range(ROW[e.name], ROW[e.name] + len(ps)))
-        si += [p.si for p in e.parameters]
+        rows += list(own)
+        si += [p.si for p in own.values()]
     return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
-
-
-def _vane(name: str) -> str | None:
-    """The vane stage that a parameter belongs to."""
-    return next((v for v in STAGES if v in name), None)
 
 
 def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ...]:

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from plant.linkage import STAGES
 from plant.parameters import derive
 from plant.stages import linkage_run
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
@@ -28,8 +27,8 @@ def linkage_stage(driven: Driven) -> Stage:
     x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     t_oil = np.ascontiguousarray(c["t_oil"])
-    which = [STAGES.index(o) for o in outputs]
-    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in STAGES]
+    which = [machine.vanes.index(o) for o in outputs]
+    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in machine.vanes]
 
     def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
         p = lanes(machine, thetas, rows, si)
@@ -37,7 +36,7 @@ def linkage_stage(driven: Driven) -> Stage:
         start = machine.start(stroke=x[0], n_r=n_r[0])
         machine.place_rings(start, tuple(first))
         s = np.repeat(start, len(thetas), axis=1)
-        out = np.empty((len(t), 3, len(thetas)))
+        out = np.empty((len(t), len(first), len(thetas)))
         linkage_run(x, n_r, t_oil, t, dt, p, s, out)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
