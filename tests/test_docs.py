@@ -109,7 +109,7 @@ LONG: dict[str, str] = {
     "vaneloop diagnose tank.csv --test": "tests/test_your_own_model.py",
     "vaneloop schedule --geometry": "tests/test_schedule.py",
     "vaneloop engine-test --tables": "tests/test_schedule.py",
-    "vaneloop diagnose examples/four_stages": "tests/test_machines.py",
+    "vaneloop diagnose examples/four_stages/worn_vgv3.parquet": "tests/test_machines.py",
     f"vaneloop diagnose {EXAMPLE}": "tests/test_search_commands.py",
     '"""A log of a machine whose play grows': "tests/test_rig.py",
 }
