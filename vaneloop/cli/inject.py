@@ -65,11 +65,10 @@ def command(args: argparse.Namespace) -> int:
         warm_up(lambda text: terminal.say(args, text))
     if args.plant is not None and args.bus != "lockstep":
         raise InputError(f"--plant is for --bus lockstep; on {args.bus} the machine is vaneloop run's: give it there")
-    plant = options.machine_of(args).plant if args.plant is not None else None
     outcomes, skipped = [], []
     with terminal.progress_bar(args, "injecting") as progress:
         for i, (name, scenario) in enumerate(made):
-            why = cannot(scenario) if args.bus != "lockstep" else lacks(scenario, plant) if plant is not None else ""
+            why = cannot(scenario) if args.bus != "lockstep" else lacks(scenario, machine.plant)
             if why and len(made) > 1:
                 skipped.append((name, scenario.title, why))
                 continue

@@ -38,7 +38,6 @@ def add_machine_options(parser: Any) -> None:
         help="model file: changed parameters and added effects (written by vaneloop extend)",
     )
     add_tables_option(parser)
-    add_plant_option(parser)
 
 
 def tell_search(say: Callable[[str], None]) -> None:
