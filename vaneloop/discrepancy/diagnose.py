@@ -205,7 +205,9 @@ def _grown(
         else:
             options += [f for m, f in singles.items() if m in names]
             leaders = [m for m in ranked if m in names][: criterion.leaders]
-            if options and min(rms_of(search.judge, f) for f in options) > TOLERATED:
+            # of a model that roams, pairs are tried where no effect helps alone
+            alone = criterion.roams and any(criterion.earns(current, f) for f in options)
+            if options and not alone and min(rms_of(search.judge, f) for f in options) > TOLERATED:
                 options += search.best_of(list(itertools.combinations(leaders, 2)))
         ok = [f for f in options if criterion.earns(current, f)]
         if not ok:

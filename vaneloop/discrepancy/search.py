@@ -224,7 +224,6 @@ class Search:
     def singles(self, names: Sequence[str]) -> dict[str, Fit]:
         """Fits with one effect each, side by side; of a model that roams, of those that promise most."""
         if self.criterion.roams:
-            names = sorted(names, key=lambda n: self.level[n])[: 2 * self.criterion.fitted]
             followed = dict(zip(names, self.judge.together([self._followed(n) for n in names]), strict=True))
             names = sorted(names, key=lambda n: followed[n])[: self.criterion.fitted]
         return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
@@ -234,7 +233,7 @@ class Search:
         in that order.
         """
         fits = []
-        for start in self.starts[name]:
+        for start in self.starts[name][:2]:
             fits.append((yield from self.judge.fitting((), start, 3)))
         fits.sort(key=self.judge.total_of)
         self.starts[name] = [f.theta for f in fits]
@@ -409,7 +408,7 @@ class Search:
         if len(new) <= most:
             return
         promise = {s: self._promise(s) for s in new}
-        leading = sorted(new, key=lambda s: promise[s])[: 2 * most]
+        leading = sorted(new, key=lambda s: promise[s])[: most + most // 2]
         for s, begins in zip(leading, self.judge.together([self._begins(s) for s in leading]), strict=True):
             self.begun[frozenset(s)] = begins
         kept = sorted(leading, key=lambda s: self.begun[frozenset(s)][0][0])[:most]

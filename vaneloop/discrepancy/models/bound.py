@@ -18,6 +18,7 @@ __all__ = ["Bound"]
 # Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
 # that the user gave, which may be wrong by a factor of ten.
 WIDE, GIVEN = 4.0, 12.0
+DRAWS = 3  # of the noise that the model starts from
 FACTOR = 10.0  # by which a value that the user gave may be wrong
 MOST_DRAWN = 7  # powers of two: sets of values drawn in all, by the number of unknown parameters
 FROM = 4  # of these that a fit begins from, beside the user's own
@@ -35,8 +36,8 @@ class Bound:
     stage     the model on all samples; the logs follow each other in time
     thinned   the same on fewer samples, where there are many; ``stages``: it, which is what the search works on
     others    values of the parameters in other valleys of the error than the best
-    floor     RMS of each output's error where nothing is missing: its noise, and what the noise of the other channels
-              does to the model
+    floor     RMS of each output's error where nothing is missing: its noise, and what noise in starts and in measured
+              motion does to the model
     data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
     runner    the model on them; ``run`` is its
     effects, placed   every law at every place: what the search is told of it, and what runs
@@ -158,22 +159,25 @@ class Bound:
         self.not_observed: dict[str, str] = {}
 
     def _carried(self, theta: Array) -> Array:
-        """RMS of the error that the noise of what drives the model, and of what it starts from, causes in each output:
-        the model on the logs with as much noise again, less the model on the logs.
+        """RMS of the error that noise in what the model starts from, and in measured motion, causes in each output: the
+        model on the logs with as much noise again, less the model on the logs.
+
+        Inputs are taken as they are: what is quick in them may be what drives the machine.
         """
         rng = np.random.default_rng(0)
-        again = []
-        for r in self.data.records:
-            columns = {
-                name: v + noise_of_channel(v) * rng.standard_normal(len(v)) if name in self.system.channels() else v
-                for name, v in r.columns.items()
-            }
-            again.append(Record(r.name, r.t, columns))
-        data = Data(self.system, again, self.data)
-        runner = Runner(data, self.runner)
-        runner.placed, runner.free_starts = self.placed, self.runner.free_starts
-        both = self.run(theta[None])[0], runner.run(theta[None])[0]
-        return np.sqrt(np.nanmean(np.where(np.isfinite(self.measured), both[1] - both[0], np.nan) ** 2, axis=1))
+        noisy = {*self.system.outputs, self.system.position, self.system.velocity} - {*self.system.inputs}
+        out = []
+        for _ in range(DRAWS):
+            again = []
+            for r in self.data.records:
+                noise = {name: noise_of_channel(v) * rng.standard_normal(len(v)) for name, v in r.columns.items()}
+                again.append(Record(r.name, r.t, {k: v + noise[k] if k in noisy else v for k, v in r.columns.items()}))
+            data = Data(self.system, again, self.data)
+            runner = Runner(data, self.runner)
+            runner.placed, runner.free_starts = self.placed, self.runner.free_starts
+            moved = runner.run(theta[None])[0] - self.run(theta[None])[0]
+            out.append(np.sqrt(np.nanmean(np.where(np.isfinite(self.measured), moved, np.nan) ** 2, axis=1)))
+        return np.asarray(np.min(out, axis=0))  # a machine that may tip over does so in some draws
 
     def theta_from(self, other: Bound, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""
