@@ -280,8 +280,10 @@ def cascade(x: Any, u: Any, p: Any) -> Any:
     return p.inflow * u.pump - down, down - p.out * max(x.lower, 0.0) ** 0.5
 
 
-@pytest.mark.parametrize("overflow", [True, False])
-@pytest.mark.parametrize("wrong", [0.12, 8.0])
+@pytest.mark.parametrize(
+    ("overflow", "wrong"),
+    [(True, 8.0), (False, 0.12), *(pytest.param(*v, marks=pytest.mark.slow) for v in ((True, 0.12), (False, 8.0)))],
+)
 def test_an_overflow_into_the_next_tank_is_found_from_starts_far_off(overflow: bool, wrong: float) -> None:
     system = System(
         "tanks", "simulate", cascade, inputs={"pump": "V"}, states={"upper": "cm", "lower": "cm"},
@@ -298,8 +300,10 @@ def test_an_overflow_into_the_next_tank_is_found_from_starts_far_off(overflow: b
         assert float(str(level)) == pytest.approx(10.0, rel=0.02)
 
 
-@pytest.mark.parametrize("time", [0.05, 20.0])
-@pytest.mark.parametrize("size", [1e-3, 1e3])
+@pytest.mark.parametrize(
+    ("time", "size"),
+    [(0.05, 1e3), (20.0, 1e-3), *(pytest.param(*v, marks=pytest.mark.slow) for v in ((0.05, 1e-3), (20.0, 1e3)))],
+)
 def test_the_answer_does_not_turn_on_units(time: float, size: float) -> None:
     rng = np.random.default_rng(11)
     t = time * T

@@ -50,7 +50,13 @@ TANKS = Family(
         *("lower_sensor.bias", "lower_sensor.saturation", "lower_sensor.lag", "upper_sensor.cubic"),
     ),
     outside={
-        "spill": Outside("the upper tank's overflow falls into the lower one", 0.02, 0.6, rate=_spill),
+        "spill": Outside(
+            "the upper tank's overflow falls into the lower one",
+            0.02,
+            0.6,
+            rate=_spill,
+            amounts_to=(frozenset({"upper.overflow_to_lower"}),),
+        ),
         "clogging": Outside("the lower outflow clogs over the log", 0.01, 0.4, rate=_clog),
     },
     # inflow (u + b) = inflow u + a constant rate
@@ -99,7 +105,10 @@ FLOW_LOOP = Family(
         *("flow.quadratic_drag", "flow_sensor.bias"),
     ),
     outside={
-        "stiction": Outside("the valve sticks and jumps", 0.005, 0.15, source=_sticky),
+        "stiction": Outside(
+            "the valve sticks and jumps", 0.005, 0.15, source=_sticky,
+            amounts_to=(frozenset({"valve.stiction"}), frozenset({"valve.stick_slip"})),
+        ),
         "equal_percentage": Outside(
             "equal-percentage trim: flow rises exponentially with the stroke", 0.05, 3.0,
             source=lambda t, u, p, s: 100.0 * np.expm1(s * u / 100.0) / np.expm1(s),
