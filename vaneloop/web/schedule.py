@@ -457,7 +457,7 @@ class _Page:
                         "x": np.round(np.asarray(line.x), 4).tolist(),
                         "y": np.round(np.asarray(line.y), 4).tolist(),
                     }
-                trace["marker"] |= {"size": 3, "opacity": 0.45}
+                    trace["marker"] |= {"size": 3, "opacity": 0.45}
                 figure_of(f, dark(self.s), 380)
         for note in r.notes[:5]:
             ui.label(f"note: {note}").classes("note")
