@@ -172,10 +172,10 @@ def test_command_exits_1_on_a_failure_and_its_log_replays(tmp_path: Path, capsys
     ("right", "wrong", "claim"),
     [
         ("elif z.degraded_timer >= k.degraded_hold - HALF_TICK:\n            mode = FAIL_SAFE",
-         "elif z.degraded_timer >= k.degraded_hold - HALF_TICK:\n            mode = STANDBY", "a mode transition that is "
-                                                                                          "not in the table"),
-        ("0.0 if trouble else z.recover_timer + TICK", "0.0 if trouble else "
-                                                       "z.recover_timer", "RUN did not come back on good frames"),
+         "elif z.degraded_timer >= k.degraded_hold - HALF_TICK:\n            mode = STANDBY",
+         "a mode transition that is not in the table"),
+        ("0.0 if trouble else z.recover_timer + TICK", "0.0 if trouble else z.recover_timer",
+         "RUN did not come back on good frames"),
     ],
     ids=["leaves DEGRADED for STANDBY", "stays in FAIL_SAFE"],
 )  # fmt: skip

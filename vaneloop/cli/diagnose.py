@@ -83,7 +83,7 @@ def show(args: argparse.Namespace, answer: Any) -> None:
                 args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}"
             )
         for x in d.shapes.get(s.stage, []):
-            terminal.say(args, f"unknown in {s.stage}: {x.text}")
+            terminal.say(args, f"{'unknown' if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
         if s.verdict == "unknown" and s.nearest:
             terminal.say(
                 args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}"
