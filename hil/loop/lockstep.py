@@ -108,7 +108,7 @@ def advance(
     """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
 
     noise      float64[ticks or 1, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed)
-    out        float64[rows or 0, 11 + stages] in SI, a row every ``every`` ticks (`columns_of`)
+    out        float64[rows or 0, 10 + stages, with a motor one more] in SI, a row every ``every`` ticks (`columns_of`)
     snapshots  float64[ticks or 0, n] copies of the whole state that the machine has, at each tick (`snapshot_names`)
     """
     z, s, inputs, given = a.z, a.s, as_inputs(a.inputs), as_outputs(a.outputs)
@@ -150,7 +150,8 @@ def advance(
                 out[r, VIGV + q] = a.angles[q]
             out[r, VIGV + stages] = given.mode
             out[r, VIGV + stages + 1] = s[places.N_R, 0]
-            out[r, VIGV + stages + 2] = s[places.I_MOTOR, 0]
+            if out.shape[1] > VIGV + stages + 2:
+                out[r, VIGV + stages + 2] = s[places.I_MOTOR, 0]
         if keep:
             for q in range(n_z):
                 snapshots[i, q] = z[a.z_rows[q]]
@@ -159,9 +160,9 @@ def advance(
         move(k, a, n_dem, n_r, p_s, t_oil)
 
 
-def columns_of(vanes: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of a run's columns, of a machine with these stages; the motor's current only of one that has a motor."""
-    return (*_BORDER, *vanes, "state", "n_engine", "i_motor")
+def columns_of(vanes: tuple[str, ...], motor: bool = False) -> tuple[str, ...]:
+    """Names of a run's columns, of a machine with these stages, and with a motor or without."""
+    return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()))
 
 
 def snapshot_names(plant: Plant) -> list[str]:
@@ -222,7 +223,7 @@ def lockstep(
     state, s = loop.state, loop.s
     state.direction, state.blend = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
-    names, sensors = columns_of(machine.vanes), len(machine.sigma)
+    names, sensors = columns_of(machine.vanes, machine.kind == "electromechanical"), len(machine.sigma)
     silent = np.zeros((1, sensors))
     advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(names))), np.empty((0, 0)))
     loop.mean[:] = 0.0
@@ -252,8 +253,6 @@ def lockstep(
     wall = time.perf_counter() - started
     factor = {**_BORDER, **dict.fromkeys(machine.vanes, 180.0 / np.pi)}
     columns = {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
-    if machine.kind != "electromechanical":
-        del columns["i_motor"]
     return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))
 
 
