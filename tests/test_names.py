@@ -156,6 +156,7 @@ def test_only_an_oscillation_of_the_machine_is_called_one(hertz, named):
     slow = 0.5 * np.sin(2.0 * np.pi * 0.21 * T)  # leaves a sawtooth at the rate of the windows
     fast = 0.0 if hertz is None else 0.3 * np.sin(2.0 * np.pi * hertz * T)
     stage = integrator(effects=LIBRARY[:1], gain=GAIN, added=slow + fast)
+    stage.memory = 10.0
     judge = Judge(stage, FLOOR)
     texts = " ".join(s.text for s in shape(judge, judge.fit((), stage.neutral())))
     assert re.findall(r"oscillates at ([\d.]+) Hz", texts) == ([named] if named else [])

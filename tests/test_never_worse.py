@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller import load_calibration
+from plant import build_plant
 from vaneloop.cli import extend
 from vaneloop.discrepancy.diagnose import extend_stage
 from vaneloop.discrepancy.fit import Judge
@@ -82,7 +84,7 @@ def test_extend_writes_no_model_that_is_no_better(after, written, monkeypatch, t
         steps=[("nominal", 151.0), ("+ internal_leakage", after)],
         excess=after,
     )
-    chain = Chain(stage.t, [stage], {}, {}, None, None, None)  # type: ignore[arg-type]
+    chain = Chain(stage.t, [stage], {}, {}, build_plant(), load_calibration(), load_calibration())
     monkeypatch.setattr(extend, "chain_of", lambda args, model: chain)
     monkeypatch.setattr(verbs, "extend_stage", lambda stage, effects: ended)
     parser = argparse.ArgumentParser()

@@ -381,7 +381,7 @@ def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(
 ) -> None:
     said = SimpleNamespace(verdict="missing", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
     monkeypatch.setattr(workflow, "_WORK", [SimpleNamespace()])
-    monkeypatch.setattr(workflow, "diagnose_stage", lambda *_: said)
+    monkeypatch.setattr(workflow, "diagnose_stage", lambda *_, **__: said)
     monkeypatch.setattr(workflow, "floor_of", lambda *_: np.ones(1))
     monkeypatch.setattr(workflow, "Judge", lambda *_: None)
     monkeypatch.setattr(workflow, "shape", lambda *_: ["a shape"])

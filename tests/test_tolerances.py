@@ -10,16 +10,17 @@ from hypothesis import strategies as st
 from hil.logs import Channel, Log
 from plant import build_plant
 from plant.geometry import STANDS_FOR, Geometry, length_tolerances, load_geometry, vane_angles
-from plant.linkage import STAGES
 from plant.model import Model
 from plant.parameters import nominal
 from tests import rig
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.models.vanes import build_chain
 from vaneloop.discrepancy.workflow import diagnose
 
 STROKE = np.linspace(0.0, 48e-3, 49)  # m
+STAGES = VANES[:3]
 PARTS = ("crank", *STAGES)
 
 

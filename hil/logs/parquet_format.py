@@ -59,12 +59,15 @@ def open_parquet(path: Path, options: Options) -> Source:
             or pa.types.is_boolean(kind)
         ):
             raise LogError(f"{path}: column {key!r} holds {kind}, not numbers")
-        chunks = [
-            c
-            for g in range(file.metadata.num_row_groups)
-            for c in _chunks(file.metadata.row_group(g))
-            if c.path_in_schema == key
-        ]
+        try:
+            chunks = [
+                c
+                for g in range(file.metadata.num_row_groups)
+                for c in _chunks(file.metadata.row_group(g))
+                if c.path_in_schema == key
+            ]
+        except damage as e:  # a name that is no text
+            raise LogError(f"{path}: column {key!r} cannot be read ({str(e)[:160]})") from None
         unpacked, most = (
             sum(c.total_uncompressed_size for c in chunks),
             _MOST_UNPACKED * (file.metadata.num_rows + 100_000),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.signal import welch
@@ -215,18 +216,29 @@ class Data:
 
 
 def noise_of_channel(y: Array) -> float:
-    """RMS of the white noise that evenly sampled values can hold at most; 0 is possible.
+    """RMS of the white noise that evenly sampled values can hold; 0 is possible.
 
-    The smaller of two bounds: third differences over the quieter half of the stretches (motion is smooth), and the
-    quietest tenth of the spectrum (white noise is everywhere).
+    The smaller of two estimates, each held against what it makes of white noise: third differences over the quieter
+    half of the stretches (motion is smooth), and the quietest tenth of the spectrum (white noise is everywhere).
     """
     y = y[np.isfinite(y)]
     if len(y) < 40:
         return 0.0
+    return min(level / white for level, white in zip(_quiet(y), _of_white(len(y)), strict=True))
+
+
+def _quiet(y: Array) -> tuple[float, float]:
+    """Third differences where they are small, and the spectrum where it is."""
     d = np.diff(y, 3)
     width = max(10, len(d) // 60)
     parts = d[: len(d) // width * width].reshape(-1, width)
     level = np.sort(np.sqrt(np.mean(parts**2, axis=1) / 20.0))
-    smooth = float(np.median(level[: max(1, len(level) // 2)]))
     _, power = welch(y, 1.0, nperseg=min(1024, len(y) // 4))
-    return min(smooth, float(np.sqrt(np.quantile(power[1:], 0.1) * 0.5)))
+    return float(np.median(level[: max(1, len(level) // 2)])), float(np.sqrt(np.quantile(power[1:], 0.1) * 0.5))
+
+
+@lru_cache(maxsize=64)
+def _of_white(n: int) -> tuple[float, float]:
+    rng = np.random.default_rng(0)
+    draws = [_quiet(rng.standard_normal(n)) for _ in range(8)]
+    return float(np.mean([d[0] for d in draws])), float(np.mean([d[1] for d in draws]))
