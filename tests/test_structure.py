@@ -45,9 +45,8 @@ DOORS: dict[str, tuple[str, ...]] = {
     "hil/inject/__main__.py": ("vaneloop.cli.inject",),  # python -m hil.inject
     # what a user describes is offered at the room's door
     "vaneloop/discrepancy/__init__.py": ("vaneloop.discrepancy.models.load", "vaneloop.discrepancy.models.system"),
-    # the blind benchmark hides effects with the rig, and says so where there is no checkout
-    "vaneloop/cli/hidden_effect.py": ("tests",),
-    "vaneloop/cli/hidden_law.py": ("tests",),
+    # the blind benchmarks hide effects and laws with simulators of the checkout, and say so where there is none
+    "vaneloop/cli/blind.py": ("tests",),
 }
 CLOCKS_AND_BUSES = {
     "asyncio",

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.vanes import VANES
+from vaneloop.cli.blind import from_checkout, print_shares, run, share
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -63,19 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _rig() -> Any:
-    import importlib
-
-    from vaneloop.base.errors import InputError
-
-    root = str(Path(__file__).resolve().parents[2])  # the checkout, where this is one
-    if root not in sys.path:
-        sys.path.append(root)
-    try:
-        return importlib.import_module("tests.rig"), importlib.import_module("tests.firmware_on_rig")
-    except ImportError:
-        raise InputError(
-            "hidden-effect needs the independent rig in tests/rig: run it from a checkout of the repository"
-        ) from None
+    return from_checkout(("tests.rig", "tests.firmware_on_rig"), "hidden-effect needs the independent rig in tests/rig")
 
 
 def draw_case(seed: int, index: int, duration: float = 300.0) -> dict[str, Any]:
@@ -288,13 +274,6 @@ def _hit(effect: str, row: dict[str, Any]) -> bool:
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Count: shares with 90 % binomial (Wilson) intervals, and every miss."""
-    from statsmodels.stats.proportion import proportion_confint
-
-    def share(hits: list[bool]) -> dict[str, Any]:
-        n, k = len(hits), sum(hits)
-        low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
-        return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
-
     single = [r for r in rows if r["kind"] == "single" and r["detectable"][0]]
     alone = [
         r
@@ -335,23 +314,20 @@ def reliability(rows: list[dict[str, Any]]) -> list[list[str]]:
     """How often effects named with a probability were hidden indeed: stated (mean), count, share right, 90 %
     interval.
     """
-    from statsmodels.stats.proportion import proportion_confint
-
     said = [(p, n in r["truth"]) for r in rows for n, p in zip(r["named"], r["probabilities"], strict=True)]
     out = []
     for low, high in ((0.0, 0.4), (0.4, 0.6), (0.6, 0.9), (0.9, 1.01)):
         inside = [(p, right) for p, right in said if low <= p < high]
         if inside:
-            k, n = sum(right for _, right in inside), len(inside)
-            a, b = proportion_confint(k, n, 0.10, "wilson")
-            stated = sum(p for p, _ in inside) / n
+            right = share([right for _, right in inside])
+            stated = sum(p for p, _ in inside) / right["of"]
             out.append(
                 [
                     f"{low:g} to {min(high, 1.0):g}",
                     f"{stated:.2f}",
-                    f"{k} of {n}",
-                    f"{k / n:.2f}",
-                    f"{a:.2f} to {b:.2f}",
+                    f"{right['hits']} of {right['of']}",
+                    f"{right['share']:.2f}",
+                    f"{right['low']:.2f} to {right['high']:.2f}",
                 ]
             )
     return out
@@ -425,36 +401,9 @@ def command(args: argparse.Namespace) -> int:
     terminal.say(args, f"seed {seed}; {len(rows)} logs done before")
     path.parent.mkdir(parents=True, exist_ok=True)
     warm_up(lambda text: terminal.say(args, text))
-    done = {r["index"] for r in rows}
-    todo = [i for i in range(args.logs) if i not in done]
-    with (
-        terminal.progress_bar(args, f"{args.logs} logs") as progress,
-        ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
-    ):
-        jobs = [pool.submit(judge_case, seed, i, args.duration, args.rate, args.experiments) for i in todo]
-        for job in as_completed(jobs):
-            rows.append(job.result())
-            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
-            if progress:
-                progress(len(rows) / args.logs)
-    rows.sort(key=lambda r: r["index"])
+    run(args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments)
     s = summary(rows)
-    table = [
-        [
-            k,
-            f"{v['hits']} of {v['of']}",
-            "-" if v["share"] is None else f"{v['share']:.3f}",
-            f"{v['low']:.3f} to {v['high']:.3f}",
-        ]
-        for k, v in s.items()
-        if isinstance(v, dict)
-    ]
-    terminal.print_table(
-        args,
-        f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis",
-        ["what", "count", "share", "90 % interval"],
-        table,
-    )
+    print_shares(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", s)
     terminal.print_table(args, "what was hidden, what was said", ["hidden", "said", "logs"], confusion(rows))
     terminal.print_table(
         args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows)

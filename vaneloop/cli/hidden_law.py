@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.cli.blind import from_checkout, print_shares, run, share
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
 
@@ -65,20 +63,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _systems() -> Any:
     """Modules of the families, the nominal models and the variants."""
-    import importlib
-
-    from vaneloop.base.errors import InputError
-
-    root = str(Path(__file__).resolve().parents[2])  # the checkout, where this is one
-    if root not in sys.path:
-        sys.path.append(root)
-    try:
-        names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants")
-        return tuple(importlib.import_module(n) for n in names)
-    except ImportError:
-        raise InputError(
-            "hidden-law needs the families of systems in tests/rig_systems: run it from a checkout of the repository"
-        ) from None
+    names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants")
+    return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
 
 
 def _said(system: Any, records: list[Any], test: list[Any]) -> dict[str, Any]:
@@ -174,15 +160,6 @@ def _hit_by(name: str, law: str, row: Row) -> bool:
     return bool(set(json.loads(row["same"])[law]) & {name, *json.loads(row["rivals"])[name]})
 
 
-def _share(hits: list[bool]) -> dict[str, Any]:
-    """A share with its 90 % binomial interval (Wilson)."""
-    from statsmodels.stats.proportion import proportion_confint
-
-    n, k = len(hits), sum(hits)
-    low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
-    return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
-
-
 def summary(rows: list[Row]) -> dict[str, Any]:
     """Count: shares with 90 % binomial intervals, and the median of the processor seconds."""
     single = [r for r in rows if r["kind"] == "single" and _seen(r)]
@@ -193,26 +170,26 @@ def summary(rows: list[Row]) -> dict[str, Any]:
     intervals = [i for r in rows for i in json.loads(r["intervals"])]
     out: dict[str, Any] = {
         "systems": len(rows),
-        "detectable single named or among rivals": _share([_hit(r["truth"][0], r) for r in single]),
-        "a single name given is right": _share([_hit(r["truth"][0], r) for r in alone]),
-        "a single name given": _share([r in alone for r in single]),
-        "a detectable single named, and nothing else": _share([_right(r) for r in single]),
-        "nothing hidden, nothing named": _share([not r["named"] and not r["error"] for r in clean]),
-        "nothing hidden, verdict none": _share([r["verdict"] == "none" for r in clean]),
-        "both of a detectable pair": _share([all(_hit(law, r) for law in r["truth"]) for r in pairs]),
-        "outside the library: unknown, or none where undetectable": _share([_right(r) for r in outside]),
-        "90 % interval covers the truth": _share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
-        "size within 5 % of the truth": _share(
+        "detectable single named or among rivals": share([_hit(r["truth"][0], r) for r in single]),
+        "a single name given is right": share([_hit(r["truth"][0], r) for r in alone]),
+        "a single name given": share([r in alone for r in single]),
+        "a detectable single named, and nothing else": share([_right(r) for r in single]),
+        "nothing hidden, nothing named": share([not r["named"] and not r["error"] for r in clean]),
+        "nothing hidden, verdict none": share([r["verdict"] == "none" for r in clean]),
+        "both of a detectable pair": share([all(_hit(law, r) for law in r["truth"]) for r in pairs]),
+        "outside the library: unknown, or none where undetectable": share([_right(r) for r in outside]),
+        "90 % interval covers the truth": share([i["low"] <= i["truth"] <= i["high"] for i in intervals]),
+        "size within 5 % of the truth": share(
             [abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]
         ),
-        "diagnosed without an error": _share([not r["error"] for r in rows]),
-        "whole answer right": _share([_right(r) for r in rows]),
+        "diagnosed without an error": share([not r["error"] for r in rows]),
+        "whole answer right": share([_right(r) for r in rows]),
         "median processor seconds": sorted(r["seconds"] for r in rows)[len(rows) // 2] if rows else None,
         "most processor seconds": max((r["seconds"] for r in rows), default=None),
     }
     tried = [json.loads(r["variants"]) for r in rows]
     for name in sorted({name for t in tried for name in t}):
-        out[f"same answer: {name}"] = _share([t[name]["same"] for t in tried if name in t])
+        out[f"same answer: {name}"] = share([t[name]["same"] for t in tried if name in t])
     return out
 
 
@@ -275,8 +252,6 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     import secrets
 
-    import polars as pl
-
     from vaneloop.base.errors import InputError
 
     rig, _, _ = _systems()
@@ -302,19 +277,7 @@ def command(args: argparse.Namespace) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{path.parent}: cannot be made ({e.strerror})") from None
-    done = {r["index"] for r in rows}
-    todo = [i for i in range(args.systems) if i not in done]
-    with (
-        terminal.progress_bar(args, f"{args.systems} systems") as progress,
-        ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool,
-    ):
-        jobs = [pool.submit(judge_case, seed, i, families, args.variants) for i in todo]
-        for job in as_completed(jobs):
-            rows.append(job.result())
-            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
-            if progress:
-                progress(len(rows) / max(args.systems, len(rows)))
-    rows.sort(key=lambda r: r["index"])
+    run(args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants)
     _print(args, rows)
     tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}
     terminal.write_json(args, {"schema": 1, "seed": seed, "summary": summary(rows), **tables})
@@ -323,18 +286,8 @@ def command(args: argparse.Namespace) -> int:
 
 def _print(args: argparse.Namespace, rows: list[Row]) -> None:
     s = summary(rows)
-    table = [
-        [
-            k,
-            f"{v['hits']} of {v['of']}",
-            "-" if v["share"] is None else f"{v['share']:.3f}",
-            f"{v['low']:.3f} to {v['high']:.3f}",
-        ]
-        for k, v in s.items()
-        if isinstance(v, dict)
-    ]
     title = f"{len(rows)} systems, {s['median processor seconds']:.1f} processor seconds a diagnosis (median)"
-    terminal.print_table(args, title, ["what", "count", "share", "90 % interval"], table)
+    print_shares(args, title, s)
     terminal.print_table(args, "single laws, by what they leave", ["noise floors", "found"], by_size(rows))
     terminal.print_table(args, "whole answers right", ["family", "right"], by_family(rows))
     for line in misses(rows):

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Criterion", "Search"]
 
-FINISHED = 5  # leading sets whose fits are finished
 SCREENED = 32  # starts simulated at one time
 DIRECTIONS = 12  # from which a fit of an effect with a direction may start
 STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
@@ -174,7 +173,7 @@ class Search:
             mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
             # a second start is worth its time where it is nearly as good as the first
             near = mine[0][0] + 0.2 * max(base_cost - mine[0][0], 0.02 * base_cost)
-            out[name] = [thetas[i] for c, i in mine[:4] if roams or c <= near][: 4 if roams else 2]
+            out[name] = [thetas[i] for c, i in mine[:2] if roams or c <= near]
             self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
             self.level[name] = mine[0][0]
         return out
@@ -233,7 +232,7 @@ class Search:
         in that order.
         """
         fits = []
-        for start in self.starts[name][:2]:
+        for start in self.starts[name]:
             fits.append((yield from self.judge.fitting((), start, 3)))
         fits.sort(key=self.judge.total_of)
         self.starts[name] = [f.theta for f in fits]
@@ -243,7 +242,7 @@ class Search:
         key = frozenset((name,))
         if key not in self.fits:
             fits = []
-            for start in self.starts[name][:2]:
+            for start in self.starts[name]:
                 fits.append((yield from self.judge.fitting((name,), start, 3)))
             best = min(fits, key=self.judge.total_of)
             if float(self.base.cost.sum() - best.cost.sum()) > self.criterion.least:  # worth finishing

@@ -226,8 +226,8 @@ def compare(
         from vaneloop.discrepancy.models.by_log import ByLog, as_given
 
         logs, name = _logs(log, model, test, added)
-        d = as_given(logs)
-        return Stages(logs.fitted, locate_stages(logs.fitted.stages), name, ByLog.of(logs, d, added))
+        located = locate_stages(logs.fitted.stages)
+        return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
     chain, name = _chain(log, model or Machine())
     return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
 

@@ -17,7 +17,7 @@ from plant import Model
 from vaneloop.base.tables import read
 from vaneloop.discrepancy.diagnose import Judged
 from vaneloop.discrepancy.error_share import ErrorShare
-from vaneloop.discrepancy.fit import Judge, recalibrate
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.laws import HYSTERETIC
 from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.runner import STARTS_LOADED
@@ -62,10 +62,9 @@ def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), mo
     return Logs(bound, system.bind(list(test), like=bound) if test else None)
 
 
-def as_given(logs: Logs) -> StageDiagnosis:
-    """The model with nothing added."""
+def as_given(logs: Logs, fit: Fit) -> StageDiagnosis:
+    """The model with nothing added, as it was fitted to say where it fails."""
     judge = Judge(logs.fitted.thinned, logs.fitted.floor)
-    fit = recalibrate(judge)
     return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
 
 
