@@ -341,7 +341,7 @@ def family_of(kind: str) -> Family:
         "valve_bench",
         "servo_axis",
         "tanks",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("levitation", "battery")),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("levitation", "pendulum", "battery")),
     ],
 )
 def test_a_rescaled_model_says_the_same_in_other_units(name: str) -> None:
