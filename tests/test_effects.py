@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from controller import load_calibration, new_state
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.tick import flashed
-from plant import Model, build_plant, chain, load_model, places, stages, write_model
+from plant import Model, build_plant, chain, load_model, places, write_model
 from plant import effects as library
 from plant.effect import DEG, KINDS, MOTOR, STAGES
 from plant.effects import (
@@ -75,7 +75,9 @@ from plant.layout import GEOMETRY, N_NOMINAL
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
 from plant.series import arctangent, tangent
-from plant.stages import SOME, W, actuator_run, engine_run, linkage_run, step_currents
+from plant.stages import actuator, actuator_run, engine_run, hydraulic_blocks, linkage, linkage_run, step_currents
+from plant.stages.blocks import W
+from plant.stages.linkage import SOME
 from tests import columns as fw
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
@@ -520,18 +522,18 @@ def test_a_block_that_leaves_out_what_its_lanes_lack_gives_the_bits_of_the_whole
     assert np.array_equal(whole[:, :-1], x[:, :-1])
 
 
-@pytest.mark.parametrize("called, name, sizes", [
-    ("ACTUATOR_BLOCKS", "valve_null_bias", {"bias": -0.5}),
-    ("LINKAGE_BLOCKS", "linkage_wear", {"vgv1": 100.0}),
+@pytest.mark.parametrize("run, blocks, name, sizes", [
+    (actuator_lanes, hydraulic_blocks, "valve_null_bias", {"bias": -0.5}),
+    (linkage_lanes, linkage, "linkage_wear", {"vgv1": 100.0}),
 ])  # fmt: skip
-def test_an_effect_that_the_blocks_do_not_call_acts_all_the_same(called: str, name: str, sizes, monkeypatch) -> None:
+def test_an_effect_that_the_blocks_do_not_call_acts_all_the_same(run, blocks, name: str, sizes, monkeypatch) -> None:
     sets = [{name: sizes} if j % 3 == 1 else {} for j in range(40)]
-    run = actuator_lanes if called == "ACTUATOR_BLOCKS" else linkage_lanes
     known = run(sets, build_plant(), 600)[0]
-    monkeypatch.setattr(stages, called, tuple(n for n in getattr(stages, called) if n != name))
+    monkeypatch.setattr(blocks, "CALLED", tuple(n for n in blocks.CALLED if n != name))
     unknown = run(sets, build_plant(), 600)[0]
     assert np.abs(known[..., 1] - known[..., 0]).max() > 1e-6 and np.allclose(unknown, known, rtol=0.0, atol=1e-12)
-    monkeypatch.setattr(stages, "_actuator_lanes" if run is actuator_lanes else "_linkage_lanes", lambda *a: None)
+    one_by_one = (actuator, "_actuator_lanes") if run is actuator_lanes else (linkage, "_linkage_lanes")
+    monkeypatch.setattr(*one_by_one, lambda *a: None)
     assert not np.allclose(run(sets, build_plant(), 600)[0][..., 1], known[..., 1])  # it was one by one indeed
 
 

@@ -21,7 +21,8 @@ from hil import inject
 from hil.bus import frames
 from hil.bus.frames import ECU_DEMAND, VERDICTS, new_receiver, receive
 from hil.inject import Expect, Outcome, Scenario, Trace, judge
-from hil.inject.scenario import OnFrame, library, load_scenario
+from hil.inject.actions import OnFrame
+from hil.inject.scenario import library, load_scenario
 from hil.inject.tamper import Gateway, Intruder
 from hil.logs.candump import write_candump
 from hil.logs.frames import Frames

@@ -730,6 +730,24 @@ def test_compiling_is_told_before_it_is_done_whatever_the_format(tmp_path: Path,
         assert "columns.cut" not in told["compiling the reader of CAN logs"]
 
 
+def test_compiled_code_is_known_by_its_function(tmp_path: Path) -> None:
+    """Before a function is compiled there is none of its code; after that there is, whatever the function is called."""
+    code = (
+        "from vaneloop.base.compiled import is_cached\n"
+        "from plant.linkage import crank\n"
+        "from plant.stages import actuator_run\n"
+        "before = is_cached(crank)\n"
+        "crank(0.0, 0.3, 0.2, 0.2, 0.1)\n"
+        "assert not before and is_cached(crank) and is_cached(actuator_run), before\n"
+    )
+    import os
+
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False,
+                          env=environment)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 def test_names_on_offer_are_those_of_any_log(tmp_path: Path) -> None:
     """A log whose units are wrong still says what it holds: the workbench's form needs it."""
     write_log(tmp_path / "rpm.csv", as_if(a_run(8.0), n_dem=lambda v: v * 300))

@@ -113,6 +113,7 @@ EXPORTS: dict[str, list[str]] = {
         "rows_at",
         "states_of",
     ],
+    "plant.stages": ["actuator_run", "engine_run", "linkage_run", "step_currents"],
     "vaneloop": [
         *(
             "Channel",

@@ -427,7 +427,7 @@ def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None
 def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> None:
     import shlex
 
-    from vaneloop.web.run import Loop
+    from vaneloop.web.running import Loop
     from vaneloop.web.session import Session
     from vaneloop.web.worker import parsed
 
@@ -1006,7 +1006,7 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
 
 
 def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path) -> None:
-    from vaneloop.web.run import Loop
+    from vaneloop.web.running import Loop
     from vaneloop.web.schedule import Plan
     from vaneloop.web.session import LogFile, Session
 

@@ -13,7 +13,7 @@ judged.
                                                                Python
     assert outcome.held, outcome.text()
 
-The schema of scenarios is `hil.inject.scenario`; its names are here, too.
+The schema of scenarios is `hil.inject.scenario` and `hil.inject.actions`; its names are here, too.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ import numpy as np
 
 from controller import MODES
 from hil.bus import frames
-from hil.inject.scenario import (
+from hil.inject.actions import (
     ACTIONS,
-    COUNTS,
     Action,
     Babble,
     BusOff,
@@ -39,7 +38,6 @@ from hil.inject.scenario import (
     Drop,
     Duplicate,
     ErrorFrames,
-    Expect,
     Flood,
     Freeze,
     Machine,
@@ -49,12 +47,10 @@ from hil.inject.scenario import (
     Override,
     Reorder,
     Replay,
-    Scenario,
     Send,
     identifier,
-    library,
-    load_scenario,
 )
+from hil.inject.scenario import COUNTS, Expect, Scenario, library, load_scenario
 from hil.inject.tamper import Gateway, Intruder, tick_of
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, judge, outcome_of
 from vaneloop.base.errors import InputError

@@ -21,7 +21,8 @@ import pytest
 
 if TYPE_CHECKING:
     from hil.inject import Outcome
-    from hil.inject.scenario import AnyAction, Expect, Scenario
+    from hil.inject.actions import AnyAction
+    from hil.inject.scenario import Expect, Scenario
 
 __all__ = ["Sil", "sil"]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.bus import frames
-from hil.inject.scenario import (
+from hil.inject.actions import (
     Action,
     Babble,
     Corrupt,

@@ -13,7 +13,7 @@ __all__ = ["cut", "warm_up", "wrong_crc"]
 
 def warm_up(say: Callable[[str], None]) -> None:
     """Tell the user that reading the first CAN log compiles; silent when the compiled code is there already."""
-    if not is_cached("columns.cut"):
+    if not is_cached(cut):
         say("compiling the reader of CAN logs for this machine (once, about 3 s) ...")
 
 

@@ -270,7 +270,7 @@ def warm_up(say: Callable[[str], None]) -> None:
     """
     from vaneloop.base.compiled import is_cached
 
-    if is_cached("lockstep.advance"):
+    if is_cached(advance):
         return
     say("compiling the simulator for this machine (once, about 15 s) ...")
     started = time.perf_counter()

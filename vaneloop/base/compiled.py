@@ -81,8 +81,10 @@ in_place = cast("Compiler", njit(cache=True, error_model="numpy", _nrt=False))  
 inlined = cast("Compiler", njit(cache=True, error_model="numpy", _nrt=False, forceinline=True))  # type: ignore[call-overload]
 
 
-def is_cached(name: str) -> bool:
-    """Whether compiled code of the function ``name`` (MODULE.FUNCTION) of these sources is there already; compiling
-    takes seconds.
-    """
+def is_cached(function: Callable[..., Any]) -> bool:
+    """Whether compiled code of a compiled ``function`` of these sources is there already; compiling takes seconds."""
+    plain = getattr(function, "py_func", None)  # what is not compiled has no code to wait for
+    if plain is None:
+        return True
+    name = f"{plain.__module__.rpartition('.')[2]}.{plain.__qualname__}"
     return any(Path(numba.config.CACHE_DIR).rglob(f"{name}-*.nbi"))  # type: ignore[attr-defined]

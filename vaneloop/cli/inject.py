@@ -58,13 +58,15 @@ def command(args: argparse.Namespace) -> int:
     made = [(Path(n).stem, load_scenario(n)) for n in named]
     if args.seed is not None:
         made = [(n, s.model_copy(update={"seed": args.seed})) for n, s in made]
+    if args.bus != "lockstep" and (given := [f"--{n}" for n in ("model", "tables", "plant") if vars(args)[n]]):
+        raise InputError(
+            f"{given[0]} is for --bus lockstep; on {args.bus} the machine is vaneloop run's: give it there"
+        )
     machine = options.machine_of(args)
     if args.bus == "lockstep":
         from hil.loop.lockstep import warm_up
 
         warm_up(lambda text: terminal.say(args, text))
-    if args.plant is not None and args.bus != "lockstep":
-        raise InputError(f"--plant is for --bus lockstep; on {args.bus} the machine is vaneloop run's: give it there")
     outcomes, skipped = [], []
     with terminal.progress_bar(args, "injecting") as progress:
         for i, (name, scenario) in enumerate(made):

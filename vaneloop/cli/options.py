@@ -42,9 +42,10 @@ def add_machine_options(parser: Any) -> None:
 
 def tell_search(say: Callable[[str], None]) -> None:
     """Tell the user that the first search compiles; silent when the compiled code is there already."""
+    from plant.stages import hydraulic_blocks, motor_blocks
     from vaneloop.base.compiled import is_cached
 
-    if not is_cached("stages.actuator_run"):
+    if not (is_cached(hydraulic_blocks.run) or is_cached(motor_blocks.run)):
         say("compiling the stages of the search for this machine (once, about 30 s) ...")
 
 

@@ -106,7 +106,8 @@ class _Injected:
     def add(self, name: str, k: int) -> None:
         """Begin the shipped scenario ``name`` now: its first action starts at tick ``k``."""
         from hil.inject import injection
-        from hil.inject.scenario import Machine, OnBus, OnFrame, Outsider, load_scenario
+        from hil.inject.actions import Machine, OnBus, OnFrame, Outsider
+        from hil.inject.scenario import load_scenario
         from hil.inject.tamper import Gateway, Intruder
 
         scenario = load_scenario(name)

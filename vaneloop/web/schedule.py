@@ -22,8 +22,8 @@ from vaneloop.pages.figures import Line, Panel, loop, overlay
 from vaneloop.pages.schedule import NAMES
 from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.verbs.machine import files_of
+from vaneloop.web.chosen_log import receive, suffixes
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table
-from vaneloop.web.missing import receive, suffixes
 from vaneloop.web.session import LogFile, Session
 from vaneloop.web.worker import STEPS
 

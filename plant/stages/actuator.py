@@ -1,0 +1,159 @@
+"""The actuator: stroke from the current."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from plant import chain, electromechanical
+from plant.chain import measured_stroke, true_stroke
+from plant.effects import aero_load, oil_compressibility, valve_null_bias
+from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
+from plant.places import (
+    AERO_LOAD,
+    CURRENT,
+    GIVE,
+    INTERNAL_LEAKAGE,
+    LAGGED,
+    LVDT_LAG_ERROR,
+    OIL_COMPRESSIBILITY,
+    PISTON_STICTION,
+    READING,
+    SCREW_PITCH_ERROR,
+    SUPPLY_PRESSURE_DROOP,
+    VALVE_HYSTERESIS,
+    VALVE_LAG,
+    VALVE_NULL_BIAS,
+    X_LVDT,
+    X,
+)
+from plant.stages import hydraulic_blocks, motor_blocks
+from plant.stages.blocks import W, between, elsewhere, in_blocks
+from vaneloop.base.compiled import compiled_free
+
+__all__ = ["actuator_run"]
+
+FEW = 1  # so few lanes or fewer are quicker one by one
+SITES = ("valve", "supply", "amplifier", "motor", "screw", "actuator")
+
+
+def actuator_run(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray | None = None,
+    window: int = 0,
+) -> None:
+    """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
+
+    current           A in every step, of `step_currents`
+    n_r, p_s, t_oil   %, Pa, degC; their mean over the step is used
+    out               quickest where a lane's samples lie side by side in memory
+    x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT
+                      saw it, so that a small error of speed does not carry it away; without them it starts from ``s``
+                      and runs free
+
+    The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where
+    the share of a constant input, 1 - exp(-h / tau), would be early by h / 2.
+    """
+    if window and x_lvdt is None:
+        raise ValueError(f"window (={window}) needs x_lvdt")
+    x = np.ascontiguousarray(x_lvdt) if window else np.zeros(1)
+    if window:
+        _rest(p, s, current[0, 0], n_r[0], t_oil[0])
+    h = dt / current.shape[1]
+    for share, tau in ((LVDT_FACTOR, LVDT_LAG), (LVDT_SHARE, LVDT_LAG_ERROR), (VALVE_SHARE, VALVE_LAG)):
+        p[share] = h / (h + np.maximum(p[tau], 0.0))
+    # what one lane of a block needs is computed for all eight: those that need the same are put side by side
+    motor = p[KIND, 0] != 0.0  # all lanes are of one machine
+    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED)
+    lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
+    order = np.lexsort(
+        (
+            p[VALVE_HYSTERESIS] != 0.0,
+            p[PISTON_STICTION] != 0.0,
+            lossy,
+            p[DRIVE_LOADED] != 0.0,
+            p[SCREW_PITCH_ERROR] != 0.0,
+            alone,
+        )
+    )
+    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
+    work = [range(j, min(j + W, wide)) for j in range(0, wide, W)]
+    each = max(1, -(-(p.shape[1] - wide) // (os.cpu_count() or 1)))
+    work += [range(j, min(j + each, p.shape[1])) for j in range(wide, p.shape[1], each)]
+
+    def run(part: range) -> None:
+        some = order[part.start : part.stop]
+        if part.start < wide and motor:
+            motor_blocks.run(current, n_r, t_oil, dt, p, s, out.T, x, window, some, np.empty(1, motor_blocks.BLOCK))
+        elif part.start < wide:
+            block = np.empty(1, hydraulic_blocks.BLOCK)
+            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block)
+        else:
+            _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some)
+
+    if len(work) == 1:
+        run(work[0])
+    else:  # compiled code needs no interpreter; the costly ones, which come last, begin first
+        with ThreadPoolExecutor(min(len(work), os.cpu_count() or 1)) as threads:
+            list(threads.map(run, work[::-1]))
+
+
+@compiled_free
+def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float, t_oil: float) -> None:
+    """Valve and oil at rest, a motor at its steady speed, under the current ``i`` (A) at ``n_r`` (%) and ``t_oil``
+    (degC).
+    """
+    for j in range(p.shape[1]):
+        current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
+        s[CURRENT : CURRENT + 4, j] = s[LAGGED, j] = current
+        load = aero_load.step(n_r, p[AERO_LOAD, j])
+        s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+        if p[KIND, j] != 0.0:
+            electromechanical.rest(p, s, j, i, load, t_oil)
+
+
+@compiled_free
+def _actuator_lanes(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray,
+    window: int,
+    lanes: np.ndarray,
+) -> None:
+    """These ``lanes``, one after the other; out[lane, k]."""
+    n, substeps = current.shape
+    h = dt / substeps
+    for j in lanes:
+        effects = p[DRIVE_EFFECTS, j] != 0.0
+        for k in range(n):
+            if k > 0:
+                speed, supply, warm = between(n_r, k), between(p_s, k), between(t_oil, k)
+                for m in range(substeps):
+                    chain.drive_step(s, p, j, current[k, m], speed, supply, warm, h, 1)
+            if not effects:
+                s[READING, j] = s[X_LVDT, j]
+            if window > 0 and k % window == 0:
+                x = true_stroke(x_lvdt[k], p, j, t_oil[k])
+                if k == 0:
+                    s[X, j] = s[X_LVDT, j] = s[READING, j] = x
+                else:
+                    shift = x - s[READING, j]
+                    s[X, j] += shift
+                    s[X_LVDT, j] += shift
+                    s[READING, j] += shift
+            out[j, k] = measured_stroke(s[READING, j], p, j, t_oil[k]) if effects else s[READING, j]

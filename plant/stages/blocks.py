@@ -1,0 +1,51 @@
+"""What the blocks of lanes share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from plant.effects import EFFECTS, NEUTRAL, ROW
+from plant.layout import N_NOMINAL
+from vaneloop.base.compiled import inlined
+
+__all__ = ["W", "between", "elsewhere", "in_blocks", "put_where_seen"]
+
+W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
+
+# A block's memory comes from the caller, who keeps it: a record that compiled code takes out of an array of its own
+# does not keep that array alive. Its width is constant, so that the compiler sees the strides.
+
+
+def in_blocks(lanes: int, width: int, few: int) -> int:
+    """How many of the lanes run in blocks; the rest of at most ``few`` one by one."""
+    rest = lanes % width
+    return lanes - rest if rest <= few else lanes
+
+
+def elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:
+    """Return bool[lane]: whether the lane has an effect of these ``sites`` that is not among the ``called`` ones."""
+    rows = [
+        ROW[e.name] + i
+        for e in EFFECTS.values()
+        if e.site in sites and e.name not in called
+        for i in range(len(e.parameters))
+    ]
+    return (p[rows] != np.array([[NEUTRAL[r - N_NOMINAL]] for r in rows]).reshape(-1, 1)).any(axis=0)
+
+
+@inlined
+def between(a: np.ndarray, k: int) -> float:
+    """Mean of a signal over the step to sample ``k``."""
+    return 0.5 * (a[k - 1] + a[k])
+
+
+@inlined
+def put_where_seen(b: Any, j: int, x: float, first: bool) -> None:
+    """Put the piston of lane ``j`` where the LVDT saw it, at the true stroke ``x`` (m), with all that trails it."""
+    shift = x - b.reading[j]
+    b.x[j] = x if first else b.x[j] + shift
+    b.x_lvdt[j] = x if first else b.x_lvdt[j] + shift
+    b.reading[j] = x if first else b.reading[j] + shift

@@ -1,0 +1,50 @@
+"""The engine: rotor speed from the demand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plant import places
+from plant.effects import acceleration_limit_error, rotor_lag_error
+from plant.engine import engine_step
+from plant.parameters import ACCELERATION, DECELERATION, LAG
+from plant.places import N_R
+from plant.stages.blocks import W
+from vaneloop.base.compiled import compiled_free
+
+__all__ = ["engine_run"]
+
+ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
+
+
+def engine_run(n_dem: np.ndarray, dt: float, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
+    """Fill out[k, lane] with the rotor speed (%) at sample k; n_dem[k] (%) holds until sample k + 1. ``s`` is
+    moved on.
+    """
+    _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
+
+
+@compiled_free
+def _engine_run(n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
+    lanes = p.shape[1]
+    h = dt / steps
+    b = np.empty((4, W))
+    for j0 in range(0, lanes, W):
+        for j in range(W):
+            q = min(j0 + j, lanes - 1)
+            b[0, j] = s[N_R, q]
+            b[1, j] = rotor_lag_error.step(p[LAG, q], p[places.ROTOR_LAG_ERROR, q])
+            b[2, j] = acceleration_limit_error.step(p[ACCELERATION, q], p[places.ACCELERATION_LIMIT_ERROR, q])
+            b[3, j] = p[DECELERATION, q]
+        last = min(W, lanes - j0)
+        for k in range(len(n_dem)):
+            if k > 0:
+                for _ in range(steps):
+                    for j in range(W):
+                        b[0, j] = engine_step(b[0, j], n_dem[k - 1], b[1, j], b[2, j], b[3, j], h)
+            for j in range(last):
+                out[k, j0 + j] = b[0, j]
+        for j in range(last):
+            s[N_R, j0 + j] = b[0, j]

@@ -1,0 +1,197 @@
+"""Blocks of lanes of the hydraulic actuator: valve, oil, piston."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from plant import chain, drive, lanes
+from plant.actuator import speed_factor
+from plant.chain import true_stroke
+from plant.effects import (
+    aero_load,
+    lvdt_nonlinearity,
+    oil_viscosity,
+    valve_gain_asymmetry,
+    valve_hysteresis,
+    valve_null_bias,
+)
+from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, FLOW_GAIN, P_REF, STROKE
+from plant.places import (
+    AERO_LOAD,
+    CURRENT,
+    INTERNAL_LEAKAGE,
+    LVDT_BIAS,
+    LVDT_GAIN,
+    LVDT_NONLINEARITY,
+    LVDT_THERMAL_DRIFT,
+    OIL_VISCOSITY,
+    PISTON_STICTION,
+    SUPPLY_PRESSURE_DROOP,
+    VALVE_FLOW_SATURATION,
+    VALVE_GAIN_ASYMMETRY,
+    VALVE_HYSTERESIS,
+    VALVE_NULL_BIAS,
+)
+from plant.stages.blocks import W, between, put_where_seen
+from vaneloop.base.compiled import compiled_free, inlined
+
+__all__ = ["BLOCK", "CALLED", "run"]
+
+# effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
+CALLED = (
+    "aero_load", "end_stop_shift", "internal_leakage", "oil_compressibility", "oil_viscosity", "piston_friction",
+    "piston_stiction", "supply_pressure_droop", "valve_dead_band", "valve_flow_saturation", "valve_gain_asymmetry",
+    "valve_hysteresis", "valve_lag", "valve_null_bias",
+)  # fmt: skip
+
+
+class _Around(NamedTuple):
+    """What a block of lanes needs of each beside `drive.Drive`: the valve's hysteresis, flow, load, reading."""
+
+    bias: float
+    width: float
+    spread: float
+    flow: float
+    viscosity: float
+    asymmetry: float
+    p_ref: float
+    aero: float
+    lvdt_gain: float
+    lvdt_drift: float
+    lvdt_bias: float
+
+
+_MEMORY = ("y1", "y2", "y3", "y4")  # A, of the valve's hysteresis
+BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, _Around, more=(*_MEMORY, "logged"))
+_state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
+_drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
+_feed, _put_around = lanes.getter(drive.Feed), lanes.putter(_Around)
+
+
+@inlined
+def _around(p: np.ndarray, q: int) -> _Around:
+    return _Around(
+        p[VALVE_NULL_BIAS, q],
+        p[VALVE_HYSTERESIS, q],
+        p[VALVE_HYSTERESIS + 1, q],
+        p[FLOW_GAIN, q],
+        p[OIL_VISCOSITY, q],
+        p[VALVE_GAIN_ASYMMETRY, q],
+        p[P_REF, q],
+        p[AERO_LOAD, q],
+        p[LVDT_GAIN, q],
+        p[LVDT_THERMAL_DRIFT, q],
+        p[LVDT_BIAS, q],
+    )
+
+
+@compiled_free
+def run(
+    current: np.ndarray,
+    n_r: np.ndarray,
+    p_s: np.ndarray,
+    t_oil: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    x_lvdt: np.ndarray,
+    window: int,
+    order: np.ndarray,
+    block: np.ndarray,
+) -> None:
+    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`."""
+    n, substeps = current.shape
+    h = dt / substeps
+    b = block[0]
+    for j0 in range(0, len(order), W):
+        last = min(W, len(order) - j0)
+        loaded = lossy = sticky = memory = viscous = sensed = curved = False
+        for j in range(W):
+            q = order[j0 + min(j, last - 1)]
+            loaded |= p[DRIVE_LOADED, q] != 0.0
+            lossy |= (
+                p[SUPPLY_PRESSURE_DROOP, q] != 0.0
+                or p[INTERNAL_LEAKAGE, q] != 0.0
+                or p[VALVE_FLOW_SATURATION + 1, q] != 0.0
+            )
+            sticky |= p[PISTON_STICTION, q] != 0.0
+            memory |= p[VALVE_HYSTERESIS, q] != 0.0
+            viscous |= p[OIL_VISCOSITY, q] != 0.0
+            sensed |= p[DRIVE_EFFECTS, q] != 0.0
+            curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
+            _put_state(b, j, drive.taken(s, q))
+            _put_drive(b, j, drive.prepare(p, q))
+            _put_around(b, j, _around(p, q))
+            b.y1[j], b.y2[j], b.y3[j], b.y4[j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
+        for k in range(n):
+            if k > 0:
+                supply, warm, speed = between(p_s, k), between(t_oil, k), between(n_r, k)
+                if viscous or k == 1:
+                    for j in range(W):
+                        gain = oil_viscosity.step(b.flow[j], warm, b.viscosity[j])
+                        b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(gain, b.asymmetry[j])
+                if loaded:
+                    for j in range(W):
+                        b.load[j] = aero_load.step(speed, b.aero[j])
+                else:
+                    for j in range(W):
+                        b.root[j] = speed_factor(supply, 0.0, b.p_ref[j])
+                if loaded and (memory or (lossy and sticky)):
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, True, True, True, True)
+                elif lossy:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, True, True, False, False)
+                elif sticky:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, True, False, True, False)
+                elif loaded:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, True, False, False, False)
+                elif memory:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, False, False, False, True)
+                else:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], supply, h, False, False, False, False)
+            if window > 0 and k % window == 0:
+                for j in range(last):
+                    put_where_seen(b, j, true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k]), k == 0)
+            for j in range(W):
+                b.logged[j] = b.reading[j]
+            if curved:
+                for j in range(last):
+                    q = order[j0 + j]
+                    b.logged[j] = lvdt_nonlinearity.step(
+                        b.reading[j], p[STROKE, q], p[LVDT_NONLINEARITY, q], p[LVDT_NONLINEARITY + 1, q]
+                    )
+            if sensed:
+                for j in range(W):
+                    b.logged[j] = chain.straight_reading(
+                        b.logged[j], b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[k]
+                    )
+            for j in range(last):
+                out[order[j0 + j], k] = b.logged[j]
+        for j in range(last):
+            q = order[j0 + j]
+            drive.stored(s, q, _state(b, j))
+            s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b.y1[j], b.y2[j], b.y3[j], b.y4[j]
+
+
+@inlined
+def _substep(b: Any, i_cmd: float, p_s: float, h: float, loaded: bool, lossy: bool, sticky: bool, memory: bool) -> None:
+    """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see
+    `plant.drive.step`.
+    """
+    for j in range(W):
+        i = valve_null_bias.step(i_cmd, b.bias[j])
+        y1 = y2 = y3 = y4 = i
+        if memory:
+            y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
+            i = valve_hysteresis.mean(y1, y2, y3, y4)
+        z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky)
+        _put_state(b, j, z)
+        b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4

@@ -1,0 +1,237 @@
+"""The linkage: vane angles from the stroke."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from plant import chain, lanes, stem
+from plant.chain import true_stroke
+from plant.effects import pot_lag
+from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
+from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
+from plant.places import LVDT_LAG_ERROR, POT, POT_LAG_ERROR, X
+from plant.series import arctangent, tangent
+from plant.stages.blocks import elsewhere, in_blocks
+from vaneloop.base.compiled import compiled_free, inlined
+
+__all__ = ["linkage_run"]
+
+WIDE = 32  # lanes in a block: its short loops over fewer would be unrolled instead of vectorised
+SOME = 5  # so few lanes or fewer are quicker one by one
+# effects that the blocks call
+CALLED = (
+    "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction",
+    "linkage_wear", "pot_bias", "pot_gain", "pot_lag", "ring_eccentricity", "thermal_growth",
+)  # fmt: skip
+
+
+def linkage_run(
+    x_lvdt: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise.
+    ``s`` is moved on.
+
+    x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading
+             moves all stages
+    n_r, t_oil, t   %, degC, s from the start of the log
+    """
+    x_lvdt = np.ascontiguousarray(x_lvdt)
+    reach = max(
+        1, round(1e-2 / dt)
+    )  # samples over which the speed is taken: shorter, and the noise of the LVDT would come through its lag
+    ahead, behind = (
+        np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1),
+        np.maximum(np.arange(len(x_lvdt)) - reach, 0),
+    )
+    speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
+    alone = elsewhere(p, ("linkage", "pot"), CALLED)
+    order = np.argsort(alone, kind="stable")
+    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
+    if wide:
+        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _linkage(out.shape[1])))
+    if wide < p.shape[1]:
+        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
+
+
+@inlined
+def _ramp_lag(tau: float, dt: float) -> tuple[float, float]:
+    """Return (e, b) of a first-order lag over ``dt`` for an input that goes straight from u0 to u1: y1 = e y0 + (b - e)
+    u0 + (1 - b) u1.
+    """
+    if tau <= 0.0:
+        return 0.0, 0.0
+    e = math.exp(-dt / tau)
+    return e, (1.0 - e) * tau / dt
+
+
+@compiled_free
+def _linkage_lanes(
+    x_lvdt: np.ndarray,
+    speed: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    lanes: np.ndarray,
+) -> None:
+    """These ``lanes``, one after the other."""
+    g, stages = GEOMETRY, out.shape[1]
+    before = np.empty(stages)
+    for j in lanes:
+        late = max(p[LVDT_LAG, j], 0.0) + p[LVDT_LAG_ERROR, j]
+        for m in range(len(x_lvdt)):
+            x = true_stroke(x_lvdt[m] + late * speed[m], p, j, t_oil[m])
+            s[X, j] = x
+            c, d = crank(x, p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+            for k in range(stages):
+                vane = chain.stem_angle(s, p, j, k, c, d, n_r[m], t_oil[m], t[m])
+                if m > 0:
+                    e, b = _ramp_lag(pot_lag.step(p[POT_LAG, j], p[POT_LAG_ERROR + k, j]), dt)
+                    s[POT + k, j] = e * s[POT + k, j] + ((b - e) * before[k] + (1.0 - b) * vane)
+                before[k] = vane
+                out[m, k, j] = s[POT + k, j]
+
+
+class _Crank(NamedTuple):
+    """What a block of lanes needs of each crank; by how much (s) the LVDT trails the stroke."""
+
+    lx0: float
+    x1: float
+    y1: float
+    le: float
+    late: float
+
+
+_OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever"))
+
+
+@lru_cache
+def _linkage(stages: int) -> np.dtype[np.void]:
+    """Block for that many stages: the compiler knows how often its loops over them go."""
+    return lanes.block(WIDE, _Crank, more=("stroke", "c", "d"), each=(stages, *_OF_STAGE))
+
+
+_stem, _put_stem = lanes.getter(stem.Stem, "k"), lanes.putter(stem.Stem, "k")
+_stem_state, _put_stem_state = lanes.getter(stem.StemState, "k"), lanes.putter(stem.StemState, "k")
+
+
+@compiled_free
+def _linkage_blocks(
+    x_lvdt: np.ndarray,
+    speed: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    t: np.ndarray,
+    dt: float,
+    p: np.ndarray,
+    s: np.ndarray,
+    out: np.ndarray,
+    order: np.ndarray,
+    block: np.ndarray,
+) -> None:
+    """The lanes of ``order``, `WIDE` at a time. ``block``: memory for one record `_linkage`."""
+    g = GEOMETRY
+    b = block[0]
+    for j0 in range(0, len(order), WIDE):
+        last = min(WIDE, len(order) - j0)
+        rubbed = eccentric = False
+        for j in range(WIDE):
+            q = order[j0 + min(j, last - 1)]
+            b.lx0[j], b.x1[j], b.y1[j], b.le[j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
+            b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
+            for k in range(b.pot.shape[0]):
+                d = stem.prepare(p, q, k)
+                _put_stem(b, k, j, d)
+                _put_stem_state(b, k, j, stem.taken(s, q, k))
+                b.pot[k, j], b.lever[k, j] = s[POT + k, q], d.ldp / d.length
+                b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
+                rubbed |= d.friction != 0.0
+                eccentric |= d.amplitude != 0.0
+        for m in range(len(x_lvdt)):
+            for j in range(WIDE):
+                q = order[j0 + min(j, last - 1)]
+                b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
+            for j in range(WIDE):
+                b.c[j], b.d[j] = _crank(b.stroke[j], b.lx0[j], b.x1[j], b.y1[j], b.le[j])
+            for k in range(b.pot.shape[0]):
+                for j in range(WIDE):
+                    b.theta[k, j] = _ring(b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.lc[k, j], b.ld[k, j])
+                if eccentric:
+                    for j in range(WIDE):
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], True)
+                else:
+                    for j in range(WIDE):
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], False)
+                if rubbed:
+                    for j in range(WIDE):
+                        z, b.theta[k, j] = stem.follow(
+                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], True
+                        )
+                        _put_stem_state(b, k, j, z)
+                else:
+                    for j in range(WIDE):
+                        z, b.theta[k, j] = stem.follow(
+                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], False
+                        )
+                        _put_stem_state(b, k, j, z)
+                for j in range(WIDE):
+                    vane = stem.reading(_stem(b, k, j), _vane(b.theta[k, j], b.lever[k, j]))
+                    before = vane if m == 0 else b.before[k, j]
+                    slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
+                    b.pot[k, j] = b.pot[k, j] if m == 0 else slow
+                    b.before[k, j] = vane
+                for j in range(last):
+                    out[m, k, order[j0 + j]] = b.pot[k, j]
+        for j in range(last):
+            q = order[j0 + j]
+            s[X, q] = b.stroke[j]
+            for k in range(b.pot.shape[0]):
+                stem.stored(s, q, k, _stem_state(b, k, j))
+                s[POT + k, q] = b.pot[k, j]
+
+
+@inlined
+def _crank(stroke: float, lx0: float, x1: float, y1: float, le: float) -> tuple[float, float]:
+    """`plant.linkage.crank` without branches."""
+    lx = lx0 + stroke
+    d2 = x1 * x1 + y1 * y1
+    m = 0.5 * (d2 + le * le - lx * lx)
+    r = d2 * le * le - m * m
+    root = math.sqrt(max(r, 0.0))
+    m = m if r > 0.0 else (math.sqrt(d2) * le if m >= 0.0 else -math.sqrt(d2) * le)
+    f = 1.0 / (d2 * le)
+    return (x1 * m - y1 * root) * f, (x1 * root + y1 * m) * f
+
+
+@inlined
+def _ring(c: float, d: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
+    """`plant.linkage.ring_angle` for angles within +-90 deg, without branches."""
+    qx = ax + lb * c
+    qy = ay + lb * d
+    q2 = qx * qx + qy * qy
+    u = 0.5 * (q2 + ld * ld - lc * lc) / ld
+    r = q2 - u * u
+    v = math.sqrt(max(r, 0.0))
+    u = u if r > 0.0 else (math.sqrt(q2) if u >= 0.0 else -math.sqrt(q2))
+    return arctangent(-(qx * u + qy * v), qy * u - qx * v)
+
+
+@inlined
+def _vane(theta: float, lever: float) -> float:
+    """`plant.linkage.vane_angle` as an arctangent, asin q = atan(q / sqrt(1 - q^2)); ``lever`` = Ld'/L."""
+    q = min(max(lever * tangent(theta), -1.0), 1.0)
+    return arctangent(q, math.sqrt(1.0 - q * q))

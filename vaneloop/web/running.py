@@ -1,0 +1,278 @@
+"""The loop of one session of page 3: begun, stopped, told what to do, and what it said."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller import FAULTS, MODES
+from hil.inject.scenario import load_scenario
+from vaneloop.base.vanes import VANES
+from vaneloop.pages.style import STAGE_ROLES
+from vaneloop.web.charts import Curves, Panel, Trace
+from vaneloop.web.jobs import Cancelled, Worker, WorkError
+from vaneloop.web.loop import COLUMNS, COMPILING
+from vaneloop.web.session import LogFile, Session
+
+__all__ = ["Loop"]
+
+KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
+SHOWN = 30.0  # s in the strip charts
+TRACED = 2000  # frames kept for the trace
+STRIPS: tuple[
+    tuple[str, str, float, tuple[tuple[str, str], ...]], ...
+] = (  # title, unit, least height of the axis, lines
+    ("speed [%]", "%", 2.0, (("n_dem", "target"), ("n_r", "measured"))),
+    ("stroke [mm]", "mm", 0.5, (("x_dem", "target"), ("x_lvdt", "measured"))),
+    ("current [mA]", "mA", 2.0, (("i_cmd", "model"),)),
+    ("vanes [deg]", "deg", 1.0, tuple(zip(VANES, STAGE_ROLES, strict=True))),
+)
+
+
+@dataclass
+class Loop:
+    """The loop that runs, or ran last, in one session."""
+
+    session: Session
+    bus: str = "lockstep"
+    speed: float = 1.0
+    demand: float = 70.0
+    profile: str | None = None
+    seed: int | None = 1
+    record: bool = True
+    running: bool = False
+    rows: np.ndarray = field(default_factory=lambda: np.empty((0, len(COLUMNS))))
+    filled: int = 0
+    trace: deque[tuple[float, int, int, dict[str, float]]] = field(default_factory=lambda: deque(maxlen=TRACED))
+    status: dict[str, Any] = field(default_factory=dict)
+    late: dict[str, Any] = field(default_factory=dict)
+    recorded: LogFile | None = None
+    events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
+    workers: dict[str, Worker] = field(default_factory=dict)
+    runs: int = 0
+    lit: dict[str, int] = field(default_factory=dict)  # lamp -> how often news came in which it was on
+
+    @property
+    def bus_name(self) -> str:
+        """The bus as a command names it: an embedded one is this session's own."""
+        return self.bus if self.bus != "local" else f"local:web-{self.session.folder.name[:8]}"
+
+    def commands(self) -> list[tuple[str, list[str]]]:
+        """Commands for what Start does, each after what it leaves out ("" where nothing)."""
+        seed = ["--seed", str(self.seed)] if self.seed is not None else []
+        record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
+        profile = ["--profile", self.profile] if self.profile else []
+        tables = self.tables_words()
+        if self.bus == "lockstep":
+            own = (
+                "The slider, the pace and the buttons are the page's own. "
+                if profile
+                else "By slider: the page's own. "
+            )
+            words = [
+                "run",
+                "--bus",
+                "lockstep",
+                *(profile or ["--profile", "ramp"]),
+                "--start-speed",
+                f"{self.demand:g}",
+                *seed,
+                *record,
+                *tables,
+            ]
+            return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
+        return [
+            ("", ["run", "--bus", self.bus_name, *seed, *record, *tables]),
+            ("", ["ecu", "--bus", self.bus_name, *profile, *tables]),
+        ]
+
+    def tables_words(self) -> list[str]:
+        """Options that name the machine."""
+        return ["--tables", self.session.tables] if self.session.tables is not None else []
+
+    # ---- begin and end
+
+    def start(self) -> None:
+        """Start as the page says."""
+        if self.running:
+            return
+        s = self.session
+        self.running, self.filled, self.status, self.late = True, 0, {}, {}
+        self.rows = np.empty((KEPT, len(COLUMNS)))
+        self.trace.clear()
+        self.events.clear()
+        self.runs += 1
+        s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
+        s.touch("loop")
+
+    def _worker(self, name: str) -> Worker:
+        w = self.workers.get(name)
+        if w is None:
+            w = self.workers[name] = Worker("vaneloop.web.loop", changed=lambda: self.session.touch("loop-jobs"))
+            w.news = self._news
+            self.session.extra.setdefault("closers", []).append(w.stop)
+        return w
+
+    def warm(self) -> None:
+        """Load the simulator before it is asked for."""
+        if not self.workers:
+            self.session.do("warm", self._warm())
+
+    async def _warm(self) -> None:
+        await self._worker("loop").call("ready", COMPILING)
+
+    def _record_path(self) -> str | None:
+        return str(self.session.folder / f"run{self.runs}.log") if self.record else None
+
+    async def _in_lockstep(self) -> None:
+        record = self._record_path()
+        try:
+            await self._worker("loop").call(
+                "lockstep",
+                "running",
+                demand=self.demand,
+                speed=self.speed,
+                record=record,
+                seed=self.seed,
+                profile=self.profile,
+                tables=self.session.tables,
+            )
+        finally:
+            self._ended(record)
+
+    async def _in_real_time(self) -> None:
+        import asyncio
+
+        record = self._record_path()
+        bus = self.bus_name
+        listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
+        calls = [
+            listener.call("listen", "running", bus=bus),
+            controller.call("node", "running", bus=bus, record=record, seed=self.seed, tables=self.session.tables),
+            engine.call(
+                "ecu", "running", bus=bus, demand=self.demand, profile=self.profile, tables=self.session.tables
+            ),
+        ]
+        tasks = [asyncio.ensure_future(c) for c in calls]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+            for t in done:
+                t.result()
+            self.late = {**self.late, **tasks[1].result()}
+        except (WorkError, Cancelled):
+            for w in (listener, controller, engine):
+                w.stop()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            raise
+        finally:
+            self._ended(record)
+
+    def _ended(self, record: str | None) -> None:
+        self.running = False
+        path = self.session.folder / f"run{self.runs}.log"
+        if record is not None and path.is_file() and path.stat().st_size:
+            self.recorded = LogFile(path, f"recorded: {path.name}", path.name)
+            self.session.files.append(self.recorded)
+            self.session.saved[f"run-{path.name}"] = path
+            self.session.touch("files")
+        self.session.touch("loop", "run")
+
+    def stop(self) -> None:
+        """Ask it to end; the record is complete then."""
+        for w in self.workers.values():
+            if w.jobs:
+                w.tell(stop=True)
+
+    # ---- while it runs
+
+    def tell(self, **content: Any) -> None:
+        """Say something to whoever it concerns."""
+        for name, w in self.workers.items():
+            if w.jobs and name != "listen":
+                w.tell(**content)
+
+    def inject(self, name: str) -> None:
+        """Start a scenario of the library now."""
+        if self.bus == "lockstep":
+            self.tell(inject=name)
+            self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
+            self.session.touch("events")
+        else:
+            self.session.do("inject", self._inject_outside(name))
+
+    async def _inject_outside(self, name: str) -> None:
+        bus = self.bus_name
+        w = Worker()
+        self.session.extra.setdefault("closers", []).append(w.stop)
+        try:
+            answer = await w.call(
+                "command", f"injecting {name}", words=["inject", name, "--bus", bus, *self.tables_words()]
+            )
+            self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
+        finally:
+            w.stop()
+            self.session.touch("events")
+
+    def now(self) -> float:
+        """Time of the latest row, s."""
+        return float(self.rows[self.filled - 1, 0]) if self.filled else 0.0
+
+    def latest(self, name: str) -> float:
+        """Return the latest value of a column; NaN before the first."""
+        return float(self.rows[self.filled - 1, COLUMNS.index(name)]) if self.filled else float("nan")
+
+    def _news(self, news: dict[str, Any]) -> None:
+        if "late" in news:
+            self.late = news
+            return
+        first = not self.filled
+        rows = news.pop("rows")[-KEPT:]
+        over = self.filled + len(rows) - KEPT
+        if over > 0:
+            drop = max(over, KEPT // 10)
+            self.rows[: self.filled - drop] = self.rows[drop : self.filled].copy()
+            self.filled = max(0, self.filled - drop)
+        self.rows[self.filled : self.filled + len(rows)] = rows
+        self.filled += len(rows)
+        self.trace.extend(news.pop("trace"))
+        self._light(rows)
+        if first and self.filled:
+            self.session.touch("loop")
+        self.status = news
+        self._draw()
+
+    def _light(self, rows: np.ndarray) -> None:
+        for mode in set(rows[:, COLUMNS.index("state")].tolist()):
+            if mode == mode and 0 <= mode < len(MODES):
+                self.lit[MODES[int(mode)]] = self.lit.get(MODES[int(mode)], 0) + 1
+        faults = rows[:, COLUMNS.index("faults")]
+        bits = int(np.bitwise_or.reduce(faults[np.isfinite(faults)].astype(np.int64), initial=0))
+        for i, fault in enumerate(FAULTS):
+            if bits >> i & 1:
+                self.lit[fault] = self.lit.get(fault, 0) + 1
+
+    def _draw(self) -> None:
+        rows = self.rows[: self.filled]
+        if not len(rows):
+            self.session.curves["run"] = Curves()
+            return
+        rows = rows[np.searchsorted(rows[:, 0], rows[-1, 0] - SHOWN) :].copy()
+        keep = np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])
+        rows = rows[keep]
+        t = rows[:, 0]
+        unfitted = {v for v in VANES if np.isnan(rows[:, COLUMNS.index(v)]).all()}
+        panels = [
+            Panel(
+                title,
+                unit,
+                t,
+                [Trace(n, rows[:, COLUMNS.index(n)], role) for n, role in lines if n not in unfitted],
+                height=120,
+                least=least,
+            )
+            for title, unit, least, lines in STRIPS
+        ]
+        self.session.curves["run"] = Curves(panels, "run")
