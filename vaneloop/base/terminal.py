@@ -44,9 +44,11 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message} ({self.prog} --help explains)\n")
 
 
-def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """Options that say where results go."""
+def add_output_options(parser: argparse.ArgumentParser, report: bool = False) -> None:
+    """Options that say where results go; ``report``: a page is one of them."""
     group = parser.add_argument_group("output")
+    if report:
+        group.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
     group.add_argument("--json", metavar="FILE", help="write the result as JSON; - is standard output")
     group.add_argument("--quiet", action="store_true", help="no text, no progress bar")
 

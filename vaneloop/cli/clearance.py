@@ -58,8 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--ring", metavar="MM", type=float, help=f"{WORDS['ring']} (default: found, so that the width comes out)"
     )
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

@@ -32,8 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--backlash-inside", type=float, metavar="MM", help="play between piston and LVDT to examine, mm"
     )
     add_plant_option(parser)
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

@@ -32,8 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_machine_options(parser)
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
     own_model.add_options(parser)
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

@@ -58,8 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="F.toml",
         help="the machine's own linkage where it is not what the tables were made for (default: theirs)",
     )
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

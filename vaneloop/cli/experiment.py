@@ -27,8 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_log_options(parser)
     add_machine_options(parser)
     parser.add_argument("--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem)")
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

@@ -27,8 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_log_options(parser)
     add_machine_options(parser)
     own_model.add_options(parser)
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def command(args: argparse.Namespace) -> int:

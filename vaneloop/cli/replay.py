@@ -46,8 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="largest RMS error allowed, in the signal's unit; signal.max_abs=value, signal.mean_abs=value for the "
         "other figures",
     )
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
     parser.add_argument(
         "--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)"
     )

@@ -78,8 +78,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     group = parser.add_argument_group("reading the log (docs/logs.md)")
     options.add_reading_options(group)
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
     parser.add_argument(
         "--out",
         metavar="DIR",

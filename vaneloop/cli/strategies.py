@@ -67,8 +67,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         )
     options.add_tables_option(parser)
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
-    terminal.add_output_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
+    terminal.add_output_options(parser, report=True)
 
 
 def _checked(args: argparse.Namespace) -> None:

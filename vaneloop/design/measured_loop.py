@@ -78,10 +78,6 @@ class MeasuredLoop:
     samples: tuple[Array, Array, Array]
     notes: list[str] = field(default_factory=list)
 
-    def stroke_for(self, angle: Array, branch: str = "mean") -> Array:
-        """Inverse of a curve: strokes, mm, for angles in deg; beyond the grid NaN."""
-        return np.interp(angle, getattr(self, branch), self.stroke, left=np.nan, right=np.nan)
-
 
 def measure_loop(
     stroke: Channel,
