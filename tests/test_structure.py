@@ -117,6 +117,7 @@ EXPORTS: dict[str, list[str]] = {
         *(
             "Channel",
             "InputError",
+            "Law",
             "Log",
             "Machine",
             "Parameter",

@@ -97,7 +97,7 @@ class Bound:
             if s.kind in ("simulate", "closed_loop"):
                 course = nominal_course(self.runner, fitted)
                 self.runner.smalls = course.smalls
-            self.placed, self.effects = places(self.data, course)
+            self.placed, self.effects = places(self.data, course, self.runner.dispatch)
             parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
         else:
             mine = self.like.stage.parameters[: len(s.parameters)]
@@ -171,7 +171,9 @@ class Bound:
             again = []
             for r in self.data.records:
                 noise = {name: noise_of_channel(v) * rng.standard_normal(len(v)) for name, v in r.columns.items()}
-                again.append(Record(r.name, r.t, {k: v + noise[k] if k in noisy else v for k, v in r.columns.items()}))
+                again.append(
+                    Record(r.name, r.t, {k: v + noise[k] if k in noisy else v for k, v in r.columns.items()}, r.begin)
+                )
             data = Data(self.system, again, self.data)
             runner = Runner(data, self.runner)
             runner.placed, runner.free_starts = self.placed, self.runner.free_starts

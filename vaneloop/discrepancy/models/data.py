@@ -21,6 +21,7 @@ class Data:
     """The logs that a system is held against.
 
     records   the logs, from time 0; what drives the model has no NaN
+    times     s, log by log: as the log it was cut out of counts
     logs      name -> slice of samples
     in_names  what drives the model: for kind force the motion, then the inputs
     u, y      log by log: float64[in_names, samples] and float64[outputs, samples]
@@ -38,6 +39,7 @@ class Data:
         if not records:
             raise StageError(f"system {system.name!r}: no log")
         self.records = [self._checked(r) for r in records]
+        self.times = [r.t + r.begin for r in self.records]
         self.logs: dict[str, slice] = {}
         at = 0
         for r in self.records:
@@ -82,7 +84,7 @@ class Data:
                     v = np.interp(t, t[~bad], v[~bad])
                     self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
             columns[c] = v
-        return Record(r.name, t - t[0], columns)
+        return Record(r.name, t - t[0], columns, r.begin)
 
     def _prepare(self) -> None:
         s = self.system

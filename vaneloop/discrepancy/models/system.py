@@ -15,13 +15,13 @@ docs/your_own_model.md says which to choose when.
 
 from __future__ import annotations
 
-import keyword
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vaneloop.discrepancy.models.own_laws import Law, check_parameters, is_name
 from vaneloop.discrepancy.stage import Array, Parameter, StageError
 
 if TYPE_CHECKING:
@@ -41,11 +41,15 @@ def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: floa
 
 @dataclass
 class Record:
-    """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured."""
+    """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured.
+
+    begin  s: where it begins in the log that it was cut out of
+    """
 
     name: str
     t: Array
     columns: dict[str, Array]
+    begin: float = 0.0
 
 
 @dataclass
@@ -79,6 +83,7 @@ class System:
                         after the sensors' laws
     places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
                 everywhere
+    laws        laws of your own beside the library's, `Law`
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
     """
 
@@ -103,6 +108,7 @@ class System:
     control: Callable[..., Any] | None = None
     commands: dict[str, str] = field(default_factory=dict)
     places: Sequence[str] | None = None
+    laws: Sequence[Law] = ()
     read: Callable[[str], Mapping[str, Any]] | None = None
     units: dict[str, str] = field(default_factory=dict)
 
@@ -129,24 +135,12 @@ class System:
             if not isinstance(given, dict):
                 raise wrong(f"{what} (={given!r}) must be a dict of name -> unit")
             for n in given:
-                if not (isinstance(n, str) and n.isidentifier() and not keyword.iskeyword(n) and not n.startswith("_")):
+                if not is_name(n):
                     raise wrong(
                         f"{what}: {n!r} must be a Python name (letters, digits, _); --map renames a log's channel"
                     )
-        for p in self.parameters:
-            if not isinstance(p, Parameter):
-                raise wrong(f"parameters: {p!r} is not a Parameter; write Parameter(...) or unknown(...)")
-            for which in ("value", "low", "high", "tolerance"):
-                number = getattr(p, which)
-                if isinstance(number, bool) or not isinstance(number, int | float | np.floating | np.integer):
-                    raise wrong(f"parameter {p.name!r}: {which} (={number!r}) must be a number")
-            if not p.name.isidentifier() or keyword.iskeyword(p.name) or p.name.startswith("_"):
-                raise wrong(f"parameter {p.name!r} must be a Python name")
-            if not (np.isfinite(p.value) and p.low <= p.value <= p.high):
-                raise wrong(f"parameter {p.name} (={p.value:g} {p.unit}) must be in [{p.low:g}, {p.high:g}]")
+        check_parameters(self.parameters, wrong)
         names = [p.name for p in self.parameters]
-        if len(set(names)) != len(names):
-            raise wrong(f"two parameters share a name among {', '.join(names)}")
         moves = self.kind in ("simulate", "closed_loop")
         if self.kind == "force" and not self.position:
             raise wrong("kind 'force' needs position=, the channel of the displacement")
@@ -187,6 +181,17 @@ class System:
         for place in self.places or ():
             if place not in known:
                 raise wrong(f"places: {place!r} is not known; allowed: {', '.join(sorted(known))}")
+        if not isinstance(self.laws, list | tuple):
+            raise wrong(f"laws (={self.laws!r}) must be a list of Law(...)")
+        for law in self.laws:
+            if not isinstance(law, Law):
+                raise wrong(f"laws: {law!r} is not a Law; write Law(name, on, function, parameters, starts)")
+            if [other.name for other in self.laws].count(law.name) > 1:
+                raise wrong(f"laws: two are named {law.name!r}")
+            for place in law.places or ():
+                if place not in known:
+                    allowed = ", ".join(sorted(known))
+                    raise wrong(f"law {law.name!r}: places: {place!r} is not known; allowed: {allowed}")
 
     def channels(self) -> tuple[str, ...]:
         """Names that a log must have."""
