@@ -41,7 +41,8 @@ class Runner:
     """The model on its logs.
 
     placed       laws and their columns in a set of parameters
-    free_starts  (log, state) of initial states that follow the model's own parameters in a set
+    free_starts  (log, state) of initial states that follow the model's own parameters in a set; of kind force the
+                 position
     steps        of the integration between two samples
     smalls       state by state, speed within which friction is regularised in a simulation; ``small``: with measured
                  motion
@@ -141,7 +142,8 @@ class Runner:
             for log, at in enumerate(self.data.logs.values()):
                 if s.kind in ("static", "force"):
                     try:
-                        out[i, :, at] = self._algebraic(theta[:n_p], log, active)
+                        starts = [theta[n_p + k] for k, (which, _) in enumerate(self.free_starts) if which == log]
+                        out[i, :, at] = self._algebraic(theta[:n_p], log, active, sum(starts))
                     except StageError:
                         if not self.ready:
                             raise
@@ -176,8 +178,10 @@ class Runner:
             if self.data.first_state(log, name, np.nan) == x0[m]:
                 x0[m] = self.dispatch.argument(q.law.code, x0[m], row)
 
-    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]]) -> Array:
+    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
         t, u = self.data.times[log], self.data.u[log]
+        if position != 0.0:
+            u = np.concatenate([u[:1] + position, u[1:]])
         inputs = [(q, row) for q, row in active if q.place == "input"]
         if inputs:
             u = u.copy()

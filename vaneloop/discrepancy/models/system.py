@@ -63,8 +63,8 @@ class System:
                 returns them
     inputs      measured channels that drive it, name -> unit
     parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
-    position, velocity   force: the channel of the displacement, and of its rate where it is measured too (else it is
-                         differentiated)
+    position, velocity   force: the channel of the displacement, of its rate, or of both: what is missing is
+                         differentiated, or integrated from a start that is fitted to each log (``start_position``)
     cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the
                 measured force
     start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force
@@ -75,8 +75,8 @@ class System:
                 of force
     force_unit  unit of forces on states with a mass
     output      simulate: function output(x, u, p); default: the states that are named like the outputs
-    start       state -> value at the start of a log; others start at their measured value, or where they are not
-                measured are fitted
+    start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
+                rates at rest, and what is not measured is fitted
     window      s: start anew from the measured states after each window of this length (for what integrates)
     between     "hold" or "line": what an input does between two samples
     control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs
@@ -102,7 +102,7 @@ class System:
     masses: dict[str, str] = field(default_factory=dict)
     force_unit: str = "N"
     output: Callable[..., Any] | None = None
-    start: dict[str, float] = field(default_factory=dict)
+    start: dict[str, float | str] = field(default_factory=dict)
     window: float | None = None
     between: str = "hold"
     control: Callable[..., Any] | None = None
@@ -142,8 +142,8 @@ class System:
         check_parameters(self.parameters, wrong)
         names = [p.name for p in self.parameters]
         moves = self.kind in ("simulate", "closed_loop")
-        if self.kind == "force" and not self.position:
-            raise wrong("kind 'force' needs position=, the channel of the displacement")
+        if self.kind == "force" and not (self.position or self.velocity):
+            raise wrong("kind 'force' needs position=, the channel of the displacement, or velocity=, that of its rate")
         if moves and not self.states:
             raise wrong(f"kind {self.kind!r} needs states=, name -> unit")
         if self.kind == "closed_loop" and not (self.control and self.commands):
@@ -160,9 +160,14 @@ class System:
                 raise wrong(f"masses: {v!r} is not a velocity of rates")
             if m not in names:
                 raise wrong(f"masses: {m!r} is not a parameter; parameters are {', '.join(names)}")
-        for s in self.start:
+        for s, begin in self.start.items():
             if s not in self.states:
                 raise wrong(f"start: {s!r} is not a state; states are {', '.join(self.states)}")
+            if begin == "fitted" and self.window:
+                raise wrong(f"start: {s!r} 'fitted' does not go with window=, which starts from measured states")
+            number = isinstance(begin, int | float | np.floating | np.integer) and not isinstance(begin, bool)
+            if begin != "fitted" and not (number and np.isfinite(float(begin))):
+                raise wrong(f"start: {s!r} (={begin!r}) must be a number or 'fitted'")
         if moves and self.output is None:
             for o in self.outputs:
                 if o not in self.states and o not in self.commands:
