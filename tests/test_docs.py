@@ -107,6 +107,8 @@ LONG: dict[str, str] = {
     "vaneloop compare tank.csv": "tests/test_your_own_model.py",  # each command compiles the model anew
     "vaneloop locate tank.csv": "tests/test_your_own_model.py",
     "vaneloop diagnose tank.csv --test": "tests/test_your_own_model.py",
+    "vaneloop diagnose tank.csv --fit": "tests/test_parts.py",
+    "vaneloop diagnose worn.csv": "tests/test_own_laws.py",
     "vaneloop schedule --geometry": "tests/test_schedule.py",
     "vaneloop engine-test --tables": "tests/test_schedule.py",
     "vaneloop diagnose examples/four_stages/worn_vgv3.parquet": "tests/test_machines.py",

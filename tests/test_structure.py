@@ -118,6 +118,7 @@ EXPORTS: dict[str, list[str]] = {
         *(
             "Channel",
             "InputError",
+            "Law",
             "Log",
             "Machine",
             "Parameter",

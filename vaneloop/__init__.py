@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hil.logs import Channel, Log, read_log, write_log
     from vaneloop.base.errors import InputError
     from vaneloop.discrepancy.models.load import load_system
+    from vaneloop.discrepancy.models.own_laws import Law
     from vaneloop.discrepancy.models.system import Record, System, unknown
     from vaneloop.discrepancy.stage import Parameter
     from vaneloop.verbs.machine import Machine
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Channel": "hil.logs",
     "InputError": "vaneloop.base.errors",
+    "Law": "vaneloop.discrepancy.models.own_laws",
     "Log": "hil.logs",
     "Machine": "vaneloop.verbs.machine",
     "Parameter": "vaneloop.discrepancy.stage",
@@ -55,6 +57,7 @@ _HOME = {
 __all__ = [
     "Channel",
     "InputError",
+    "Law",
     "Log",
     "Machine",
     "Parameter",

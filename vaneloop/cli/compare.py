@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from vaneloop.base import terminal
-from vaneloop.cli import own_model, replay
+from vaneloop.cli import options, own_model, replay
 from vaneloop.cli.options import chain_of
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -68,6 +68,8 @@ def command(args: argparse.Namespace) -> int:
             columns,
             rows,
         )
+        options.say_tested(args, answer.tested)
+        extra |= {"tested": answer.to_dict()["tested"]} if answer.tested else {}
         terminal.say(args, answer.sentence())
         extra["not_observed"] = chain.not_observed
         extra["verdict"] = "fails" if answer.fails else "agrees"

@@ -71,6 +71,7 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
     terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
+    options.say_tested(args, answer.tested)
     for s in d.stages:
         for f in s.effects:
             values = ", ".join(

@@ -73,6 +73,7 @@ def command(args: argparse.Namespace) -> int:
             rows.append([r.stage, r.outputs[k], *figures, f"{r.error_after[k] / r.floor[k]:.2f}", r.units[k]])
     columns = ["stage", "signal", "error before", "error after", "noise floor", "after / floor", "unit"]
     terminal.print_table(args, "errors are RMS on held-out data", columns, rows)
+    options.say_tested(args, answer.tested)
     for r in results:
         for f in r.effects:
             values = ", ".join(

@@ -41,6 +41,7 @@ def command(args: argparse.Namespace) -> int:
     else:
         chain = chain_of(args)
         answer = Stages(chain, locate_stages(chain.stages), args.log)
+    options.say_tested(args, answer.tested)
     for x in answer.located:
         say_located(args, x)
     terminal.write_json(args, answer.to_dict())

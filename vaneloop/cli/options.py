@@ -23,8 +23,10 @@ __all__ = [
     "chain_of",
     "log_options",
     "machine_of",
+    "parts_to_test",
     "read_log_of",
     "say_located",
+    "say_tested",
     "tables_of",
     "tell_search",
 ]
@@ -54,15 +56,31 @@ def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
     describes.
     """
     from hil.loop.lockstep import warm_up
+    from vaneloop.verbs.parts import bind_parts, split
 
     machine = machine_of(args, model)
+    own_parts = split([x for group in getattr(args, "fit", ()) for x in group], parts_to_test(args))[:2]
     log = read_log_of(args, require=())
     warm_up(lambda text: terminal.say(args, text))
     tell_search(lambda text: terminal.say(args, text))
-    chain = machine.bind(log)
+    chain = bind_parts(machine, log, *own_parts)
     for note in chain.notes:
         terminal.say(args, f"note: {note}")
     return chain
+
+
+def parts_to_test(args: argparse.Namespace) -> list[str]:
+    """What ``--test`` names: parts of the log; with ``--system`` also logs."""
+    return [name for group in getattr(args, "test", ()) for name in group]
+
+
+def say_tested(args: argparse.Namespace, rows: Any) -> None:
+    """Print the errors on the part of the log that nothing was fitted to (`vaneloop.verbs.parts.Tested`)."""
+    if rows:
+        columns = ["stage", "signal", "error before", "error after", "noise floor", "unit", "samples"]
+        figures = [[f"{v:.4g}" for v in (r.error_before, r.error_after, r.noise_floor)] for r in rows]
+        lines = [[r.stage, r.signal, *three, r.unit, f"{r.samples:,}"] for r, three in zip(rows, figures, strict=True)]
+        terminal.print_table(args, "RMS error on the part that nothing was fitted to", columns, lines)
 
 
 def say_located(args: argparse.Namespace, located: Any, most: int = 4) -> None:

@@ -20,24 +20,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--also", metavar="LOG", action="append", nargs="+", default=[], help="further logs to fit, with --system"
     )
-    group.add_argument(
-        "--test",
-        metavar="LOG",
+    parts = parser.add_argument_group("which part of the log is fitted")
+    parts.add_argument(
+        "--fit",
+        metavar="FROM:TO",
         action="append",
         nargs="+",
         default=[],
-        help="logs that nothing is fitted to, with --system",
+        help="seconds of the log that are fitted, such as 0:200 or :200 (default: all); may be given again",
+    )
+    parts.add_argument(
+        "--test",
+        metavar="FROM:TO|LOG",
+        action="append",
+        nargs="+",
+        default=[],
+        help="seconds of it that nothing is fitted to, such as 200:; with --system also other logs",
     )
 
 
 def asked(args: argparse.Namespace) -> bool:
     """Whether the user brought a model; refuses options that only then make sense."""
     from vaneloop.base.errors import InputError
+    from vaneloop.base.spans import is_span
 
     if not args.system:
-        for name in ("also", "test"):
-            if getattr(args, name):
-                raise InputError(f"--{name} needs --system MY.py")
+        logs = [name for name in options.parts_to_test(args) if not is_span(name)]
+        for name, given in (("also", args.also), ("test", logs)):
+            if given:
+                what = f" {logs[0]}" if name == "test" else ""
+                raise InputError(f"--{name}{what} needs --system MY.py")
         return False
     for name in ("strategy", "tolerance", "tables", "out"):
         if getattr(args, name, None) and not (name == "out" and hasattr(args, "effect")):
@@ -51,13 +63,15 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
     from vaneloop.discrepancy import StageError, load_system
     from vaneloop.discrepancy.models.by_log import load_model_of
     from vaneloop.verbs import search
+    from vaneloop.verbs.parts import split
 
     try:
         system = load_system(args.system)
         added = load_model_of(args.model, system) if args.model else None
         logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
-        test = [_record(args, system, p) for group in args.test for p in group]
-        return getattr(search, verb)(logs, model=system, test=test, added=added, **more)
+        fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
+        test = [*parts, *(_record(args, system, p) for p in others)]
+        return getattr(search, verb)(logs, model=system, fit=fit, test=test, added=added, **more)
     except StageError as e:
         raise InputError(str(e)) from None
 

@@ -14,13 +14,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vaneloop.base.errors import InputError
+
 __all__ = ["Bound", "Effect", "Model", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
 
 Array = np.ndarray
 FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 
 
-class StageError(ValueError):
+class StageError(InputError):
     """A stage that cannot be used: one line naming the stage, the thing and what is allowed."""
 
 

@@ -66,7 +66,14 @@ def _stage(bound: Bound, name: str) -> Stage:
     return next(s for s in bound.stages if s.name == name)
 
 
-def compare_page(located: Sequence[Located], bound: Bound, command: str, log: str, by_log: ByLog | None = None) -> Page:
+def compare_page(
+    located: Sequence[Located],
+    bound: Bound,
+    command: str,
+    log: str,
+    by_log: ByLog | None = None,
+    tested: Sequence[Any] = (),
+) -> Page:
     """The page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
     page = Page(
         f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
@@ -86,6 +93,7 @@ def compare_page(located: Sequence[Located], bound: Bound, command: str, log: st
         [name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in bound.not_observed.items()
     ]
     page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
+    _tested(page, tested)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
         judge = Judge(_stage(bound, x.stage), x.floor)
@@ -96,6 +104,17 @@ def compare_page(located: Sequence[Located], bound: Bound, command: str, log: st
         curves_by_log(page, by_log)
         _notes(page, by_log.notes)
     return page
+
+
+def _tested(page: Page, rows: Sequence[Any]) -> None:
+    """Errors on the part of the log that nothing was fitted to (`vaneloop.verbs.parts.Tested`)."""
+    if rows:
+        page.section("On the part that nothing was fitted to", "RMS error with the parameters of the fitted part.")
+        columns = ["stage", "signal", "error before", "error after", "noise floor", "unit", "samples"]
+        page.table(
+            columns,
+            [[r.stage, r.signal, r.error_before, r.error_after, r.noise_floor, r.unit, r.samples] for r in rows],
+        )
 
 
 def _notes(page: Page, notes: Sequence[str]) -> None:
@@ -112,6 +131,7 @@ def diagnosis_page(
     log: str,
     experiment: dict[str, Any] | None = None,
     by_log: ByLog | None = None,
+    tested: Sequence[Any] = (),
 ) -> Page:
     """The page of ``vaneloop diagnose`` or ``extend``."""
     title = f"Diagnosis of {Path(log).name}"
@@ -133,6 +153,7 @@ def diagnosis_page(
             rows.append([s.stage, s.verdict, s.outputs[k], s.error_before[k], s.error_after[k], s.floor[k], s.units[k]])
     rows += [[name, "not observed: " + why, "", None, None, None, ""] for name, why in d.not_observed.items()]
     page.table(["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"], rows)
+    _tested(page, tested)
     found = [(s, f) for s in d.stages for f in s.effects]
     if found:
         page.section(

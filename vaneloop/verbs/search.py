@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,6 +19,7 @@ from vaneloop.discrepancy.workflow import Diagnosis, diagnosis_json, extend_stag
 from vaneloop.discrepancy.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.parts import Tested, bind_parts, records_of, split, tested
 from vaneloop.verbs.replay import log_of
 
 if TYPE_CHECKING:
@@ -49,6 +51,11 @@ class Stages(Answer):
     log: str = ""
     by_log: ByLog | None = None
 
+    @cached_property
+    def tested(self) -> list[Tested]:
+        """Errors on the part of the log that nothing was fitted to, of a `Machine`."""
+        return tested(self.bound, [(x.stage, x.fit, x.fit) for x in self.located])
+
     @property
     def fails(self) -> bool:
         """Whether any stage's error is more than noise."""
@@ -63,7 +70,7 @@ class Stages(Answer):
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop locate``."""
         out: dict[str, Any] = {"schema": 1, "log": self.log, "stages": [x.json() for x in self.located]}
-        out |= {"not_observed": self.bound.not_observed, "notes": self.bound.notes}
+        out |= {"not_observed": self.bound.not_observed, "notes": self.bound.notes} | _tested_json(self.tested)
         if self.by_log is not None:
             signals = [{**f.json(), "reference": "measured"} for x in self.located for f in x.signals]
             out |= {"signals": signals, **self.by_log.json(), "verdict": "fails" if self.fails else "agrees"}
@@ -73,7 +80,7 @@ class Stages(Answer):
         """The answer as a page."""
         from vaneloop.pages.diagnosis import compare_page
 
-        return compare_page(self.located, self.bound, command, self.log, self.by_log)
+        return compare_page(self.located, self.bound, command, self.log, self.by_log, self.tested)
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,11 @@ class Diagnosed(Answer):
     diagnosis: Diagnosis
     log: str = ""
     by_log: ByLog | None = None
+
+    @cached_property
+    def tested(self) -> list[Tested]:
+        """Errors on the part of the log that nothing was fitted to, of a `Machine`."""
+        return tested(self.bound, [(s.stage, s.base, s.final) for s in self.diagnosis.stages])
 
     @property
     def verdict(self) -> str:
@@ -107,13 +119,14 @@ class Diagnosed(Answer):
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop diagnose``."""
-        return diagnosis_json(self.diagnosis, self.log) | (self.by_log.json() if self.by_log else {})
+        by_log = self.by_log.json() if self.by_log else {}
+        return diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested)
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         from vaneloop.pages.diagnosis import diagnosis_page
 
-        return diagnosis_page(self.diagnosis, self.bound, command, self.log, by_log=self.by_log)
+        return diagnosis_page(self.diagnosis, self.bound, command, self.log, by_log=self.by_log, tested=self.tested)
 
 
 @dataclass(frozen=True)
@@ -186,9 +199,16 @@ class Experiment(Answer):
 # ---- the verbs -------------------------------------------------------------------------------------------------------
 
 
-def _chain(log: Log | str | Path, machine: Machine) -> tuple[Chain, str]:
+def _tested_json(rows: Sequence[Tested]) -> dict[str, Any]:
+    return {"tested": [asdict(row) for row in rows]} if rows else {}
+
+
+def _chain(log: Log | str | Path, machine: Machine, fit: Any = (), test: Any = ()) -> tuple[Chain, str]:
     read = log_of(log, require=())
-    return machine.bind(read), read.path
+    to_fit, to_test, others = split(fit, test)
+    if others:
+        raise InputError(f"test={others[0]!r}: the vane chain takes parts of its log, such as (200, None)")
+    return bind_parts(machine, read, to_fit, to_test), read.path
 
 
 def _records(logs: Any, system: System) -> list[Record]:
@@ -196,13 +216,16 @@ def _records(logs: Any, system: System) -> list[Record]:
     return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
 
 
-def _logs(log: Any, system: System, test: Any, added: Model | None) -> tuple[Logs, str]:
+def _logs(log: Any, system: System, fit: Any, test: Any, added: Model | None) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
     from vaneloop.discrepancy.models.by_log import bind
 
-    records = _records(log, system)
+    to_fit, to_test, others = split(fit, test)
     try:
-        return bind(system, records, _records(test, system), added), records[0].name
+        first, *more = _records(log, system)
+        fitted = [*records_of(first, to_fit), *more]
+        tests = [*(records_of(first, to_test) if to_test else ()), *_records(others, system)]
+        return bind(system, fitted, tests, added), first.name
     except StageError as e:
         raise InputError(str(e)) from None
 
@@ -211,6 +234,7 @@ def compare(
     log: Any,
     model: Machine | System | None = None,
     *,
+    fit: Any = (),
     test: Any = (),
     added: Model | None = None,
     progress: Progress | None = None,
@@ -219,16 +243,17 @@ def compare(
 
     log    a log of the vane machine (`Log` or a file's name); of a `System`, one or several `Record` or files' names
     model  what the log is held against; default: the machine of the shipped tables
-    test   records that nothing is fitted to, of a `System`
+    fit    parts of the (first) log that are fitted, (from, to) in s of its own time, None an open end; default: all
+    test   parts of it that only test what was fitted; of a `System` also records
     added  parameters and laws that a `System` has by now; a `Machine` has its own
     """
     if isinstance(model, System):
         from vaneloop.discrepancy.models.by_log import ByLog, as_given
 
-        logs, name = _logs(log, model, test, added)
+        logs, name = _logs(log, model, fit, test, added)
         located = locate_stages(logs.fitted.stages)
         return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
-    chain, name = _chain(log, model or Machine())
+    chain, name = _chain(log, model or Machine(), fit, test)
     return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
 
 
@@ -239,6 +264,7 @@ def diagnose(
     log: Any,
     model: Machine | System | None = None,
     *,
+    fit: Any = (),
     test: Any = (),
     added: Model | None = None,
     workers: int = 2,
@@ -248,12 +274,12 @@ def diagnose(
     if isinstance(model, System):
         from vaneloop.discrepancy.models.by_log import ByLog
 
-        logs, name = _logs(log, model, test, added)
+        logs, name = _logs(log, model, fit, test, added)
         d = search(logs.fitted.stages, None, progress, 1, logs.judged())
         by_log = ByLog.of(logs, d.stages[0], added)
         d.notes = by_log.notes
         return Diagnosed(logs.fitted, d, name, by_log)
-    chain, name = _chain(log, model or Machine())
+    chain, name = _chain(log, model or Machine(), fit, test)
     return diagnosed(chain, name, workers, progress)
 
 
@@ -269,6 +295,7 @@ def extend(
     effects: Sequence[str],
     model: Machine | System | None = None,
     *,
+    fit: Any = (),
     test: Any = (),
     added: Model | None = None,
 ) -> Extended:
@@ -277,10 +304,10 @@ def extend(
     Raises InputError for an effect that is not in the library, or whose stage the log does not show.
     """
     if isinstance(model, System):
-        return _extended(*_logs(log, model, test, added), effects, added)
+        return _extended(*_logs(log, model, fit, test, added), effects, added)
     machine = model or Machine()
     known(effects)
-    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy, machine.table))
+    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy, machine.table), fit, test)
     return extended(chain, effects, machine.added, name)
 
 

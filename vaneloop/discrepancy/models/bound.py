@@ -66,6 +66,8 @@ class Bound:
         self.placed: list[Placed]
         self.stage: Stage
         self.others: list[Array] = []  # values of the parameters in other valleys of the error
+        self.starts: list[Parameter] = []  # initial states to fit, and the size of each as far as the logs tell it
+        self.start_sizes: list[float] = []
         self._make()
 
     def _make(self) -> None:
@@ -73,9 +75,7 @@ class Bound:
         s = self.system
         if self.like is not None:
             self.effects, self.placed = self.like.effects, self.like.placed
-        starts: list[Parameter] = []
-        if s.kind in ("simulate", "closed_loop"):
-            starts = self._starts()
+        starts = self.starts = self._starts() if s.kind != "static" else []
         if self.like is None:
             known = [p.name for p in s.parameters]
             for name in self.values:
@@ -97,7 +97,7 @@ class Bound:
             if s.kind in ("simulate", "closed_loop"):
                 course = nominal_course(self.runner, fitted)
                 self.runner.smalls = course.smalls
-            self.placed, self.effects = places(self.data, course)
+            self.placed, self.effects = places(self.data, course, self.runner.dispatch)
             parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
         else:
             mine = self.like.stage.parameters[: len(s.parameters)]
@@ -171,7 +171,9 @@ class Bound:
             again = []
             for r in self.data.records:
                 noise = {name: noise_of_channel(v) * rng.standard_normal(len(v)) for name, v in r.columns.items()}
-                again.append(Record(r.name, r.t, {k: v + noise[k] if k in noisy else v for k, v in r.columns.items()}))
+                again.append(
+                    Record(r.name, r.t, {k: v + noise[k] if k in noisy else v for k, v in r.columns.items()}, r.begin)
+                )
             data = Data(self.system, again, self.data)
             runner = Runner(data, self.runner)
             runner.placed, runner.free_starts = self.placed, self.runner.free_starts
@@ -222,24 +224,29 @@ class Bound:
             }
 
     def _starts(self) -> list[Parameter]:
-        """Initial states that no log tells, as parameters to fit."""
+        """Initial states that no log tells, or that the user wants fitted, as parameters to fit."""
         s = self.system
         out: list[Parameter] = []
         if s.window:
             return out
+        states = s.states
+        if s.kind == "force":
+            states = {} if s.position else {"position": s.units.get("position", "m")}
         for log in range(len(self.data.records)):
-            for m, (name, unit) in enumerate(s.states.items()):
-                if name in s.start or (name in s.outputs and name in self.data.records[log].columns):
-                    continue
-                if name in s.rates:
-                    continue  # machines start at rest
+            for m, (name, unit) in enumerate(states.items()):
+                if s.start.get(name) != "fitted":
+                    if name in s.start or (name in s.outputs and name in self.data.records[log].columns):
+                        continue
+                    if name in s.rates:
+                        if not self.like:
+                            self.notes += self.data.begins_in_motion(log, name)
+                        continue  # machines start at rest
                 self.runner.free_starts.append((log, m))
                 suffix = f"_{log + 1}" if len(self.data.records) > 1 else ""
-                out.append(Parameter(f"start_{name}{suffix}", self._guess(log, name), unit, -np.inf, np.inf, np.inf))
+                guess, size = self.data.begin(log, name)
+                self.start_sizes.append(size)
+                out.append(Parameter(f"start_{name}{suffix}", guess, unit, -np.inf, np.inf, np.inf))
         return out
-
-    def _guess(self, log: int, name: str) -> float:
-        return 0.0
 
     def _prefit(self, parameters: Sequence[Parameter]) -> Array:
         """Values of the unknown parameters that suit the logs best while nothing is added."""
@@ -249,7 +256,7 @@ class Bound:
         free = [i for i, p in enumerate(parameters) if np.isinf(p.tolerance)]
         scale = np.nanstd(self.measured, axis=1)
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
-        size = np.array([abs(values[i]) or self._unit_size(parameters[i]) for i in free])
+        size = np.array([self._first_size(parameters[i]) for i in free])
         low, high = (np.array([getattr(parameters[i], side) for i in free]) / size for side in ("low", "high"))
         given = np.clip(values[free] / size, low, high)
         moves = self.system.kind in ("simulate", "closed_loop")
@@ -340,12 +347,23 @@ class Bound:
         size = float(np.max(np.abs(good))) if len(good) else 1.0
         for c in columns:
             trials = np.repeat(theta[None], 11, axis=0)
-            trials[:, c] = size * np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, -0.1, -0.25, -0.5, -1.0, -2.0])
+            own = self.start_sizes[c - len(self.system.parameters)] or size
+            trials[:, c] += own * np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, -0.1, -0.25, -0.5, -1.0, -2.0])
             e = np.where(np.isfinite(self.measured), self.run(trials) - np.nan_to_num(self.measured), 0.0)
             theta[c] = trials[int(np.argmin(np.sum(e**2, axis=(1, 2)))), c]
 
+    def _first_size(self, p: Parameter) -> float:
+        """Size by which a parameter's first value is varied; a start may lie anywhere near."""
+        size = abs(p.value)
+        if p.name.startswith("start_"):
+            return max(size, self._unit_size(p))
+        return size or self._unit_size(p)
+
     def _unit_size(self, p: Parameter) -> float:
         if p.name.startswith("start_"):
+            names = [q.name for q in self.starts]
+            if p.name in names and (own := self.start_sizes[names.index(p.name)]):
+                return own
             y = self.measured[np.isfinite(self.measured)]
             return float(np.std(y)) or 1.0
         return min((abs(v) for v in (p.low, p.high) if np.isfinite(v) and v != 0.0), default=1.0)

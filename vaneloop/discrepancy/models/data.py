@@ -14,6 +14,7 @@ from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["Data", "noise_of_channel"]
 
+MOVES = 0.3  # times its RMS: a velocity above that at the start is told
 EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differentiated log
 
 
@@ -21,6 +22,7 @@ class Data:
     """The logs that a system is held against.
 
     records   the logs, from time 0; what drives the model has no NaN
+    times     s, log by log: as the log it was cut out of counts
     logs      name -> slice of samples
     in_names  what drives the model: for kind force the motion, then the inputs
     u, y      log by log: float64[in_names, samples] and float64[outputs, samples]
@@ -38,6 +40,7 @@ class Data:
         if not records:
             raise StageError(f"system {system.name!r}: no log")
         self.records = [self._checked(r) for r in records]
+        self.times = [r.t + r.begin for r in self.records]
         self.logs: dict[str, slice] = {}
         at = 0
         for r in self.records:
@@ -82,7 +85,7 @@ class Data:
                     v = np.interp(t, t[~bad], v[~bad])
                     self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
             columns[c] = v
-        return Record(r.name, t - t[0], columns)
+        return Record(r.name, t - t[0], columns, r.begin)
 
     def _prepare(self) -> None:
         s = self.system
@@ -132,8 +135,8 @@ class Data:
     def first_state(self, log: int, state: str, fallback: float, at: int = 0) -> float:
         """A state at the start of a log: given, measured, or else ``fallback``."""
         s = self.system
-        if state in s.start and at == 0:
-            return s.start[state]
+        if at == 0 and isinstance(begin := s.start.get(state), int | float):
+            return float(begin)
         r = self.records[log]
         if state in s.outputs and state in r.columns:
             y = r.columns[state][at : at + 3]
@@ -141,6 +144,40 @@ class Data:
             if len(good):
                 return float(good[0])
         return fallback
+
+    def begin(self, log: int, state: str) -> tuple[float, float]:
+        """Where a state that is fitted may start, and how large it is: as measured, from its displacement, or of kind
+        force in the middle of its way; 0 where the log does not tell.
+        """
+        s, r = self.system, self.records[log]
+        if s.kind == "force":
+            x = self.u[log][0]
+            return -0.5 * float(x.max() + x.min()), 0.5 * float(np.ptp(x))
+        if state in s.outputs and state in r.columns:
+            return self.first_state(log, state, 0.0), float(np.nanstd(r.columns[state]))
+        if s.rates.get(state, "") in r.columns:
+            v = self._speed(log, state)
+            return float(np.median(v[:3])), float(np.sqrt(np.mean(v**2)))
+        return 0.0, 0.0
+
+    def begins_in_motion(self, log: int, state: str) -> list[str]:
+        """A note where a velocity that starts at rest was none."""
+        s, r = self.system, self.records[log]
+        if s.rates[state] not in r.columns:
+            return []
+        v = self._speed(log, state)
+        first, size = float(np.median(v[:3])), float(np.sqrt(np.mean(v**2)))
+        if not abs(first) > MOVES * size:
+            return []
+        return [
+            f"{r.name}: {state} is about {first:.3g} {s.states[state]} at the start, where the model starts at rest; "
+            f"start={{'{state}': 'fitted'}} fits it"
+        ]
+
+    def _speed(self, log: int, state: str) -> Array:
+        """A velocity from its measured displacement, float64[samples]."""
+        r = self.records[log]
+        return np.asarray(np.gradient(smoothed(r.t, r.columns[self.system.rates[state]]), r.t))
 
     def restarts(self, log: int, n: int) -> tuple[Array, Array]:
         """At which of a log's first ``n`` samples a window starts anew, bool[n]; states there, float64[states, n]."""

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from vaneloop.discrepancy import laws
-from vaneloop.discrepancy.laws import MEMORY
+from vaneloop.discrepancy.models.dispatch import Dispatch, compiled_code
 from vaneloop.discrepancy.models.user_code import UserCode
 
 __all__ = ["Kernel", "build_kernels"]
@@ -19,7 +18,7 @@ __all__ = ["Kernel", "build_kernels"]
 Kernel = Callable[..., Any]
 
 
-def build_kernels(code: UserCode) -> tuple[Kernel, Kernel]:
+def build_kernels(code: UserCode, dispatch: Dispatch) -> tuple[Kernel, Kernel]:
     """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled."""
     s = code.system
     rates = "\n".join(f"dx[{i}] = d" if code.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
@@ -29,11 +28,13 @@ def build_kernels(code: UserCode) -> tuple[Kernel, Kernel]:
     def rhs(match: re.Match[str]) -> str:
         indent, at, to = match.groups()
         states = ", ".join(f"AT[{i}]" for i in range(len(s.states))) + ","
-        text = _RHS.format(x=states, u=u, p=p, rates=rates).strip()
+        own = _OWN_RATE if dispatch.rate is not None else ""
+        text = _RHS.format(x=states, u=u, p=p, rates=rates, own=own).strip()
         text = re.sub(r"\bAT\b", at, re.sub(r"\bdx\b", to, text))
         return textwrap.indent(text, indent)
 
     source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
+    source = source.replace("{own}", _OWN_HELD if dispatch.rate is not None else "")
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
     def build(jit: Callable[[Any], Any]) -> Kernel:
@@ -41,17 +42,15 @@ def build_kernels(code: UserCode) -> tuple[Kernel, Kernel]:
             "np": np, "jit": jit, "X": code.X, "U": code.U, "P": code.P, "Y": code.Y, "R": code.R,
             "model": jit(s.model),
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
-            "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": laws.transform, "MEMORY": MEMORY,
+            "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
+            "own_rate": dispatch.rate, "MEMORY": dispatch.memory,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
         }  # fmt: skip
         exec(compile(source, f"<{s.name}>", "exec"), space)
         return space["run"]
 
-    def compiled(f: Any) -> Any:
-        return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
-
-    return build(compiled), build(lambda f: getattr(f, "py_func", f))
+    return build(compiled_code), build(lambda f: getattr(f, "py_func", f))
 
 
 def _output_source(code: UserCode) -> str:
@@ -99,7 +98,7 @@ if len(code) > 0:
     for i in range(len(code)):
         w = where[i]
         c = code[i]
-        if c > 40:
+        {own}if c > 40:
             if c != STATE_LIMIT and c != STATE_RATE_LIMIT and c != STATE_OVERFLOW:
                 dx[w] -= state_rate(c, AT[w], rows[i])
         elif not memory[i]:
@@ -111,6 +110,16 @@ if len(code) > 0:
             w = where[i]
             dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
 """
+
+_OWN_RATE = """if c > 100:
+            if not memory[i]:
+                dx[w] -= own_rate(c, AT[w], AT[position[w]], now, 1.0, rows[i], none) / mass[w]
+        el"""
+_OWN_HELD = """if memory[i] and code[i] > 100:
+                    w = where[i]
+                    since = 0.0 if first else h
+                    held[w] += own_rate(code[i], x[w], x[position[w]], now, since, rows[i], remembered[i]) / mass[w]
+                el"""
 
 _SOURCE = """
 @jit
@@ -177,8 +186,9 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
         for q in range(steps):
             for w in range(m):
                 held[w] = 0.0
+            now = t[k] + q * h
             for i in range(len(code)):
-                if memory[i] and code[i] <= 40:
+                {own}if memory[i] and code[i] <= 40:
                     w = where[i]
                     f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
                                  remembered[i])
@@ -191,6 +201,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 0.5) / steps
+            now = t[k] + (q + 0.5) * h
             for w in range(m):
                 z[w] = x[w] + 0.5 * h * k1[w]
             rhs z k2
@@ -200,6 +211,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 1.0) / steps
+            now = t[k] + (q + 1.0) * h
             for w in range(m):
                 z[w] = x[w] + h * k3[w]
             rhs z k4

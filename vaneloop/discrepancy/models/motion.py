@@ -39,8 +39,18 @@ def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> floa
 
 
 def motion(s: System, r: Record, cutoff: float | None) -> tuple[Array, Array, Array]:
-    """Displacement, velocity and acceleration of a log, differentiated up to ``cutoff`` (Hz; None: as measured)."""
-    x = r.columns[str(s.position)]
+    """Displacement, velocity and acceleration of a log, differentiated up to ``cutoff`` (Hz; None: as measured); a
+    displacement that is not measured is integrated from 0.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    if s.position is None:  # the position at the start is added where it is known (`Runner`)
+        v = r.columns[str(s.velocity)]
+        x = cumulative_trapezoid(v, r.t, initial=0.0)
+        if cutoff:
+            x, v = low_pass(r.t, x, cutoff), low_pass(r.t, v, cutoff)
+        return x, v, np.gradient(v, r.t) if cutoff else np.zeros(len(v))
+    x = r.columns[s.position]
     if cutoff:
         x = low_pass(r.t, x, cutoff)
     v = np.gradient(x, r.t) if s.velocity is None else r.columns[s.velocity]

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.discrepancy.library import FORCE_LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.discrepancy.library import LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.dispatch import Dispatch, try_law
 from vaneloop.discrepancy.models.nominal import Course
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import Record, System
@@ -19,7 +20,7 @@ __all__ = ["places"]
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
 
 
-def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
+def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed], list[Effect]]:
     """Every law at every place where it may act, in the same order: what runs, and what the search is told of it."""
     s = data.system
     out: list[Placed] = []
@@ -30,11 +31,14 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
         effects.append(Effect(name, tuple(ps), starts, law.looks))
         out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
 
-    def add(prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()) -> None:
-        for law in family.values():
-            if law.name in leave:
-                continue
-            put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
+    def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:
+        for law in LAWS[family].values():
+            if law.name not in leave:
+                put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
+        for own in s.laws:
+            if own.on == family and own.allowed(place, name, by_default="bias" not in leave):
+                try_law(own, prefix, size)
+                put(f"{prefix}.{own.name}", dispatch.own[family][own.name], place, at, size, 0.0)
 
     outputs = list(s.outputs)
     if s.kind == "force" and _allowed(s, "force", "force"):
@@ -47,7 +51,7 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
             speed=max(float(np.sqrt(np.mean(v**2))), 1e-300), speed_unit=f"{unit}/s",
             travel=max(0.5 * float(np.ptp(x)), 1e-300), travel_unit=unit,
         )  # fmt: skip
-        add("force", "force", 0, FORCE_LAWS, size)
+        add("force", "force", "force", 0, "force", size)
     if s.kind in ("simulate", "closed_loop"):
         for i, (name, unit) in enumerate(s.states.items()):
             if not (_allowed(s, "state", name) or (name in s.rates and _allowed(s, "force", name))):
@@ -67,10 +71,10 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
                     speed=max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), 1e-300), speed_unit=unit,
                     travel=max(0.5 * float(np.ptp(np.concatenate(z))), 1e-300), travel_unit=s.states[s.rates[name]],
                 )  # fmt: skip
-                add(name, "force", i, FORCE_LAWS, size)
+                add(name, "force", name, i, "force", size)
             else:
                 size = _size(data.records, values, unit)
-                add(name, "state", i, STATE_LAWS, size, ("overflow",))
+                add(name, "state", name, i, "state", size, ("overflow",))
                 for j, (other, other_unit) in enumerate(s.states.items()):  # into any other of the same kind
                     if j != i and other_unit == unit and other not in s.rates.values():
                         put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, float(j))
@@ -82,7 +86,8 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
                 if s.kind == "closed_loop"
                 else [u[i + (3 if s.kind == "force" else 0)] for u in data.u]
             )
-            add(name, "input", i + (3 if s.kind == "force" else 0), SIGNAL_LAWS, _size(data.records, rows, unit))
+            first = 3 if s.kind == "force" else 0
+            add(name, "input", name, i + first, "signal", _size(data.records, rows, unit))
     for i, name in enumerate(outputs):
         if name in s.commands or not _allowed(s, "output", name):
             continue
@@ -93,7 +98,7 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
         named = any(p in (s.places or ()) for p in ("output", name))
         leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
         prefix = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
-        add(prefix, "output", i, SIGNAL_LAWS, _size(data.records, rows, s.outputs[name]), leave)
+        add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
     return out, effects
 
 

@@ -6,16 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba.core.errors import NumbaError
 
 from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy import laws
-from vaneloop.discrepancy.laws import PARAMETERS
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.dispatch import Dispatch, dispatch_of
 from vaneloop.discrepancy.models.kernel import Kernel, build_kernels
 from vaneloop.discrepancy.models.motion import low_pass
-from vaneloop.discrepancy.models.user_code import UserCode
+from vaneloop.discrepancy.models.own_laws import FIRST_CODE
+from vaneloop.discrepancy.models.user_code import UserCode, cannot
 from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["STARTS_LOADED", "Placed", "Runner"]
@@ -41,10 +41,12 @@ class Runner:
     """The model on its logs.
 
     placed       laws and their columns in a set of parameters
-    free_starts  (log, state) of initial states that follow the model's own parameters in a set
+    free_starts  (log, state) of initial states that follow the model's own parameters in a set; of kind force the
+                 position
     steps        of the integration between two samples
     smalls       state by state, speed within which friction is regularised in a simulation; ``small``: with measured
                  motion
+    dispatch     the laws that it may be given
     loaded       hysteretic elements start with the measured force
     far          size of an output beyond all measured ones; what is beyond it, or not finite, counts as that
     like         take compiled model, steps and these speeds from an earlier one (for test logs)
@@ -54,6 +56,8 @@ class Runner:
         s = data.system
         self.system, self.data = s, data
         self.code = UserCode(s, data.in_names)
+        self.dispatch: Dispatch = like.dispatch if like else dispatch_of(s.laws)
+        self.trying = False  # whether numba can compile the model
         self.kernel: Kernel
         self.slow: Kernel  # the same, not compiled
         self.ready = like is not None  # the model ran with the user's own values
@@ -77,6 +81,8 @@ class Runner:
         if s.kind in ("static", "force"):
             values = np.array([q.value for q in s.parameters])
             self.code.static(values, data.u[0], data.records[0].t, check=True)
+            if self.dispatch.python and like is None:
+                data.notes.append(f"numba cannot compile {self.dispatch.python}; it runs as plain Python")
             return
         if like is not None:
             self.kernel, self.slow = like.kernel, like.slow
@@ -88,20 +94,22 @@ class Runner:
     def _tried(self) -> Kernel:
         """The kernel, tried on three samples: compiled, or where numba cannot, as plain Python."""
         s = self.system
-        fast, self.slow = build_kernels(self.code)
+        fast, self.slow = build_kernels(self.code, self.dispatch)
+        why = self.dispatch.python
+        self.trying = True
         try:
-            self._try(fast)
-        except NumbaError as e:
-            why = next((line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line), "")[
-                :100
-            ]
+            if not why:
+                self._try(fast)
+        except Exception as e:  # numba says in many ways that it cannot
+            why = cannot(e)
+        if why:
             self.data.notes.append(
                 f"system {s.name!r}: numba cannot compile the model ({why}); it runs as plain Python, some 100 times "
                 f"slower"
             )
             self.code.call("model", self._try, self.slow)
-            return self.slow
-        return fast
+        self.trying = False
+        return self.kernel
 
     def _try(self, kernel: Kernel) -> None:
         self.kernel = kernel
@@ -116,7 +124,7 @@ class Runner:
         for q in self.placed:
             values = theta[q.columns]
             if not np.array_equal(values, q.neutral):
-                row = np.zeros(PARAMETERS + 1)
+                row = np.zeros(self.dispatch.parameters + 1)
                 row[: len(values)] = values
                 row[len(values)] = q.constant
                 out.append((q, row))
@@ -134,7 +142,8 @@ class Runner:
             for log, at in enumerate(self.data.logs.values()):
                 if s.kind in ("static", "force"):
                     try:
-                        out[i, :, at] = self._algebraic(theta[:n_p], log, active)
+                        starts = [theta[n_p + k] for k, (which, _) in enumerate(self.free_starts) if which == log]
+                        out[i, :, at] = self._algebraic(theta[:n_p], log, active, sum(starts))
                     except StageError:
                         if not self.ready:
                             raise
@@ -167,22 +176,27 @@ class Runner:
                 continue
             m = names.index(name)
             if self.data.first_state(log, name, np.nan) == x0[m]:
-                x0[m] = laws.argument(q.law.code, x0[m], row)
+                x0[m] = self.dispatch.argument(q.law.code, x0[m], row)
 
-    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]]) -> Array:
-        t, u = self.data.records[log].t, self.data.u[log]
+    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
+        t, u = self.data.times[log], self.data.u[log]
+        if position != 0.0:
+            u = np.concatenate([u[:1] + position, u[1:]])
         inputs = [(q, row) for q, row in active if q.place == "input"]
         if inputs:
             u = u.copy()
             for q, row in inputs:
-                u[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
+                u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
         y = self.code.static(p, u, t)
         forces = [(q, row) for q, row in active if q.place == "force"]
         if forces:
             gap = sum(row[0] for q, row in forces if q.law.code == laws.BACKLASH_GAP)
             asymmetry = sum(row[0] for q, row in forces if q.law.code == laws.FRICTION_ASYMMETRY)
             for q, row in forces:
-                if q.law.code not in laws.HYSTERETIC:
+                if q.law.code >= FIRST_CODE["force"]:
+                    assert self.dispatch.forces is not None
+                    y[0] += self.dispatch.forces(q.law.code, t, u[1], u[0], row)
+                elif q.law.code not in laws.HYSTERETIC:
                     y[0] += _forces(q.law.code, u[1], u[0], row, gap, asymmetry, self.small, 0.0)
             springs = [(q, row) for q, row in forces if q.law.code in laws.HYSTERETIC and row[1] > 0.0]
             held = self.data.held(log) - y[0, 0] if self.loaded else 0.0
@@ -198,14 +212,14 @@ class Runner:
             y = np.array([low_pass(t, row, self.data.cutoff) for row in y])
         for q, row in active:
             if q.place == "output":
-                y[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
+                y[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
         return y
 
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
     ) -> Array:
         s = self.system
-        t, u = self.data.records[log].t[:upto], self.data.u[log][:, :upto]
+        t, u = self.data.times[log][:upto], self.data.u[log][:, :upto]
         loop = s.kind == "closed_loop"
         n_states = len(s.states)
         names = list(s.states)
@@ -219,7 +233,7 @@ class Runner:
         code = np.array([q.law.code for q, _ in inside], dtype=np.int64)
         where = np.array([q.at for q, _ in inside], dtype=np.int64)
         memory = np.array([q.law.memory for q, _ in inside], dtype=np.bool_)
-        rows = np.array([row for _, row in inside]).reshape(len(inside), PARAMETERS + 1)
+        rows = np.array([row for _, row in inside]).reshape(len(inside), self.dispatch.parameters + 1)
         position = np.array([names.index(s.rates[n]) if n in s.rates else -1 for n in names], dtype=np.int64)
         known = [q.name for q in s.parameters]
         mass = np.array([p[known.index(s.masses[n])] if n in s.masses else 1.0 for n in names])
@@ -227,13 +241,13 @@ class Runner:
             for q, row in active:
                 if q.place == "input":
                     u = u.copy() if u is self.data.u[log] or u.base is not None else u
-                    u[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
+                    u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
         ends = [(q, row) for q, row in active if q.place in ("input", "output")] if loop else []
         e_code = np.array([q.law.code for q, _ in ends], dtype=np.int64)
         e_at = np.array([q.at for q, _ in ends], dtype=np.int64)
         e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
-        e_rows = np.array([row for _, row in ends]).reshape(len(ends), PARAMETERS + 1)
-        if np.isin(code, laws.SWITCHING).any():
+        e_rows = np.array([row for _, row in ends]).reshape(len(ends), self.dispatch.parameters + 1)
+        if np.isin(code, laws.SWITCHING).any() or np.any((code >= FIRST_CODE["force"]) & (code < FIRST_CODE["state"])):
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         out = np.full((len(s.outputs), len(t)), np.nan)
@@ -247,9 +261,9 @@ class Runner:
         try:
             with np.errstate(all="ignore"):
                 self.kernel(*arguments)
-        except NumbaError:
-            raise
         except Exception as e:  # with the user's own values that is told; what a search tries may be far off
+            if self.trying:
+                raise
             out[:] = np.nan
             if not self.ready:
                 with np.errstate(all="ignore"):
@@ -258,7 +272,7 @@ class Runner:
         if not loop:
             for q, row in active:
                 if q.place == "output":
-                    out[q.at] = laws.apply(q.law.code, t, np.ascontiguousarray(out[q.at]), row)
+                    out[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(out[q.at]), row)
         return out
 
 

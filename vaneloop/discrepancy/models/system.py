@@ -15,13 +15,13 @@ docs/your_own_model.md says which to choose when.
 
 from __future__ import annotations
 
-import keyword
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vaneloop.discrepancy.models.own_laws import Law, check_parameters, is_name
 from vaneloop.discrepancy.stage import Array, Parameter, StageError
 
 if TYPE_CHECKING:
@@ -41,11 +41,15 @@ def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: floa
 
 @dataclass
 class Record:
-    """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured."""
+    """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured.
+
+    begin  s: where it begins in the log that it was cut out of
+    """
 
     name: str
     t: Array
     columns: dict[str, Array]
+    begin: float = 0.0
 
 
 @dataclass
@@ -59,8 +63,8 @@ class System:
                 returns them
     inputs      measured channels that drive it, name -> unit
     parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
-    position, velocity   force: the channel of the displacement, and of its rate where it is measured too (else it is
-                         differentiated)
+    position, velocity   force: the channel of the displacement, of its rate, or of both: what is missing is
+                         differentiated, or integrated from a start that is fitted to each log (``start_position``)
     cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the
                 measured force
     start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force
@@ -71,14 +75,15 @@ class System:
                 of force
     force_unit  unit of forces on states with a mass
     output      simulate: function output(x, u, p); default: the states that are named like the outputs
-    start       state -> value at the start of a log; others start at their measured value, or where they are not
-                measured are fitted
+    start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
+                rates at rest, and what is not measured is fitted
     window      s: start anew from the measured states after each window of this length (for what integrates)
     between     "hold" or "line": what an input does between two samples
     control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs
                         after the sensors' laws
     places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
                 everywhere
+    laws        laws of your own beside the library's, `Law`
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
     """
 
@@ -97,12 +102,13 @@ class System:
     masses: dict[str, str] = field(default_factory=dict)
     force_unit: str = "N"
     output: Callable[..., Any] | None = None
-    start: dict[str, float] = field(default_factory=dict)
+    start: dict[str, float | str] = field(default_factory=dict)
     window: float | None = None
     between: str = "hold"
     control: Callable[..., Any] | None = None
     commands: dict[str, str] = field(default_factory=dict)
     places: Sequence[str] | None = None
+    laws: Sequence[Law] = ()
     read: Callable[[str], Mapping[str, Any]] | None = None
     units: dict[str, str] = field(default_factory=dict)
 
@@ -129,27 +135,15 @@ class System:
             if not isinstance(given, dict):
                 raise wrong(f"{what} (={given!r}) must be a dict of name -> unit")
             for n in given:
-                if not (isinstance(n, str) and n.isidentifier() and not keyword.iskeyword(n) and not n.startswith("_")):
+                if not is_name(n):
                     raise wrong(
                         f"{what}: {n!r} must be a Python name (letters, digits, _); --map renames a log's channel"
                     )
-        for p in self.parameters:
-            if not isinstance(p, Parameter):
-                raise wrong(f"parameters: {p!r} is not a Parameter; write Parameter(...) or unknown(...)")
-            for which in ("value", "low", "high", "tolerance"):
-                number = getattr(p, which)
-                if isinstance(number, bool) or not isinstance(number, int | float | np.floating | np.integer):
-                    raise wrong(f"parameter {p.name!r}: {which} (={number!r}) must be a number")
-            if not p.name.isidentifier() or keyword.iskeyword(p.name) or p.name.startswith("_"):
-                raise wrong(f"parameter {p.name!r} must be a Python name")
-            if not (np.isfinite(p.value) and p.low <= p.value <= p.high):
-                raise wrong(f"parameter {p.name} (={p.value:g} {p.unit}) must be in [{p.low:g}, {p.high:g}]")
+        check_parameters(self.parameters, wrong)
         names = [p.name for p in self.parameters]
-        if len(set(names)) != len(names):
-            raise wrong(f"two parameters share a name among {', '.join(names)}")
         moves = self.kind in ("simulate", "closed_loop")
-        if self.kind == "force" and not self.position:
-            raise wrong("kind 'force' needs position=, the channel of the displacement")
+        if self.kind == "force" and not (self.position or self.velocity):
+            raise wrong("kind 'force' needs position=, the channel of the displacement, or velocity=, that of its rate")
         if moves and not self.states:
             raise wrong(f"kind {self.kind!r} needs states=, name -> unit")
         if self.kind == "closed_loop" and not (self.control and self.commands):
@@ -166,9 +160,14 @@ class System:
                 raise wrong(f"masses: {v!r} is not a velocity of rates")
             if m not in names:
                 raise wrong(f"masses: {m!r} is not a parameter; parameters are {', '.join(names)}")
-        for s in self.start:
+        for s, begin in self.start.items():
             if s not in self.states:
                 raise wrong(f"start: {s!r} is not a state; states are {', '.join(self.states)}")
+            if begin == "fitted" and self.window:
+                raise wrong(f"start: {s!r} 'fitted' does not go with window=, which starts from measured states")
+            number = isinstance(begin, int | float | np.floating | np.integer) and not isinstance(begin, bool)
+            if begin != "fitted" and not (number and np.isfinite(float(begin))):
+                raise wrong(f"start: {s!r} (={begin!r}) must be a number or 'fitted'")
         if moves and self.output is None:
             for o in self.outputs:
                 if o not in self.states and o not in self.commands:
@@ -187,6 +186,17 @@ class System:
         for place in self.places or ():
             if place not in known:
                 raise wrong(f"places: {place!r} is not known; allowed: {', '.join(sorted(known))}")
+        if not isinstance(self.laws, list | tuple):
+            raise wrong(f"laws (={self.laws!r}) must be a list of Law(...)")
+        for law in self.laws:
+            if not isinstance(law, Law):
+                raise wrong(f"laws: {law!r} is not a Law; write Law(name, on, function, parameters, starts)")
+            if [other.name for other in self.laws].count(law.name) > 1:
+                raise wrong(f"laws: two are named {law.name!r}")
+            for place in law.places or ():
+                if place not in known:
+                    allowed = ", ".join(sorted(known))
+                    raise wrong(f"law {law.name!r}: places: {place!r} is not known; allowed: {allowed}")
 
     def channels(self) -> tuple[str, ...]:
         """Names that a log must have."""

@@ -14,7 +14,7 @@ import numpy as np
 from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, StageError
 
-__all__ = ["UserCode", "place_of"]
+__all__ = ["UserCode", "cannot", "place_of"]
 
 
 class UserCode:
@@ -140,3 +140,11 @@ def place_of(e: BaseException) -> str:
     ours = str(Path(__file__).parents[1]), str(Path(numba.__file__).parent), "<frozen"
     frames = [f for f in traceback.extract_tb(e.__traceback__) if not f.filename.startswith(ours)]
     return f" at line {frames[-1].lineno} of {Path(frames[-1].filename).name}" if frames else ""
+
+
+def cannot(e: BaseException) -> str:
+    """Why numba cannot compile a function of the user, in some words."""
+    if "IMPORT_NAME" in str(e):
+        return "an import inside a function; it belongs at the top of the file"
+    said = [line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line]
+    return (said[0] if said else type(e).__name__)[:100]

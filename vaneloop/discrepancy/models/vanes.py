@@ -69,6 +69,7 @@ class Chain:
     stages        the stages that can be judged
     not_observed  stage -> what the log lacks
     columns       channel -> values on the common raster ``t`` (border units), for plots
+    test          the stages on a part of the log that nothing is fitted to; None: there is none
     plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
     """
 
@@ -80,6 +81,7 @@ class Chain:
     built: Calibration
     calibration: Calibration
     notes: list[str] = field(default_factory=list)
+    test: Chain | None = None
 
     def stage(self, name: str) -> Stage:
         """Return a stage by name."""

@@ -1,0 +1,133 @@
+"""One log in parts: what is fitted, and what only tests what the fit has found."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vaneloop.base.errors import InputError
+from vaneloop.base.spans import Span, apart, is_span, spans_of
+from vaneloop.discrepancy import Record
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.stage import Array, Stage
+
+if TYPE_CHECKING:
+    from hil.logs import Log
+    from vaneloop.verbs.machine import Machine
+
+__all__ = ["Tested", "bind_parts", "part_of", "records_of", "split", "tested"]
+
+
+@dataclass(frozen=True)
+class Tested:
+    """Error of a signal on the part of a log that nothing was fitted to, RMS in its unit.
+
+    error_before, error_after  with the model as it was, and with what was found, both with parameters of the other part
+    """
+
+    stage: str
+    signal: str
+    unit: str
+    error_before: float
+    error_after: float
+    noise_floor: float
+    samples: int
+
+
+def split(fit: Any, test: Any) -> tuple[list[Span], list[Span], list[Any]]:
+    """Parts to fit, parts to test, and what else is to test: logs of their own. Raises InputError, one line."""
+    listed = [test] if is_span(test) or not isinstance(test, Sequence) or isinstance(test, str) else list(test)
+    to_fit = spans_of(fit, "--fit")
+    to_test = spans_of([x for x in listed if is_span(x)], "--test")
+    apart(to_fit, to_test)
+    return to_fit, to_test, [x for x in listed if not is_span(x)]
+
+
+def records_of(record: Record, spans: Sequence[Span]) -> list[Record]:
+    """Each part of a record as one of its own; without parts, the record."""
+    out = []
+    t = np.asarray(record.t, dtype=float)
+    for span in spans:
+        use = _inside(t, span, record.name)
+        columns = {k: v[use] if np.shape(v) == t.shape else v for k, v in _arrays(record).items()}
+        begin = record.begin + float(t[use][0] - t[0])
+        out.append(Record(f"{record.name} {span}", t[use], columns, begin))
+    return out or [record]
+
+
+def part_of(log: Log, spans: Sequence[Span]) -> Log:
+    """A log's samples within these parts; without parts, the log."""
+    from hil.logs import Channel
+
+    if not spans:
+        return log
+    whole = np.unique(np.concatenate([c.t for c in log.channels.values()]))
+    for span in spans:
+        _inside(whole, span, log.path)
+    channels = {}
+    for name, c in log.channels.items():
+        use = np.any([(c.t >= s.low) & (c.t < s.high) for s in spans], axis=0)
+        if np.count_nonzero(use) > 1:
+            channels[name] = Channel(c.t[use], c.values[use])
+    return dataclasses.replace(log, channels=channels)
+
+
+def bind_parts(machine: Machine, log: Log, fit: Sequence[Span], test: Sequence[Span]) -> Any:
+    """The stages of the parts of a log that are fitted, with those of the other parts as its ``test``."""
+    chain = machine.bind(part_of(log, fit))
+    if test:
+        chain.test = machine.bind(part_of(log, test))
+    return chain
+
+
+def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
+    """What each stage's fits before and after say on the part of the log that they have not seen."""
+    test = getattr(chain, "test", None)
+    out: list[Tested] = []
+    if test is None:
+        return out
+    for name, before, after in fits:
+        stage = next((s for s in test.stages if s.name == name), None)
+        if stage is None:
+            continue
+        here = next(s for s in chain.stages if s.name == name)
+        judge = Judge(stage, stage.floor)
+        thetas = np.array([_carried(here, f.theta, stage) for f in (before, after)])
+        n = np.maximum(judge.valid.sum(axis=1), 1)
+        rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / n) * judge.floor
+        for k, signal in enumerate(stage.outputs):
+            figures = float(rms[0, k]), float(rms[1, k]), float(judge.floor[k]), int(n[k])
+            out.append(Tested(name, signal, stage.units[k], *figures))
+    return out
+
+
+def _carried(here: Stage, theta: Array, there: Stage) -> Array:
+    """Parameters of one stage as another's of the same machine."""
+    out = there.neutral()
+    names = [p.name for p in here.parameters]
+    for i, p in enumerate(there.parameters):
+        if p.name in names:
+            out[i] = theta[names.index(p.name)]
+    mine = here.index()
+    for name, columns in there.index().items():
+        if name in mine:
+            out[columns] = theta[mine[name]]
+    return out
+
+
+def _arrays(record: Record) -> dict[str, Array]:
+    return {k: np.asarray(v, dtype=float) for k, v in record.columns.items()}
+
+
+def _inside(t: Array, span: Span, name: str) -> Array:
+    """Which times lie in a part; refuses one that has none."""
+    use = (t >= span.low) & (t < span.high)
+    if np.count_nonzero(use) < 2:
+        raise InputError(
+            f"{name}: {np.count_nonzero(use)} samples in '{span}'; the log is from {t[0]:g} to {t[-1]:g} s"
+        )
+    return np.asarray(use)
