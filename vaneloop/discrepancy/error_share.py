@@ -5,7 +5,8 @@ On real data small effects that nobody models dominate what is left. A threshold
 everything, since the errors of a wrong model are large, correlated and alike from sample to sample. So, block by block
 (blocks as in `vaneloop.discrepancy.fit`):
 
-- `LEAST_FALL`: the held-out sum of squares falls by at least this share;
+- `LEAST_FALL`: what the held-out sum of squares has beyond noise falls by at least this share, and by at least
+  `LEAST_OF_NOISE` of the noise, whose level is known no better;
 - `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of
   small motion, which is wrong by a constant that suits the large motions, counts as much as they do; a block that is
   nearly perfect (`FLAT`, or the noise) cannot get better or worse;
@@ -42,7 +43,8 @@ if TYPE_CHECKING:
 
 __all__ = ["LEAST_FALL", "ErrorShare", "structure", "worth"]
 
-LEAST_FALL = 0.20  # share of the held-out sum of squares (10 % of the RMS) that an effect must explain
+LEAST_FALL = 0.20  # share of the held-out sum of squares beyond noise that an effect must explain
+LEAST_OF_NOISE = 0.10  # and share of the noise (5 % of its RMS)
 LEAST_HELP = 0.75  # share of the change over the blocks that is improvement
 AGREE = 0.05  # fall of a block's log mean square that counts as agreement
 FLAT = 0.1  # of the whole log's error: a block with less is as good as perfect
@@ -52,6 +54,7 @@ BETTER = 0.02  # log error by which one must be better to be exchanged for anoth
 HARM = 0.10  # log error by which a test log may get worse
 LEAST_USE = 0.02  # log error by which some log must get better
 UNKNOWN = 1.25  # times the most noise that the samples can hold: what is left is not noise, whatever predicts it
+MOST_LEFT = 0.25  # of the sum of squares beyond noise may be left: what does not even halve the error is not the answer
 STRUCTURE = 0.25  # share of the error left that the logged channels predict, from which it is called unknown physics
 
 Figures = Callable[[Array], Mapping[str, float]]  # parameters -> log -> log of its RMS error
@@ -64,16 +67,18 @@ class Evidence:
     fall   share of the sum of squares by which it falls
     help   share of the change, block by block, that is improvement
     agree  blocks that improve
+    least  share by which the sum of squares must fall
     """
 
     fall: float
     help: float
     agree: int
+    least: float = LEAST_FALL
 
     @property
     def good(self) -> bool:
         """Whether it is enough."""
-        return self.fall >= LEAST_FALL and self.help >= LEAST_HELP and self.agree >= 2
+        return self.fall >= self.least and self.help >= LEAST_HELP and self.agree >= 2
 
 
 def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
@@ -85,13 +90,15 @@ def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
 
 def worth(judge: Judge, before: Fit, after: Fit) -> Evidence:
     """Evidence for ``after`` against ``before``."""
-    least = max(1.0, FLAT * rms_of(judge, before))
-    (a, _), (b, _) = _levels(judge, before, least), _levels(judge, after, least)
+    flat = max(1.0, FLAT * rms_of(judge, before))
+    (a, _), (b, _) = _levels(judge, before, flat), _levels(judge, after, flat)
     r = np.log(a / b)
     change = float(np.abs(r).sum())
-    fall = 1.0 - float(_levels(judge, after)[0].sum() / _levels(judge, before)[0].sum())
+    was, noise = float(_levels(judge, before)[0].sum()), float(judge.n)
+    fall = 1.0 - float(_levels(judge, after)[0].sum()) / was
+    least = max(LEAST_FALL * (was - noise), LEAST_OF_NOISE * noise) / was
     helps = float(np.maximum(r, 0.0).sum()) / change if change > 0 else 0.0
-    return Evidence(fall, helps, int(np.sum(r > AGREE)))
+    return Evidence(fall, helps, int(np.sum(r > AGREE)), least)
 
 
 def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
@@ -297,8 +304,17 @@ class ErrorShare:
         for f in effects:
             if at_bound(stage, fit, f.effect):
                 self.notes.append(f"{f.effect} stands at the end of its physical range: the log would have it go on")
-        verdict = "missing" if effects else "unknown" if unknown else "none"
-        out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
+        excess = max(rms_of(judge, base) ** 2 - 1.0, 1e-300)
+        share = max(left * left - 1.0, 0.0) / excess
+        poor = bool(effects) and left > UNKNOWN and share > MOST_LEFT
+        verdict = "missing" if effects and not poor else "unknown" if unknown or poor else "none"
+        if poor:  # no name rather than a poor one
+            out = answer_of(judge, verdict, base, base, [], steps, candidates)
+            out.nearest = list(dict.fromkeys(m for f in effects for m in (f.effect, *f.rivals)))[:3]
+            named = " + ".join(f.effect for f in effects)
+            out.refused = [f"{named} comes nearest and leaves {np.sqrt(share):.0%} of the error"]
+        else:
+            out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
         out.notes, out.gain = self.notes, "fall of the held-out error [%]"
         return out
 

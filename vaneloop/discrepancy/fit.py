@@ -98,6 +98,8 @@ class Judge:
         self.samples = np.add.reduceat(self.valid.sum(axis=0), self.block_start)
         self.n = int(self.samples.sum())
         self.scale = self._scales()
+        names = stage.outputs  # what each parameter moves: the only output, the only log
+        self._moves = [(names.index(p.output) if p.output in names else None, p.log) for p in stage.all_parameters()]
         self._counts: Array | None = None
         if self.window_start is not None:
             self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
@@ -343,18 +345,17 @@ class Judge:
         """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta,
         if they are.
         """
-        names = self.stage.outputs
-        owner = [names.index(p.output) if p.output in names else None for p in self.stage.all_parameters()]
+        moves = [self._moves[c] for c in free]
         row = np.zeros(len(free), dtype=int)
-        groups: list[list[int | None]] = []
-        for i, c in enumerate(free):  # parameters that move different outputs share a simulation
+        groups: list[list[tuple[int | None, int | None]]] = []
+        for i, mine in enumerate(moves):  # parameters that move different outputs or logs share a simulation
             for g, taken in enumerate(groups):
-                if owner[c] is not None and None not in taken and owner[c] not in taken:
-                    taken.append(owner[c])
+                if all(any(None not in (a, b) and a != b for a, b in zip(mine, other, strict=True)) for other in taken):
+                    taken.append(mine)
                     row[i] = g
                     break
             else:
-                groups.append([owner[c]])
+                groups.append([mine])
                 row[i] = len(groups) - 1
         thetas = np.repeat(theta[None], len(groups) + 1, axis=0)
         steps = np.empty(len(free))
@@ -368,9 +369,12 @@ class Judge:
         def derivative(e: Array) -> tuple[Array, Array]:
             here, moved = (e[0].copy(), e[1:]) if known is None else (known, e)
             jac = np.zeros((len(free), *here.shape))
-            for i, c in enumerate(free):
-                only = slice(None) if owner[c] is None else owner[c]
+            for i in range(len(free)):
+                output, log = moves[i]
+                only = slice(None) if output is None else slice(output, output + 1)
                 jac[i, only] = (here[only] - moved[row[i], only]) / steps[i]
+                if log is not None and "log" in self.stage.regimes:
+                    jac[i] *= self.stage.regimes["log"] == log
             return here, jac
 
         return thetas if known is None else thetas[1:], derivative

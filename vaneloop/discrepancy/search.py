@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step
+from vaneloop.discrepancy.promise import Slopes, along
 from vaneloop.discrepancy.stage import Array, Effect
 
 if TYPE_CHECKING:
@@ -119,26 +120,6 @@ class Search:
 
     # ---- one effect --------------------------------------------------------------------------------------------------
 
-    def _followers(self, theta: Array) -> tuple[Array, Array, Callable[[Array], list[float]]]:
-        """Error at ``theta``; its derivatives by the nominal parameters; and the function from errors of sets that
-        differ by an effect to the sum of squares that is left when the nominal parameters have followed, as the slopes
-        at ``theta`` have it.
-        """
-        judge, free = self.judge, self.base.free
-        e0, jac = judge.linearise(theta, free)
-        flat = jac.reshape(len(free), e0.size)
-        a = flat @ flat.T + np.diag(self.base.prior * judge.scale[free] ** 2 + 1e-9)
-        room = [(b[free] - theta[free]) / judge.scale[free] for b in judge.bounds()]
-
-        def costs(errors: Array) -> list[float]:
-            errors = errors.reshape(-1, e0.size)
-            pull = errors @ flat.T
-            step = np.clip(np.linalg.solve(a, pull.T).T, *room)  # nominal parameters stay within their tolerances
-            left = np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ a) * step, axis=1)
-            return [float(v) for v in left]
-
-        return e0, jac, costs
-
     def _screen(self) -> dict[str, list[Array]]:
         """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal
         model.
@@ -150,7 +131,7 @@ class Search:
         costs: list[float] = []
         base_cost = 0.0
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
-            e0, jac, left = self._followers(nominal)
+            slopes = Slopes(judge, nominal, self.base.free, self.base.prior)
             first = len(thetas)
             for e in stage.effects:
                 for s in e.starts[-2:] if self.quiet else e.starts:
@@ -159,13 +140,17 @@ class Search:
                     thetas.append(theta)
                     owner.append(e.name)
             if k == 0:
-                base_cost = float(np.sum(e0 * e0))
+                base_cost = float(np.sum(slopes.error * slopes.error))
                 for e in stage.effects if not self.quiet else ():
-                    turned = self._turned(e, e0, jac)
+                    turned = self._turned(e, slopes.error, slopes.jac)
                     thetas += turned
                     owner += [e.name] * len(turned)
-            for i in range(first, len(thetas), SCREENED):
-                costs += left(judge.errors(np.array(thetas[i : i + SCREENED])))
+            left, better = self._tried(slopes, nominal, thetas[first:], owner[first:])
+            costs += left
+            for name, (cost, theta) in better.items():
+                thetas.append(theta)
+                owner.append(name)
+                costs.append(cost)
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         self.level: dict[str, float] = {}
@@ -177,6 +162,38 @@ class Search:
             self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
             self.level[name] = mine[0][0]
         return out
+
+    def _tried(
+        self, slopes: Slopes, theta: Array, thetas: list[Array], owner: list[str]
+    ) -> tuple[list[float], dict[str, tuple[float, Array]]]:
+        """What is left at each of these sets, which differ from ``theta`` by the effect ``owner``, once what is fitted
+        there has followed; and of a model that roams, for each effect a set with a better size that the slopes
+        promise, where there is one: name -> what is left there, and the set.
+        """
+        judge, index, (low, high) = self.judge, self.stage.index(), self.judge.bounds()
+        costs: list[float] = []
+        shares: list[float] = []
+        promised: list[float] = []
+        for i in range(0, len(thetas), SCREENED):
+            errors = judge.errors(np.array(thetas[i : i + SCREENED]))
+            costs += slopes.left(errors)
+            if self.criterion.roams:
+                share, promise = slopes.line(errors)
+                shares += share.tolist()
+                promised += promise.tolist()
+        best: dict[str, int] = {}
+        for i, name in enumerate(owner if self.criterion.roams else ()):
+            if name not in best or promised[i] < promised[best[name]]:
+                best[name] = i
+        again: dict[str, Array] = {}
+        for name, i in best.items():
+            at = index[name]
+            moved = along(self.stage.effect(name), thetas[i][at], shares[i], low[at], high[at])
+            if moved is not None:
+                again[name] = theta.copy()
+                again[name][at] = moved
+        left = slopes.left(judge.errors(np.array(list(again.values())))) if again else []
+        return costs, {name: (c, t) for (name, t), c in zip(again.items(), left, strict=True)}
 
     def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
         """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
@@ -423,7 +440,7 @@ class Search:
             return self.level[last]
         if key not in self.promises:
             fit, index = self.fits[key], self.stage.index()
-            left = self._followers(fit.theta)[2]
+            slopes = Slopes(self.judge, fit.theta, fit.free, fit.prior)
             thetas, owner = [], []
             for e in self.stage.effects:
                 for start in e.starts if e.name not in rest else ():
@@ -431,12 +448,11 @@ class Search:
                     theta[index[e.name]] = start
                     thetas.append(theta)
                     owner.append(e.name)
-            found: dict[str, tuple[float, Array]] = {}
-            for i in range(0, len(thetas), SCREENED):
-                for j, cost in enumerate(left(self.judge.errors(np.array(thetas[i : i + SCREENED])))):
-                    name = owner[i + j]
-                    if name not in found or cost < found[name][0]:
-                        found[name] = cost, thetas[i + j][index[name]]
+            costs, found = self._tried(slopes, fit.theta, thetas, owner)
+            for name, cost, theta in zip(owner, costs, thetas, strict=True):
+                if name not in found or cost < found[name][0]:
+                    found[name] = cost, theta
+            found = {name: (cost, theta[index[name]]) for name, (cost, theta) in found.items()}
             self.promises[key] = found
         return self.promises[key][last][0]
 

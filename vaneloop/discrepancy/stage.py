@@ -36,6 +36,7 @@ class Parameter:
                effect's parameter: how well it is known beforehand; 0: not at all
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one
                simulation
+    log        the only log that it moves, as the stage's condition "log" counts them, if there is one; likewise
     scale      size of a usual change of it; 0: from its tolerance, its value or its effect's starts
     shape      of an effect's parameter: it says how the effect acts, not how much, and has no neutral value of its own
     period     after which it repeats itself, as an angle does: ``low`` and ``high`` are where one turn is cut, no
@@ -52,6 +53,7 @@ class Parameter:
     scale: float = 0.0
     shape: bool = False
     period: float = 0.0
+    log: int | None = None
 
     def wrapped(self, value: float) -> float:
         """Return the same value within the turn that begins at ``low``; of a parameter without period, the value."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.models.data import Data, noise_of_channel
 from vaneloop.discrepancy.models.nominal import Course, nominal_course
 from vaneloop.discrepancy.models.places import places
 from vaneloop.discrepancy.models.runner import Placed, Runner
+from vaneloop.discrepancy.models.stairs import steps_seen
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError
 
@@ -19,6 +22,9 @@ __all__ = ["Bound"]
 # that the user gave, which may be wrong by a factor of ten.
 WIDE, GIVEN = 4.0, 12.0
 DRAWS = 3  # of the noise that the model starts from
+FORGOTTEN = 0.2  # of an output's noise: what noise in a reading that a state starts at may do to it, and not be fitted
+TRIED = 0.1  # of the noise: by so much a start is moved to see what it does
+WITHIN = 3.0  # times its sensor's noise: so far a start may be from its reading
 FACTOR = 10.0  # by which a value that the user gave may be wrong
 MOST_DRAWN = 7  # powers of two: sets of values drawn in all, by the number of unknown parameters
 FROM = 4  # of these that a fit begins from, beside the user's own
@@ -36,8 +42,10 @@ class Bound:
     stage     the model on all samples; the logs follow each other in time
     thinned   the same on fewer samples, where there are many; ``stages``: it, which is what the search works on
     others    values of the parameters in other valleys of the error than the best
-    floor     RMS of each output's error where nothing is missing: its noise, and what noise in starts and in measured
-              motion does to the model
+    read_starts  states that start at their sensors' readings are fitted within the sensors' noise: the system forgets
+              them slowly
+    floor     RMS of each output's error where nothing is missing: its noise, and what noise in starts that are not
+              fitted and in measured motion does to the model
     data      the logs as they were checked; ``t``, ``u``, ``measured`` are its
     runner    the model on them; ``run`` is its
     effects, placed   every law at every place: what the search is told of it, and what runs
@@ -68,6 +76,7 @@ class Bound:
         self.others: list[Array] = []  # values of the parameters in other valleys of the error
         self.starts: list[Parameter] = []  # initial states to fit, and the size of each as far as the logs tell it
         self.start_sizes: list[float] = []
+        self.read_starts = False
         self._make()
 
     def _make(self) -> None:
@@ -99,9 +108,11 @@ class Bound:
                 self.runner.smalls = course.smalls
             self.placed, self.effects = places(self.data, course, self.runner.dispatch)
             parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
+            if self._starts_matter(fitted):
+                parameters += self._read_starts()
         else:
             mine = self.like.stage.parameters[: len(s.parameters)]
-            parameters = [*mine, *starts]
+            parameters = [*mine, *starts, *(self._read_starts() if self.like.read_starts else [])]
         at = len(parameters)
         placed = []
         for name in self.present:
@@ -132,6 +143,9 @@ class Bound:
             )
             at += len(e.parameters)
         self.placed = self.runner.placed = placed
+        if self.like is None:
+            searched = self._with_steps(searched, parameters)
+            self.effects = [next((e for e in searched if e.name == old.name), old) for old in self.effects]
         regimes, units = self.data.regimes()
         self.stage = Stage(
             s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t,
@@ -158,6 +172,22 @@ class Bound:
         self.stages: list[Stage] = [self.thinned]
         self.not_observed: dict[str, str] = {}
 
+    def _with_steps(self, effects: list[Effect], parameters: Sequence[Parameter]) -> list[Effect]:
+        """Effects, those that round an output with the steps to begin from that its values tell."""
+        at = {q.effect: q.at for q in self.placed if q.place == "output" and q.law.code == laws.QUANTISATION}
+        if not any(e.name in at for e in effects):
+            return effects
+        neutral = np.array([p.value for p in (*parameters, *(p for e in effects for p in e.parameters))])
+        model, noise = self.run(neutral[None])[0], self.data.noise()
+        out = []
+        for e in effects:
+            if e.name in at:
+                k, (step,) = at[e.name], e.parameters
+                seen = [s for s in steps_seen(self.measured[k], model[k], noise[k]) if s < step.high]
+                e = replace(e, starts=tuple((s,) for s in sorted({*seen, *(v for (v,) in e.starts)})))
+            out.append(e)
+        return out
+
     def _carried(self, theta: Array) -> Array:
         """RMS of the error that noise in what the model starts from, and in measured motion, causes in each output: the
         model on the logs with as much noise again, less the model on the logs.
@@ -179,7 +209,9 @@ class Bound:
             runner.placed, runner.free_starts = self.placed, self.runner.free_starts
             moved = runner.run(theta[None])[0] - self.run(theta[None])[0]
             out.append(np.sqrt(np.nanmean(np.where(np.isfinite(self.measured), moved, np.nan) ** 2, axis=1)))
-        return np.asarray(np.min(out, axis=0))  # a machine that may tip over does so in some draws
+        if self.system.kind in ("simulate", "closed_loop"):
+            return np.asarray(np.min(out, axis=0))  # a machine that may tip over does so in some draws
+        return np.asarray(np.sqrt(np.mean(np.square(out), axis=0)))
 
     def theta_from(self, other: Bound, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""
@@ -197,16 +229,19 @@ class Bound:
         if not k:
             return out
         use = np.isfinite(self.measured)
-        size = np.array([self._unit_size(p) for p in self.stage.parameters[n_p : n_p + k]])
+        starts = self.stage.parameters[n_p : n_p + k]
+        size = np.array([p.tolerance if np.isfinite(p.tolerance) else self._unit_size(p) for p in starts])
+        low = np.array([p.value - p.tolerance for p in starts]) / size
+        high = np.array([p.value + p.tolerance for p in starts]) / size
 
         def error(z: Array) -> Array:
             trial = out.copy()
             trial[n_p : n_p + k] = z * size
             return np.where(use, self.run(trial[None])[0] - np.where(use, self.measured, 0.0), 0.0).ravel()
 
-        self._scan_starts(out, list(range(n_p, n_p + k)))
+        self._scan_starts(out, [n_p + i for i, p in enumerate(starts) if np.isinf(p.tolerance)])
         first = out[n_p : n_p + k] / size
-        out[n_p : n_p + k] = least_squares(error, first, diff_step=1e-3, max_nfev=30).x * size
+        out[n_p : n_p + k] = least_squares(error, first, bounds=(low, high), diff_step=1e-3, max_nfev=30).x * size
         return out
 
     def figures(self, theta: Array) -> dict[str, Array]:
@@ -246,6 +281,46 @@ class Bound:
                 guess, size = self.data.begin(log, name)
                 self.start_sizes.append(size)
                 out.append(Parameter(f"start_{name}{suffix}", guess, unit, -np.inf, np.inf, np.inf))
+        return out
+
+    def _read(self) -> list[tuple[int, int, str]]:
+        """Log, state and its name of each state that starts a log at its sensor's reading."""
+        s = self.system
+        if s.window or s.kind not in ("simulate", "closed_loop"):
+            return []
+        return [
+            (log, m, name) for log in range(len(self.data.records)) for m, name in enumerate(s.states)
+            if name in s.outputs and name not in s.start and np.isfinite(self.data.first_state(log, name, np.nan))
+        ]  # fmt: skip
+
+    def _starts_matter(self, values: Array) -> bool:
+        """Whether noise in the readings that states start at does more to an output than `FORGOTTEN` of its noise."""
+        noise, runner = self.data.noise(), self.runner
+        names, n_p = list(self.system.outputs), len(self.system.parameters)
+        known, read = len(runner.free_starts), self._read()
+        sets = [np.concatenate([values, [self.data.first_state(log, name, 0.0) for log, _, name in read]])]
+        for state in dict.fromkeys(name for _, _, name in read):
+            step = [TRIED * noise[names.index(name)] * (name == state) for _, _, name in read]
+            sets.append(sets[0] + np.concatenate([np.zeros(n_p + known), step]))
+        if len(sets) == 1:
+            return False
+        runner.free_starts += [(log, m) for log, m, _ in read]
+        out = self.run(np.array(sets))
+        del runner.free_starts[known:]
+        moved = np.sqrt(np.mean(np.sum((out[1:] - out[0]) ** 2, axis=0), axis=1)) / TRIED
+        return bool(np.any(moved > FORGOTTEN * noise))
+
+    def _read_starts(self) -> list[Parameter]:
+        """States that start a log at their sensors' readings, as parameters known to within the sensors' noise."""
+        self.read_starts = True
+        out = []
+        noise = self.data.noise() if self.like is None else self.like.data.noise()
+        for log, m, name in self._read():
+            self.runner.free_starts.append((log, m))
+            suffix = f"_{log + 1}" if len(self.data.records) > 1 else ""
+            value, wide = self.data.first_state(log, name, 0.0), WITHIN * noise[list(self.system.outputs).index(name)]
+            unit = self.system.states[name]
+            out.append(Parameter(f"start_{name}{suffix}", value, unit, tolerance=float(wide), log=log + 1))
         return out
 
     def _prefit(self, parameters: Sequence[Parameter]) -> Array:

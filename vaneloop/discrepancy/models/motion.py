@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,14 @@ __all__ = ["MOTION", "highest_frequency", "low_pass", "motion", "smoothed", "use
 MOTION = ("position", "velocity", "acceleration")
 FORCE_SHARE = 0.9995  # of the power of the measured force lies below the frequency to which motion is differentiated
 
-NOISE = 2.0  # times the quietest tenth of a spectrum: more than that is not its white noise
+PARTS = 20  # of a spectrum: the quieter quarter of them is its white noise
+SPREADS = 2.0  # by so many the power above a frequency may exceed that of white noise
 
 
 def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> float:
-    """Up to which frequency the motion is differentiated: where the measured forces have their power."""
+    """Up to which frequency the motion is differentiated: what the measured forces have above it is white noise, or
+    next to nothing.
+    """
     from scipy.signal import welch
 
     best = 0.0
@@ -29,11 +33,14 @@ def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> floa
             y = r.columns[o]
             y = np.where(np.isfinite(y), y, np.nanmean(y))
             f, power = welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
-            # white noise is everywhere; what rises into it is no force
-            total = np.cumsum(np.maximum(power - NOISE * np.quantile(power, 0.1), 0.0))
-            if not total[-1] > 0.0:
+            noise = float(np.quantile([part.mean() for part in np.array_split(power, PARTS)], 0.25))
+            above = np.cumsum(power[::-1])[::-1] - power  # of each frequency
+            left = np.arange(len(f))[::-1]
+            total = float(power.sum()) - noise * len(f)
+            if not total > 0.0:
                 continue
-            best = max(best, float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))]))
+            force = above - noise * left - SPREADS * noise * np.sqrt(left)
+            best = max(best, float(f[int(np.argmax(force <= (1.0 - FORCE_SHARE) * total))]))
     rate = 1.0 / float(np.median(np.diff(records[0].t)))
     return float(np.clip(best, 5.0 / records[0].t[-1], 0.2 * rate))
 
@@ -47,20 +54,55 @@ def motion(s: System, r: Record, cutoff: float | None) -> tuple[Array, Array, Ar
     if s.position is None:  # the position at the start is added where it is known (`Runner`)
         v = r.columns[str(s.velocity)]
         x = cumulative_trapezoid(v, r.t, initial=0.0)
-        if cutoff:
-            x, v = low_pass(r.t, x, cutoff), low_pass(r.t, v, cutoff)
-        return x, v, np.gradient(v, r.t) if cutoff else np.zeros(len(v))
+        if not cutoff:
+            return x, v, np.zeros(len(v))
+        x, v = low_pass(r.t, x, cutoff), low_pass(r.t, v, cutoff)
+        return x, v, _derivative(r.t, v)
     x = r.columns[s.position]
-    if cutoff:
-        x = low_pass(r.t, x, cutoff)
-    v = np.gradient(x, r.t) if s.velocity is None else r.columns[s.velocity]
-    if s.velocity is not None and cutoff:
-        v = low_pass(r.t, v, cutoff)
-    a = np.gradient(v, r.t) if cutoff else np.zeros(len(x))
-    return x, v, a
+    if not cutoff:
+        return x, np.gradient(x, r.t) if s.velocity is None else r.columns[s.velocity], np.zeros(len(x))
+    x = low_pass(r.t, x, cutoff)
+    v = _derivative(r.t, x) if s.velocity is None else low_pass(r.t, r.columns[s.velocity], cutoff)
+    return x, v, _derivative(r.t, v)
+
+
+def _derivative(t: Array, x: Array) -> Array:
+    """That of a cubic spline through all samples."""
+    from scipy.interpolate import CubicSpline
+
+    return np.asarray(CubicSpline(t, x)(t, 1))
 
 
 def low_pass(t: Array, x: Array, cutoff: float) -> Array:
+    """Zero-phase low-pass that looks no farther than one period of ``cutoff`` (Hz) to either side: farther from its
+    ends a log is filtered exactly, and so is what is linear in it. Beyond its ends it goes on mirrored.
+    """
+    from scipy.signal import oaconvolve
+
+    good = np.isfinite(x)
+    if not good.all():
+        x = np.interp(t, t[good], x[good]) if good.any() else np.zeros(len(x))
+    kernel = _kernel(min(cutoff * float(np.median(np.diff(t))), 0.475))
+    more, mean = len(kernel) // 2, float(np.mean(x))
+    return np.asarray(oaconvolve(np.pad(x - mean, more, mode="symmetric"), kernel, mode="valid") + mean)
+
+
+@lru_cache(maxsize=64)
+def _kernel(cutoff: float) -> Array:
+    """Weights of `low_pass` for a cut-off in periods a sample: those of a fourth-order Butterworth filter run forward
+    and backward, under a window of cos^4 that ends after one period.
+    """
+    n = int(np.ceil(1.0 / cutoff))
+    f = np.fft.rfftfreq(64 * n)
+    h = np.fft.irfft(1.0 / (1.0 + (f / cutoff) ** 8))
+    k = np.arange(-n, n + 1)
+    kernel = h[k] * np.cos(0.5 * np.pi * k / (n + 1)) ** 4
+    kernel = kernel / kernel.sum()
+    kernel.setflags(write=False)
+    return np.asarray(kernel)
+
+
+def _butterworth(t: Array, x: Array, cutoff: float) -> Array:
     """Zero-phase fourth-order Butterworth filter."""
     from scipy.signal import butter, sosfiltfilt
 
@@ -80,7 +122,7 @@ def smoothed(t: Array, x: Array) -> Array:
     f, power = welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
     total = np.cumsum(power)
     highest = float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))])
-    return low_pass(t, x, min(max(0.05 * rate, 1.5 * highest), 0.4 * rate))
+    return _butterworth(t, x, min(max(0.05 * rate, 1.5 * highest), 0.4 * rate))
 
 
 def uses(f: Callable[..., Any], name: str) -> bool:

@@ -175,7 +175,7 @@ class Runner:
             if q.law.memory or name not in names or name in s.start:
                 continue
             m = names.index(name)
-            if self.data.first_state(log, name, np.nan) == x0[m]:
+            if np.isfinite(self.data.first_state(log, name, np.nan)):
                 x0[m] = self.dispatch.argument(q.law.code, x0[m], row)
 
     def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
