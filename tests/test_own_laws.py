@@ -153,8 +153,9 @@ def test_a_law_with_memory_is_found_in_a_sensor() -> None:
 
 def test_an_own_force_is_found_in_measured_motion() -> None:
     t = np.arange(0.0, 20.0, 0.005)
-    x = np.cumsum(wave(4, t)) * 0.005
-    v, a = np.gradient(x, t), np.gradient(np.gradient(x, t), t)
+    w, size = np.array([0.7, 1.9, 3.1, 5.3]), np.array([0.5, 0.3, 0.15, 0.05])
+    x, v = np.sin(np.outer(t, w)) @ size, np.cos(np.outer(t, w)) @ (size * w)
+    a = -np.sin(np.outer(t, w)) @ (size * w * w)
     f = 2.0 * a + 4.0 * v + 3.0 * np.tanh(x / 0.3) * np.exp(-((x / 0.8) ** 2)) + 0.05 * noise(len(t))
     system = System(
         "axis", "force", lambda u, p: p.mass * u.acceleration + p.viscous * u.velocity, outputs={"force": "N"},

@@ -129,7 +129,7 @@ class Search:
         thetas: list[Array] = []
         owner: list[str] = []
         costs: list[float] = []
-        base_cost = 0.0
+        base_cost, plain = 0.0, 0
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
             slopes = Slopes(judge, nominal, self.base.free, self.base.prior)
             first = len(thetas)
@@ -145,6 +145,7 @@ class Search:
                     turned = self._turned(e, slopes.error, slopes.jac)
                     thetas += turned
                     owner += [e.name] * len(turned)
+                plain = len(thetas)  # so many are tried beside the base
             left, better = self._tried(slopes, nominal, thetas[first:], owner[first:])
             costs += left
             for name, (cost, theta) in better.items():
@@ -158,7 +159,11 @@ class Search:
             mine = sorted((c, i) for i, (o, c) in enumerate(zip(owner, costs, strict=True)) if o == name)
             # a second start is worth its time where it is nearly as good as the first
             near = mine[0][0] + 0.2 * max(base_cost - mine[0][0], 0.02 * base_cost)
-            out[name] = [thetas[i] for c, i in mine[:2] if roams or c <= near]
+            kept = [i for c, i in mine[:2] if roams or c <= near]
+            # beside a model that is not fitted, slopes may promise what no fit keeps: one that is tried beside the base
+            if roams and not any(i < plain for i in kept):
+                kept.append(next(i for _, i in mine if i < plain))
+            out[name] = [thetas[i] for i in kept]
             self.reach[name] = max(abs(c - base_cost) for c, _ in mine)  # what the largest sizes change at all
             self.level[name] = mine[0][0]
         return out
