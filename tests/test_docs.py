@@ -1,19 +1,22 @@
-"""Every command and every Python snippet of README.md and docs/*.md runs as it is written.
+"""Every command and every Python snippet of README.md, CONTRIBUTING.md and docs/ runs as it is written.
 
 A page's steps run in their order, in a folder of its own. What cannot run here as written stands in one of the tables,
 with the reason: `REPLACED` (smaller, or a placeholder filled in), `NOT_RUN` (only parsed), `LONG` (run by `make
-test-all`). An entry that no page has fails.
+test-all`). An entry that no page has fails. Every command line is parsed by the command's own parser, whether it is run
+or not; commands, targets, modules and files that the text names in passing must be there.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 import runpy
 import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +29,7 @@ from tests.conftest import ROOT
 from vaneloop.base import terminal
 from vaneloop.cli.main import COMMANDS, main
 
-PAGES = ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+PAGES = ["README.md", "CONTRIBUTING.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md"))]
 EXAMPLE = "examples/hidden_effect.parquet"
 
 # words of a page's commands and snippets -> what is run instead, and why
@@ -42,6 +45,13 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
         "--logs 200": ("--logs 1 --duration 60", "200 logs of 300 s take an hour"),
     },
     "docs/replay.md": {"LOG": ("examples/engine_run.blf", "any log")},
+    "docs/architecture.md": {"LOG": ("examples/engine_run.blf", "any log")},
+    "docs/real_time.md": {
+        "--bus local --record run.mf4": (
+            "--bus local:docs --duration 3 --record run.mf4",
+            "else it runs until Ctrl-C, and meets others on its bus",
+        )
+    },
     "docs/bus.md": {"--frames 10000000": ("--frames 20000", "ten million frames take minutes")},
     "docs/rig.md": {"manoeuvre(seed=7)": ("manoeuvre(seed=7, duration=30.0)", "300 s take long")},
 }
@@ -63,9 +73,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop record run.mf4 --bus vcan0": VCAN,
     "vaneloop record night.mf4 --bus vcan0": VCAN,
     "candump vcan0": VCAN,
-    "vaneloop run --bus local --record run.mf4": LIVE,
-    "vaneloop run --bus lockstep --inputs run.mf4": "repeats the run before it",
-    "vaneloop replay run.mf4": "replays the run before it; tests/test_record.py",
+    "vaneloop replay run.mf4": "wants a run with an ECU, which is there until Ctrl-C; tests/test_record.py",
     "vaneloop inject masquerade --bus local": LIVE,
     "python warm_play.py": "the page's snippet under that name, which is run as such",
     "python -m can.logger": "runs until Ctrl-C; tests/test_bus.py",
@@ -81,13 +89,17 @@ NOT_RUN: dict[str, str] = {
     "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
     "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
     "python -m benchmarks": "measures for minutes; no test judges time",
-    "python -m hil.replay LOG": "the same function as vaneloop replay; tests/test_replay.py",
-    "python -m hil.inject": "the same function as vaneloop inject; tests/test_exit_codes.py",
-    "vaneloop engine-test --profile": "names the option, not a run",
-    "vaneloop ecu --model": "names the option, not a run",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
     "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",
     "# vaneloop/base/errors.py": "signatures, not a program",
+}
+
+# named in passing, not as a run -> where it is run
+NAMES: dict[str, str] = {
+    "python -m hil.replay": "docs/architecture.md",
+    "python -m hil.inject": "tests/test_exit_codes.py",
+    "vaneloop engine-test --profile": "tests/test_machines.py",
+    "vaneloop ecu --model": "an option, which the command must have",
 }
 
 # the beginning of a step that takes long -> the quick test that covers what it does
@@ -184,7 +196,7 @@ def test_the_pages_hold_what_this_test_is_for() -> None:
     assert used - {"--help"} <= set(COMMANDS)
 
 
-@pytest.mark.parametrize("table", [NOT_RUN, LONG], ids=["not run", "long"])
+@pytest.mark.parametrize("table", [NOT_RUN, LONG, NAMES], ids=["not run", "long", "names"])
 def test_every_exception_is_a_step_of_some_page(table: dict[str, str]) -> None:
     steps = [t for page, steps in ALL.items() for s in steps for t in (s, Step(s.line, s.kind, replaced(page, s.text)))]
     assert [k for k in table if not any(s.listed({k: ""}) for s in steps)] == []
@@ -200,18 +212,76 @@ def test_every_replacement_is_used(page: str) -> None:
         assert any(replaced(page, s.text) != s.text and words in s.text for s in ALL[page]), words
 
 
+def parser_of(name: str) -> terminal.Parser:
+    """The parser of a command."""
+    module = importlib.import_module(COMMANDS[name][0])
+    parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
+    module.add_options(parser)
+    return parser
+
+
 @pytest.mark.parametrize("page", REAL)
-def test_what_is_not_run_is_a_command_with_the_options_that_it_shows(
-    page: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_of_a_page_parses(page: str) -> None:
     for s in ALL[page]:
-        if s.kind == "command" and s.text.startswith("vaneloop ") and s.listed(NOT_RUN):
-            name, *words = shlex.split(s.text)[1:]
-            module = importlib.import_module(COMMANDS[name][0])
-            parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
-            module.add_options(parser)
-            for option in (w.split("=")[0] for w in words if w.startswith("--")):
-                assert option in parser.format_help(), f"{page}:{s.line}: {s.text}: {option}"
+        if s.kind != "command" or not s.text.startswith("vaneloop "):
+            continue
+        where = f"{page}:{s.line}: {s.text}"
+        name, *words = shlex.split(s.text)[1:]
+        if name.startswith("--"):
+            assert name in ("--help", "--version"), where
+            continue
+        parser = parser_of(name)
+        if len(words) == 1 and words[0].startswith("--"):  # names an option, not a run
+            assert words[0] in parser.format_help(), where
+            continue
+        try:
+            parser.parse_args(words)
+        except SystemExit as refused:
+            assert not refused.code, where
+
+
+def named(page: str) -> list[tuple[int, list[str]]]:
+    """Commands that a page has in back-quotes, also over the end of a line: line and words."""
+    text = re.sub(
+        r"^```.*?^```", lambda m: "\n" * m[0].count("\n"), (ROOT / page).read_text("utf-8"), flags=re.M | re.S
+    )
+    found = re.finditer(r"`((?:vaneloop|make|python -m|python|pip install|pytest) [^`]+)`", text)
+    return [(text[: m.start()].count("\n") + 1, m[1].split()) for m in found]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_a_page_names_in_passing_is_there(page: str) -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    for line, words in named(page):
+        where = f"{page}:{line}: {' '.join(words)}"
+        if words[0] == "vaneloop":
+            assert words[1] in COMMANDS or words[1] in ("--help", "--version", "COMMAND"), where
+        elif words[0] == "make":
+            assert words[1] in targets, where
+        elif words[:2] == ["python", "-m"]:
+            assert importlib.util.find_spec(words[2]) is not None, where
+        elif words[0] == "pytest":
+            assert all((ROOT / file).exists() for file in words[1:] if not file.startswith("-")), where
+        elif words[0] == "pip" and (extra := re.search(r"vaneloop\[(\w+)\]", words[-1])):
+            assert extra[1] in project["optional-dependencies"], where
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_other_blocks_are_what_they_say(page: str) -> None:
+    for m in re.finditer(r"^```(\w+)\n(.*?)^```", (ROOT / page).read_text("utf-8"), re.M | re.S):
+        line = (ROOT / page).read_text("utf-8")[: m.start()].count("\n") + 1
+        if m[1] == "toml":
+            assert tomllib.loads(m[2]), f"{page}:{line}"
+        elif m[1] == "diff":  # what it leaves or takes away stands in the file
+            files = sorted((ROOT / "plant").glob("*.py"))
+            for row in m[2].splitlines():
+                if row.startswith("@@") and "/" in row:
+                    files = [ROOT / row.split()[1].rstrip(",")]
+                kept = row[1:].strip() if row[:1] in (" ", "-") else ""
+                assert any(kept in file.read_text("utf-8") for file in files), f"{page}:{line}: {row}"
+        else:
+            assert m[1] in ("python", "sh"), f"{page}:{line}: {m[1]}"
 
 
 # ---- running ---------------------------------------------------------------------------------------------------------
@@ -314,7 +384,12 @@ def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool
         m.syspath_prepend(str(ROOT))
         for s in ALL[page]:
             run = Step(s.line, s.kind, replaced(page, s.text))
-            if s.listed(NOT_RUN) or (run.listed(LONG) and not long) or re.match(r"# \w+\.py\n", s.text):
+            if (
+                s.text in NAMES
+                or s.listed(NOT_RUN)
+                or (run.listed(LONG) and not long)
+                or re.match(r"# \w+\.py\n", s.text)
+            ):
                 continue
             given = before(page, run, folder)
             try:

@@ -41,7 +41,7 @@ SWITCHES, STEPS = ("coulomb", "stribeck", "friction_asymmetry", "elastic_plastic
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Models run as plain Python: a few short runs take less time than to compile them."""
-    monkeypatch.setattr(runner, "build_kernels", lambda code: (build_kernels(code)[1],) * 2)
+    monkeypatch.setattr(runner, "build_kernels", lambda *of: (build_kernels(*of)[1],) * 2)
 
 
 def exact(system: System, case: Case) -> System:

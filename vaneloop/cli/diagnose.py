@@ -70,6 +70,9 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
+    else:
+        for note in d.notes[len(answer.bound.notes) :]:
+            terminal.say(args, f"note: {note}")
     terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
     options.say_tested(args, answer.tested)
     for s in d.stages:

@@ -66,6 +66,9 @@ def command(args: argparse.Namespace) -> int:
     results = answer.diagnosis.stages
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
+    else:
+        for note in answer.diagnosis.notes[len(answer.bound.notes) :]:
+            terminal.say(args, f"note: {note}")
     rows = []
     for r in results:
         for k in range(len(r.floor)):

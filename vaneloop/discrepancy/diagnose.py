@@ -161,7 +161,13 @@ def _to_the_floor(
 
     search, current, candidates, steps = _down_to(stage, floor, ask)
     effects, current = search.criterion.name(search, current, candidates)
-    return search.criterion.conclude(search.base, current, effects, candidates, steps)
+    d = search.criterion.conclude(search.first, current, effects, candidates, steps)
+    if search.base is not search.first:
+        was, now = (rms_of(search.judge, f) for f in (search.first, search.base))
+        d.notes.append(
+            f"with nothing added {stage.name} comes to {now:.4g} noise floors, not {was:.4g}, from where the search led"
+        )
+    return d
 
 
 def _search(search: Search) -> Said:

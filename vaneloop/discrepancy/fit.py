@@ -19,7 +19,7 @@ import numpy as np
 
 from vaneloop.discrepancy.stage import Array, Stage
 
-__all__ = ["Fit", "Judge", "Task", "bounded_step", "recalibrate"]
+__all__ = ["Fit", "Judge", "Task", "bounded_step", "finished", "recalibrate"]
 
 Answer = TypeVar("Answer")
 Task = Generator[
@@ -34,6 +34,7 @@ MAX_VALUES = 8_000_000  # errors of several tasks held at one time
 # error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
 # often as they say (docs/diagnosis.md).
 EVIDENCE = 200.0
+STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
 MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
@@ -474,8 +475,23 @@ def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
     return step
 
 
+def finished(judge: Judge, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
+    """The fit, gone on with until its error falls no more."""
+    fit = yield from task
+    for _ in range(4 if go_on else 0):
+        more = yield from judge.fitting(fit.effects, fit, 8)
+        gained = judge.total_of(fit) - judge.total_of(more)
+        if gained > 0.0:
+            fit = more
+        if gained < STILL * fit.cost.sum():
+            break
+    return fit
+
+
 def recalibrate(judge: Judge) -> Fit:
-    """The stage with nothing added, its nominal parameters refitted within their tolerances: what every verb starts
-    from.
+    """The stage with nothing added, its nominal parameters refitted within their tolerances, from wherever the stage
+    says that a fit may begin: what every verb starts from.
     """
-    return judge.fit((), judge.stage.neutral())
+    begins = [judge.stage.neutral(), *(judge.stage.begins if judge.stage.begins is not None else ())]
+    fits = judge.together([finished(judge, judge.fitting((), b), len(begins) > 1) for b in begins])
+    return min(fits, key=judge.total_of)

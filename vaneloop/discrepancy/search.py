@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step, finished, recalibrate
 from vaneloop.discrepancy.promise import Slopes, along
 from vaneloop.discrepancy.stage import Array, Effect
 
@@ -22,7 +22,6 @@ __all__ = ["Criterion", "Search"]
 
 SCREENED = 32  # starts simulated at one time
 DIRECTIONS = 12  # from which a fit of an effect with a direction may start
-STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
 
 
 class Criterion(Protocol):
@@ -96,8 +95,7 @@ class Search:
         begins = [self.stage.neutral()]
         if self.stage.begins is not None:
             begins += list(self.stage.begins)
-        firsts = judge.together([self._finished(judge.fitting((), b), len(begins) > 1) for b in begins])
-        self.base = self.fits[frozenset()] = min(firsts, key=judge.total_of)
+        self.base = self.first = self.fits[frozenset()] = recalibrate(judge)
         self.tick()
         # other places from which a model without what it lacks sees nothing better: a law may lead on from there
         self.nominal = [self.base.theta, *begins[1:]]
@@ -108,15 +106,7 @@ class Search:
 
     def _finished(self, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
         """The fit, gone on with until its error falls no more."""
-        fit = yield from task
-        for _ in range(4 if go_on else 0):
-            more = yield from self.judge.fitting(fit.effects, fit, 8)
-            gained = self.judge.total_of(fit) - self.judge.total_of(more)
-            if gained > 0.0:
-                fit = more
-            if gained < STILL * fit.cost.sum():
-                break
-        return fit
+        return (yield from finished(self.judge, task, go_on))
 
     # ---- one effect --------------------------------------------------------------------------------------------------
 

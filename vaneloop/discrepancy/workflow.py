@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 
 from vaneloop.discrepancy.diagnose import Judged, diagnose_stage, extend_stage, floor_of
-from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, as_close, correlation_of, significant
 from vaneloop.discrepancy.stage import Stage, StageError
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output
 
 __all__ = [
-    "Diagnosis", "StageError", "StageFigures", "compare_stages", "diagnose", "diagnosis_json", "extend_stage",
-    "floor_of", "locate_stages",
-    "no_better",
+    "Diagnosis", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
+    "extend_stage", "floor_of", "locate_stages", "no_better",
 ]  # fmt: skip
 
 
@@ -62,8 +61,22 @@ _JUDGED: list[Judged] = [NoiseFloor]  # of the work
 
 def _one(i: int, tick: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
-    d = diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0])
+    d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0]))
     return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
+
+
+def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The diagnosis with the error before as `compare_stages` has it, where a search has begun anew with a lower noise
+    floor.
+    """
+    floor = floor_of(stage)
+    if not np.array_equal(d.floor, floor):
+        judge = Judge(stage, floor)
+        d.base = recalibrate(judge)
+        d.error_before = rms_per_output(judge, d.base)
+        if not d.final.effects:
+            d.final, d.error_after = d.base, d.error_before
+    return d
 
 
 def _leaves(d: StageDiagnosis) -> bool:

@@ -212,7 +212,7 @@ def diagnosis_page(
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
         page.table(["effect", "stage", "what would excite it"], unseen)
-    _notes(page, by_log.notes if by_log is not None else ())
+    _notes(page, d.notes)
     return page
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import Record, StageError, System
 from vaneloop.discrepancy.locate import Located, agrees
-from vaneloop.discrepancy.workflow import Diagnosis, diagnosis_json, extend_stage, locate_stages, no_better
+from vaneloop.discrepancy.workflow import Diagnosis, as_compared, diagnosis_json, extend_stage, locate_stages, no_better
 from vaneloop.discrepancy.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.models.by_log import ByLog, Logs
     from vaneloop.discrepancy.models.vanes import Chain
     from vaneloop.discrepancy.stage import Bound
+    from vaneloop.discrepancy.stage_answer import StageDiagnosis
     from vaneloop.pages.page import Page
 
 __all__ = [
@@ -286,8 +287,17 @@ def diagnose(
 def diagnosed(chain: Chain, log: str, workers: int = 2, progress: Progress | None = None) -> Diagnosed:
     """`diagnose` of a log that has been put into stages."""
     d = search(chain.stages, chain.not_observed, progress, workers)
-    d.notes = list(chain.notes)
+    d.notes = [*chain.notes, *_at_limit(d.stages)]
     return Diagnosed(chain, d, log)
+
+
+def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
+    """Nominal parameters that stand at the end of their tolerance, a line each."""
+    return [
+        f"{s.stage}: {r['parameter']} stands at the end of its tolerance, {float(cast(float, r['value'])):.4g} "
+        f"{r['unit']}: the log would have it go on"
+        for s in stages for r in s.recalibrated if r["at_limit"]
+    ]  # fmt: skip
 
 
 def extend(
@@ -368,7 +378,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
         else:
             effects[name] = before.effects[name]
-    results = [extend_stage(chain.stage(s), tuple(names)) for s, names in by_stage.items()]
+    results = [as_compared(chain.stage(s), extend_stage(chain.stage(s), tuple(names))) for s, names in by_stage.items()]
     parameters: dict[str, Any] = dict(before.parameters)
     for r in results:
         parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
@@ -377,7 +387,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             effects[f.effect] = {k: float(cast(float, v["value"])) for k, v in f.parameters.items() if k in own}
     model = Model(parameters=parameters, effects=effects, meta=before.meta)
     seconds = time.perf_counter() - started
-    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, list(chain.notes))
+    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
     return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
 
 

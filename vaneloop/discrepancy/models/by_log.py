@@ -20,6 +20,7 @@ from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.laws import HYSTERETIC
 from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.doubts import doubts
 from vaneloop.discrepancy.models.runner import STARTS_LOADED
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
@@ -139,6 +140,7 @@ class ByLog:
                 was = f"it was {v0:.4g} {p.unit} while {laws} was missing"
                 self.notes.append(f"{p.name}: not needed any more, set to 0 ({was})")
         self.notes += [*_loaded(bound, judge, d), *d.notes]
+        self.notes += [n for n in doubts(bound, judge, d) if n not in self.notes]
 
     def together(self) -> dict[str, dict[str, Array]]:
         """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test"
