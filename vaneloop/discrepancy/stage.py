@@ -14,7 +14,18 @@ from typing import Any, Protocol
 
 import numpy as np
 
-__all__ = ["Bound", "Effect", "Model", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
+__all__ = [
+    "KNOWN_TO",
+    "Bound",
+    "Effect",
+    "Model",
+    "Parameter",
+    "Stage",
+    "StageError",
+    "noise_of",
+    "reach_of",
+    "without_jumps",
+]
 
 Array = np.ndarray
 FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
@@ -84,8 +95,8 @@ class Stage:
               the error there; None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
-    lost      one draw of the error that the raster causes in each output, float64[outputs, samples]: it need not be
-              even; None: it is
+    lost      draws of the error that the raster causes in each output, float64[draws, outputs, samples]: it need not
+              be even; None: it is
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these
               parameters: an effect may turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit

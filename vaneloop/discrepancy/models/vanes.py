@@ -139,7 +139,7 @@ def build_chain(
         smooth = without_noise(t, have, machine)
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns:
-            law, off = servo_law(t, have, cal, smooth)
+            law, *off = servo_law(t, have, cal, smooth)
             what = other_current(t, have, law, run, cal)
             if what:
                 notes.append(
@@ -148,10 +148,10 @@ def build_chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, machine)
-                law, off = servo_law(t, have, cal, smooth)
+                law, *off = servo_law(t, have, cal, smooth)
             sampled = what == SAMPLED
-            have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
-            unknown = off.mean(axis=1) - off[:, -1] if sampled else None
+            have["law"], have["law_error"] = law, off[1] if sampled else off[0]
+            unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
             size = cal.scalars.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
                 between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
