@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from plant import chain, places
+from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
 from vaneloop.discrepancy.models.vane_stages.twins import like_time
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.stage import Array, Stage, without_jumps
 
 __all__ = ["actuator_stage"]
 
@@ -58,8 +59,19 @@ def actuator_stage(driven: Driven) -> Stage:
     stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
     window = int(round(WINDOW / dt))
 
+    columns = stage.index()
+
     def hidden(theta: Array) -> Array:
-        return rms(stage, simulate(theta[None])[0] - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        out = simulate(theta[None])[0]
+        between = rms(stage, out - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        if "piston_stiction" not in columns or theta[columns["piston_stiction"].start] == 0.0:
+            return between
+        excess, speed = theta[columns["piston_stiction"]] * (1.0, 1e-3)
+        give = oil_compressibility.NOMINAL
+        if "oil_compressibility" in columns:
+            give += 1e-6 * float(theta[columns["oil_compressibility"].start])  # mm/kN
+        force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
+        return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
 
     stage.raster_error = np.array([QUASI_STATIC])
     if others is not i:
