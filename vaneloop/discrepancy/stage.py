@@ -19,6 +19,7 @@ __all__ = [
     "Bound",
     "Effect",
     "Model",
+    "Named",
     "Parameter",
     "Stage",
     "StageError",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 Array = np.ndarray
+Named = Mapping[str, Mapping[str, Mapping[str, Any]]]  # effect -> parameter -> value, low, high, unit
 FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 
 
@@ -95,6 +97,8 @@ class Stage:
               the error there; None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
+    coarse    channels that the stage explains or is driven by whose reading is coarser than its sensor's, and what is
+              to be said of it: no name rests on such a reading
     lost      draws of the error that the raster causes in each output, float64[draws, outputs, samples]: it need not
               be even; None: it is
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these
@@ -107,6 +111,8 @@ class Stage:
               the best model is known, whose errors hold less of the machine's motion
     twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of
               theirs)
+    alike     effects whose law is also that of something the library does not have: function from the parameters of all
+              effects named, with their intervals, to what that is, "" where the sizes rule it out
     memory    s: longer than the stage remembers; blocks of the log that are judged apart are as long. None: not known
     begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
               what it lacks may have lost its way to; None: there are none
@@ -126,6 +132,7 @@ class Stage:
     regimes: Mapping[str, Array] = field(default_factory=dict)
     regime_units: Mapping[str, str] = field(default_factory=dict)
     raster_error: Array | None = None
+    coarse: Mapping[str, str] = field(default_factory=dict)
     lost: Array | None = None
     hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
@@ -133,6 +140,7 @@ class Stage:
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None
     twins: Mapping[str, tuple[str, Callable[[Array], Array]]] = field(default_factory=dict)
+    alike: Mapping[str, Callable[[Named], str]] = field(default_factory=dict)
     memory: float | None = None
     begins: Array | None = None
     excerpt: Callable[[Array], Stage] | None = None

@@ -12,7 +12,7 @@ from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
 from vaneloop.discrepancy.models.vane_stages.twins import like_time
-from vaneloop.discrepancy.stage import Array, Stage, without_jumps
+from vaneloop.discrepancy.stage import Array, Named, Stage, without_jumps
 
 __all__ = ["actuator_stage"]
 
@@ -57,6 +57,7 @@ def actuator_stage(driven: Driven) -> Stage:
     stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
     ageing = like_time(t, t_oil)
     stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
+    stage.alike = {"valve_flow_saturation": _quadratic_drag}
     window = int(round(WINDOW / dt))
 
     columns = stage.index()
@@ -86,3 +87,11 @@ def actuator_stage(driven: Driven) -> Stage:
 
     stage.excerpt = excerpts(actuator_stage, driven, stage, kept)
     return stage
+
+
+def _quadratic_drag(named: Named) -> str:
+    """A drag b v^2 takes b v^2 / A off the pressure drop of the orifices, so v = v0 / sqrt(1 + (v0 / limit)^2): an
+    orifice in series, the round end of the saturation.
+    """
+    round_end = float(named["valve_flow_saturation"]["roundness"]["high"]) >= 1.0 - 1e-6
+    return "a drag that grows with the square of the speed" if round_end else ""
