@@ -9,7 +9,8 @@ Symbols: level greatest friction force (N), force Coulomb's (N), excess above it
 transcendental function. The second falls from 1 to 1/2 about a tenth of the Stribeck speed: there the piston sticks
 and slips on its oil column, and the mean of that sawtooth is half the excess.
 Limits: the sawtooth itself, some hundred hertz and up to C excess high, is not in it (C see oil_compressibility); it
-stays as scatter.
+stays as scatter: of a sawtooth as high as twice what the second factor takes off, A = excess (1 + r / 8)^-8 100 r /
+(1 + 100 r), the RMS is A / sqrt(12) (`scatter`).
 In a log: lost motion at reversals as with piston_friction, 2 C (force + excess), but hardly slower at speed; after
 slow reversals a small catching up when it lets go; scatter of some micrometres in slow motion.
 Source: Stribeck curve and stick-slip, Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), sections 2
@@ -18,10 +19,12 @@ and 3.
 
 from __future__ import annotations
 
+import numpy as np
+
 from plant.effect import HYDRAULIC, Effect, Parameter
 from vaneloop.base.compiled import compiled
 
-__all__ = ["EFFECT", "step"]
+__all__ = ["EFFECT", "scatter", "step"]
 
 EFFECT = Effect(
     "piston_stiction",
@@ -48,3 +51,9 @@ def step(force: float, v: float, excess: float, speed: float) -> float:
     a *= a
     a *= a
     return force + excess * (a * a) * (1.0 + 50.0 * r2) / (1.0 + 100.0 * r2)
+
+
+def scatter(v: np.ndarray, excess: float, speed: float) -> np.ndarray:
+    """RMS (N) of the friction's sawtooth about its mean at the speeds ``v`` (m/s)."""
+    r = (v / speed) ** 2
+    return np.asarray(excess * (1.0 + 0.125 * r) ** -8 * 100.0 * r / (1.0 + 100.0 * r) / np.sqrt(12.0))

@@ -87,8 +87,7 @@ def show(args: argparse.Namespace, answer: Any) -> None:
             )
         for x in d.shapes.get(s.stage, []):
             terminal.say(args, f"{'unknown' if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
-        if s.verdict == "unknown" and s.nearest:
-            terminal.say(
-                args, f"unknown in {s.stage}, nearest: {', '.join(s.nearest)}{''.join(f'; {why}' for why in s.refused)}"
-            )
+        if s.verdict == "unknown" and (s.nearest or s.refused):
+            nearest = ", ".join(s.nearest) or "none"
+            terminal.say(args, f"unknown in {s.stage}, nearest: {nearest}{''.join(f'; {why}' for why in s.refused)}")
     terminal.say(args, answer.sentence())

@@ -249,18 +249,18 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     return False
 
 
-# what is outside the library as a law of it with another cause
-OTHER_CAUSE = {"play_temperature": ("linkage_wear", "oil temperature")}
+# what is outside the library and has the law of effects in it, under another cause
+OTHER_CAUSE = {
+    "play_temperature": ({"linkage_wear"}, "oil temperature"),
+    "piston_cushion": ({"valve_flow_saturation"}, "a drag that grows with the square of the speed"),
+    "pot_cross_talk": ({"pot_gain", "pot_bias"}, "a share of another stage's reading"),
+}
 
 
 def _told(row: dict[str, Any]) -> bool:
-    """Whether the answer says that it cannot tell the true law's cause from that of the one effect it names."""
-    effects, truth = json.loads(row["answer"])["effects"], row["truth"][0]
-    return (
-        len(effects) == 1
-        and truth in OTHER_CAUSE
-        and (effects[0]["effect"], *effects[0]["inseparable"]) == OTHER_CAUSE[truth]
-    )
+    """Whether the answer names only what has the true law, and says that it cannot tell the true cause from it."""
+    effects, (law, cause) = json.loads(row["answer"])["effects"], OTHER_CAUSE.get(row["truth"][0], (set(), ""))
+    return {e["effect"] for e in effects} == law and any(cause in e["inseparable"] for e in effects)
 
 
 def _all_named(answer: dict[str, Any]) -> set[str]:

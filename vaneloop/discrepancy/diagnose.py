@@ -54,7 +54,7 @@ def diagnose_stage(
     second excerpt is taken from what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG:
-        return _to_the_floor(stage, floor, keep, tick, judged)
+        return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
     judge = Judge(stage, floor, keep)
     base = recalibrate(judge)
     left = base
@@ -66,7 +66,15 @@ def diagnose_stage(
         if found.verdict != "unknown" or said.verdict == "unknown":
             break
         left = found.final
-    return found
+    return _unless_coarse(stage, found)
+
+
+def _unless_coarse(stage: Stage, said: StageDiagnosis) -> StageDiagnosis:
+    """The answer; "unknown" where it would rest on a channel that lacks bits, or explains one."""
+    if stage.coarse and (said.effects or any(o in stage.coarse for o in stage.outputs)):
+        nearest = [f.effect for f in said.effects] or said.nearest
+        said = replace(said, verdict="unknown", nearest=nearest, effects=[], refused=list(stage.coarse.values()))
+    return said
 
 
 def _excerpt(judge: Judge, fit: Fit) -> Array:

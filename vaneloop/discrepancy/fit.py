@@ -134,7 +134,7 @@ class Judge:
         """
         if self.stage.lost is None:
             return np.ones_like(self.measured)
-        squares = self._whiten(self.measured - self.stage.lost[None])[0] ** 2
+        squares = np.mean(self._whiten(self.measured - self.stage.lost) ** 2, axis=0)
         mean = squares.sum(axis=1) / np.maximum(self.valid.sum(axis=1), 1)
         return 1.0 + squares - mean[:, None]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
-from vaneloop.discrepancy.stage import Array, without_jumps
+from vaneloop.discrepancy.stage import KNOWN_TO, Array, without_jumps
 from vaneloop.discrepancy.stage_answer import rms_per_output
 
 __all__ = [
@@ -224,6 +224,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
 
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
+    known = (1.0 + KNOWN_TO) ** 2 if stage.lost is not None else 1.0  # drawn floors are as uneven as that is known
     raw = []
     looks = 0
     for k, output in enumerate(stage.outputs):
@@ -243,7 +244,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
     out = []
     z_limit = norm.isf(LEVEL / max(looks, 1))
     for k, output, name, edges, n, ms in raw:
-        z = (ms - 1.0) * np.sqrt(np.maximum(n, 1) / (2.0 * correlation))
+        z = (ms / known - 1.0) * np.sqrt(np.maximum(n, 1) / (2.0 * correlation))
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)
         share = excess / excess.sum() if excess.sum() > 0 else np.full(len(n), 1.0 / len(n))

@@ -217,6 +217,11 @@ class NoiseFloor:
                     found[-1] = replace(found[-1], refused=f"would have to turn on {cause}")
                 elif not _worse(judge, twin, current, correlation, 0.0):
                     found[-1] = replace(found[-1], inseparable=[cause])
+        named = {f.effect: f.parameters for f in found}
+        for k, said_of in enumerate(found):
+            law = judge.stage.alike.get(said_of.effect)
+            if law and (like := law(named)):
+                found[k] = replace(said_of, inseparable=[*said_of.inseparable, like])
         return found, current
 
     def conclude(

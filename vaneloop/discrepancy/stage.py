@@ -16,9 +16,13 @@ import numpy as np
 
 from vaneloop.base.errors import InputError
 
-__all__ = ["Bound", "Effect", "Model", "Parameter", "Stage", "StageError", "noise_of", "reach_of", "without_jumps"]
+__all__ = [
+    "KNOWN_TO", "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "noise_of", "reach_of",
+    "without_jumps",
+]  # fmt: skip
 
 Array = np.ndarray
+Named = Mapping[str, Mapping[str, Mapping[str, Any]]]  # effect -> parameter -> value, low, high, unit
 FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 
 
@@ -88,8 +92,10 @@ class Stage:
               the error there; None for stages that do not integrate
     regimes   conditions on the same samples, for example rotor speed, direction of motion: where does it fail?
     raster_error  RMS of what the log's raster hides from each output, in its unit; None: nothing
-    lost      one draw of the error that the raster causes in each output, float64[outputs, samples]: it need not be
-              even; None: it is
+    coarse    channels that the stage explains or is driven by whose reading is coarser than its sensor's, and what is
+              to be said of it: no name rests on such a reading
+    lost      draws of the error that the raster causes in each output, float64[draws, outputs, samples]: it need not
+              be even; None: it is
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these
               parameters: an effect may turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
@@ -100,6 +106,8 @@ class Stage:
               the best model is known, whose errors hold less of the machine's motion
     twins     effects that turn on time or on the oil's temperature: (the other of the two, ``run`` with it in place of
               theirs)
+    alike     effects whose law is also that of something the library does not have: function from the parameters of all
+              effects named, with their intervals, to what that is, "" where the sizes rule it out
     memory    s: longer than the stage remembers; blocks of the log that are judged apart are as long. None: not known
     begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
               what it lacks may have lost its way to; None: there are none
@@ -119,6 +127,7 @@ class Stage:
     regimes: Mapping[str, Array] = field(default_factory=dict)
     regime_units: Mapping[str, str] = field(default_factory=dict)
     raster_error: Array | None = None
+    coarse: Mapping[str, str] = field(default_factory=dict)
     lost: Array | None = None
     hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
@@ -126,6 +135,7 @@ class Stage:
     noise: Callable[[Array, Array], float] | None = None
     finer: Callable[[Array], Array] | None = None
     twins: Mapping[str, tuple[str, Callable[[Array], Array]]] = field(default_factory=dict)
+    alike: Mapping[str, Callable[[Named], str]] = field(default_factory=dict)
     memory: float | None = None
     begins: Array | None = None
     excerpt: Callable[[Array], Stage] | None = None

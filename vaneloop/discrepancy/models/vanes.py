@@ -23,7 +23,7 @@ from scipy.ndimage import binary_propagation
 
 from controller import Calibration, load_calibration
 from controller.records import RUN
-from hil.figures import noise_floor
+from hil.figures import noise_floor, resolution
 from hil.logs import Log, LogError
 from hil.loop.tick import flashed
 from plant import Plant, build_plant
@@ -141,7 +141,7 @@ def build_chain(
         smooth = without_noise(t, have, machine)
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns:
-            law, off = servo_law(t, have, cal, smooth)
+            law, *off = servo_law(t, have, cal, smooth)
             what = other_current(t, have, law, run, cal)
             if what:
                 notes.append(
@@ -150,16 +150,17 @@ def build_chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, machine)
-                law, off = servo_law(t, have, cal, smooth)
+                law, *off = servo_law(t, have, cal, smooth)
             sampled = what == SAMPLED
-            have["law"], have["law_error"] = law, off[:, -1] if sampled else off.mean(axis=1)
-            unknown = off.mean(axis=1) - off[:, -1] if sampled else None
+            have["law"], have["law_error"] = law, off[1] if sampled else off[0]
+            unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
             size = cal.scalars.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
                 between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
     regimes, units = regimes_of(t, columns)
+    bits = _lost_bits(log, machine)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
         "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
@@ -192,6 +193,8 @@ def build_chain(
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]
+        if bits and "x_lvdt" in (*needs, *gives):
+            stage.coarse = {"x_lvdt": bits}
         if name == "actuator":
             # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's
             # motion, may be quieter
@@ -203,3 +206,20 @@ def build_chain(
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, tables, cal, notes)
+
+
+def _lost_bits(log: Log, machine: Plant) -> str:
+    """What is to be said of a stroke in steps of at least four of the LVDT's converter; "": it is not.
+
+    Steps that end in 1, 2, 2.5 or 5 are some logger's last digit and say nothing of the machine.
+    """
+    if "x_lvdt" not in log.channels:
+        return ""
+    sensors, step = machine.table.sensors, resolution(log.channels["x_lvdt"].values)
+    own = sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value
+    if step < 4.0 * own:
+        return ""
+    digits = step / 10.0 ** np.floor(np.log10(step))
+    if np.min(np.abs(digits / np.array([1.0, 2.0, 2.5, 5.0, 10.0]) - 1.0)) < 1e-3:
+        return ""
+    return f"x_lvdt comes in steps of {step:.4g} mm, {step / own:.0f} of its converter's: low bits are lost"

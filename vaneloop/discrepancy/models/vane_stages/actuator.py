@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from plant import chain, places
+from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
 from vaneloop.discrepancy.models.vane_stages.twins import like_time
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.stage import Array, Named, Stage, without_jumps
 
 __all__ = ["actuator_stage"]
 
@@ -56,10 +57,22 @@ def actuator_stage(driven: Driven) -> Stage:
     stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
     ageing = like_time(t, t_oil)
     stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
+    stage.alike = {"valve_flow_saturation": _quadratic_drag}
     window = int(round(WINDOW / dt))
 
+    columns = stage.index()
+
     def hidden(theta: Array) -> Array:
-        return rms(stage, simulate(theta[None])[0] - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        out = simulate(theta[None])[0]
+        between = rms(stage, out - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        if "piston_stiction" not in columns or theta[columns["piston_stiction"].start] == 0.0:
+            return between
+        excess, speed = theta[columns["piston_stiction"]] * (1.0, 1e-3)
+        give = oil_compressibility.NOMINAL
+        if "oil_compressibility" in columns:
+            give += 1e-6 * float(theta[columns["oil_compressibility"].start])  # mm/kN
+        force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
+        return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
 
     stage.raster_error = np.array([QUASI_STATIC])
     if others is not i:
@@ -74,3 +87,11 @@ def actuator_stage(driven: Driven) -> Stage:
 
     stage.excerpt = excerpts(actuator_stage, driven, stage, kept)
     return stage
+
+
+def _quadratic_drag(named: Named) -> str:
+    """A drag b v^2 takes b v^2 / A off the pressure drop of the orifices, so v = v0 / sqrt(1 + (v0 / limit)^2): an
+    orifice in series, the round end of the saturation.
+    """
+    round_end = float(named["valve_flow_saturation"]["roundness"]["high"]) >= 1.0 - 1e-6
+    return "a drag that grows with the square of the speed" if round_end else ""

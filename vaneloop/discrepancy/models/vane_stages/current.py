@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from controller import Calibration
+from hil.figures import resolution
 from plant import chain
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, WINDOW
 from vaneloop.discrepancy.models.vane_stages.stroke import SMOOTH, Smooth
@@ -17,42 +18,53 @@ from vaneloop.discrepancy.stage import Array
 __all__ = ["BEFORE", "SAMPLED", "between_rows", "other_current", "servo_law"]
 
 SAMPLED = "the current of the tick at each row"
+DRAWS = 8  # of what the log hides: the integral wanders, so that one draw says little of a stretch of the log
 BEFORE = "the mean of the ten ticks before the row"
 
 
-def servo_law(t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth) -> tuple[Array, Array]:
+def servo_law(t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth) -> tuple[Array, Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
     the stroke.
 
-    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and a draw
-    of how much they are off because the stroke between two rows is not logged, of the same shape.
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
+    how much their mean, and the last of them, are off because not all of stroke and demand is logged, each
+    float64[rows, DRAWS].
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
-    # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
-    before, two = np.roll(x_dem, 1), np.roll(x_dem, 2)
-    before[0], two[:2] = x_dem[0], x_dem[0]
-    ramp = two[:, None] + (before - two)[:, None] * (np.arange(2, 12) / 10.0)[None]
-    ramp[:, -1] = before + (x_dem - before) / 10.0
-    rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
-    rate[:, -1] = (x_dem - before) / RASTER
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
     stroke = CubicSpline(t, smooth.stroke)(when)
-    straight = np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
-    stroke[:, -1] = straight[:, -1] = x
-    error = ramp - stroke
+    between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
+    stroke[:, -1] = x
+
+    def ramp(demand: Array) -> tuple[Array, Array]:
+        # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
+        before, two = np.roll(demand, 1), np.roll(demand, 2)
+        before[0], two[:2] = demand[0], demand[0]
+        ticks = two[:, None] + (before - two)[:, None] * (np.arange(2, 12) / 10.0)[None]
+        ticks[:, -1] = before + (demand - before) / 10.0
+        rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
+        rate[:, -1] = (demand - before) / RASTER
+        return ticks, rate
 
     def loop(e: Array) -> Array:
         return np.asarray(kp * e + ki * np.cumsum(e).reshape(e.shape) * chain.TICK)
 
-    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, and the way between them, which is
-    # known as well as a straight line and a cubic agree
-    noise = smooth.noise * np.random.default_rng(0).standard_normal((len(t), 10))
-    off = CubicSpline(t, smooth.left + smooth.distortion)(when) - noise + (stroke - straight)
-    off[:, -1] = 0.0
-    return loop(error) + kff * rate, loop(off)
+    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
+    # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
+    draw, step = np.random.default_rng(0), resolution(x_dem)
+    of_mean, of_last = np.empty((len(t), DRAWS)), np.empty((len(t), DRAWS))
+    for k in range(DRAWS):
+        off = CubicSpline(t, smooth.left(draw) + smooth.distortion)(when) + between
+        off -= smooth.noise * draw.standard_normal(off.shape)
+        off[:, -1] = 0.0
+        digit, digit_rate = ramp(step * draw.uniform(-0.5, 0.5, len(t)))
+        error = loop(off - digit) - kff * digit_rate
+        of_mean[:, k], of_last[:, k] = error.mean(axis=1), error[:, -1]
+    demand, rate = ramp(x_dem)
+    return loop(demand - stroke) + kff * rate, of_mean, of_last
 
 
 def between_rows(

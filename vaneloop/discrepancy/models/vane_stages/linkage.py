@@ -14,7 +14,7 @@ from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
 from vaneloop.discrepancy.models.vane_stages.twins import like_temperature, like_time
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.stage import Array, Named, Stage
 
 __all__ = ["linkage_stage"]
 
@@ -52,6 +52,7 @@ def linkage_stage(driven: Driven) -> Stage:
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
     both = partial(_on_two_cores, simulate, least=32)  # a block of lanes
     stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, both, t, measured)
+    stage.alike = {"pot_gain": _cross_talk}
     ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)
     stage.twins = {
         "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
@@ -74,6 +75,18 @@ def linkage_stage(driven: Driven) -> Stage:
 def _crossed(x: Array) -> Array:
     """Samples from which on the stroke x (mm) has crossed any ring's play: where in it the ring began is forgotten."""
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
+
+
+def _cross_talk(named: Named) -> str:
+    """The stages turn together: a share of another's reading is a gain and an offset to 1 %."""
+    changed = {
+        effect: {v for v, p in named[effect].items() if not p["low"] <= none <= p["high"]}
+        for effect, none in (("pot_gain", 1.0), ("pot_bias", 0.0))
+        if effect in named
+    }
+    gains = changed["pot_gain"]
+    one = len(gains) == 1 and gains <= changed.get("pot_bias", set())
+    return "a share of another stage's reading" if one else ""
 
 
 def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int) -> Array:

@@ -8,7 +8,7 @@ from hil.figures import noise_floor
 from vaneloop.discrepancy.models.vane_stages.declared import declared
 from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.raster import WINDOW, no_gap_in_window, rms
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.stage import KNOWN_TO, Array, Stage, without_jumps
 
 __all__ = ["servo_stage"]
 
@@ -17,7 +17,7 @@ def servo_stage(driven: Driven) -> Stage:
     """Current from logged demand and stroke, by the firmware's law."""
     t, c, machine, cal, outputs, run, present = driven
     parameters, effects, _, _ = declared("servo", machine, present)
-    mean, hidden = c["law"].mean(axis=1), c["law_error"]
+    mean, hidden = c["law"].mean(axis=1), c["law_error"].T
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
@@ -38,8 +38,12 @@ def servo_stage(driven: Driven) -> Stage:
         np.where(run & near, c["i_cmd"], np.nan)[None],
         window=WINDOW,
     )
-    # the part of the hidden error that moves too slowly to be seen as noise in the stage's error
-    seen = min(noise_floor(t, hidden), noise_floor(t, stage.measured[0] - mean))
-    stage.raster_error = np.sqrt(np.maximum(rms(stage, hidden) ** 2 - seen**2, 0.0))
-    stage.lost = hidden[None]
+    # the part of the hidden error that moves too slowly to be seen as noise in the stage's error; two estimates of one
+    # noise are one noise
+    drawn = float(np.mean([noise_floor(t, h) for h in hidden]))
+    own = noise_floor(t, without_jumps(stage, stage.measured[0] - mean))
+    seen = own if own < (1.0 + KNOWN_TO) * drawn else drawn
+    whole = np.mean([rms(stage, h[None]) ** 2 for h in hidden], axis=0)
+    stage.raster_error = np.sqrt(np.maximum(whole - seen**2, 0.0))
+    stage.lost = hidden[:, None]
     return stage

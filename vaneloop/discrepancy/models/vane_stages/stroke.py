@@ -19,21 +19,29 @@ __all__ = ["SMOOTH", "Smooth", "without_noise"]
 
 SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
 SMOOTH_ORDER = 3
+AROUND = 1.0  # s: over which what smoothing bends is told from noise
 BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
 
 
 class Smooth(NamedTuple):
-    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); errors (mm) such as it leaves, and as
-    smoothing makes.
+    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); over how many rows it is smoothed; errors
+    (mm) such as smoothing makes; RMS (mm) of what the model of the motion is off by from row to row.
 
     off: mm, the logged stroke less the fitted model's, whose motion is mostly gone.
     """
 
     stroke: Array
     noise: float
-    left: Array
+    rows: int
     distortion: Array
+    uneven: Array
     off: Array
+
+    def left(self, draw: np.random.Generator) -> Array:
+        """Error (mm) such as noise and model leave in the stroke at the rows: one draw."""
+        noise = self.noise * draw.standard_normal(len(self.off))
+        uneven = self.uneven * draw.standard_normal(len(self.off))
+        return np.asarray(savgol_filter(noise, self.rows, SMOOTH_ORDER) + uneven)
 
 
 def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
@@ -69,9 +77,35 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
     _, rows, size, smooth = min(tried, key=lambda x: x[0])
     noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
-    left = savgol_filter(noise * np.random.default_rng(1).standard_normal(len(t)), rows, SMOOTH_ORDER)
-    distortion = smooth - savgol_filter(off, rows // 4 * 2 + 1, SMOOTH_ORDER)
-    fast = np.abs(distortion) > 2.0 * noise  # rather noisy than wrong
-    return Smooth(
-        np.where(fast, c["x_lvdt"], model + smooth), noise, left, np.where(fast, off - smooth, distortion), off
+    half = rows // 4 * 2 + 1
+    differs = smooth - savgol_filter(off, half, SMOOTH_ORDER)
+    fast = np.abs(differs) > 2.0 * noise  # rather noisy than wrong
+    wide, narrow, as_is = savgol_coeffs(rows, SMOOTH_ORDER), np.zeros(rows), np.zeros(rows)
+    narrow[(rows - half) // 2 : (rows + half) // 2] = savgol_coeffs(half, SMOOTH_ORDER)
+    as_is[rows // 2] = 1.0
+    around = int(round(AROUND / dt))
+    bent = np.maximum(
+        _above_noise(differs, wide - narrow, noise, around), _above_noise(off - smooth, as_is - wide, noise, around)
     )
+    distortion = differs * np.sqrt(bent / np.maximum(uniform_filter1d(differs**2, around), 1e-300))
+    # and what the model of the motion leaves at each row, in proportion to how fast the motion changes: least squares
+    jerky = uniform_filter1d((calibrated - uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around)
+    weights = as_is - wide
+    more = (off - smooth) ** 2 - float(weights @ weights) * noise**2 - bent
+    share = max(0.0, float(more[whole] @ jerky[whole]) / max(float(jerky[whole] @ jerky[whole]), 1e-300))
+    uneven = np.sqrt(share * jerky)
+    stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
+    return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+def _above_noise(values: Array, weights: Array, noise: float, around: int) -> Array:
+    """Mean square of ``values`` over ``around`` rows above what white noise gives them; 0 where it may be noise.
+
+    ``values`` are the logged ones under a filter of these ``weights`` w, which leaves noise^2 sum(w^2) of white noise.
+    The mean square of that scatters by sqrt(2 / around sum(rho^2)) of it, rho the autocorrelation of the weights; what
+    is above by three times as much is not noise.
+    """
+    alike = np.correlate(weights, weights, "full") / (weights @ weights)
+    chance = noise**2 * float(weights @ weights)
+    power = uniform_filter1d(values**2, around)
+    return np.where(power > chance * (1.0 + 3.0 * np.sqrt(2.0 / around * float(alike @ alike))), power - chance, 0.0)
