@@ -53,6 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)"
     )
     options.add_tables_option(parser)
+    options.add_controller_options(parser)
     parser.add_argument(
         "--geometry",
         metavar="F.toml",
@@ -62,6 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", metavar="F.html", help="write a self-contained HTML page with plots")
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from hil.loop.lockstep import warm_up

@@ -41,10 +41,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
     options.add_machine_options(parser)
+    options.add_controller_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run what ``args`` ask for; return the exit code."""
     known = library()
