@@ -54,8 +54,8 @@ def header() -> str:
     return f"""\
 /* The interface between VaneLoop and a controller of your own. C99, no dependency. docs/own_controller.md explains it.
  *
- * Build:  gcc -std=c99 -O2 -fPIC -shared -o controller.so controller.c -lm
- * Run:    vaneloop run --bus lockstep --controller ./controller.so
+ * Build:  gcc -std=c99 -O2 -fPIC -shared -o my_controller.so controller.c -lm
+ * Run:    vaneloop run --bus lockstep --controller ./my_controller.so
  *
  * Units are SI, speeds in % of design speed; positive current extends. Every number is a double. The tick is 1 ms; a
  * frame of the ECU comes every 10 ms. There is no clock: time is an argument. Each simulated loop gets a copy of the

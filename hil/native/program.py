@@ -170,8 +170,12 @@ class Program:
 _KEPT: dict[int, tuple[ctypes.CDLL, _Calibration, Calibration]] = {}  # what a running controller reads, by its memory
 
 
-def save(foreign: Foreign) -> bytes | None:
-    """The controller's whole state; None where it has no vaneloop_save and vaneloop_restore."""
+def save(foreign: Any) -> bytes | None:
+    """The whole state of a controller (`Foreign`); None where it has no vaneloop_save and vaneloop_restore, and of the
+    firmware here.
+    """
+    if not foreign:
+        return None
     library = _KEPT[foreign.at_fed][0]
     if not (hasattr(library, "vaneloop_save") and hasattr(library, "vaneloop_restore")):
         return None
@@ -182,7 +186,7 @@ def save(foreign: Foreign) -> bytes | None:
     return room.raw
 
 
-def restore(foreign: Foreign, state: bytes) -> None:
+def restore(foreign: Foreign, state: bytes | None) -> None:
     """Give the controller a state that `save` took."""
     library = _KEPT[foreign.at_fed][0]
     library.vaneloop_restore.argtypes = [ctypes.c_void_p]
