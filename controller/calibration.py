@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import model_validator
@@ -42,11 +42,13 @@ class Calibration(NamedTuple):
     k       float64[n] of `records.SCALARS`, SI; ``scalars``: their record
     table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
     angles  float64[1 + stages, m]: stroke (m), then the angle (rad) of each stage at it in the middle of the play
+    program a controller of the user's own, to be flashed with it (`hil.native.Program`); None: the firmware here
     """
 
     k: np.ndarray
     table: np.ndarray
     angles: np.ndarray
+    program: Any = None
 
     @property
     def vanes(self) -> tuple[str, ...]:

@@ -20,9 +20,9 @@ from numba.extending import overload
 from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = [
-    "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OUTPUTS", "OUTPUT_FIELDS", "SCALARS", "SCALAR_FIELDS",
-    "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs", "as_scalars", "as_state",
-    "flat", "flat_names", "kind", "record", "state_rows",
+    "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OBSERVABLE_FIELDS", "OUTPUTS", "OUTPUT_FIELDS",
+    "SCALARS", "SCALAR_FIELDS", "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs",
+    "as_scalars", "as_state", "flat", "flat_names", "kind", "record", "state_rows",
 ]  # fmt: skip
 
 Record = Any  # a numpy.record: its fields are attributes, which the types of numpy do not know
@@ -211,6 +211,13 @@ STATE_FIELDS = (
     Field("learned_up", "s", "learned on side +1", _vanes("learned_up")),
     Field("learned_down", "s", "learned on side -1", _vanes("learned_down")),
 )
+
+# what a controller of the user's own may show of itself (docs/own_controller.md); the same names in its state here
+OBSERVED = (
+    "n_dem", "n_r_raw", "n_r", "direction", "blend", "x_target", "x_from", "x_meas", "x_servo", "integral", "saturated",
+    "speed", "side", "crossing", "offset_in_use", "width_in_use",
+)  # fmt: skip
+OBSERVABLE_FIELDS = tuple(f for name in OBSERVED for f in STATE_FIELDS if f.name == name)
 
 
 def flat_names(fields: tuple[Field, ...]) -> tuple[str, ...]:

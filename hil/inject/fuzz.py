@@ -45,6 +45,7 @@ from hil.bus.frames import (
 )
 from hil.logs.signals import e2e_crc
 from hil.loop.node import MOST_SENT, Node, NodeArrays, node_tick
+from hil.native.program import restore, save
 from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
 
@@ -309,16 +310,35 @@ class Bench:
         plant: Plant | None = None,
         calibration: Calibration | None = None,
     ):
-        self.node = Node(plant, calibration, n_r=60.0, seed=0)
+        self._made = plant, calibration
+        self.node = self._node()
         self.recovery = recovery
         k = self.node.loop.built.scalars
         self.limits = np.array([k.current_limit, k.stroke_min, k.stroke_max]) if limits is None else limits
         self.noise = np.random.Generator(np.random.PCG64(0)).standard_normal((NOISE_ROWS, len(self.node.loop.sigma)))
         self.transitions, self.ticks_in = np.zeros((5, 5), np.int64), np.zeros(5, np.int64)
         self._sent = np.zeros((MOST_SENT, 2), np.int64)
-        self._cold = self._saved()
+        self._cold, self._cold_program = self._saved(), save(self.node.loop.foreign)
         self._watch(0, WARM, WARM, np.arange(0, WARM, 10), good_frames(0, WARM // 10))
-        self._warm = self._saved()
+        self._warm, self._warm_program = self._saved(), save(self.node.loop.foreign)
+
+    def _node(self) -> Node:
+        plant, calibration = self._made
+        return Node(plant, calibration, n_r=60.0, seed=0)
+
+    def _to_start(self, warm: bool) -> None:
+        """Put everything back to switch-on, or to a controller that has run on good frames for `WARM` ticks."""
+        program = self._warm_program if warm else self._cold_program
+        foreign = self.node.loop.foreign
+        if foreign and program is None:  # it cannot be put back: a new copy of it
+            self.node = self._node()
+            if warm:
+                self._watch(0, WARM, WARM, np.arange(0, WARM, 10), good_frames(0, WARM // 10))
+            return
+        for there, then in zip(self._arrays(), self._warm if warm else self._cold, strict=True):
+            there[:] = then
+        if foreign:
+            restore(foreign, program)
 
     def _arrays(self) -> list[np.ndarray]:
         a = self.node.arrays
@@ -336,8 +356,7 @@ class Bench:
 
     def run(self, attack: Attack) -> tuple[int, int, int]:
         """Run one episode; return what failed (`CLAIMS`), the tick, and the ticks that recovery took."""
-        for there, then in zip(self._arrays(), self._warm if attack.warm else self._cold, strict=True):
-            there[:] = then
+        self._to_start(attack.warm)
         end = attack.end + self.recovery
         at = np.concatenate([attack.at, np.arange(attack.end, end, 10)])
         rows = np.concatenate([attack.rows, good_frames(attack.counter, len(at) - len(attack.at))])

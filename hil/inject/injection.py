@@ -50,9 +50,11 @@ from hil.inject.actions import (
     Send,
     identifier,
 )
+from hil.inject.any_controller import Reactions, expected_of_any
 from hil.inject.scenario import COUNTS, Expect, Scenario, library, load_scenario
 from hil.inject.tamper import Gateway, Intruder, tick_of
-from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, judge, outcome_of
+from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, failed, judge, outcome_of
+from hil.native.isolation import ControllerFailed, isolated
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 
@@ -178,6 +180,7 @@ def _lockstep(
     plant: Plant | None,
     calibration: Calibration | None,
     progress: Callable[[float], None] | None,
+    reactions: Reactions | None,
 ) -> Outcome:
     """Run a scenario in simulated time."""
     from hil.bus.lockstep_bus import Channel
@@ -256,7 +259,11 @@ def _lockstep(
         dict(zip(heard, late.T, strict=True)),
         (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
         float(cal.current_limit) * 1e3,
+        ours=reactions is None,
     )
+    if reactions is not None:
+        of_any = reactions.limits
+        trace.stroke, trace.current = (of_any.stroke_min.value, of_any.stroke_max.value), of_any.current.value
     wall = time.perf_counter() - started
     return outcome_of(
         name,
@@ -400,16 +407,32 @@ def run(
     calibration: Calibration | None = None,
     name: str | None = None,
     progress: Callable[[float], None] | None = None,
+    reactions: Reactions | None = None,
+    save_crash: str | None = None,
 ) -> Outcome:
     """Run a scenario and judge it.
 
     scenario  a `Scenario`, the name of a shipped one, or a TOML file
     bus       ``lockstep``, or a bus on which a controller and an ECU run (``local``, ``vcan0``)
-    plant, calibration  on lockstep: other than the shipped tables
+    plant, calibration  on lockstep: other than the shipped tables; a controller of the user's own in ``calibration``
+                        runs in a process of its own
+    reactions   judge the scenarios that it names by what must be seen of any controller (`hil.inject.any_controller`)
+    save_crash  file for the inputs of a controller of the user's own that fails (`hil.native.crash_log`)
     Raises InputError for what cannot be read, or cannot be done on this bus.
     """
     made = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     called = name or (Path(str(scenario)).stem if not isinstance(scenario, Scenario) else "scenario")
+    if reactions is not None and called in reactions.reactions:
+        made = expected_of_any(called, made, reactions)
     if bus == "lockstep":
-        return _lockstep(called, made, plant, calibration, progress)
+
+        def go() -> Outcome:
+            return _lockstep(called, made, plant, calibration, progress, reactions)
+
+        if calibration is None or calibration.program is None:
+            return go()
+        try:
+            return isolated(go, save_crash)
+        except ControllerFailed as e:
+            return failed(called, made, str(e))
     return _on_bus(called, made, bus, progress)

@@ -10,6 +10,9 @@ Installed with VaneLoop; nothing has to be imported or configured::
     def test_my_own_bad_day(sil):
         outcome = sil.run(sil.Drop(start=2.0, duration=0.1), duration=4.0)
         assert outcome.mode_at(2.06) == "DEGRADED" and outcome.mode == "RUN"
+
+``pytest --vaneloop-controller PATH.so`` runs a controller of the user's own in its place (docs/own_controller.md);
+shipped scenarios are then judged by what must be seen of any controller, ``--vaneloop-reactions F.toml``.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
     from hil.inject.actions import AnyAction
     from hil.inject.scenario import Expect, Scenario
 
-__all__ = ["Sil", "sil"]
+__all__ = ["Sil", "pytest_addoption", "sil"]
 
 
 class Sil:
@@ -32,8 +35,8 @@ class Sil:
     attributes (``sil.Drop``).
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, folder: Path, controller: str | None = None, reactions: str | None = None):
+        self.folder, self.controller, self.reactions = folder, controller, reactions
 
     def __getattr__(self, name: str) -> Any:
         """Give an action or `Expect` by its name in `hil.inject`."""
@@ -64,10 +67,21 @@ class Sil:
             name = "scenario"
         if changes:
             scenario = inject.Scenario.model_validate({**scenario.model_dump(), **changes})
-        outcome = inject.run(scenario, name=name)
+        outcome = inject.run(scenario, name=name, **self._of_own_controller())
         if not outcome.held:
             pytest.fail(outcome.text(), pytrace=False)
         return outcome
+
+    def _of_own_controller(self) -> dict[str, Any]:
+        """What `hil.inject.run` takes for a controller of the user's own."""
+        if self.controller is None:
+            return {}
+        from controller import load_calibration
+        from hil.inject.any_controller import SHIPPED, load_reactions
+        from hil.native import Program
+
+        calibration = load_calibration()._replace(program=Program(self.controller))
+        return {"calibration": calibration, "reactions": load_reactions(self.reactions or SHIPPED)}
 
     def run(self, *actions: AnyAction, duration: float, expect: list[Expect] | None = None, **keys: Any) -> Outcome:
         """Run actions as a scenario of ``duration`` s; ``keys`` are others of `Scenario` (``demand``, ``seed``). Fails
@@ -88,4 +102,12 @@ def sil(request: pytest.FixtureRequest) -> Sil:
     """Software in the loop: run a scenario of frame and fault injection and fail where the controller did not react as
     it must.
     """
-    return Sil(request.path.parent)
+    option = request.config.getoption
+    return Sil(request.path.parent, option("--vaneloop-controller"), option("--vaneloop-reactions"))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Declare the options of the plugin."""
+    group = parser.getgroup("vaneloop", "VaneLoop: software in the loop")
+    group.addoption("--vaneloop-controller", metavar="PATH.so", help="controller that the fixture sil runs")
+    group.addoption("--vaneloop-reactions", metavar="F.toml", help="limits and reactions by which it is judged")

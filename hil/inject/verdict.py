@@ -14,7 +14,7 @@ import numpy as np
 from controller import FAULTS, MODES
 from hil.inject.scenario import Expect, Scenario
 
-__all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "judge", "outcome_of"]
+__all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "failed", "judge", "outcome_of"]
 
 # docs/controller.md, "Modes": these and no others
 TRANSITIONS = frozenset({
@@ -52,6 +52,7 @@ class Trace:
     stroke: tuple[float, float] = (0.0, 48.0)
     current: float = 40.0
     exact: bool = True  # every tick was seen, not only what frames say
+    ours: bool = True  # of the firmware here, whose mode changes are documented
 
     def truth(self, claim: Expect) -> np.ndarray | None:
         """Whether the claim's condition holds, sample by sample; None where this bus does not show it."""
@@ -138,7 +139,7 @@ def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Ch
         seen = f"{np.min(values):.4g} to {np.max(values):.4g} {unit}" if len(values) else "nothing"
         checks.append(Check(f"always {least:g} <= {name} <= {most:g} {unit}", seen, good and len(values) > 0))
     changes = [(MODES[a], MODES[b]) for a, b in zip(trace.mode, trace.mode[1:], strict=False) if a != b]
-    if trace.exact:
+    if trace.exact and trace.ours:
         wrong = [f"{a} > {b}" for a, b in changes if (a, b) not in TRANSITIONS]
         checks.append(
             Check(
@@ -148,6 +149,13 @@ def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Ch
             )
         )
     return checks
+
+
+def failed(name: str, scenario: Scenario, why: str) -> Outcome:
+    """Outcome of a scenario in which the controller ended its process (``why``): nothing else is known of it."""
+    nothing = Trace(np.zeros(1), np.zeros(1, np.int8), np.zeros(1, np.int64), {}, ours=False)
+    checks = [Check("the controller runs to the end", why, False)]
+    return Outcome(name, scenario.title, "lockstep", checks, nothing, [(0.0, MODES[0])], [], {}, [], 0.0, 0.0, None)
 
 
 @dataclass(frozen=True)

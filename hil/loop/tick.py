@@ -13,12 +13,13 @@ while the loop runs acts from the next tick on; `plant.parameters.derive` must f
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from controller import Calibration, give, new_inputs, new_outputs, new_state, tick
+from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state, state_rows
+from hil.native.call import firmware
 from plant import Plant, chain, places
 from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place, inlined
@@ -51,6 +52,7 @@ class Loop(NamedTuple):
                  (rad; NaN = not fitted), stage by stage, a row every 10 ms, the last one held
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
+    foreign      a controller of the user's own (`hil.native.call.Foreign`); (): the firmware here
     """
 
     inputs: np.ndarray
@@ -68,6 +70,7 @@ class Loop(NamedTuple):
     angles: np.ndarray
     pots: np.ndarray
     sent: np.ndarray
+    foreign: Any = ()
 
     @property
     def fed(self) -> Record:
@@ -101,12 +104,13 @@ def new_loop(
     same_stages(geometry=plant.vanes, vane_angles=calibration.vanes)
     stages = len(plant.vanes)
     cal = flashed(calibration, plant)
+    foreign = () if calibration.program is None else calibration.program.start(cal)
     stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
     return Loop(
         new_inputs(),
         new_outputs(),
         new_state(),
-        calibration,
+        calibration._replace(program=None),
         cal,
         plant.p[list(CHANGED_BY), 0],
         plant.start(stroke=stroke, n_r=n_engine, t_oil=t_oil),
@@ -118,13 +122,14 @@ def new_loop(
         np.zeros(stages),
         np.empty((0, 2 * stages)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
         np.full((KEPT, 4), np.nan),
+        foreign,
     )
 
 
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
-    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
-    _flash(calibration, cal, np.empty(3), plant.p)
+    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy(), program=None)
+    _flash(calibration._replace(program=None), cal, np.empty(3), plant.p)
     return cal
 
 
@@ -201,8 +206,7 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
         for q in range(a.angles.shape[0]):
             inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
-    tick(a.inputs, a.z, a.calibration)
-    give(a.z, a.outputs)
+    firmware(a.inputs, a.outputs, a.z, a.calibration, a.foreign)
     a.mean[0] += as_outputs(a.outputs).i_cmd
     a.mean[1] += 1.0
 

@@ -7,7 +7,7 @@ import sys
 
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model, replay
-from vaneloop.cli.options import chain_of
+from vaneloop.cli.options import chain_of, guarded
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -30,6 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     own_model.add_options(parser)
 
 
+@guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     if own_model.asked(args):
@@ -78,7 +79,7 @@ def command(args: argparse.Namespace) -> int:
             terminal.say(args, f"page: {answer.report(report, words)}")
             report = None
     args.report = report
-    return replay.command(args, {"stages": stages, **extra}, floors)
+    return replay.replayed(args, {"stages": stages, **extra}, floors)
 
 
 def _own(args: argparse.Namespace) -> int:

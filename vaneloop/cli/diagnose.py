@@ -30,11 +30,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     add_machine_options(parser)
+    options.add_controller_options(parser)
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.base.errors import InputError

@@ -53,6 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)"
     )
     options.add_tables_option(parser)
+    options.add_controller_options(parser)
     parser.add_argument(
         "--geometry",
         metavar="F.toml",
@@ -61,6 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     terminal.add_output_options(parser, report=True)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from hil.loop.lockstep import warm_up

@@ -56,6 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="s within which RUN must be back (default 2.5)",
     )
     options.add_machine_options(parser)
+    options.add_controller_options(parser)
     parser.epilog = """examples:
   vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
   vaneloop fuzz --replay fuzz_failure.log
@@ -64,6 +65,7 @@ exit codes: 0 everything held, 1 something did not, 2 bad input"""
     terminal.add_output_options(parser)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run ``vaneloop fuzz``."""
     if args.frames < 1:

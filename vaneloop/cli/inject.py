@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hil.inject.any_controller import SHIPPED, load_reactions
 from hil.inject.injection import cannot, lacks, run
 from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
@@ -22,6 +23,7 @@ examples:
   vaneloop inject demand_stops               one of them
   vaneloop inject --all --junit inject.xml   all of them, for continuous integration
   vaneloop inject MY_DAY.toml                your own (docs/injection.md)
+  vaneloop inject --all --controller FW.so --junit fw.xml   a controller of your own (docs/own_controller.md)
   vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
 
 On lockstep (default) controller, ECU and bus run in simulated time, bit for bit the same every time. On another bus
@@ -41,6 +43,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
     options.add_machine_options(parser)
+    options.add_controller_options(parser)
+    parser.add_argument(
+        "--reactions",
+        metavar="F.toml",
+        help="limits and fail-safe times that count for any controller, instead of the scenarios' own claims; with "
+        "--controller the shipped any_controller.toml is the default",
+    )
     terminal.add_output_options(parser)
     parser.add_argument("--junit", metavar="FILE", help="write the result as JUnit XML, one test case a scenario")
 
@@ -67,6 +76,13 @@ def command(args: argparse.Namespace) -> int:
         from hil.loop.lockstep import warm_up
 
         warm_up(lambda text: terminal.say(args, text))
+    if args.bus != "lockstep" and (args.controller or args.reactions):
+        raise InputError(f"--controller and --reactions are for --bus lockstep; on {args.bus} give vaneloop run yours")
+    if args.save_crash is not None and (args.controller is None or not args.save_crash.endswith(".parquet")):
+        raise InputError(f"--save-crash {args.save_crash}: must end with .parquet, and needs --controller")
+    reactions = None
+    if args.controller or args.reactions:
+        reactions = load_reactions(args.reactions or SHIPPED)
     outcomes, skipped = [], []
     with terminal.progress_bar(args, "injecting") as progress:
         for i, (name, scenario) in enumerate(made):
@@ -88,10 +104,17 @@ def command(args: argparse.Namespace) -> int:
                     calibration=machine.calibration,
                     name=name,
                     progress=told,
+                    reactions=reactions,
+                    save_crash=args.save_crash and _crash_file(args.save_crash, name, len(made) > 1),
                 )
             )
     _report(args, outcomes, skipped)
     return 0 if all(o.held for o in outcomes) else 1
+
+
+def _crash_file(file: str, name: str, several: bool) -> str:
+    """Name of a scenario's crash log."""
+    return str(Path(file).with_name(f"{Path(file).stem}_{name}.parquet")) if several else file
 
 
 def _list(args: argparse.Namespace, known: dict[str, Path]) -> int:

@@ -5,7 +5,9 @@ stages.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,14 @@ from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
     "CAN_SUFFIXES",
+    "add_controller_options",
     "add_log_options",
     "add_machine_options",
     "add_plant_option",
     "add_reading_options",
     "add_tables_option",
     "chain_of",
+    "guarded",
     "log_options",
     "machine_of",
     "parts_to_test",
@@ -136,6 +140,48 @@ def add_plant_option(group: Any) -> None:
     )
 
 
+def add_controller_options(parser: Any) -> None:
+    """Declare ``--controller`` and ``--save-crash``; the command's function must be `guarded`."""
+    group = parser.add_argument_group("a controller of your own (docs/own_controller.md)")
+    group.add_argument(
+        "--controller",
+        metavar="PATH.so",
+        help="run this shared library in place of the firmware; vaneloop new-controller writes one to begin with",
+    )
+    group.add_argument(
+        "--save-crash",
+        metavar="F.parquet",
+        help="where the controller fails, keep its inputs of every tick: vaneloop replay F.parquet --controller "
+        "PATH.so runs to the same failure",
+    )
+
+
+def guarded(command: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """Run a command with ``--controller`` in a process of its own: where the controller fails, one line says how, and
+    the exit code is 1.
+    """
+
+    @wraps(command)
+    def run(args: argparse.Namespace) -> int:
+        if args.controller is None:
+            if args.save_crash is not None:
+                raise InputError(
+                    f"--save-crash {args.save_crash}: needs --controller; the firmware here does not crash"
+                )
+            return command(args)
+        from hil.native.isolation import ControllerFailed, isolated
+
+        if args.save_crash is not None and not args.save_crash.endswith(".parquet"):
+            raise InputError(f"--save-crash {args.save_crash}: must end with .parquet")
+        try:
+            return isolated(lambda: terminal.run(lambda: command(args)), args.save_crash)
+        except ControllerFailed as e:
+            print(f"vaneloop: {e}", file=sys.stderr)
+            return 1
+
+    return run
+
+
 def tables_of(args: argparse.Namespace, tell: bool = False) -> dict[str, str]:
     """File of each table, by name without suffix: from the folder ``--tables`` or the shipped one; ``tell`` says
     which.
@@ -154,7 +200,11 @@ def machine_of(args: argparse.Namespace, model: Any = None, strategy: str | None
     """The machine that ``--tables`` and ``model`` (default: ``--model``) describe."""
     named = getattr(args, "model", None) or None
     return Machine(
-        getattr(args, "tables", None), named if model is None else model, strategy, getattr(args, "plant", None)
+        getattr(args, "tables", None),
+        named if model is None else model,
+        strategy,
+        getattr(args, "plant", None),
+        getattr(args, "controller", None),
     )
 
 

@@ -13,7 +13,7 @@ from vaneloop.base import terminal
 from vaneloop.cli import options
 from vaneloop.verbs.replay import replay
 
-__all__ = ["DESCRIPTION", "add_options", "command"]
+__all__ = ["DESCRIPTION", "add_options", "command", "replayed"]
 
 DESCRIPTION = """Replay a logged engine run through the controller's firmware and the plant.
 
@@ -38,6 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)",
     )
     options.add_machine_options(group)
+    options.add_controller_options(parser)
     group.add_argument(
         "--tolerance",
         metavar="signal=value",
@@ -52,7 +53,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def command(
+@options.guarded
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    if args.controller is not None:
+        from hil.native.crash_log import is_crash_log
+
+        if is_crash_log(args.log):
+            return _crash_again(args)
+    return replayed(args)
+
+
+def _crash_again(args: argparse.Namespace) -> int:
+    """Run a controller on the inputs on which one failed before; where it fails again, that ends this process."""
+    from hil.native import Program, crash_log
+
+    rows, about, calibration = crash_log.read(args.log)
+    terminal.say(args, f"{args.log}: {len(rows):,} ticks from power-on; then: {about['failure']}")
+    crash_log.feed(rows, calibration, Program(args.controller))
+    terminal.say(args, f"{args.controller} does not fail on these inputs")
+    terminal.write_json(args, {"schema": 1, "log": args.log, "ticks": len(rows), "then": about["failure"]})
+    return 0
+
+
+def replayed(
     args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None
 ) -> int:
     """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit

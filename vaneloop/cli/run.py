@@ -56,6 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
     options.add_machine_options(parser)
+    options.add_controller_options(parser)
     parser.add_argument(
         "--start-speed",
         metavar="N",
@@ -77,6 +78,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.base.errors import InputError

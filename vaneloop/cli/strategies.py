@@ -66,6 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             f"--{name}", type=float, metavar=meta, default=default, help=f"{text} (default {default:g})"
         )
     options.add_tables_option(parser)
+    options.add_controller_options(parser)
     parser.add_argument("--seed", type=int, default=1, help="seed of the sensors' noise (default 1)")
     terminal.add_output_options(parser, report=True)
 
@@ -81,6 +82,7 @@ def _checked(args: argparse.Namespace) -> None:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from hil.loop.lockstep import warm_up

@@ -47,6 +47,7 @@ class Machine:
     model     model file (or `plant.Model`) with recalibrated parameters and effects beyond the nominal machine
     strategy  control strategy, one of `controller.STRATEGIES`; None: the calibration's
     table     plant table in place of that of ``tables``, such as plant_electromechanical.toml
+    controller  shared library of the user's own in place of the firmware here (docs/own_controller.md)
 
     A wrong folder, table or model raises InputError when the machine is made.
     """
@@ -55,6 +56,7 @@ class Machine:
     model: str | Path | Model | None = None
     strategy: str | None = None
     table: str | Path | None = None
+    controller: str | Path | None = None
 
     def __post_init__(self) -> None:
         """Read what is named, so that a wrong name, or tables of different stages, are refused here."""
@@ -86,7 +88,12 @@ class Machine:
         from controller import load_calibration
 
         f = self.files
-        return load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"])
+        made = load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"])
+        if self.controller is None:
+            return made
+        from hil.native import Program
+
+        return made._replace(program=Program(str(self.controller)))
 
     def _built(self, model: Model | None) -> Plant:
         from plant import build_plant

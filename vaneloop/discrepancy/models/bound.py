@@ -153,13 +153,13 @@ class Bound:
             regimes=regimes, regime_units=units,
         )  # fmt: skip
         if self.like is None:
-            known = len(s.parameters) + len(starts)
+            unknowns = len(s.parameters) + len(starts)
             given = self.stage.neutral()
-            given[:known] = [p.value for p in (*s.parameters, *starts)]
-            self._scan_starts(given, list(range(len(s.parameters), known)))
+            given[:unknowns] = [p.value for p in (*s.parameters, *starts)]
+            self._scan_starts(given, list(range(len(s.parameters), unknowns)))
             begins = np.repeat(given[None], 1 + len(self.others), axis=0)
             for begin, other in zip(begins[1:], self.others, strict=True):
-                begin[:known] = other
+                begin[:unknowns] = other
             self.stage.begins = None if self.values else begins  # a model file's values are better than these
             self.floor: Array = np.hypot(self.data.noise(), self._carried(self.stage.neutral()))
             self.stage.floor = self.floor

@@ -34,6 +34,7 @@ from vaneloop.discrepancy.models.vane_stages.demand import demand_stage
 from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.engine import engine_stage
 from vaneloop.discrepancy.models.vane_stages.linkage import linkage_stage
+from vaneloop.discrepancy.models.vane_stages.own_controller import own_demand_stage
 from vaneloop.discrepancy.models.vane_stages.raster import (
     RASTER,
     SETTLE,
@@ -99,6 +100,7 @@ def build_chain(
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
     cal = flashed(tables, machine)
+    theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
     t, columns, fresh, lacking, notes = on_raster(log)
     if len(t) < 500:
         raise LogError(
@@ -140,7 +142,7 @@ def build_chain(
     if {"x_lvdt", "i_cmd"} <= columns.keys():
         smooth = without_noise(t, have, machine)
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
-        if "x_dem" in columns:
+        if "x_dem" in columns and not theirs:
             law, *off = servo_law(t, have, cal, smooth)
             what = other_current(t, have, law, run, cal)
             if what:
@@ -168,8 +170,15 @@ def build_chain(
         "actuator": (("i_cmd",), ("x_lvdt",), actuator_stage),
         "linkage": (("x_lvdt",), machine.vanes, linkage_stage),
     }
+    if theirs:
+        cal = cal._replace(program=tables.program)
+        makers["demand"] = (("n_dem", "n_r"), ("x_dem",), own_demand_stage)
+        del makers["servo"]
     stages, absent = [], {}
     for name in STAGE_ORDER:
+        if name not in makers:
+            absent[name] = "a controller of your own gives its current for its own demand, not for the logged one"
+            continue
         needs, gives, make = makers[name]
         missing = [c for c in needs if c not in columns]
         outputs = tuple(c for c in gives if c in columns)
