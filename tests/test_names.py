@@ -125,7 +125,8 @@ def test_a_rival_that_another_stage_refutes_goes():
     alone = answers(reading("actuator", ("lvdt_bias", "end_stop"), 1.0))["actuator"].effects[0]
     assert {alone.effect, *alone.rivals} == {"lvdt_bias", "end_stop"}
     both = answers(reading("actuator", ("lvdt_bias", "end_stop"), 1.0), reading("linkage", ("lvdt_bias",), 0.0))
-    assert [(f.effect, f.rivals, f.probability) for f in both["actuator"].effects] == [("end_stop", [], 1.0)]
+    assert [(f.effect, f.rivals) for f in both["actuator"].effects] == [("end_stop", [])]
+    assert both["actuator"].effects[0].evidence["share"] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_name_without_a_rival_that_another_stage_refutes_is_none():

@@ -288,8 +288,8 @@ class ErrorShare:
             share = float(wins) / (1.0 + len(rivals))
             gained = float(rest.held_out.sum() - fit.held_out.sum())
             shares = {name: share} | dict.fromkeys(rivals, share)
-            found = Found(name, share, parameters_of(stage, fit, name), rivals, gained, alternatives, shares)
-            out.append(found)
+            fall = rms_of(judge, rest) / max(rms_of(judge, fit), 1e-300)
+            out.append(Found(name, share, parameters_of(stage, fit, name), rivals, gained, alternatives, shares, fall))
         return out
 
     def conclude(
@@ -315,6 +315,7 @@ class ErrorShare:
             out.refused = [f"{named} comes nearest and leaves {np.sqrt(share):.0%} of the error"]
         else:
             out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
+        out.criterion = "error_share"
         out.notes, out.gain = self.notes, "fall of the held-out error [%]"
         return out
 

@@ -172,6 +172,7 @@ class NoiseFloor:
         leading = [c.effect for c in candidates if c.effect not in chosen][:10]
         correlation = correlation_of(judge, current)
         said: dict[str, tuple[list[str], float, dict[str, Fit], dict[str, float]]] = {}
+        falls: dict[str, float] = {}
         for name in chosen:
             rest = tuple(c for c in current.effects if c != name)
             _widen_steps(judge, current, name, correlation)
@@ -197,7 +198,9 @@ class NoiseFloor:
                 best = next((m for m in others if as_good[m] and not at_bound(judge.stage, alternatives[m], m)), best)
             alternatives = {m: f for m, f in alternatives.items() if m == best or not at_bound(judge.stage, f, m)}
             current = alternatives[best]
-            nats = gain(judge, search.joined(rest) if rest else search.base, current, correlation)[0]
+            before = search.joined(rest) if rest else search.base
+            nats = gain(judge, before, current, correlation)[0]
+            falls[best] = rms_of(judge, before) / max(rms_of(judge, current), 1e-300)
             freer = {m: freedom[m] - freedom[best] for m in alternatives}
             rivals = [
                 m for m, f in alternatives.items() if m != best and not _worse(judge, f, current, correlation, freer[m])
@@ -208,7 +211,8 @@ class NoiseFloor:
             said[best] = (with_rivals(best, rivals, shares), nats, alternatives, shares)
         found = []
         for m, (rivals, nats, tried_fits, shares) in said.items():
-            found.append(Found(m, shares[m], parameters_of(judge.stage, current, m), rivals, nats, tried_fits, shares))
+            sizes = parameters_of(judge.stage, current, m)
+            found.append(Found(m, shares[m], sizes, rivals, nats, tried_fits, shares, falls[m]))
             if m in judge.stage.twins:
                 cause, run = judge.stage.twins[m]
                 other = Judge(replace(judge.stage, run=run), judge.floor, judge.valid)
@@ -257,6 +261,7 @@ class NoiseFloor:
         else:
             verdict = "none"
         out = answer_of(judge, verdict, base, current, effects, steps, candidates, correlation)
+        out.criterion = "noise_floor"
         if verdict == "unknown":
             out.nearest = list(dict.fromkeys([*refused, *current.effects, *leading]))[:3]
             out.refused = [f"{name} {why}" for name, why in refused.items()]

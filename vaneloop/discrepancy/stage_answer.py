@@ -8,10 +8,11 @@ import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.trust import trust
 
 __all__ = [
     "Candidate", "Found", "StageDiagnosis", "answer_of", "at_bound", "found_of", "parameters_of", "recalibrated",
-    "rms_of", "rms_per_output",
+    "rms_of", "rms_per_output", "weigh",
 ]  # fmt: skip
 
 
@@ -34,8 +35,11 @@ class Candidate:
 class Found:
     """An effect named as missing.
 
+    probability  that it is what is missing, `vaneloop.discrepancy.trust`; that of each rival: `probabilities`
     fits         the stage's fit with it, and with each that was tried in its place
-    shares       the probability of each of these
+    shares       of each of these: how much speaks for it among them
+    fall         error without it over the error with it
+    evidence     what the probability follows from
     inseparable  what this log cannot tell from what the effect turns on ("time", "oil temperature")
     refused      why it comes nearest and yet is no answer; "": it is one
     """
@@ -47,6 +51,9 @@ class Found:
     nats: float
     fits: dict[str, Fit] = field(default_factory=dict, repr=False)
     shares: dict[str, float] = field(default_factory=dict, repr=False)
+    fall: float = 1.0
+    evidence: dict[str, float] = field(default_factory=dict)
+    probabilities: dict[str, float] = field(default_factory=dict)
     inseparable: list[str] = field(default_factory=list)
     refused: str = ""
 
@@ -73,12 +80,25 @@ class StageDiagnosis:
     nearest: list[str] = field(default_factory=list)  # where the verdict is unknown: the effects that come nearest
     refused: list[str] = field(default_factory=list)  # and why they are no answer, in words
     gain: str = "gain on held-out data [nats]"  # what `Candidate.nats` counts
+    criterion: str = ""  # what an effect had to do to be named: `vaneloop.discrepancy.trust.COEFFICIENTS`
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
 
 
 def rms_of(judge: Judge, fit: Fit) -> float:
     """RMS of the held-out error, in noise floors."""
     return float(np.sqrt(max(fit.held_out.sum(), 0.0) / max(judge.n, 1)))
+
+
+def weigh(d: StageDiagnosis) -> None:
+    """Give each effect of the answer, and each of its rivals, the probability that it is what is missing."""
+    left = float(np.max(d.error_after / d.floor))
+    for f in d.effects:
+        shares = {m: f.shares.get(m, 1.0) for m in (f.effect, *f.rivals)}
+        said = sum(shares.values())
+        f.evidence = {"left": left, "fall": f.fall, "share": said}
+        together = trust(d.criterion, f.evidence)
+        f.probabilities = {m: together * v / max(said, 1e-300) for m, v in shares.items()}
+        f.probability = f.probabilities[f.effect]
 
 
 def rms_per_output(judge: Judge, fit: Fit) -> Array:

@@ -18,7 +18,7 @@ from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.locate import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, as_close, correlation_of, significant
 from vaneloop.discrepancy.stage import Stage, StageError
-from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
 
 __all__ = [
     "Diagnosis", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
@@ -121,6 +121,8 @@ def diagnose(
                 progress((n + 1) / len(order))
     results = [done[i][0] for i in range(len(_WORK))]
     _agree({s.name: s for s in stages}, results)
+    for d in results:
+        weigh(d)
     shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
     verdicts = {d.verdict for d in results}
     verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
@@ -174,9 +176,10 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
                 for other in d.effects:
                     if other is not f:
                         other.parameters = parameters_of(stages[d.stage], fit, other.effect)
-            shares = {m: f.shares.get(m, 1.0) for m in left}
+            shares = {m: v for m, v in f.shares.items() if m in left or m not in options}  # the others are refuted
+            whole = max(sum(shares.values()), 1e-300)
             d.effects[k] = replace(
-                f, effect=name, rivals=left[1:], probability=shares[name] / max(sum(shares.values()), 1e-300),
+                f, effect=name, rivals=left[1:], shares={m: v / whole for m, v in shares.items()},
                 parameters=parameters_of(stages[d.stage], fit, name),
             )  # fmt: skip
 
@@ -258,7 +261,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
                 {
                     "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters,
                     "rivals": f.rivals,
-                    "inseparable": f.inseparable,
+                    "inseparable": f.inseparable, "probabilities": f.probabilities, "evidence": f.evidence,
                 }
             )  # fmt: skip
         recalibrated += s.recalibrated
