@@ -15,6 +15,8 @@ from tests.conftest import ROOT
 from tests.test_discrepancy import FLOOR, integrator
 from tests.test_your_own_model import STRAIGHT, T, cascade, noise, tanks, wave
 from vaneloop import Parameter, Record, System, unknown
+from vaneloop.discrepancy import Stage
+from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.workflow import compare_stages, diagnose
 from vaneloop.verbs.search import Diagnosed, Stages
 
@@ -177,3 +179,17 @@ def test_the_vane_chain_s_compare_and_diagnose_show_the_same_error_before() -> N
     log = vaneloop.read_log(ROOT / "examples" / "hidden_effect.parquet")
     compared = vaneloop.compare(log, fit=(0, 60))
     assert before(compared) == before(vaneloop.diagnose(log, fit=(0, 60)))
+
+
+def test_a_stage_begins_where_its_fit_may_begin_whoever_asks() -> None:
+    """A sine whose nominal frequency lies in another valley of the error than the beginning that the stage offers."""
+    when = np.linspace(0.0, 20.0, 2000)
+    measured = np.sin(3.0 * when) + 0.01 * np.random.default_rng(2).standard_normal(len(when))
+    stage = Stage(
+        "sine", ("y",), ("V",), (Parameter("w", 2.0, "rad/s", 0.0, 10.0, 8.0),), (),
+        lambda thetas: np.sin(thetas[:, :1] * when)[:, None, :], when, measured[None],
+        floor=np.array([0.01]), begins=np.array([[2.98]]),
+    )  # fmt: skip
+    (figures,) = compare_stages([stage])
+    assert figures.rms < 0.011
+    assert diagnose([stage], judged=ErrorShare).stages[0].error_before.tolist() == [figures.rms]

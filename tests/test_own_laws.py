@@ -332,3 +332,74 @@ def test_the_command_line_says_so_with_exit_code_2(tmp_path: Path, capsys: pytes
     assert main(["compare", "log.csv", "--system", str(tmp_path / "m.py")]) == 2
     err = capsys.readouterr().err
     assert "law 'dead_zone': the library has a law of that name (on a signal)" in err and len(err.splitlines()) == 1
+
+
+# ---- the same as a law of the library, in every kind of model --------------------------------------------------------
+
+
+def scale(u: Any, t: Any, p: Any) -> Any:
+    return u * p.factor
+
+
+def brake(v: Any, x: Any, t: Any, p: Any) -> Any:
+    return p.coefficient * v
+
+
+def loss(x: Any, t: Any, p: Any) -> Any:
+    return p.coefficient * x
+
+
+def follow(u: Any, t: Any, dt: Any, p: Any, m: Any) -> Any:
+    """Play: m[0] stands until an end of its band pushes it."""
+    m[0] = u if dt == 0.0 else min(max(m[0], u - 0.5 * p.width), u + 0.5 * p.width)
+    return m[0]
+
+
+OWN = {
+    "gain": Law("scale", "signal", scale, [Parameter("factor", 1.0, "-", 0.0, 20.0)], [2.0]),
+    "play": Law("follow", "signal", follow, [Parameter("width", 0.0, "-", 0.0, 20.0)], [0.1], memory=1),
+    "viscous": Law("brake", "force", brake, [Parameter("coefficient", 0.0, "-", 0.0, 20.0)], [0.5]),
+    "leak": Law("loss", "state", loss, [Parameter("coefficient", 0.0, "-", -20.0, 20.0)], [0.5]),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "law", "size", "window"),
+    [
+        pytest.param("simulate", "u", "gain", 1.3, None, marks=pytest.mark.slow),
+        ("simulate", "x_sensor", "gain", 0.7, 2.0),
+        ("simulate", "v", "viscous", 0.4, None),
+        pytest.param("simulate", "w", "leak", 0.3, None, marks=pytest.mark.slow),
+        pytest.param("closed_loop", "u", "gain", 1.3, None, marks=pytest.mark.slow),
+        ("closed_loop", "x_sensor", "play", 0.2, None),
+        pytest.param("closed_loop", "v", "viscous", 0.4, None, marks=pytest.mark.slow),
+    ],
+)
+def test_an_own_law_with_the_equation_of_the_library_s_gives_the_same(
+    kind: str, place: str, law: str, size: float, window: float | None
+) -> None:
+    t = np.arange(0.0, 20.0, 0.05)
+    loop = kind == "closed_loop"
+    drive = {"r": "m"} if loop else {"u": "N"}
+    given: dict[str, Any] = {"control": lambda r, y, p: 2.0 * (r.r - y.x), "commands": {"u": "N"}} if loop else {}
+    own = OWN[law]
+    system = System(
+        "swing", kind, lambda x, u, p: (x.v, u.u - 2.0 * x.x - 0.3 * x.v, x.x - x.w), inputs=drive,
+        states={"x": "m", "v": "m/s", "w": "m"}, outputs={"x": "m", "w": "m"}, rates={"v": "x"}, laws=[own],
+        window=window, start={"x": 0.0, "w": 0.0}, **given,
+    )  # fmt: skip
+    columns = {next(iter(drive)): wave(3, t), "x": 0.3 * wave(4, t), "w": 0.2 * wave(5, t)}
+    effects = [f"{place}.{name}" for name in (law, own.name)]
+    p = own.parameters[0]
+    bound = system.bind([Record("run", t, columns)], present={e: {p.name: size} for e in effects})
+    bound.runner.steps = 8
+    names = [q.name for q in bound.stage.parameters]
+    column = [names.index(f"{e}.{p.name}") for e in effects]
+
+    def with_(*sizes: float) -> np.ndarray:
+        theta = bound.stage.neutral()
+        theta[column] = sizes
+        return np.asarray(bound.run(theta[None]))
+
+    np.testing.assert_allclose(with_(p.value, size), with_(size, p.value), rtol=1e-12, atol=1e-14)
+    assert not np.allclose(with_(p.value, size), with_(p.value, p.value))

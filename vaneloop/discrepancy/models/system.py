@@ -83,8 +83,9 @@ class System:
                         after the sensors' laws
     places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
                 everywhere
-    laws        laws of your own beside the library's, `Law`
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
+    units       of the position of kind force, {"position": "mm"}
+    laws        laws of your own beside the library's, `Law`
     """
 
     name: str
@@ -108,9 +109,9 @@ class System:
     control: Callable[..., Any] | None = None
     commands: dict[str, str] = field(default_factory=dict)
     places: Sequence[str] | None = None
-    laws: Sequence[Law] = ()
     read: Callable[[str], Mapping[str, Any]] | None = None
     units: dict[str, str] = field(default_factory=dict)
+    laws: Sequence[Law] = ()
 
     def __post_init__(self) -> None:
         """Check what the user wrote; one line says what is wrong and what is allowed."""
