@@ -90,6 +90,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
     distortion = differs * np.sqrt(bent / np.maximum(uniform_filter1d(differs**2, around), 1e-300))
     # and what the model of the motion leaves at each row, in proportion to how fast the motion changes: least squares
     jerky = uniform_filter1d((calibrated - uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around)
+    jerky = np.maximum(jerky, 0.0)  # a running sum of squares may end a rounding below 0
     weights = as_is - wide
     more = (off - smooth) ** 2 - float(weights @ weights) * noise**2 - bent
     share = max(0.0, float(more[whole] @ jerky[whole]) / max(float(jerky[whole] @ jerky[whole]), 1e-300))
