@@ -18,6 +18,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from plant import chain, places
+from plant.effects import piston_stiction, valve_flow_saturation
 from tests.test_effects import machine_with, speed
 
 RNG = np.random.default_rng(0)
@@ -395,3 +396,23 @@ def test_the_drive_with_several_effects_is_their_equations_in_the_order_of_the_f
         if machine.p[chain.DRIVE_EFFECTS, 0]:
             rows = [places.LAGGED, places.FRICTION, places.FRICTION + 1, places.GIVE, places.READING]
             assert np.allclose(s[rows, 0], (b.lagged, b.friction, b.off, b.give, b.reading), rtol=1e-6, atol=1e-9), tick
+
+
+def test_a_drag_with_the_square_of_the_speed_is_the_round_end_of_a_saturation() -> None:
+    """v = v0 sqrt(1 - b v^2 / (A p)) has one solution; it is the saturation's with limit = sqrt(A p / b)."""
+    pressure, area, drag = 21e6, 1.2e-3, 1.1e7
+    for v0 in (0.005, 0.03, 0.1, -0.15):
+        v = brentq(lambda v, v0=v0: v - v0 * math.sqrt(max(1.0 - drag * v * v / (area * pressure), 0.0)), -0.2, 0.2)
+        assert valve_flow_saturation.step(v0, math.sqrt(area * pressure / drag), 1.0) == pytest.approx(v, rel=1e-9)
+
+
+def test_stictions_scatter_is_that_of_a_sawtooth_twice_as_high_as_its_mean_falls() -> None:
+    excess, speed = 2400.0, 5e-3
+    assert piston_stiction.scatter(np.zeros(1), excess, speed)[0] == 0.0
+    for v in (1e-4, 5e-4, 2e-3):
+        r = (v / speed) ** 2
+        whole = excess * (1.0 + r / 8.0) ** -8  # without what the sawtooth takes off
+        height = 2.0 * (whole - piston_stiction.step(0.0, v, excess, speed))
+        sawtooth = height * np.linspace(-0.5, 0.5, 100_001)
+        rms = float(np.sqrt(np.mean(sawtooth**2)))
+        assert piston_stiction.scatter(np.array([v]), excess, speed)[0] == pytest.approx(rms, rel=1e-3)

@@ -15,6 +15,7 @@ from scipy.signal import savgol_coeffs
 
 from hil import figures
 from hil.logs import Channel, Log
+from plant import build_plant
 from tests.conftest import ROOT
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
@@ -23,7 +24,7 @@ from vaneloop.discrepancy import locate as core
 from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
 from vaneloop.discrepancy.models.vane_stages import stroke
 from vaneloop.discrepancy.models.vane_stages.raster import rms
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.discrepancy.models.vanes import Chain, _lost_bits, build_chain
 from vaneloop.discrepancy.workflow import compare_stages, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
@@ -214,3 +215,25 @@ def test_the_servo_s_floor_holds_what_the_demand_s_last_digit_hides() -> None:
         error = rms(c.stage("servo"), (s := c.stage("servo")).measured - s.run(s.neutral()[None])[0])[0]
         assert error / floors[-1] == pytest.approx(1.0, abs=0.06)
     assert floors[1] > 1.2 * floors[0]
+
+
+def test_a_stroke_at_rest_after_gross_motion_has_finite_errors() -> None:
+    """A running sum of squares may end a rounding below zero there, whose root is none."""
+    n, draw = 6000, np.random.default_rng(4)
+    i = np.where(np.arange(n) < 3000, 30.0 * np.sin(0.3 * np.arange(n)), 0.0)
+    columns = {"i_cmd": i, "p_s": np.full(n, 21.0), "t_oil": np.full(n, 40.0), "fresh": np.ones(n)}
+    columns["x_lvdt"] = np.where(np.arange(n) < 3000, 24.0 + np.cumsum(i) * 0.01, 24.0) + draw.normal(0.0, 0.005, n)
+    smooth = stroke.without_noise(np.arange(n) * 0.01, columns, build_plant())
+    for value in (smooth.stroke, smooth.distortion, smooth.uneven, smooth.left(draw)):
+        assert np.all(np.isfinite(value))
+
+
+@pytest.mark.parametrize(
+    ("step", "lost"), [(0.001, False), (0.01, False), (0.05, False), (0.0430, True), (0.787, True)]
+)
+def test_a_stroke_in_steps_of_many_of_its_converter_s_lacks_bits_and_a_logger_s_digits_lack_none(
+    step: float, lost: bool
+) -> None:
+    t = np.arange(2000) * 0.01
+    x = step * np.round((24.0 + 10.0 * np.sin(t)) / step)
+    assert bool(_lost_bits(Log("rig", {"x_lvdt": Channel(t, x)}), build_plant())) == lost
