@@ -44,6 +44,10 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
         "LOG": (EXAMPLE, "any log"),
         "--logs 200": ("--logs 1 --duration 60", "200 logs of 300 s take an hour"),
     },
+    "docs/own_controller.md": {
+        "LOG": ("examples/engine_run.blf", "any log"),
+        "./my_controller.so": ("my_controller/my_controller.so", "the page's session is in that folder"),
+    },
     "docs/replay.md": {"LOG": ("examples/engine_run.blf", "any log")},
     "docs/architecture.md": {"LOG": ("examples/engine_run.blf", "any log")},
     "docs/real_time.md": {
@@ -343,6 +347,11 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
         assert toml is not None
         (folder / "my_day.toml").write_text(toml[1], encoding="utf-8")
         shutil.copy(ROOT / "tables" / "calibration.toml", folder / "mine.toml")
+    if page == "docs/own_controller.md" and (folder / "my_controller").is_dir():
+        if shutil.which("gcc") is None or shutil.which("make") is None:
+            pytest.skip("no C compiler: gcc or make is not installed")
+        subprocess.run(["make", "-C", str(folder / "my_controller")], check=True, capture_output=True)
+        shutil.copy(folder / "my_controller" / "reactions.toml", folder)
     if page == "docs/tables.md":
         shutil.copy(ROOT / "tables" / "calibration.toml", folder / "my_calibration.toml")
     if page == "docs/scheduling.md":

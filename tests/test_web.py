@@ -1036,3 +1036,29 @@ def test_the_live_loop_runs_another_machine(tmp_path: Path) -> None:
     rows = np.concatenate([c["rows"] for c in told])
     known = {v for v in VANES if np.isfinite(rows[-1, loop.COLUMNS.index(v)])}
     assert known == set(VANES[:4])
+
+
+def test_a_controller_of_one_s_own_that_crashes_is_told_and_the_page_goes_on(tmp_path: Path, gcc: str) -> None:
+    import asyncio
+
+    from tests.native_builds import wrong
+    from vaneloop.web.jobs import WorkError
+    from vaneloop.web.loop import COLUMNS
+    from vaneloop.web.run import Loop
+    from vaneloop.web.session import Session
+
+    path = wrong(gcc, tmp_path, "*(volatile int *)0 = 1;")
+
+    async def run(controller: str | None) -> Loop:
+        lp = Loop(Session("x", tmp_path / f"{bool(controller)}0123456789", [], None, controller))
+        lp.speed, lp.demand, lp.running, lp.rows = 0.0, 80.0, True, np.empty((36_000, len(COLUMNS)))
+        assert ("--controller" in lp.commands()[0][1]) == (controller is not None)
+        try:
+            await lp._in_lockstep()
+        finally:
+            for w in lp.workers.values():
+                w.stop()
+        return lp
+
+    with pytest.raises(WorkError, match=r"ended its process, in tick 500, 0\.500 s after power-on; last inputs: n_dem"):
+        asyncio.run(run(path))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import faulthandler
 import os
 import pickle
 import resource
@@ -27,7 +28,7 @@ from controller.records import INPUT_FIELDS, TICK
 from hil.native import black_box, crash_log
 from hil.native.call import REASONS
 
-__all__ = ["PATIENCE", "ControllerFailed", "isolated"]
+__all__ = ["PATIENCE", "ControllerFailed", "isolated", "told"]
 
 PATIENCE = 5.0  # s for which a step may last before the controller counts as hanging
 _LOOK = 0.1  # s
@@ -85,6 +86,7 @@ def _run(task: Callable[[], Any], pipe: int, folder: Path, every_tick: bool) -> 
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        faulthandler.disable()  # the parent says what happened, in one line
         black_box.watched(folder, every_tick)
         try:
             answer = pickle.dumps((True, task()))
@@ -158,18 +160,22 @@ def _failure(folder: Path, status: int, hung: bool, patience: float, save_crash:
         return f"the process with the controller {ended}, outside a step of it{hint}"
     if hung:
         why = f"did not come back within {patience:g} s"
-    elif box.reason:
-        why = REASONS[box.reason].format(box.value)
     else:
         why = ended + (f" ({_SIGNALS[signal.Signals(number)]})" if number in _SIGNALS else "")
+    line = told(box, why)
+    if save_crash is not None and box.tick >= 0:
+        line += f"; {crash_log.write(save_crash, box, line)}"
+    return line
+
+
+def told(box: black_box.Box, why: str) -> str:
+    """What a controller of the user's own did, in one line: the reason for which it was stopped, else ``why``."""
+    if box.reason:
+        why = REASONS[box.reason].format(box.value)
     if box.tick < 0:
         return f"--controller {box.controller}: {why}, while it was switched on"
     line = f"--controller {box.controller}: {why}, in tick {box.tick}, {box.tick * TICK:.3f} s after power-on"
-    if len(box.inputs):
-        line += f"; last inputs: {_words(box.inputs[-1])}"
-    if save_crash is not None:
-        line += f"; {crash_log.write(save_crash, box, line)}"
-    return line
+    return f"{line}; last inputs: {_words(box.inputs[-1])}" if len(box.inputs) else line
 
 
 def _words(inputs: Any) -> str:

@@ -11,11 +11,12 @@ import mmap
 import os
 import platform
 import shutil
+import struct
 import tempfile
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
@@ -24,9 +25,10 @@ from controller.header import VERSION
 from hil.native import black_box
 from hil.native.call import CANARIES, CANARY, N_IN, N_OUT, N_SEEN, SHOWN, STARTED, Foreign
 from vaneloop.base.errors import InputError
+from vaneloop.base.tables import load_toml
 from vaneloop.base.vanes import VANES
 
-__all__ = ["NEEDED", "OPTIONAL", "Program"]
+__all__ = ["NEEDED", "OPTIONAL", "Program", "observables", "restore", "save"]
 
 NEEDED = ("vaneloop_version", "vaneloop_init", "vaneloop_step")
 OPTIONAL = ("vaneloop_observe", "vaneloop_save", "vaneloop_restore", "vaneloop_describe")
@@ -62,6 +64,44 @@ class _Calibration(ctypes.Structure):
     ]
 
 
+class _OwnScalar(ctypes.Structure):
+    """``vaneloop_own_scalar``."""
+
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("unit", ctypes.c_char_p),
+        ("meaning", ctypes.c_char_p),
+        ("value", _Doubles),
+        ("low", ctypes.c_double),
+        ("high", ctypes.c_double),
+    ]
+
+
+class _OwnObservable(ctypes.Structure):
+    """``vaneloop_own_observable``."""
+
+    _fields_ = [("name", ctypes.c_char_p), ("unit", ctypes.c_char_p), ("meaning", ctypes.c_char_p), ("value", _Doubles)]
+
+
+class _Description(ctypes.Structure):
+    """``vaneloop_description``."""
+
+    _fields_ = [
+        ("scalars", ctypes.c_int32),
+        ("observables", ctypes.c_int32),
+        ("scalar", ctypes.POINTER(_OwnScalar)),
+        ("observable", ctypes.POINTER(_OwnObservable)),
+    ]
+
+
+def _description(library: ctypes.CDLL) -> _Description:
+    """What the controller says of itself; nothing where it has no vaneloop_describe."""
+    if not hasattr(library, "vaneloop_describe"):
+        return _Description()
+    library.vaneloop_describe.restype = ctypes.POINTER(_Description)
+    return cast("_Description", library.vaneloop_describe()[0])
+
+
 def _given(cal: Calibration) -> _Calibration:
     """The calibration as C sees it, in the memory of ``cal``."""
     assert cal.k.flags.c_contiguous and cal.table.flags.c_contiguous and cal.angles.flags.c_contiguous
@@ -92,9 +132,11 @@ class Program:
     """A shared library that is a controller.
 
     path  of the file; a missing one, or one that is no shared library of this machine's kind, raises InputError
+    own   TOML file with calibration scalars of the controller's own, a section each: value, unit, origin
     """
 
     path: str
+    own: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be loaded, without running any of it."""
@@ -125,6 +167,7 @@ class Program:
                 f"{self._named}: is compiled for interface {found}; this VaneLoop has interface {VERSION}: compile it "
                 f"again with the header that ships"
             )
+        self._set_own(library)
         told = _given(calibration)
         library.vaneloop_init.restype = ctypes.c_char_p
         library.vaneloop_init.argtypes = [ctypes.POINTER(_Calibration)]
@@ -150,6 +193,23 @@ class Program:
         weakref.finalize(fed.base, _KEPT.pop, out.at_fed, None)
         return out
 
+    def _set_own(self, library: ctypes.CDLL) -> None:
+        """Set the controller's own calibration scalars. Raises InputError with file, scalar, value, what is allowed."""
+        if self.own is None:
+            return
+        told = _description(library)
+        known = {_text(s.name): s for s in told.scalar[: told.scalars]}
+        for name, section in load_toml(self.own).items():
+            if name not in known:
+                allowed = ", ".join(known) or "none; it has no vaneloop_describe"
+                raise InputError(f"{self.own}: {name} is no calibration scalar of {self.path}; allowed: {allowed}")
+            s, value, unit = known[name], (section or {}).get("value"), (section or {}).get("unit")
+            if unit != _text(s.unit):
+                raise InputError(f"{self.own}: {name}.unit (={unit!r}) must be {_text(s.unit)!r}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not s.low <= value <= s.high:
+                raise InputError(f"{self.own}: {name} (={value!r} {unit}) must be in [{s.low:g}, {s.high:g}]")
+            s.value[0] = float(value)
+
     @property
     def _named(self) -> str:
         return f"--controller {self.path}"
@@ -168,6 +228,19 @@ class Program:
 
 
 _KEPT: dict[int, tuple[ctypes.CDLL, _Calibration, Calibration]] = {}  # what a running controller reads, by its memory
+
+
+def observables(foreign: Any) -> dict[str, dict[str, Any]]:
+    """Quantities of the controller's own after its last step: name -> value, unit, meaning; none of the firmware
+    here.
+    """
+    if not foreign:
+        return {}
+    told = _description(_KEPT[foreign.at_fed][0])
+    return {
+        _text(o.name): {"value": float(o.value[0]), "unit": _text(o.unit), "meaning": _text(o.meaning)}
+        for o in told.observable[: told.observables]
+    }
 
 
 def save(foreign: Any) -> bytes | None:
@@ -198,9 +271,28 @@ def _address(library: Any, name: str) -> int:
     return ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0 if hasattr(library, name) else 0
 
 
+def _text(words: bytes | None) -> str:
+    return (words or b"").decode("utf-8", "replace")
+
+
 def _line(text: Any) -> str:
     words = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
     return " ".join(words.split())[:300]
+
+
+def _length(file: BinaryIO) -> int:
+    """Bytes that the segments of a little-endian ELF file of 64 bits need; 0 for others."""
+    file.seek(0)
+    head = file.read(64)
+    if len(head) < 64 or head[4:6] != b"\x02\x01":
+        return 0
+    start, size, number = int.from_bytes(head[32:40], "little"), *struct.unpack_from("<HH", head, 54)
+    file.seek(start)
+    table = file.read(size * number)
+    if len(table) < size * number or size < 56:
+        return start + size * number
+    spans = [struct.unpack_from("<8xQ16xQ", table, size * i) for i in range(number)]
+    return max((offset + length for offset, length in spans), default=0)
 
 
 def _check_file(path: str) -> None:
@@ -209,6 +301,7 @@ def _check_file(path: str) -> None:
     try:
         with Path(path).open("rb") as f:
             head = f.read(20)
+            whole = _length(f)
     except OSError as e:
         raise InputError(f"{named}: cannot be read ({e.strerror})") from None
     if len(head) < 20 or head[:4] != b"\x7fELF":
@@ -220,5 +313,7 @@ def _check_file(path: str) -> None:
     if wanted is not None and (head[4], machine) != wanted:
         found = _NAMES.get(machine, f"ELF machine {machine}")
         raise InputError(f"{named}: is built for {found}, {32 * head[4]} bits; this machine is {here}: build it here")
+    if (size := Path(path).stat().st_size) < whole:
+        raise InputError(f"{named}: is cut short: {size:,} bytes of {whole:,}")  # the loader would crash on it
     if kind != _SHARED_OBJECT:
         raise InputError(f"{named}: is no shared library (ELF type {kind}); build it with gcc -shared -fPIC")

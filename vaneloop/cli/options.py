@@ -140,7 +140,7 @@ def add_plant_option(group: Any) -> None:
     )
 
 
-def add_controller_options(parser: Any) -> None:
+def add_controller_options(parser: Any, save_crash: bool = True) -> None:
     """Declare ``--controller`` and ``--save-crash``; the command's function must be `guarded`."""
     group = parser.add_argument_group("a controller of your own (docs/own_controller.md)")
     group.add_argument(
@@ -148,6 +148,8 @@ def add_controller_options(parser: Any) -> None:
         metavar="PATH.so",
         help="run this shared library in place of the firmware; vaneloop new-controller writes one to begin with",
     )
+    if not save_crash:
+        return
     group.add_argument(
         "--save-crash",
         metavar="F.parquet",

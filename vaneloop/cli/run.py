@@ -139,7 +139,11 @@ def _node_json(node: Any) -> dict[str, Any]:
 
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
     n_dem = float(node.loop.state.n_dem)
+    from hil.native.program import observables
+
+    own = observables(node.loop.foreign)
     return {
+        **({"own": own} if own else {}),
         "mode": node.mode,
         "n_dem": n_dem,
         "faults": faults,
@@ -151,6 +155,8 @@ def _node_json(node: Any) -> dict[str, Any]:
 def _say_node(args: argparse.Namespace, node: Any) -> None:
     c, state = node.counts, _node_json(node)
     faults = ", ".join(state["faults"]) or "none"
+    for name, o in state.get("own", {}).items():
+        terminal.say(args, f"{name}: {o['value']:g} {o['unit']} ({o['meaning']})")
     refused = sum(c[k] for k in ("wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind"))
     terminal.say(
         args,

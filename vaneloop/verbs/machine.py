@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TABLES", "Machine", "files_of"]
 
+OWN = "own_calibration.toml"  # beside the other tables: scalars of a controller of the user's own
 TABLES = ("calibration", "stroke_tables", "vane_angles", "geometry", "schedules", "plant")
 
 
@@ -34,7 +35,7 @@ def files_of(tables: str | Path | None, plant: str | Path | None = None) -> dict
     if not folder.is_dir():
         raise InputError(f"--tables {folder}: is not a folder")
     found = {name: str(folder / file) for name, file in shipped.items() if (folder / file).is_file()}
-    if not found:
+    if not found and not (folder / OWN).is_file():
         raise InputError(f"--tables {folder}: holds none of {', '.join(shipped.values())}")
     return {**shipped, **found}
 
@@ -93,7 +94,8 @@ class Machine:
             return made
         from hil.native import Program
 
-        return made._replace(program=Program(str(self.controller)))
+        own = Path(self.tables or "") / OWN
+        return made._replace(program=Program(str(self.controller), str(own) if self.tables and own.is_file() else None))
 
     def _built(self, model: Model | None) -> Plant:
         from plant import build_plant

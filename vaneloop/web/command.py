@@ -9,7 +9,7 @@ import socket
 import sys
 from pathlib import Path
 
-from vaneloop.cli.options import add_tables_option, machine_of
+from vaneloop.cli.options import add_controller_options, add_tables_option, machine_of
 from vaneloop.web.guard import is_loopback
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -52,6 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--upload-limit", metavar="MB", type=int, default=512, help="largest file that may be uploaded (default 512)"
     )
     add_tables_option(parser)
+    add_controller_options(parser, save_crash=False)
     parser.add_argument("--no-open", action="store_true", help="do not open a browser, only print the link")
     parser.add_argument("--quiet", action="store_true", help="say nothing but the link")
 
@@ -97,7 +98,7 @@ def command(args: argparse.Namespace) -> int:
 
     from vaneloop.web.server import serve
 
-    serve(sock, folder, token, args.upload_limit << 20, is_loopback(args.host), ready, args.tables)
+    serve(sock, folder, token, args.upload_limit << 20, is_loopback(args.host), ready, args.tables, args.controller)
     return 0
 
 

@@ -13,6 +13,7 @@ import queue
 import random
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -150,6 +151,15 @@ def _compile() -> None:
     take(channel.wire, place, np.zeros((256, 2), np.int64))
 
 
+def _machine(tables: str | None, controller: str | None, boxes: str | None) -> Machine:
+    """The machine of a run; a controller of the user's own leaves its black boxes in ``boxes``."""
+    if boxes is not None:
+        from hil.native import black_box
+
+        black_box.watched(Path(boxes), False)
+    return Machine(tables, controller=controller)
+
+
 def ready(progress: Progress) -> None:
     """Load and compile what a run needs."""
     progress(None, COMPILING)
@@ -164,10 +174,13 @@ def lockstep(
     seed: int | None,
     profile: str | None,
     tables: str | None = None,
+    controller: str | None = None,
+    boxes: str | None = None,
 ) -> dict[str, Any]:
     """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop.
 
     tables  folder of the machine's tables; None: the shipped ones
+    controller, boxes  shared library of the user's own, and the folder of its black boxes; None: the firmware here
     """
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
@@ -179,7 +192,7 @@ def lockstep(
     typed = Typed(demand)
     progress(None, COMPILING)
     _compile()
-    machine = Machine(tables)
+    machine = _machine(tables, controller, boxes)
     node = Node(machine.plant, machine.calibration, n_r=demand, seed=seed)
     ecu = EcuStation(typed, ecu=Ecu(machine.plant, n_dem=demand, seed=None if seed is None else seed + 1))
     channel = Channel(seed=seed or 0)
@@ -262,13 +275,19 @@ def lockstep(
 
 
 def node(
-    progress: Progress, bus: str, record: str | None, seed: int | None, tables: str | None = None
+    progress: Progress,
+    bus: str,
+    record: str | None,
+    seed: int | None,
+    tables: str | None = None,
+    controller: str | None = None,
+    boxes: str | None = None,
 ) -> dict[str, Any]:
     """Controller and plant in real time, as ``vaneloop run`` does: lateness as it goes, until told to stop."""
     from hil.loop.node import Node
 
     progress(None, COMPILING)
-    machine = Machine(tables)
+    machine = _machine(tables, controller, boxes)
     made = Node(machine.plant, machine.calibration, seed=seed)
     return _in_real_time(progress, bus, made, record, None)
 

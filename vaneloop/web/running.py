@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,6 +56,7 @@ class Loop:
     events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
+    boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
     lit: dict[str, int] = field(default_factory=dict)  # lamp -> how often news came in which it was on
 
     @property
@@ -65,7 +69,7 @@ class Loop:
         seed = ["--seed", str(self.seed)] if self.seed is not None else []
         record = ["--record", f"run{self.runs + (not self.running)}.log"] if self.record else []
         profile = ["--profile", self.profile] if self.profile else []
-        tables = self.tables_words()
+        tables = [*self.tables_words(), *self.controller_words()]
         if self.bus == "lockstep":
             own = (
                 "The slider, the pace and the buttons are the page's own. "
@@ -86,12 +90,52 @@ class Loop:
             return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
         return [
             ("", ["run", "--bus", self.bus_name, *seed, *record, *tables]),
-            ("", ["ecu", "--bus", self.bus_name, *profile, *tables]),
+            ("", ["ecu", "--bus", self.bus_name, *profile, *self.tables_words()]),
         ]
 
     def tables_words(self) -> list[str]:
         """Options that name the machine."""
-        return ["--tables", self.session.tables] if self.session.tables is not None else []
+        tables = self.session.tables
+        return ["--tables", tables] if tables is not None else []
+
+    def controller_words(self) -> list[str]:
+        """Options that name a controller of the user's own."""
+        return ["--controller", self.session.controller] if self.session.controller else []
+
+    def _own(self) -> dict[str, Any]:
+        """What the loop's process takes of it."""
+        if not self.session.controller:
+            return {}
+        self.boxes = self.session.folder / f"boxes{self.runs}"
+        self.boxes.mkdir(exist_ok=True)
+        return {"controller": self.session.controller, "boxes": str(self.boxes)}
+
+    async def _watched(self, worker: Worker, call: Coroutine[Any, Any, Any]) -> Any:
+        """Wait for a run; end its process where a controller of the user's own hangs, and say how it failed."""
+        import asyncio
+
+        from hil.native import black_box
+        from hil.native.isolation import PATIENCE, told
+
+        task = asyncio.ensure_future(call)
+        seen: tuple[float, ...] = ()
+        since, hung = time.monotonic(), False
+        while not (await asyncio.wait([task], timeout=0.5))[0]:
+            now = black_box.progress(self.boxes) if self.boxes is not None else ()
+            if now != seen or not now:
+                seen, since = now, time.monotonic()
+            elif time.monotonic() - since > PATIENCE:
+                hung = True
+                worker.stop()
+        try:
+            return await task
+        except (WorkError, Cancelled):
+            box = black_box.left(self.boxes) if self.boxes is not None else None
+            if box is None:
+                raise
+            raise WorkError(
+                told(box, f"did not come back within {PATIENCE:g} s" if hung else "ended its process")
+            ) from None
 
     # ---- begin and end
 
@@ -130,7 +174,8 @@ class Loop:
     async def _in_lockstep(self) -> None:
         record = self._record_path()
         try:
-            await self._worker("loop").call(
+            worker, own = self._worker("loop"), self._own()
+            call = worker.call(
                 "lockstep",
                 "running",
                 demand=self.demand,
@@ -139,7 +184,9 @@ class Loop:
                 seed=self.seed,
                 profile=self.profile,
                 tables=self.session.tables,
+                **own,
             )
+            await self._watched(worker, call)
         finally:
             self._ended(record)
 
@@ -151,7 +198,12 @@ class Loop:
         listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))
         calls = [
             listener.call("listen", "running", bus=bus),
-            controller.call("node", "running", bus=bus, record=record, seed=self.seed, tables=self.session.tables),
+            self._watched(
+                controller,
+                controller.call(
+                    "node", "running", bus=bus, record=record, seed=self.seed, tables=self.session.tables, **self._own()
+                ),
+            ),
             engine.call(
                 "ecu", "running", bus=bus, demand=self.demand, profile=self.profile, tables=self.session.tables
             ),

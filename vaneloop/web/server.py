@@ -105,23 +105,25 @@ def serve(
     loopback: bool,
     ready: Callable[[str], None],
     tables: str | None = None,
+    controller: str | None = None,
 ) -> None:
     """Serve until Ctrl-C. ``sock`` listens already; ``most``: bytes of an upload; ``ready`` takes a word that does for
-    the token once; ``tables``: folder of the machine's tables, None: the shipped ones.
+    the token once; ``tables``: folder of the machine's tables, None: the shipped ones;
+    ``controller``: shared library of the user's own, None: the firmware here.
     """
     with private_folder() as private:
         tempfile.tempdir = str(private)  # uploads on their way are private too
-        _serve(sock, folder, token, most, loopback, ready, private, tables)
+        _serve(sock, folder, token, most, loopback, ready, private, tables, controller)
 
 
 def _serve(
     sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None],
-    private: Path, tables: str | None,
+    private: Path, tables: str | None, controller: str | None,
 ) -> None:  # fmt: skip
     files = logs_in(folder)
 
     def new(key: str) -> Session:
-        session = Session(key, private / secrets.token_hex(8), list(files), tables)
+        session = Session(key, private / secrets.token_hex(8), list(files), tables, controller)
         session.search.start()  # ready by the time that a log is chosen
         session.bench.start()
         return session

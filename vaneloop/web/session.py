@@ -86,9 +86,14 @@ class Fitted:
 class Session:
     """State of the pages of one browser. ``versions`` count what has changed, section by section."""
 
-    def __init__(self, number: str, folder: Path, files: list[LogFile], tables: str | None = None):
+    def __init__(
+        self, number: str, folder: Path, files: list[LogFile], tables: str | None = None, controller: str | None = None
+    ):
         self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
         self.tables = tables  # folder of the machine's tables; None: the shipped ones
+        self.controller = controller and str(
+            Path(controller).resolve()
+        )  # library of the user's own; None: the firmware
         folder.mkdir(mode=0o700, parents=True)
         self.versions: dict[str, int] = {}
         self.lookers: list[Callable[[], None]] = []  # pages that want to know
