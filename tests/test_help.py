@@ -46,7 +46,7 @@ def made() -> set[str]:
     for name in COMMANDS:
         for words in examples(name):
             out |= {b for a, b in zip(words, words[1:], strict=False) if a in _MAKES}
-            if words[0] == "record":
+            if words[0] in ("record", "new-controller"):
                 out.add(words[1])
     return out
 
