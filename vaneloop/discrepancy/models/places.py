@@ -27,7 +27,11 @@ def places(data: Data, course: Course) -> tuple[list[Placed], list[Effect]]:
 
     def put(name: str, law: Law, place: str, at: int, size: Size, constant: float) -> None:
         ps, starts = law.make(size)
-        effects.append(Effect(name, tuple(ps), starts, law.looks))
+        holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
+        if law.holds is not None:
+            other, pattern = law.holds
+            holds = ((f"{name.rpartition('.')[0]}.{other}", pattern),)
+        effects.append(Effect(name, tuple(ps), starts, law.looks, holds))
         out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
 
     def add(prefix: str, place: str, at: int, family: dict[str, Law], size: Size, leave: tuple[str, ...] = ()) -> None:
