@@ -191,7 +191,8 @@ class ErrorShare:
                 for g in search.best_of([(*f.effects, n) for n in single if n not in f.effects])
                 if self.earns(f, g)
             ]
-            options = [f for f in (*one, *two) if len(f.free) < len(fit.free) and not self.earns(f, fit)]
+            held = search.simpler(fit, drop)
+            options = [f for f in (*one, *two, *held) if len(f.free) < len(fit.free) and not self.earns(f, fit)]
             if options:
                 fit = min(options, key=self.order)
         return fit
@@ -274,7 +275,9 @@ class ErrorShare:
             rest_names = tuple(e for e in fit.effects if e != name)
             rest = search.joined(rest_names)
             alternatives = {name: fit}
-            for f in search.best_of([(*rest_names, n) for n in names if n not in fit.effects]):
+            tried = search.best_of([(*rest_names, n) for n in names if n not in fit.effects])
+            holding = [n for n in names if any(held == name for held, _ in stage.effect(n).holds)]
+            for f in (*tried, *(search.joined((*rest_names, n)) for n in holding if n not in fit.effects)):
                 alternatives[next(e for e in f.effects if e not in rest_names)] = f
             mine = score(judge, fit)
             # what has more parameters and does no better holds the named effect within it

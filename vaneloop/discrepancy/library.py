@@ -66,6 +66,7 @@ class Law:
     make   Size -> parameters (neutral values and bounds) and starts, the parameter vectors from which a fit is tried
     looks  how it shows in a log
     memory True where the answer depends on what was before
+    holds   a law of the same place that this one is at some values of its parameters, and where, as `Effect.holds`
     constant  a number of the law that is not free, from the size of the data; it follows the parameters
     """
 
@@ -76,6 +77,7 @@ class Law:
     looks: str = ""
     memory: bool = False
     constant: Callable[[Size], float] | None = None
+    holds: tuple[str, tuple[float | None, ...]] | None = None
 
 
 # ---- parameters from the size of the data ----------------------------------------------------------------------------
@@ -349,11 +351,7 @@ LAWS: dict[str, dict[str, Law]] = {
             ),
             Law("saturation", laws.SATURATION, "nothing passes beyond a limit", _saturation, "flat tops"),
             Law(
-                "smooth_saturation",
-                laws.SMOOTH_SATURATION,
-                "limits by and by (tanh)",
-                _smooth_saturation,
-                "rounded tops",
+                "smooth_saturation", laws.SMOOTH_SATURATION, "limits by and by (tanh)", _smooth_saturation, "round tops"
             ),
             Law("quantisation", laws.QUANTISATION, "moves in steps", _quantisation, "stairs"),
             Law(
@@ -371,6 +369,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 _stiction,
                 "flat after each reversal or stop, a jump, then parallel",
                 True,
+                holds=("play", (None, 0.0, None)),
             ),
             Law(
                 "stick_slip",
@@ -379,6 +378,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 _stiction,
                 "stairs while the command moves",
                 True,
+                holds=("play", (None, 0.0, None)),
             ),
             Law(
                 "rate_limit",
@@ -436,6 +436,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 "Coulomb friction that is larger (or smaller) at small speed",
                 _stribeck,
                 "spikes at reversals",
+                holds=("coulomb", (None, 0.0, np.nan)),
             ),
             Law(
                 "bouc_wen",
@@ -444,6 +445,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 _bouc_wen,
                 "rounded loops",
                 True,
+                holds=("elastic_plastic", (None, None, 20.0)),  # all but
             ),
             Law(
                 "backlash_gap",
@@ -477,14 +479,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 "flat tops",
                 True,
             ),
-            Law(
-                "rate_limit",
-                laws.STATE_RATE_LIMIT,
-                "cannot change faster than a limit",
-                _rate_limit,
-                "straight ramps",
-                True,
-            ),
+            Law("rate_limit", laws.STATE_RATE_LIMIT, "cannot change faster than a limit", _rate_limit, "ramps", True),
             Law(
                 "overflow",
                 laws.STATE_OVERFLOW,

@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["LINE", "Slopes", "along"]
+__all__ = ["LINE", "Slopes", "along", "followed", "out_of", "within"]
 
 LINE = (0.02, 5.0)  # times the size tried, within which a better size is looked for
+TOGETHER = 16  # sets whose slopes are simulated at one time
 SAME = (0.8, 1.25)  # times a size that count as that size
 
 
@@ -23,11 +24,12 @@ class Slopes:
     them.
 
     prior  of the free parameters, as a fit has it
+    known  error and slopes, where they are
     """
 
-    def __init__(self, judge: Judge, theta: Array, free: Array, prior: Array):
-        """Simulate the fit and its difference steps."""
-        self.error, self.jac = judge.linearise(theta, free)
+    def __init__(self, judge: Judge, theta: Array, free: Array, prior: Array, known: tuple[Array, Array] | None = None):
+        """Simulate the fit and its difference steps, where they are not known."""
+        self.error, self.jac = known if known is not None else judge.linearise(theta, free)
         self._flat = self.jac.reshape(len(free), self.error.size)
         self._normal = self._flat @ self._flat.T + np.diag(prior * judge.scale[free] ** 2 + 1e-9)
         self._room = [(b[free] - theta[free]) / judge.scale[free] for b in judge.bounds()]
@@ -36,11 +38,15 @@ class Slopes:
         """Sum of squares that is left of each set of errors when the free parameters have followed, within their
         bounds.
         """
+        return self._follow(errors)[1]
+
+    def _follow(self, errors: Array) -> tuple[Array, list[float]]:
+        """Steps of the free parameters, in their scales, and what is left."""
         errors = errors.reshape(-1, self.error.size)
         pull = errors @ self._flat.T
         step = np.clip(np.linalg.solve(self._normal, pull.T).T, *self._room)
         left = np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ self._normal) * step, axis=1)
-        return [float(v) for v in left]
+        return step, [float(v) for v in left]
 
     def line(self, errors: Array) -> tuple[Array, Array]:
         """By how many times the way from the fit to each set of errors the least would be left, and how much that is:
@@ -56,6 +62,49 @@ class Slopes:
         good = size > 1e-9 * np.maximum(np.sum(d * d, axis=1), 1e-300)
         share = np.clip(np.where(good, down / np.where(good, size, 1.0), 0.0), *LINE)
         return share, here - 2.0 * share * down + share**2 * size
+
+
+def followed(judge: Judge, thetas: list[Array], free: Array, prior: Array) -> tuple[Array, list[float]]:
+    """Errors at each set of parameters, and what is left when the free ones have followed by the slopes that they have
+    *there*; the sets are moved there. For a parameter in which the outputs are linear (a gain, an offset) that is exact
+    however far it has to go.
+    """
+    scale, high = judge.scale[free], judge.bounds()[1]
+    errors, costs = [], []
+    for i in range(0, len(thetas), TOGETHER):
+        batch = [judge._differences(theta, free, scale, high) for theta in thetas[i : i + TOGETHER]]
+        all_errors = judge.errors(np.concatenate([asked for asked, _ in batch]))
+        at = 0
+        for k, (asked, derivative) in enumerate(batch, i):
+            slopes = Slopes(judge, thetas[k], free, prior, derivative(all_errors[at : at + len(asked)]))
+            at += len(asked)
+            step, left = slopes._follow(slopes.error)
+            thetas[k] = thetas[k].copy()
+            thetas[k][free] += step[0] * scale
+            errors.append(slopes.error)
+            costs += left
+    return np.array(errors), costs
+
+
+def within(stage: Stage, theta: Array, name: str, held: str) -> Array:
+    """The parameters of a model with the effect ``held`` as those of one with ``name``, which holds it within it."""
+    index, out, neutral = stage.index(), theta.copy(), stage.neutral()
+    values = iter(theta[index[held]])
+    out[index[name]] = [
+        next(values) if fixed is None else n if np.isnan(fixed) else fixed
+        for fixed, n in zip(dict(stage.effect(name).holds)[held], neutral[index[name]], strict=True)
+    ]
+    out[index[held]] = neutral[index[held]]
+    return out
+
+
+def out_of(stage: Stage, theta: Array, name: str, held: str) -> Array:
+    """The parameters of a model with the effect ``name`` as those of one with ``held``, which it holds within it."""
+    index, out = stage.index(), theta.copy()
+    pattern = dict(stage.effect(name).holds)[held]
+    out[index[held]] = [v for v, fixed in zip(theta[index[name]], pattern, strict=True) if fixed is None]
+    out[index[name]] = stage.neutral()[index[name]]
+    return out
 
 
 def along(effect: Effect, start: Array, share: float, low: Array, high: Array) -> Array | None:

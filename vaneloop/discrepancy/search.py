@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step, finished, recalibrate
-from vaneloop.discrepancy.promise import Slopes, along
+from vaneloop.discrepancy.promise import Slopes, along, followed, out_of, within
 from vaneloop.discrepancy.stage import Array, Effect
 
 if TYPE_CHECKING:
@@ -111,9 +111,7 @@ class Search:
     # ---- one effect --------------------------------------------------------------------------------------------------
 
     def _screen(self) -> dict[str, list[Array]]:
-        """Best starting points of every effect: all starts of all effects simulated at once beside the fitted nominal
-        model.
-        """
+        """Best starts of every effect: those of all effects simulated at once beside the fitted nominal model."""
         stage, judge, roams = self.stage, self.judge, self.criterion.roams
         index = stage.index()
         thetas: list[Array] = []
@@ -136,12 +134,11 @@ class Search:
                     thetas += turned
                     owner += [e.name] * len(turned)
                 plain = len(thetas)  # so many are tried beside the base
-            left, better = self._tried(slopes, nominal, thetas[first:], owner[first:])
-            costs += left
-            for name, (cost, theta) in better.items():
-                thetas.append(theta)
-                owner.append(name)
-                costs.append(cost)
+            some = thetas[first:]
+            left, better = self._tried(slopes, nominal, some, owner[first:])
+            thetas[first:] = [*some, *(theta for _, theta in better.values())]
+            costs += [*left, *(cost for cost, _ in better.values())]
+            owner += better
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         self.level: dict[str, float] = {}
@@ -162,24 +159,30 @@ class Search:
         self, slopes: Slopes, theta: Array, thetas: list[Array], owner: list[str]
     ) -> tuple[list[float], dict[str, tuple[float, Array]]]:
         """What is left at each of these sets, which differ from ``theta`` by the effect ``owner``, once what is fitted
-        there has followed; and of a model that roams, for each effect a set with a better size that the slopes
-        promise, where there is one: name -> what is left there, and the set.
+        there has followed (of a quick model it has, in ``thetas``); and of a model that roams, for each effect a set
+        with a better size that the slopes promise, where there is one: name -> what is left there, and the set.
         """
         judge, index, (low, high) = self.judge, self.stage.index(), self.judge.bounds()
         costs: list[float] = []
-        shares: list[float] = []
+        shares: list[float] = []  # these two only of a model that roams
         promised: list[float] = []
         for i in range(0, len(thetas), SCREENED):
-            errors = judge.errors(np.array(thetas[i : i + SCREENED]))
-            costs += slopes.left(errors)
+            part = thetas[i : i + SCREENED]
+            if self.stage.quick:
+                errors, left = followed(judge, part, self.base.free, self.base.prior)
+                thetas[i : i + SCREENED] = part
+            else:
+                errors = judge.errors(np.array(part))
+                left = slopes.left(errors)
+            costs += left
             if self.criterion.roams:
                 share, promise = slopes.line(errors)
                 shares += share.tolist()
                 promised += promise.tolist()
         best: dict[str, int] = {}
-        for i, name in enumerate(owner if self.criterion.roams else ()):
-            if name not in best or promised[i] < promised[best[name]]:
-                best[name] = i
+        for i in range(len(promised)):
+            if owner[i] not in best or promised[i] < promised[best[owner[i]]]:
+                best[owner[i]] = i
         again: dict[str, Array] = {}
         for name, i in best.items():
             at = index[name]
@@ -194,9 +197,8 @@ class Search:
         """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
         are best there.
 
-        Size and direction are polar coordinates: from a wrong direction a fit comes to the right one by a long way
-        round. In a fixed direction the sizes act linearly near neutral, so that their best values follow from one
-        simulation.
+        Size and direction are polar coordinates: from a wrong direction the way is long. In a fixed direction the sizes
+        act linearly near neutral, so that their best values follow from one simulation.
 
         e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
         """
@@ -240,15 +242,16 @@ class Search:
         return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
 
     def _followed(self, name: str) -> Task[float]:
-        """What the best start of an effect leaves once the model's own parameters have followed it; the starts are put
-        in that order.
+        """What a quick fit of an effect leaves, from the start that is best once the model's own parameters have
+        followed it; that fit and the starts then are where a fit begins.
         """
         fits = []
         for start in self.starts[name]:
-            fits.append((yield from self.judge.fitting((), start, 3)))
+            fits.append((yield from self.judge.fitting((), start, 2)))
         fits.sort(key=self.judge.total_of)
-        self.starts[name] = [f.theta for f in fits]
-        return self.judge.total_of(fits[0])
+        quick = yield from self.judge.fitting((name,), fits[0].theta, 2)
+        self.starts[name] = [quick.theta, *(f.theta for f in fits[1:])]
+        return self.judge.total_of(quick)
 
     def _single(self, name: str) -> Task[Fit]:
         key = frozenset((name,))
@@ -268,19 +271,44 @@ class Search:
         return self.fits[key]
 
     def _no_worse(self, fit: Fit) -> Task[Fit]:
-        """The fit, or a better one from the best fit of a part of its effects: with more effects a fit never ends
-        higher.
+        """The fit, or a better one from the best fit that it contains: with more effects, or with one that holds
+        another within it, a fit never ends higher.
 
         A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher
         than it starts.
         """
         mine = frozenset(fit.effects)
-        parts = [f for key, f in self.fits.items() if key < mine]
-        part = min(parts, key=self.judge.total_of, default=None)
+        parts = [(f, f.theta) for key, f in self.fits.items() if key < mine]
+        parts += [(f, within(self.stage, f.theta, name, held)) for name, held, f in self._held(fit.effects)]
+        part, theta = min(parts, key=lambda p: self.judge.total_of(p[0]), default=(None, fit.theta))
         if part is None or self.judge.total_of(fit) <= self.judge.total_of(part):
             return fit
-        again = yield from self.judge.fitting(fit.effects, part.theta, 8)
+        again = yield from self.judge.fitting(fit.effects, theta, 8)
         return min(again, fit, key=self.judge.total_of)
+
+    def _held(self, effects: Sequence[str]) -> list[tuple[str, str, Fit]]:
+        """Fits made with an effect that one of these holds within it in its place: that one, the other, the fit."""
+        out = []
+        for name in effects:
+            for held, _ in self.stage.effect(name).holds:
+                key = (frozenset(effects) - {name}) | {held}
+                if held not in effects and key in self.fits:
+                    out.append((name, held, self.fits[key]))
+        return out
+
+    def simpler(self, fit: Fit, name: str) -> list[Fit]:
+        """Fits with an effect that ``name`` holds within it in its place, from where ``fit`` has it too."""
+        out = []
+        for held, _ in self.stage.effect(name).holds:
+            if held in fit.effects:
+                continue
+            effects = tuple(held if e == name else e for e in fit.effects)
+            theta = out_of(self.stage, fit.theta, name, held)
+            again = self.judge.together([self._finished(self.judge.fitting(effects, theta, 8))])[0]
+            known = self.fits.get(frozenset(effects), again)
+            out.append(min(known, again, key=self.judge.total_of))
+            self.fits[frozenset(effects)] = out[-1]
+        return out
 
     def _refine(self, name: str, fit: Fit) -> Task[Fit]:
         """Search between the starts next to the fit, where a size acts in steps (a threshold, whole frames) and has no
@@ -353,7 +381,9 @@ class Search:
             rest, theta = begins[k]
             fit = yield from judge.fitting(rest, theta, 2)
             out.append((judge.total_of(fit), fit.theta))
-        return sorted(out, key=lambda c: c[0])
+        out.sort(key=lambda c: c[0])
+        fit = yield from judge.fitting(effects, out[0][1], 2)
+        return [(judge.total_of(fit), fit.theta), *out[1:]]
 
     def _joined(self, effects: tuple[str, ...], finished: bool) -> Task[Fit]:
         """``finished`` False: a few iterations, enough to rank it."""

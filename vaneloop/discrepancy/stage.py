@@ -72,12 +72,15 @@ class Effect:
     starts      parameter vectors from which a fit is tried; they span undetectable to gross, both signs where the sign
                 is free
     excites     what a log needs to show it, in words
+    holds       effects that it is at some values of its parameters: (name, a number for each parameter that is fixed,
+                NaN where any will do, None for each that is the other's, in order)
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     starts: tuple[tuple[float, ...], ...]
     excites: str = ""
+    holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
 
 
 @dataclass
@@ -111,6 +114,7 @@ class Stage:
     memory    s: longer than the stage remembers; blocks of the log that are judged apart are as long. None: not known
     begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
               what it lacks may have lost its way to; None: there are none
+    quick     a run costs next to nothing: slopes are taken at every start
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
     """
@@ -138,6 +142,7 @@ class Stage:
     alike: Mapping[str, Callable[[Named], str]] = field(default_factory=dict)
     memory: float | None = None
     begins: Array | None = None
+    quick: bool = False
     excerpt: Callable[[Array], Stage] | None = None
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +27,7 @@ TRIED = 0.1  # of the noise: by so much a start is moved to see what it does
 WITHIN = 3.0  # times its sensor's noise: so far a start may be from its reading
 FACTOR = 10.0  # by which a value that the user gave may be wrong
 MOST_DRAWN = 7  # powers of two: sets of values drawn in all, by the number of unknown parameters
+WINDOWS, LEAST_WINDOW = 60, 10  # of a log that values are first fitted to; samples in one at least
 FROM = 4  # of these that a fit begins from, beside the user's own
 MOST_STEPS = 16
 MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
@@ -169,7 +170,7 @@ class Bound:
             s.name, self.stage.outputs, self.stage.units, self.stage.parameters, self.stage.effects,
             lambda thetas: self.run(thetas)[:, :, ::stride], self.t[::stride], self.measured[:, ::stride],
             regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units, floor=self.stage.floor,
-            begins=self.stage.begins,
+            begins=self.stage.begins, quick=s.kind in ("static", "force"),
         )  # fmt: skip
 
         self.stages: list[Stage] = [self.thinned]
@@ -369,6 +370,7 @@ class Bound:
         if moves and not stays:
             self._choose_steps(self._with(values, free, drawn[0] * size))
         begins = [given, *drawn] if stays else drawn
+        begins += self._in_windows(error, begins, low, high)
         fits = [least_squares(error, b, bounds=(low, high), diff_step=1e-4, max_nfev=20) for b in begins]
         fits.sort(key=lambda f: f.cost)
         again = [least_squares(error, f.x, bounds=(low, high), diff_step=1e-4, max_nfev=60) for f in fits[:2]]
@@ -382,6 +384,23 @@ class Bound:
         if self.system.kind in ("simulate", "closed_loop"):
             self._choose_steps(values)
         return values
+
+    def _in_windows(self, error: Callable[[Array], Array], begins: list[Array], low: Array, high: Array) -> list[Array]:
+        """Values that suit short windows, each begun from the measured states; nothing where these are not measured.
+
+        A free run from wrong values loses its phase, and its error many valleys; a short one does neither.
+        """
+        from scipy.optimize import least_squares
+
+        s, data = self.system, self.data
+        measured = all(n in s.outputs or (n in s.rates and s.rates[n] in s.outputs) for n in s.states)
+        if s.window or s.kind != "simulate" or not s.rates or not measured:
+            return []
+        data.window = max(data.records[0].t[-1] / WINDOWS, LEAST_WINDOW * float(np.median(np.diff(data.records[0].t))))
+        first = min(begins, key=lambda z: float(np.sum(error(z) ** 2)))
+        best = least_squares(error, first, bounds=(low, high), diff_step=1e-4, max_nfev=20).x
+        data.window = None
+        return [best]
 
     def _with(self, values: Array, columns: list[int], new: Array) -> Array:
         out = values.copy()

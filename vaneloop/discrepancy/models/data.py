@@ -29,6 +29,7 @@ class Data:
     t         s, of all logs, one after the other
     measured  float64[outputs, samples], of all logs
     cutoff    Hz, up to which motion is differentiated and forces are compared; None: they are as measured
+    window    s, after which the model starts anew from the measured states; None: it does not
     notes     what the user should know
     like      take the cut-off from an earlier one (for test logs)
     """
@@ -50,7 +51,8 @@ class Data:
             self.logs[name] = slice(at, at + len(r.t))
             at += len(r.t)
         self._prepare()
-        self._restart_cache: dict[int, tuple[Array, Array]] = {}
+        self.window = system.window
+        self._restart_cache: dict[tuple[int, float], tuple[Array, Array]] = {}
 
     def _checked(self, r: Record) -> Record:
         s = self.system
@@ -183,11 +185,11 @@ class Data:
         """At which of a log's first ``n`` samples a window starts anew, bool[n]; states there, float64[states, n]."""
         s = self.system
         restart = np.zeros(n, dtype=np.bool_)
-        if not s.window:
+        if not self.window:
             return restart, np.zeros((len(s.states), 1))
-        if log not in self._restart_cache:
+        if (log, self.window) not in self._restart_cache:
             r = self.records[log]
-            w = (r.t / s.window + 1e-9).astype(int)
+            w = (r.t / self.window + 1e-9).astype(int)
             first = np.diff(w, prepend=-1) > 0
             values = np.zeros((len(s.states), len(r.t)))
             moving = dict(s.rates)
@@ -203,8 +205,8 @@ class Data:
                         "measured one)"
                     )
             first &= np.all(np.isfinite(values), axis=0)
-            self._restart_cache[log] = first, values
-        first, values = self._restart_cache[log]
+            self._restart_cache[log, self.window] = first, values
+        first, values = self._restart_cache[log, self.window]
         return first[:n], np.ascontiguousarray(values[:, :n])
 
     def held(self, log: int) -> float:

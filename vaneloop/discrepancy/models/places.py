@@ -28,7 +28,11 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
 
     def put(name: str, law: Law, place: str, at: int, size: Size, constant: float) -> None:
         ps, starts = law.make(size)
-        effects.append(Effect(name, tuple(ps), starts, law.looks))
+        holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
+        if law.holds is not None:
+            other, pattern = law.holds
+            holds = ((f"{name.rpartition('.')[0]}.{other}", pattern),)
+        effects.append(Effect(name, tuple(ps), starts, law.looks, holds))
         out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
 
     def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:

@@ -2,8 +2,8 @@
 
 Rounding to steps S adds to a value y the sawtooth -S/pi (sin 2 pi y/S - sin(4 pi y/S)/2 + ...). So errors that come
 from it go with sin(2 pi f y) at f = 1/S, and values that are rounded, with little noise on top, with cos(2 pi f y).
-A step that is wrong by a quarter of S^2 over the range of y shows nothing: frequencies stand a quarter of 1/range
-apart.
+Both show in the magnitude of the sum with exp(2 pi i f y), at frequencies a quarter of 1/range apart; steps count from
+zero, so that the phase then tells f closer, by the range from there.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ __all__ = ["steps_seen"]
 
 LEAST = 1.0  # times the noise: a smaller step makes an error of less than 0.3 of it
 MOST_FREQUENCIES = 6000
-SAMPLES = 3000  # looked at for the frequencies; a step is then tried on all
+SAMPLES = 3000  # looked at
 KEPT = 3  # of each kind of peak
-FINE = 41  # steps tried around a peak
-NEXT = (0.998, 1.0, 1.002)  # a start, and two from which a search between starts ends beside it
+FINER, MOST_FINER = 16.0, 500  # frequencies tried around a peak, to one turn of the phase; at most
 
 
 def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
@@ -38,19 +37,22 @@ def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
         return []
     f = np.arange(2.0 / span, 1.0 / least, 0.25 / span)
     stride = max(1, len(y) // SAMPLES)
-    error = (y - m)[::stride]
-    error = error - error.mean()
-    goes_with_error, of_values = np.empty(len(f)), np.empty(len(f))
+    y, m = y[::stride], m[::stride]
+    error = y - m - np.mean(y - m)
+    with_error, of_values = np.empty(len(f)), np.empty(len(f))
     for i in range(0, len(f), 256):
-        turn = 2.0 * np.pi * f[i : i + 256, None]
-        goes_with_error[i : i + 256] = -np.sin(turn * m[::stride]) @ error
-        of_values[i : i + 256] = np.cos(turn * y[::stride]).mean(axis=1)
+        turn = 2j * np.pi * f[i : i + 256, None]
+        with_error[i : i + 256] = np.abs(np.exp(turn * (m - m[0])) @ error)
+        of_values[i : i + 256] = np.abs(np.exp(turn * (y - y[0])).mean(axis=1))
     out: set[float] = set()
-    for height in (goes_with_error, of_values):
+    finer = 1.0 / (FINER * max(float(np.max(np.abs(m))), span))
+    for height in (with_error, of_values):
         inner = height[1:-1]
         peaks = 1 + np.flatnonzero((inner >= height[:-2]) & (inner > height[2:]))
         for k in peaks[np.argsort(-height[peaks], kind="stable")][:KEPT]:
-            sizes = 1.0 / np.linspace(f[k] - 0.25 / span, f[k] + 0.25 / span, FINE)
+            many = min(int(0.25 / span / finer) + 1, MOST_FINER // 2)
+            sizes = 1.0 / (f[k] + finer * np.arange(-many, many + 1))
             left = [float(np.sum((y - np.round(m / s) * s) ** 2)) for s in sizes]
-            out.add(float(sizes[int(np.argmin(left))]))
-    return sorted(s * near for s in out for near in NEXT)
+            best = f[k] + finer * (int(np.argmin(left)) - many)
+            out |= {float(1.0 / (best + near * finer)) for near in (-1.0, 0.0, 1.0)}
+    return sorted(out)

@@ -1,0 +1,130 @@
+"""What is promised before anything is fitted is what a fit then finds; what starts, edges and steps tell is used."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vaneloop import Record, System, unknown
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.motion import low_pass
+from vaneloop.discrepancy.models.stairs import steps_seen
+from vaneloop.discrepancy.promise import Slopes, along, followed, out_of, within
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+
+N = 600
+T = np.arange(N) * 0.1
+RNG = np.random.default_rng(3)
+U, W = np.cumsum(RNG.standard_normal((2, N)), axis=1) / 10.0
+
+
+def linear_stage() -> Stage:
+    """y = offset + gain u + size w, with size 0.7 hidden."""
+
+    def run(theta: np.ndarray) -> np.ndarray:
+        return (theta[:, :1] + theta[:, 1:2] * U + theta[:, 2:3] * W)[:, None]
+
+    measured = run(np.array([[0.3, 2.0, 0.7]]))[0] + 0.05 * np.random.default_rng(4).standard_normal((1, N))
+    own = (Parameter("offset", 0.0, "-", tolerance=10.0), Parameter("gain", 1.0, "-", tolerance=10.0))
+    effects = (
+        Effect("w", (Parameter("size", 0.0, "-", -5.0, 5.0),), ((0.2,), (4.0,))),
+        Effect(
+            "two",
+            (Parameter("size", 0.0, "-"), Parameter("how", 0.5, "-", shape=True)),
+            ((0.5, 0.5),),
+            "",
+            (("w", (None, 0.0)),),
+        ),
+    )
+    return Stage("linear", ("y",), ("-",), own, effects, run, T, measured, floor=np.array([0.05]))
+
+
+def test_the_best_size_of_what_acts_linearly_follows_from_one_simulation():
+    judge = Judge(linear_stage(), np.array([0.05]))
+    base = judge.fit((), judge.stage.neutral())
+    fit = judge.fit(("w",), base.theta)
+    slopes = Slopes(judge, base.theta, base.free, base.prior)
+    for start in (0.2, 4.0):
+        tried = base.theta.copy()
+        tried[2] = start
+        share, left = slopes.line(judge.errors(tried[None]))
+        assert share[0] * start == pytest.approx(fit.theta[2], rel=1e-3)
+        assert left[0] == pytest.approx(fit.cost.sum(), rel=1e-3)
+        moved = along(judge.stage.effects[0], np.array([start]), float(share[0]), np.array([-5.0]), np.array([5.0]))
+        assert moved == pytest.approx([fit.theta[2]], rel=1e-3)
+
+
+def test_a_gain_that_is_far_off_follows_at_once():
+    judge = Judge(linear_stage(), np.array([0.05]))
+    base = judge.fit((), judge.stage.neutral())
+    start = np.array([5.0, -8.0, 0.7, 0.0, 0.5])
+    thetas = [start]
+    errors, left = followed(judge, thetas, base.free, base.prior)
+    assert errors[0] == pytest.approx(judge.errors(start[None])[0])
+    assert thetas[0][:2] == pytest.approx([0.3, 2.0], abs=0.02)
+    assert left[0] == pytest.approx(float(np.sum(judge.errors(thetas[0][None]) ** 2)), rel=1e-2)
+
+
+def test_an_effect_and_one_that_holds_it_say_the_same_in_both_directions():
+    stage = linear_stage()
+    theta = np.array([0.1, 2.0, 0.6, 0.0, 0.5])
+    wider = within(stage, theta, "two", "w")
+    assert wider.tolist() == [0.1, 2.0, 0.0, 0.6, 0.0]
+    assert out_of(stage, wider, "two", "w").tolist() == theta.tolist()
+
+
+@pytest.mark.parametrize(("step", "noise", "offset"), [(0.5, 0.05, 0.0), (0.08, 0.03, 0.0), (0.03, 0.012, 7.0)])
+def test_the_step_of_a_sensor_is_read_from_its_values(step: float, noise: float, offset: float) -> None:
+    model = offset + 1.5 * np.sin(0.37 * T) + 0.8 * np.sin(0.11 * T)
+    measured = np.round(model / step) * step + noise * np.random.default_rng(1).standard_normal(N)
+    seen = steps_seen(measured, model, noise)
+    # within a quarter of a step at the far end of the range
+    assert min(abs(s - step) for s in seen) < 0.25 * step * step / np.max(np.abs(model))
+
+
+def test_nothing_is_read_from_an_output_that_stands_still():
+    assert steps_seen(np.ones(200), np.ones(200), 0.1) == []
+
+
+def test_what_is_linear_in_the_motion_holds_up_to_a_period_from_the_ends():
+    """Filtering a force and filtering the motion that it is made of are one and the same there."""
+    rate, cutoff = 1000.0, 2.0
+    t = np.arange(4000) / rate
+    x, a = np.sin(5.0 * t + 1.0), -25.0 * np.sin(5.0 * t + 1.0)
+    smooth = low_pass(t, x, cutoff)
+    twice = np.gradient(np.gradient(smooth, t), t)
+    inside = slice(int(rate / cutoff) + 5, -int(rate / cutoff) - 5)
+    error = np.abs(twice - low_pass(t, a, cutoff))
+    assert np.max(error[inside]) < 1e-3 * 25.0
+    assert np.max(error) > 0.1 * 25.0  # and not before
+
+
+def test_a_system_that_forgets_slowly_has_its_starts_fitted():
+    """A pendulum that hardly loses: noise in the first sample would stay in the whole log."""
+    rng = np.random.default_rng(0)
+    noise = 0.03
+
+    def system(damping: float) -> System:
+        return System(
+            "swing", "simulate", lambda x, u, p: (-p.stiff * x.angle - p.damping * x.rate, x.rate),
+            states={"rate": "rad/s", "angle": "rad"}, outputs={"angle": "rad", "rate": "rad/s"},
+            rates={"rate": "angle"},
+            parameters=[unknown("stiff", 8.0, "1/s^2", low=0.0), unknown("damping", damping, "1/s", low=0.0)],
+        )  # fmt: skip
+
+    def log(damping: float, samples: int) -> Record:
+        t = np.arange(samples) * 0.02
+        w = np.sqrt(9.0 - 0.25 * damping**2)
+        decay = np.exp(-0.5 * damping * t)
+        angle = decay * np.cos(w * t)
+        rate = np.gradient(angle, t, edge_order=2)
+        angle, rate = (v + noise * rng.standard_normal(len(t)) for v in (angle, rate))
+        return Record("swing", t, {"angle": angle, "rate": rate})
+
+    slow = system(0.02).bind([log(0.02, 1500)])
+    assert slow.read_starts and [p.name for p in slow.stage.parameters[2:]] == ["start_rate", "start_angle"]
+    assert slow.floor == pytest.approx(slow.data.noise())
+    fit = Judge(slow.stage, slow.floor).fit((), slow.stage.neutral())
+    assert float(np.sqrt(fit.cost.sum() / (2 * len(slow.t)))) == pytest.approx(1.0, abs=0.06)
+    assert fit.theta[3] == pytest.approx(1.0, abs=0.01)  # the reading is off by some 0.03
+    assert not system(3.0).bind([log(3.0, 12000)]).read_starts
