@@ -19,7 +19,7 @@ adapter for the code of a generator, a Makefile, the limits and reactions that i
 make and gcc, passes its tests and runs (docs/own_controller.md).
 
 examples:
-  vaneloop new-controller my_controller/
+  vaneloop new-controller MY_CONTROLLER/
 
 exit codes: 0 written, 2 bad input"""
 
