@@ -6,7 +6,8 @@ everything, since the errors of a wrong model are large, correlated and alike fr
 (blocks as in `vaneloop.discrepancy.fit`):
 
 - `LEAST_FALL`: what the held-out sum of squares has beyond noise falls by at least this share, and by at least
-  `LEAST_OF_NOISE` of the noise, whose level is known no better;
+  `LEAST_OF_NOISE` of the noise, whose level is known no better, and by what an error of `FORM` of all that laws are to
+  explain would be: the next law must not patch the form of those before it;
 - `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of
   small motion, which is wrong by a constant that suits the large motions, counts as much as they do; a block that is
   nearly perfect (`FLAT`, or the noise) cannot get better or worse;
@@ -45,6 +46,7 @@ __all__ = ["LEAST_FALL", "ErrorShare", "structure", "worth"]
 
 LEAST_FALL = 0.20  # share of the held-out sum of squares beyond noise that an effect must explain
 LEAST_OF_NOISE = 0.10  # and share of the noise (5 % of its RMS)
+FORM = 0.02  # of the error that laws are to explain: no equation of friction or flow is known better
 LEAST_HELP = 0.75  # share of the change over the blocks that is improvement
 AGREE = 0.05  # fall of a block's log mean square that counts as agreement
 FLAT = 0.1  # of the whole log's error: a block with less is as good as perfect
@@ -88,15 +90,17 @@ def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
     return np.maximum(fit.held_out[use], m * least * least), m
 
 
-def worth(judge: Judge, before: Fit, after: Fit) -> Evidence:
-    """Evidence for ``after`` against ``before``."""
+def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
+    """Evidence for ``after`` against ``before``; ``form``: error (noise floors) by which the equations of what is in the
+    model already may be wrong.
+    """
     flat = max(1.0, FLAT * rms_of(judge, before))
     (a, _), (b, _) = _levels(judge, before, flat), _levels(judge, after, flat)
     r = np.log(a / b)
     change = float(np.abs(r).sum())
     was, noise = float(_levels(judge, before)[0].sum()), float(judge.n)
     fall = 1.0 - float(_levels(judge, after)[0].sum()) / was
-    least = max(LEAST_FALL * (was - noise), LEAST_OF_NOISE * noise) / was
+    least = max(LEAST_FALL * (was - noise), LEAST_OF_NOISE * noise, form * form * noise) / was
     helps = float(np.maximum(r, 0.0).sum()) / change if change > 0 else 0.0
     return Evidence(fall, helps, int(np.sum(r > AGREE)), least)
 
@@ -124,8 +128,13 @@ class ErrorShare:
 
     def __init__(self, judge: Judge, figures: Figures | None = None, tests: frozenset[str] = frozenset()):
         self.judge, self.figures, self.tests = judge, figures, tests
+        self.form = 0.0
         self.notes: list[str] = []
         self.left_out: dict[str, str] = {}  # effect that helped -> why it is not named
+
+    def begin(self, base: Fit) -> None:
+        """Note what the laws are to explain: their form is known to a share of it."""
+        self.form = FORM * rms_of(self.judge, base)
 
     def learn(self, fit: Fit) -> None:
         """Nothing: the errors are not compared with noise."""
@@ -144,13 +153,13 @@ class ErrorShare:
 
     def earns(self, before: Fit, after: Fit) -> bool:
         """Whether the evidence is good."""
-        return worth(self.judge, before, after).good
+        return worth(self.judge, before, after, self.form).good
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Per cent of the held-out error; share of the change that is improvement."""
         judge = self.judge
         per_cent = 100.0 * (1.0 - rms_of(judge, after) / max(rms_of(judge, before), 1e-300))
-        return per_cent, worth(judge, before, after).help
+        return per_cent, worth(judge, before, after, self.form).help
 
     # ---- the best model ----------------------------------------------------------------------------------------------
 

@@ -127,6 +127,9 @@ class NoiseFloor:
         self.correlation = 1.0
         self.left_out: dict[str, str] = {}
 
+    def begin(self, base: Fit) -> None:
+        """Nothing: what is left is compared with noise."""
+
     def learn(self, fit: Fit) -> None:
         """Note how correlated the errors are that the best single effect leaves."""
         self.correlation = correlation_of(self.judge, fit)

@@ -45,6 +45,9 @@ class Criterion(Protocol):
     roams: bool
     left_out: dict[str, str]
 
+    def begin(self, base: Fit) -> None:
+        """Note what the model leaves as it is."""
+
     def learn(self, fit: Fit) -> None:
         """Note what the errors of the best single effect say of the log."""
 
@@ -101,6 +104,7 @@ class Search:
         self.nominal = [self.base.theta, *begins[1:]]
         # a stage that stands at its noise floor needs no effect; what the log could have shown is known from the
         # largest sizes
+        criterion.begin(self.base)
         self.quiet = not criterion.fails(self.base)
         self.starts = self._screen()
 
