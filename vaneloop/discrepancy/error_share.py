@@ -91,8 +91,9 @@ def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
 
 
 def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
-    """Evidence for ``after`` against ``before``; ``form``: error (noise floors) by which the equations of what is in the
-    model already may be wrong.
+    """Evidence for ``after`` against ``before``.
+
+    form  error (noise floors) by which the equations of what is in the model already may be wrong
     """
     flat = max(1.0, FLAT * rms_of(judge, before))
     (a, _), (b, _) = _levels(judge, before, flat), _levels(judge, after, flat)
