@@ -15,6 +15,7 @@ COMMANDS = {
         "vaneloop.cli.replay",
         "run a logged engine run through firmware and plant; errors in figures and pictures",
     ),
+    "map": ("vaneloop.cli.map", "which name of a log is which signal, guessed and shown; writes a mapping file"),
     "compare": (
         "vaneloop.cli.compare",
         "the model against a log: the whole loop, and each stage on its own logged inputs",
