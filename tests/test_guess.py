@@ -285,7 +285,8 @@ def test_names_units_order_and_other_columns_do_not_change_what_is_read(
 @pytest.mark.parametrize("name", [*FOREIGN, "fuel_pressure", "ENGINE_OIL_PRESSURE", "Raumtemperatur", "valve_position",
     "Ventilstrom_Ist", "n_corr", "vehicle speed", "gear_position", "tank_temp", "brake_pressure", "battery_current",
     "pump_current", "x_rear", "Servo_Motor_Position", "throttle position demand", "pressure", "Druck", "temp", "vgv",
-    "vgv1_demand", "status", "state", "counter", "CRC", "x", "n", "s", "S17", "X2", "", "   ", "12", "%", "\u00b0", "[rpm]", "u", "y"])  # fmt: skip
+    "vgv1_demand", "status", "state", "counter", "CRC", "x", "n", "s", "S17", "X2", "",
+    "   ", "12", "%", "\u00b0", "[rpm]", "u", "y"])  # fmt: skip
 def test_a_name_that_says_something_else_is_no_guess(name: str) -> None:
     m = meaning(name, ALL)
     assert m is None or m.confidence < ENOUGH, m

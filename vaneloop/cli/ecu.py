@@ -80,7 +80,7 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
     one. What there is to note on reading it is said, and goes into ``notes``.
     """
     from hil.loop import ecu
-    from vaneloop.base.errors import InputError
+    from vaneloop.base.errors import InputError, meant
     from vaneloop.base.tables import load_toml
 
     if args.profile and args.log:
@@ -111,8 +111,10 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
         n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
     if not path.suffix:
+        near = meant(name, [*ecu.BUILTIN, "engine-test"])
         raise InputError(
-            f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)"
+            f"--profile {name!r} is not known{near}; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file "
+            "(.toml, .csv)"
         )
     return ecu.read_profile(path, tell, **reading)
 

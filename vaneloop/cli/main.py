@@ -6,6 +6,7 @@ import importlib
 import sys
 
 from vaneloop.base import terminal
+from vaneloop.base.errors import meant
 
 __all__ = ["COMMANDS", "main", "run"]
 
@@ -58,6 +59,7 @@ COMMANDS = {
     "ecu": ("vaneloop.cli.ecu", "the engine control unit on the CAN bus: demand from a profile, a log or the keyboard"),
     "record": ("vaneloop.cli.record", "all frames of a CAN bus into MDF4, BLF, candump or Parquet; survives kill -9"),
     "design": ("vaneloop.cli.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
+    "completion": ("vaneloop.cli.completion", "completion of commands and options for bash, zsh and fish"),
     "web": ("vaneloop.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }
 
@@ -88,7 +90,8 @@ def main(argv: list[str]) -> int:
         return 0
     name = argv[0]
     if name not in COMMANDS:
-        print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
+        near = meant(name, COMMANDS)
+        print(f"vaneloop: {name!r} is not a command{near}; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
     # a command's imports take half a second, in which Ctrl-C may come, too
     return terminal.start(f"vaneloop {name}", lambda: importlib.import_module(COMMANDS[name][0]), argv[1:])

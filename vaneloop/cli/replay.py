@@ -113,7 +113,7 @@ def _figure(v: float | None) -> str:
 
 def _limits(options: list[str]) -> dict[tuple[str, str], float]:
     """Parse ``--tolerance`` into {(signal, statistic): limit}."""
-    from vaneloop.base.errors import InputError
+    from vaneloop.base.errors import InputError, meant
 
     out = {}
     for key, text in terminal.pairs(options, "tolerance").items():
@@ -121,7 +121,8 @@ def _limits(options: list[str]) -> dict[tuple[str, str], float]:
         statistic = statistic or "rms"
         if signal not in STAGE or statistic not in STATISTICS:
             allowed = f"{', '.join(STAGE)}, each also with .{', .'.join(STATISTICS)}"
-            raise InputError(f"--tolerance {key}={text}: {key!r} is not known; allowed: {allowed}")
+            near = meant(key, [*STAGE, *(f"{s}.{k}" for s in STAGE for k in STATISTICS)])
+            raise InputError(f"--tolerance {key}={text}: {key!r} is not known{near}; allowed: {allowed}")
         try:
             value = float(text)
         except ValueError:
