@@ -54,6 +54,7 @@ class Survey:
     other       names that are no signal of ours
     notes       what reading would note beside the guesses
     complaint   the line with which reading refuses the log; "" where it reads
+    damaged     what reading refuses is a channel itself: other names or units will not mend it
     design_rpm  rotor speed that is 100 %, rpm, as stated; ``suggested_rpm``: as the log suggests where it is missing
     """
 
@@ -66,6 +67,7 @@ class Survey:
     design_rpm: float | None
     suggested_rpm: float | None
     dbc: Path | None
+    damaged: bool
 
     @property
     def guessed(self) -> bool:
@@ -105,7 +107,7 @@ def survey(
     """
     path = Path(path)
     out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file)
-    rows = []
+    rows, damaged = [], False
     if isinstance(out.source, Table):
         rows.append(_time(path, out.source, out.units, {*(mapping or {}), *(mapping or {}).values()}))
     for signal in UNITS:
@@ -117,6 +119,7 @@ def survey(
         try:
             s = out.source.series(keys[0])
         except LogError:
+            damaged = True
             continue
         unit = out.units.get(signal, s.unit) or UNITS[signal]
         how = "guessed" if g else "stated" if stated else "named"
@@ -138,7 +141,7 @@ def survey(
         complaint = f"{path}: none of its names is a signal of ours ({', '.join(UNITS)}); --map NAME=signal names one"
     return Survey(
         str(path), rows, open_, [n for n in out.source.names if n not in used], notes, complaint, out.design_rpm,
-        suggested, out.dbc,
+        suggested, out.dbc, damaged and bool(complaint),
     )  # fmt: skip
 
 
