@@ -285,7 +285,7 @@ def test_names_units_order_and_other_columns_do_not_change_what_is_read(
 @pytest.mark.parametrize("name", [*FOREIGN, "fuel_pressure", "ENGINE_OIL_PRESSURE", "Raumtemperatur", "valve_position",
     "Ventilstrom_Ist", "n_corr", "vehicle speed", "gear_position", "tank_temp", "brake_pressure", "battery_current",
     "pump_current", "x_rear", "Servo_Motor_Position", "throttle position demand", "pressure", "Druck", "temp", "vgv",
-    "vgv1_demand", "status", "state", "counter", "CRC", "x", "n", "s", "S17", "X2", "",
+    "vgv1_demand", "status", "state", "counter", "CRC", "x", "n", "s", "S17", "X2", "", "position_x",
     "   ", "12", "%", "\u00b0", "[rpm]", "u", "y"])  # fmt: skip
 def test_a_name_that_says_something_else_is_no_guess(name: str) -> None:
     m = meaning(name, ALL)
@@ -308,6 +308,25 @@ def test_two_rotors_are_named_and_neither_is_guessed(tmp_path: Path, run: dict[s
     log = read_log(file, mapping={"N2_Dem": "n_dem"})
     np.testing.assert_allclose(log.channels["n_dem"].values, run["n_dem"] * 0.9, rtol=1e-8)
     assert not log.guesses
+
+
+def test_the_measured_speed_is_of_the_rotor_of_the_demand(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "N1_DEM": run["n_dem"], "N2_ACT": run["n_r"] * 0.95, "N1_ACT": run["n_r"]}
+    log = read_log(table(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(log.channels["n_r"].values, run["n_r"], rtol=1e-8)
+    del columns["N1_ACT"]
+    log = read_log(table(tmp_path / "a.csv", columns))
+    assert set(log.channels) == {"n_dem"} and any("another rotor than that of 'N1_DEM'" in n for n in log.notes)
+    columns = {"t": run["t"], "NH_CMD": run["n_dem"], "NL_FBK": run["n_r"], "HP Speed Measured": run["n_r"] * 0.98}
+    log = read_log(table(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(log.channels["n_r"].values, run["n_r"] * 0.98, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "name", ["timeout", "dead_time", "date_of_test", "uptime", "Zeitkonstante", "rise_time_s", "T1"]
+)
+def test_a_name_with_time_in_it_is_not_yet_the_time(name: str) -> None:
+    assert is_time(name) == (0.0, "")
 
 
 def test_what_contradicts_the_other_signals_is_withdrawn(tmp_path: Path, run: dict[str, np.ndarray]) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.names import Meaning, meaning
+from hil.logs.names import Meaning, meaning, spool
 from hil.logs.source import LogError, Source
 from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.signals import UNITS
@@ -101,6 +101,7 @@ def guess(
             doubts.setdefault(m.signal, []).append(f"{key!r} ({why})")
             continue
         found.setdefault(m.signal, []).append(Guess(m.signal, key, unit, m.confidence * sure, f"{m.why}; {why}"))
+    _of_one_rotor(found, doubts)
     for signal, candidates in found.items():
         first, *rest = sorted(candidates, key=lambda g: -g.confidence)
         alike = [g for g in rest if g.confidence >= first.confidence - ALIKE]
@@ -118,6 +119,19 @@ def guess(
         if signal not in out.made and signal not in out.open:
             out.open[signal] = f"may be {' or '.join(which[:3])}: not guessed; --map NAME={signal} takes one"
     return out
+
+
+def _of_one_rotor(found: dict[str, list[Guess]], doubts: dict[str, list[str]]) -> None:
+    """Leave the measured speed of another rotor than the demand's out: N2_ACT beside N1_DEM."""
+    demands = {spool(g.name) for g in found.get("n_dem", [])}
+    if len(demands) != 1 or not (which := demands.pop()):
+        return
+    for g in found.get("n_r", [])[:]:
+        if spool(g.name) not in ((), which):
+            found["n_r"].remove(g)
+            doubts.setdefault("n_r", []).append(f"{g.name!r} (another rotor than that of {found['n_dem'][0].name!r})")
+    if not found.get("n_r"):
+        found.pop("n_r", None)
 
 
 def _meant(key: str, comment: str, signals: tuple[str, ...]) -> Meaning | None:

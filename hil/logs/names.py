@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from vaneloop.base.vanes import VANES
 
-__all__ = ["CERTAIN", "Meaning", "is_time", "meaning", "unit_in_name"]
+__all__ = ["CERTAIN", "Meaning", "is_time", "meaning", "spool", "unit_in_name"]
 
 CERTAIN = 0.98  # of a name that says all that there is to say
 
@@ -219,14 +219,14 @@ def _quantity(words: tuple[str, ...]) -> str:
 def is_time(name: str) -> tuple[float, str]:
     """How surely a name means the time, 0 to 1, and the unit that it says ("" where it says none)."""
     words, unit, _ = unit_in_name(name)
-    kinds, unknown, numbers, misspelt = _kinds(words)
+    kinds, _, numbers, misspelt = _kinds(words)
     if words == ("t",):
         return CERTAIN, unit
-    if (
-        "time" not in kinds
-        or set(unknown) - _CLOCK
-        or any(k not in ("time", "filler", "actual", "supply") for k in kinds)
-    ):
+    rest = tuple(
+        w for w in words if not w.isdigit() and w not in _CLOCK and _MEANING.get(w) not in ("time", "actual", "supply")
+    )
+    strange = set(_kinds(rest)[0]) - {"time"} or _kinds(rest)[1]  # a misspelt time is one
+    if "time" not in kinds or strange:
         return 0.0, ""
     return CERTAIN - 0.1 * (numbers > 0) - 0.1 * misspelt, unit
 
@@ -275,12 +275,20 @@ def meaning(name: str, signals: tuple[str, ...]) -> Meaning | None:
         sure -= less
         if not roles and not more and (len(words) == 1 or numbers) and len(words[0]) == 1:
             sure = 0.5  # one letter, or one letter and a number, may be anything
+        if of == "stroke" and {"x", "s"} & set(words) and kinds.count("stroke") > 1 and "lvdt" not in words:
+            sure = 0.5  # position_x is a coordinate
         if unknown or more - must - may:
             sure = 0.4
         elif must and not must & more:
             sure = 0.5
         return Meaning(signal, unit, round(sure, 2), _why(quantity, roles, more, unknown))
     return None
+
+
+def spool(name: str) -> tuple[str, ...]:
+    """Which rotor a name speaks of: its number, or words such as NH; empty where it does not say."""
+    which = {"nh": "hp", "nhp": "hp", "hd": "hp", "nl": "lp", "nlp": "lp", "nd": "lp", "hp": "hp", "lp": "lp"}
+    return tuple(sorted({which.get(w, w) for w in unit_in_name(name)[0] if w in which or w.isdigit()}))
 
 
 def _why(quantity: str, roles: set[str], more: set[str], unknown: list[str]) -> str:

@@ -190,7 +190,8 @@ class ChosenLog:
                 for signal in ("t", *UNITS):
                     name, unit, how, sure, why, curve = seen["signals"].get(signal, ("", "", "", 0.0, "", []))
                     with ui.element("div").style(
-                        "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:2px 8px;align-items:center"
+                        "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:2px 8px;"
+                        "align-items:center;align-content:start"
                     ):
                         ui.label(signal).classes("mono")
                         label = f"name of {signal} in the log"
