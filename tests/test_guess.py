@@ -338,6 +338,9 @@ def test_what_contradicts_the_other_signals_is_withdrawn(tmp_path: Path, run: di
     said = " ".join(log.notes)
     assert "'VGV1_Winkel' would be it by name, but it runs against x_lvdt; --unit vgv1=-deg" in said
     assert "drives the stroke backwards" in said
+    log = read_log(file, units={"vgv1": "-deg", "i_cmd": "-mA"})  # what the notes propose mends it
+    np.testing.assert_allclose(log.channels["vgv1"].values, run["vgv1"], rtol=1e-8)
+    np.testing.assert_allclose(log.channels["i_cmd"].values, run["i_cmd"], rtol=1e-8)
     log = read_log(file, mapping={"VGV1_Winkel": "vgv1"}, units={"vgv1": "-deg"})
     np.testing.assert_allclose(log.channels["vgv1"].values, run["vgv1"], rtol=1e-8)
 
@@ -449,7 +452,11 @@ def test_a_wrong_mapping_file_is_refused_in_one_line(tmp_path: Path, text: str, 
 
 COMMANDS = [
     ["replay", "{log}"],
+    ["compare", "{log}"],
     ["locate", "{log}"],
+    ["diagnose", "{log}"],
+    ["experiment", "{log}"],
+    ["extend", "{log}", "--effect", "valve_dead_band", "--out", "{folder}/m.toml"],
     ["schedule", "--log", "{log}"],
     ["run", "--bus", "lockstep", "--log", "{log}"],
     ["run", "--bus", "lockstep", "--profile", "{log}"],
@@ -462,14 +469,14 @@ def test_every_guess_is_in_text_and_json_of_a_command(
 ) -> None:
     file = table(tmp_path / "a.csv", {"Zeit_s": run["t"], **styled(run, GERMAN)})
     out = tmp_path / "a.json"
-    assert main([w.format(log=file) for w in words] + ["--json", str(out)]) in (0, 1)
+    assert main([w.format(log=file, folder=tmp_path) for w in words] + ["--json", str(out)]) in (0, 1)
     said = capsys.readouterr().out
     guesses = [g.note() for g in read_log(file).guesses]
     notes = json.loads(out.read_text())["notes"]
     assert len(guesses) == len(SIGNALS)
     for note in guesses:
         assert said.count(note) == 1 and note in notes
-    assert main([w.format(log=file) for w in words] + ["--no-guess"]) == 2
+    assert main([w.format(log=file, folder=tmp_path) for w in words] + ["--no-guess"]) == 2
     assert "no time column" in capsys.readouterr().err
 
 

@@ -155,6 +155,8 @@ def _unit(
     for unit, where in ((stated, "you say"), (in_file, "the log says"), (in_name, "its name says")):
         if unit.strip().casefold() in NO_UNIT or unit.strip() == "1":
             continue
+        given, sign = unit, -1.0 if where == "you say" and unit.startswith("-") else 1.0
+        unit = unit.removeprefix("-")
         factor, speed = factor_of(unit, own), None
         if signal in ("n_dem", "n_r") and not isinstance(factor, tuple):
             speed = factor_of(unit, "rpm")
@@ -166,9 +168,9 @@ def _unit(
             if factor is None and where == "the log says":
                 continue  # a unit that nobody knows
             return None, 0.0, f"{where} {unit}, which is no unit of {signal}"
-        if why := plausible.judge(signal, v * factor[0] + factor[1])[1]:
+        if why := plausible.judge(signal, sign * v * factor[0] + factor[1])[1]:
             return None, 0.0, f"{where} {unit}, but {why}"
-        return unit, 1.0, f"{where} {unit}"
+        return given, 1.0, f"{where} {given}"
     size = float(np.percentile(np.abs(v), 99.0))
     able = [u for u, (low, high) in _USUAL[_LIKE.get(signal, signal)].items() if low <= size <= high]
     said = f"its values reach {size:.4g}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hil.replay import STAGE, STATISTICS, ReplayResult
@@ -53,10 +53,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def command(
-    args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None
+    args: argparse.Namespace,
+    extra: dict[str, Any] | None = None,
+    floors: Mapping[str, float] | None = None,
+    said: Sequence[str] = (),
 ) -> int:
-    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit
-    code.
+    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`, notes that have been
+    ``said`` are not said again. Return the exit code.
     """
     from pathlib import Path
 
@@ -88,7 +91,7 @@ def command(
     terminal.print_table(
         args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows
     )
-    for note in result.notes:
+    for note in (n for n in result.notes if n not in said):
         terminal.say(args, f"note: {note}")
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
