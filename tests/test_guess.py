@@ -246,7 +246,7 @@ NAMES: dict[str, list[str]] = {
     "n_r": ["N_Meas", "Istdrehzahl", "speed_actual", "RotorSpeed", "N1_ACT", "nIst", "Engine Speed Feedback"],
     "x_dem": ["Stroke_Cmd", "Sollweg", "actuator_position_demand", "xSoll", "HubSoll", "VGV_Stroke_Req"],
     "x_lvdt": ["LVDT", "Istweg", "actuator_position", "xIst", "Kolbenhub", "Ram Position Measured"],
-    "i_cmd": ["SV_Current_Cmd", "Servoventilstrom", "valve_current_demand", "iServoSoll"],
+    "i_cmd": ["SV_Current_Cmd", "Servoventilstrom_Soll", "valve_current_demand", "iServoSoll"],
     "p_s": ["Supply_Pressure", "Versorgungsdruck", "p_sys", "HydPress", "Systemdruck"],
     "t_oil": ["Oil_Temp", "Oeltemperatur", "TempOil", "fluid temperature"],
 }
@@ -261,7 +261,7 @@ SCALES: dict[str, list[tuple[str, float, float]]] = {
 FOREIGN = ["fuel_flow", "T3", "EGT", "room_temperature", "coolant_pressure", "wheel_speed", "motor_current", "op", "u"]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 def test_names_units_order_and_other_columns_do_not_change_what_is_read(
     tmp_path: Path, run: dict[str, np.ndarray], draw: st.DataObject
@@ -493,6 +493,8 @@ def test_map_shows_what_is_in_a_log(
     assert main(["map", str(file), "--design-rpm", "38000"]) == 0
     assert main(["map", str(table(tmp_path / "b.csv", {"t": run["t"], "Fuel": run["t"]}))]) == 1
     assert "none of its names is a signal of ours" in capsys.readouterr().out
+    (tmp_path / "c.csv").write_text("t;n_dem\n")
+    assert main(["map", str(tmp_path / "c.csv")]) == 1 and "has no sample" in capsys.readouterr().out
 
 
 def test_a_sparkline_rises_with_its_curve() -> None:

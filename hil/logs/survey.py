@@ -137,6 +137,8 @@ def survey(
         ).notes  # fmt: skip
     except InputError as e:
         complaint = str(e)
+    if not complaint and rows and not any(r.curve.size for r in rows):
+        complaint = f"{path}: has no sample"
     if not complaint and not any(r.signal != "t" for r in rows):
         complaint = f"{path}: none of its names is a signal of ours ({', '.join(UNITS)}); --map NAME=signal names one"
     return Survey(
