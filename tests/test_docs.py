@@ -311,7 +311,10 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
     """
     text = step.text
     if page == "docs/logs.md":
-        if "N1_DEM" in text and step.kind == "python":
+        if "bench.csv" in text:
+            names = {"Zeit_s": "t", "Drehzahl_Soll_U_min": "n_dem", "Kolbenweg_Ist_mm": "x_lvdt"}
+            log_of(folder, {**names, "Versorgungsdruck_bar": "p_s"}, "bench.csv", n_dem=380.0, p_s=10.0)
+        elif "N1_DEM" in text and step.kind == "python":
             log_of(folder, {"t": "t", "N1_DEM": "n_dem", "x_lvdt": "x_lvdt"}, n_dem=380.0)
         elif "N1_DEM" in text:
             log_of(folder, {"Zeit": "t", "N1_DEM": "n_dem", "N1_ACT": "n_r", "vigv": "vigv"})

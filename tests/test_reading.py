@@ -442,7 +442,7 @@ def test_a_time_that_counts_in_smaller_units_is_refused_with_the_option(tmp_path
     assert "--unit t=" in refused(tmp_path / "a.csv")
     assert read_log(tmp_path / "a.csv", units={"t": unit}).channels["n_dem"].t[-1] == pytest.approx(299.99)
     (tmp_path / "b.csv").write_text("t,n_dem\n" + "".join(f"{(_T0 + k * 0.01) * factor:.0f},60\n" for k in n[:100]))
-    assert "--unit t=" in refused(tmp_path / "b.csv")
+    assert "--unit t=" in refused(tmp_path / "b.csv", guess=False)
 
 
 def test_spans_out_of_proportion_to_the_rows_are_refused(tmp_path: Path) -> None:

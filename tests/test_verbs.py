@@ -114,7 +114,10 @@ def test_replay_says_in_a_notebook_what_the_command_says(tmp_path: Path) -> None
 def test_an_experiment_of_a_log_without_rivals(diagnosed: Diagnosed, tmp_path: Path) -> None:
     answer = vaneloop.experiment(LOG, diagnosed)
     assert isinstance(answer, Experiment) and answer.recommended is None
-    assert answer.to_dict() == {"schema": 1, "log": answer.log, "recommended": None, "profiles": []}
+    notes = diagnosed.diagnosis.notes
+    assert answer.to_dict() == {
+        "schema": 1, "log": answer.log, "recommended": None, "profiles": [], "notes": notes,
+    }  # fmt: skip
     shown(answer, tmp_path)
 
 

@@ -261,25 +261,54 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
     page.get_by_role("alert").filter(has_text="junk.parquet").wait_for()
     assert "Traceback" not in page.get_by_role("alert").inner_text()
 
+    # a file that cannot be opened has no names to be mapped, whatever was chosen before it
+    junk = tmp_path / "junk.mf4"
+    junk.write_bytes(b"MDF     4.10    " + bytes(range(256)) * 40)
+    page.locator("input[type=file]").first.set_input_files(junk)
+    page.get_by_role("alert").filter(has_text="junk.mf4").wait_for()
+    assert page.get_by_text("Names and units").count() == 0
+
 
 @needs_browser
 def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     page.goto(server.url)
     choose(page, "renamed.csv")
-    page.get_by_role("alert").wait_for()  # n_dem and n_r are missing under our names
+    # the form is open: a name is guessed, and the speeds are in rpm, whose design speed is proposed
+    stroke = page.get_by_label("name of x_lvdt in the log")
+    stroke.wait_for()
+    assert stroke.get_attribute("placeholder") == "ACT_POS"
+    page.get_by_text(re.compile("guessed, 8. % sure")).first.wait_for()
+    assert page.locator(".spark").count() >= 4
+    page.get_by_text("--design-rpm 38000, if that is 100 %").first.wait_for()
+    looks(page, "guessed")
     for ours, name in (("n_dem", "N1_DEM"), ("n_r", "N1"), ("x_lvdt", "ACT_POS")):
-        page.get_by_label(f"name of {ours} in the log").click()
-        page.get_by_role("option", name=name, exact=True).click()
+        page.get_by_label(f"name of {ours} in the log").fill(name)
     for ours, unit in (("n_dem", "rpm"), ("n_r", "rpm"), ("x_lvdt", "m")):
         page.get_by_label(f"unit of {ours} in the log").fill(unit)
-    page.get_by_label("design speed [rpm]").fill("38000")
-    page.get_by_role("button", name="Read again").click()
+    rpm = page.get_by_label("design speed [rpm]")
+    rpm.fill("38000")
+    rpm.press("Enter")
+    page.locator(".cmd code", has_text="--design-rpm 38000").first.wait_for()
     page.get_by_text("fails most in the").wait_for()
+    assert page.get_by_label("name of n_r in the log").input_value() == "N1"
     preview = page.locator(".vtable").first.inner_text()
     assert "ACT_POS" in preview and "N1_DEM" in preview
     command = page.locator(".cmd code").first.inner_text()
     assert "--map N1=n_r" in command and "--unit x_lvdt=m" in command and "--design-rpm 38000" in command
     shot(page, "mapped_1280_light")
+
+
+def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
+    from vaneloop.web.session import Choice, LogFile
+
+    log, bench = (LogFile(tmp_path / n, n, n) for n in ("a.csv", "bench.toml"))
+    c = Choice(
+        file=log, bench=bench, mapping={"n_dem": "N1"}, units={"n_dem": "rpm"}, design_rpm=" 38000 ", guess=False
+    )
+    assert c.words(real=False) == [
+        "a.csv", "--map", "N1=n_dem", "--unit", "n_dem=rpm", "--design-rpm", "38000", "--mapping", "bench.toml",
+        "--no-guess",
+    ]  # fmt: skip
 
 
 # ---- page 2: schedule ------------------------------------------------------------------------------------------------

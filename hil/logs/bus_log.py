@@ -33,6 +33,7 @@ class Bus:
         self.frames, self.dbc = frames, dbc
         self.notes = notes + frames.notes
         self.names: dict[str, tuple[str, ...]] = {}
+        self.comments: dict[str, str] = {}
         self._of: dict[str, tuple[Message, Any]] = {}
         self._silent: dict[str, str] = {}
         self._rows: dict[int, np.ndarray] = {}
@@ -45,6 +46,7 @@ class Bus:
                 if here:
                     self.names[key] = (key, s.name)
                     self._of[key] = m, s
+                    self.comments[key] = str(s.comment or "")
                 else:
                     why = (
                         f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no "

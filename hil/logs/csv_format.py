@@ -12,6 +12,8 @@ import numpy as np
 
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, read_bytes
 from hil.logs.table import Table, polars_table, split_unit, time_column
+from hil.logs.times import from_dates
+from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.signals import UNITS
 
 __all__ = ["open_csv", "write_csv"]
@@ -38,6 +40,9 @@ def open_csv(path: Path, options: Options) -> Source:
         head, _, rest = rest.partition(b"\n")
         first += 1
     line = head.decode().strip("\r")
+    if re.fullmatch(r'"?sep=.?"?', line) and rest:  # what Excel writes to be read by Excel
+        head, _, rest = rest.partition(b"\n")
+        line, first = head.decode().strip("\r"), first + 1
     separator = max(",;\t", key=line.count)
     try:
         headers = [h.strip() for h in next(csv.reader([line], delimiter=separator), [])]
@@ -48,24 +53,45 @@ def open_csv(path: Path, options: Options) -> Source:
     again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
     if again is not None:
         raise LogError(f"{path}: column {again!r} is there more than once")
+    units = _units_row(rest, headers, separator)
+    if units:
+        rest, first = rest.partition(b"\n")[2], first + 1
     comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
 
-    time = time_column(path, headers, options.mapping)
-    known = {*UNITS, *options.mapping, time}
-    table = _Csv(
-        path, rest, headers, [h for h in headers if h in known or split_unit(h)[0] in known], separator, comma, first
-    )
-    return Table([h for h in headers if h], table.column, first, time)
+    time = time_column(path, headers, options)
+    known = {*UNITS, *options.mapping, time.name}
+    wanted = [h for h in headers if h in known or split_unit(h)[0] in known]
+    rows = _Csv(path, rest, headers, wanted, separator, comma, first, time.name)
+    table = Table([h for h in headers if h], rows.column, first, time, units)
+    rows.notes = table.notes
+    return table
+
+
+def _units_row(rest: bytes, headers: list[str], separator: str) -> dict[str, str]:
+    """Column -> unit, where the row under the header holds units and nothing else; empty where it does not."""
+    try:
+        cells = [c.strip().strip("[]()") for c in next(csv.reader([rest.partition(b"\n")[0].decode().strip("\r")],
+                                                                  delimiter=separator), [])]  # fmt: skip
+    except csv.Error:
+        return {}
+    said = [c for c in cells if c.casefold() not in NO_UNIT]
+    if not said:
+        return {}
+    if any(re.fullmatch(r"[-+\d.,:eE]+|(?i:nan|[-+]?inf)", c) or factor_of(c, "s") is None for c in said):
+        return {}
+    return {h: c for h, c in zip(headers, cells, strict=False) if h and c.casefold() not in NO_UNIT}
 
 
 class _Csv:
     """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
 
     def __init__(
-        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int
-    ):
+        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int,
+        time: str,
+    ):  # fmt: skip
         self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
         self.separator, self.comma, self.first = separator, comma, first
+        self.time, self.notes = time, list[str]()
         self.ready: dict[str, np.ndarray] | None = None
 
     def column(self, header: str) -> np.ndarray:
@@ -110,6 +136,9 @@ class _Csv:
         text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
         number = (text.str.replace(",", ".", literal=True) if self.comma else text).cast(pl.Float64, strict=False)
         bad = (number.is_null() & text.is_not_null()).arg_true()
+        if bad.len() and header == self.time and (dates := from_dates(text)) is not None:
+            self.notes.append(dates[1])
+            return dates[0]
         if bad.len():
             raise LogError(
                 f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number"

@@ -10,24 +10,18 @@ interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.asc import read_asc, write_asc
-from hil.logs.blf import read_blf, write_blf
-from hil.logs.bus_log import bus_reader, bus_writer
-from hil.logs.candump import read_candump, write_candump
-from hil.logs.csv_format import open_csv, write_csv
-from hil.logs.frames import Frames
-from hil.logs.mdf import open_mdf, write_mdf
-from hil.logs.parquet_format import open_parquet, write_parquet
+from hil.logs.formats import FORMATS, Format, format_of
+from hil.logs.guess import Guess
+from hil.logs.opening import is_ours, open_log, wanted_design_speed
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
 from hil.logs.table import NoTime
-from hil.logs.trc import read_trc, write_trc
 from hil.logs.units import Units
 from vaneloop.base.signals import UNITS
 
@@ -38,7 +32,8 @@ _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, no
 
 @dataclass(frozen=True)
 class Log:
-    """A measured run: where it is from, its channels by name, and what was left out or assumed on reading.
+    """A measured run: where it is from, its channels by name, what was left out or assumed on reading, and which of
+    its names and units are guesses (each has its note, too).
 
     Raises LogError where a channel of the product's signals cannot be in its unit, or where the time spans more than
     the rows are worth (`hil.logs.plausible`): no command gets such a log, whoever made it.
@@ -48,23 +43,17 @@ class Log:
     channels: dict[str, Channel]
     notes: list[str] = field(default_factory=list)
     signals: Mapping[str, str] = field(default_factory=lambda: UNITS, repr=False)
+    guesses: tuple[Guess, ...] = ()
 
     def __post_init__(self) -> None:
         wrong = []
         for name, c in self.channels.items():
-            if _ours(name, self.signals) and (why := plausible.judge(name, c.values)[1]):
+            if is_ours(name, self.signals) and (why := plausible.judge(name, c.values)[1]):
                 wrong.append((name, name, why, c.values))
         _refuse_units(self.path, wrong)
         times = [c.t for c in self.channels.values() if c.t.size]
         if times and (why := plausible.span_complaint(times)):
             raise LogError(f"{self.path}: {why}; --unit t=ms, if time counts in ms")
-
-
-def _ours(name: str, signals: Mapping[str, str]) -> bool:
-    """Whether ``name`` is one of the product's signals: a system of a user's own may give its name to something
-    else.
-    """
-    return name in plausible.RANGES and signals.get(name) == UNITS[name]
 
 
 def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]]) -> None:
@@ -75,63 +64,7 @@ def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]
         raise LogError(f"{path}: {signal} ({key}): {why}; {plausible.proposed(signal, values)}{also}")
 
 
-# --- formats ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Format:
-    """How to read a file of the format, how to write channels into one (with a database, for CAN), and how to read its
-    frames, where it holds nothing else.
-    """
-
-    read: Callable[[Path, Options], Source]
-    write: Callable[[Path, dict[str, Channel], Path | None], None]
-    frames: Callable[[Path], Frames] | None = None
-
-
-def _can(read: Callable[[Path], Frames], write: Callable[[Path, Frames], None]) -> Format:
-    """Format of a CAN log, seen through the database."""
-    return Format(bus_reader(read), bus_writer(write), read)
-
-
-FORMATS: dict[str, Format] = {
-    ".log": _can(read_candump, write_candump),
-    ".asc": _can(read_asc, write_asc),
-    ".blf": _can(read_blf, write_blf),
-    ".trc": _can(read_trc, write_trc),
-    ".mf4": Format(open_mdf, write_mdf),
-    ".csv": Format(open_csv, write_csv),
-    ".parquet": Format(open_parquet, write_parquet),
-}
-
-
-def _format(path: Path) -> Format:
-    found = FORMATS.get(path.suffix.lower())
-    if found is None:
-        raise LogError(f"{path}: suffix {path.suffix!r} is not a log's; allowed: {', '.join(FORMATS)}")
-    return found
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, str] = UNITS) -> dict[str, str]:
-    """Mapping as signal -> name in the log; both directions are understood, {"N1": "n_dem"} and {"n_dem": "N1"}."""
-    known = {*signals, "t"}
-    out: dict[str, str] = {}
-    for a, b in (mapping or {}).items():
-        if b in known:
-            name, signal = a, b
-        elif a in known:
-            name, signal = b, a
-        else:
-            raise LogError(
-                f"{path}: map {a}={b}: {b!r} is not a signal{close_names(b, known)}; allowed: {', '.join(signals)}, t"
-            )
-        if signal in out and out[signal] != name:
-            raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
-        out[signal] = name
-    return out
 
 
 def _take(
@@ -228,6 +161,8 @@ def read_log(
     design_rpm: float | None = None,
     require: Iterable[str] = ("n_dem",),
     signals: Mapping[str, str] = UNITS,
+    guess: bool = True,
+    mapping_file: str | Path | None = None,
 ) -> Log:
     """Read a log of any format into channels with the product's names and units.
 
@@ -239,11 +174,13 @@ def read_log(
     design_rpm  design speed, rpm; needed where a rotor speed is not in %
     require     signals without which the log is of no use; each needs two samples
     signals     name -> unit of all signals to look for; default: the product's
+    guess       guess names and units that nobody states (`hil.logs.guess`), each with a note; not with a mapping file
+    mapping_file  names, units, design speed and database of a bench (`hil.logs.mapping`); what is given beside it goes
+                before
 
     Raises LogError, one line, for whatever cannot be used.
     """
     path, require = Path(path), tuple(require)
-    named = _pairs(path, mapping, signals)
     for what, given in (("unit of", dict(units or {})), ("required", dict.fromkeys(require))):
         for signal in given:
             if signal not in signals and signal != "t":
@@ -254,11 +191,14 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    source = _format(path).read(
-        path, Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()})
-    )
-    notes: list[str] = []
-    unit = Units(path, units or {}, design_rpm, notes, signals)
+    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file)
+    source, named, notes, units = log.source, log.named, log.notes, log.units
+    if log.guesses.rpm:
+        speed, _, words = wanted_design_speed(path, log)
+        if not log.taken or set(log.guesses.rpm) & set(require):
+            raise LogError(f"{path}: {speed}: {words}")
+        notes.append(f"{speed}: {words}")
+    unit = Units(path, units, log.design_rpm, notes, signals)
     channels: dict[str, Channel] = {}
     keys: dict[str, str] = {}
     wrong: list[tuple[str, str, str, np.ndarray]] = []
@@ -285,20 +225,21 @@ def read_log(
             if not source.sorted:
                 t = _in_time(s, t, known, notes)
             channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
-            if channel is not None and _ours(signal, signals):
+            if channel is not None and is_ours(signal, signals):
                 channel = _inside(signal, key, channel, wrong, notes)
             if channel is not None:
                 channels[signal], keys[signal] = channel, key
         if signal in require and (signal not in channels or channels[signal].t.size < 2):
             found = "only one sample of" if signal in channels else "no"
             reason = "; ".join(source.notes[said[0] :] + notes[said[1] :]) or source.absent(name)
+            reason = "; ".join(filter(None, (reason, log.guesses.open.get(signal), log.absent.get(signal))))
             asked = f"looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
             raise LogError(f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}")
     _refuse_units(path, wrong)
     channels = _one_run(path, channels, require, notes)
-    _shift(channels, notes)
-    ours = {name: (c.t, c.values) for name, c in channels.items() if _ours(name, signals)}
-    sure, perhaps = plausible.too_small(ours, set(units or {}))
+    _shift(channels, notes, "1900" if units.get("t") == "day" else "1970")
+    ours = {name: (c.t, c.values) for name, c in channels.items() if is_ours(name, signals)}
+    sure, perhaps = plausible.too_small(ours, set(units) - set(log.guesses.made))
     if sure:
         small, *others = sure
         raise LogError(
@@ -306,7 +247,9 @@ def read_log(
             + (f"; the same for {', '.join(others)}" if others else "")
         )
     notes += [f"{name} ({keys[name]}): {why}" for name, why in perhaps.items()]
-    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals)
+    notes += [f"{name}: {why}" for name, why in log.guesses.open.items() if name not in log.guesses.rpm]
+    made = tuple(g for g in log.guesses.made.values() if g.signal in channels)
+    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made)
 
 
 def _inside(
@@ -356,19 +299,19 @@ def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
     """Names that a log offers and that ``mapping`` may name. Raises LogError for a file that is no log."""
     path = Path(path)
     try:
-        source = _format(path).read(path, Options(Path(dbc) if dbc is not None else None, {}))
+        source = format_of(path).read(path, Options(Path(dbc) if dbc is not None else None, {}))
     except NoTime as e:
         return [h for h in e.headers if h]
     time = getattr(source, "time", None)  # a table's time column is a column like any other
     return [*([time] if time else []), *source.names]
 
 
-def _shift(channels: dict[str, Channel], notes: list[str]) -> None:
-    """Count time from the start of the log where the file counts from 1970, from midnight, or from an event far
-    away.
+def _shift(channels: dict[str, Channel], notes: list[str], era: str) -> None:
+    """Count time from the start of the log where the file counts from 1970 (or another ``era``), from midnight, or
+    from an event far away.
     """
     if channels and abs(start := min(float(c.t[0]) for c in channels.values())) > plausible.JUMP:
-        since = "counts from 1970" if start > _EPOCH else "does not count from the start"
+        since = f"counts from {era}" if start > _EPOCH else "does not count from the start"
         notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
         for name, c in channels.items():
             channels[name] = Channel(c.t - start, c.values)
@@ -385,7 +328,7 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
     LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
     """
     path = Path(path)
-    write = _format(path).write
+    write = format_of(path).write
     if not channels:
         raise LogError(f"{path}: no channel to write")
     checked = {}

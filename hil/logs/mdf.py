@@ -5,8 +5,8 @@ chain of blocks or an allocation of terabytes (seen in fuzzing, asammdf 8.8). A 
 reader down, so a child process with limits on time and memory opens the file and hands back arrays. It costs 0.3 s a
 file.
 
-Request, one line of JSON on the child's stdin: {"path", "wanted": [names]}. Answer on its stdout: one line of JSON,
-then the bytes of the arrays it lists. {"error": text} stands for what the file is to blame for.
+Request, one line of JSON on the child's stdin: {"path", "wanted": [names], "guess"}. Answer on its stdout: one line of
+JSON, then the bytes of the arrays it lists. {"error": text} stands for what the file is to blame for.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 
 from hil.logs.bus_log import encode_channels, open_bus_log
 from hil.logs.frames import EXTENDED, Frames, in_order
+from hil.logs.names import meaning
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
 from vaneloop.base.signals import UNITS
 
@@ -50,6 +51,7 @@ class Groups:
     def __init__(self, content: dict[str, Any]):
         self.notes: list[str] = []
         self.names = {key: tuple(names) for key, names in content["names"].items()}
+        self.comments: dict[str, str] = content["comments"]
         self._series, self._why = content["series"], content["why"]
 
     def has(self) -> str:
@@ -71,7 +73,7 @@ def open_mdf(path: Path, options: Options) -> Source:
     asked for.
     """
     wanted = [*UNITS, *options.mapping]
-    content, frames = read_mdf(path, wanted)
+    content, frames = read_mdf(path, wanted, options.guess)
     groups = Groups(content)
     if frames is not None and (
         options.dbc is not None or not any(find(groups, n, n in options.mapping) for n in wanted)
@@ -80,11 +82,12 @@ def open_mdf(path: Path, options: Options) -> Source:
     return groups
 
 
-def read_mdf(path: Path, wanted: list[str]) -> tuple[dict[str, Any], Frames | None]:
+def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[str, Any], Frames | None]:
     """Channels and CAN frames of a file.
 
     Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit) of the keys that
-    answer to ``wanted``, "why" (key -> reason it has no numbers), and the frames of its bus logging, if any.
+    answer to ``wanted`` (with ``guess``, of those too whose name or comment means one of our signals), "comments" of
+    these, "why" (key -> reason it has no numbers), and the frames of its bus logging, if any.
     """
     head = read_bytes(path, 168)
     if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or head[64:68] != b"##HD":
@@ -92,7 +95,7 @@ def read_mdf(path: Path, wanted: list[str]) -> tuple[dict[str, Any], Frames | No
         raise LogError(
             f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else "")
         )
-    request = json.dumps({"path": str(path.absolute()), "wanted": wanted}) + "\n"
+    request = json.dumps({"path": str(path.absolute()), "wanted": wanted, "guess": guess}) + "\n"
     answer = _child(request.encode(), _TIME[0] + check_file(path) / _TIME[1])
     line, _, body = answer.partition(b"\n")
     try:
@@ -111,7 +114,7 @@ def read_mdf(path: Path, wanted: list[str]) -> tuple[dict[str, Any], Frames | No
     for i in range(reply["buses"]):
         t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
         parts.append((*in_order(str(path), t, notes := []), ident, bus, length, data, notes))  # type: ignore[var-annotated]
-    return {"names": reply["names"], "series": series, "why": reply["why"]}, _merge(parts)
+    return {**{k: reply[k] for k in ("names", "comments", "why")}, "series": series}, _merge(parts)
 
 
 def _merge(parts: list[Any]) -> Frames | None:
@@ -169,7 +172,7 @@ def answer(request: bytes, out: BinaryIO) -> None:
     arrays: dict[str, np.ndarray] = {}
     try:
         with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
-            reply = _read(mdf, asked["wanted"], arrays)
+            reply = _read(mdf, asked["wanted"], asked["guess"], arrays)
     except MemoryError:
         reply = {
             "error": f"unpacks to more memory than its size allows, {_MEMORY[0]:,} bytes and {_MEMORY[1]} for each of "
@@ -185,7 +188,7 @@ def answer(request: bytes, out: BinaryIO) -> None:
         out.write(np.ascontiguousarray(a).tobytes())
 
 
-def _read(mdf: Any, wanted: list[str], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """Names, wanted series and bus frames of an open file; numbers go to ``arrays``."""
     found, buses = [], 0
     for g, group in enumerate(mdf.groups):
@@ -203,15 +206,20 @@ def _read(mdf: Any, wanted: list[str], arrays: dict[str, np.ndarray]) -> dict[st
                 found.append((g, i, name, label, master))
     plain = [f[2] for f in found]
     full = [f"{f[3]}.{f[2]}" for f in found]
-    reply: dict[str, Any] = {"names": {}, "series": {}, "why": {}, "buses": buses}
+    reply: dict[str, Any] = {"names": {}, "series": {}, "comments": {}, "why": {}, "buses": buses}
     fold = {w.casefold() for w in wanted}
     for n, (g, i, name, label, master) in enumerate(found):
         short = name.split("\\")[0]
         key = name if plain.count(name) == 1 else full[n] if full.count(full[n]) == 1 else f"{g}.{name}"
         names = list(dict.fromkeys((key, name, short, f"{label}.{name}", f"{label}.{short}", f"{g}.{name}")))
         reply["names"][key] = names
-        if not fold & {a.casefold() for a in names}:
+        comment = str(mdf.groups[g].channels[i].comment or "")[:200] if guess else ""
+        if not fold & {a.casefold() for a in names} and not (
+            guess and any(meaning(x, tuple(UNITS)) for x in (short, comment))
+        ):
             continue
+        if comment:
+            reply["comments"][key] = comment
         if master is None or mdf.groups[g].channels[master].sync_type not in (0, 1):
             reply["why"][key] = "its channel group has no time"
             continue

@@ -10,6 +10,7 @@ import numpy as np
 
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, check_file
 from hil.logs.table import Table, polars_table, time_column
+from hil.logs.times import from_dates
 
 __all__ = ["open_parquet", "write_parquet"]
 
@@ -46,14 +47,18 @@ def open_parquet(path: Path, options: Options) -> Source:
             f"{path}: {size:,} bytes say that they hold {file.metadata.num_rows:,} rows; allowed: up to {most:,}"
         )
 
+    time = time_column(path, list(schema.names), options)
+
     def load(key: str) -> np.ndarray:
         kind = schema.field(key).type
         kind = kind.value_type if pa.types.is_dictionary(kind) else kind
         scale = 1.0
+        dates = key == time.name and (pa.types.is_string(kind) or pa.types.is_large_string(kind))
         if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
         elif not (
-            pa.types.is_integer(kind)
+            dates
+            or pa.types.is_integer(kind)
             or pa.types.is_floating(kind)
             or pa.types.is_decimal(kind)
             or pa.types.is_boolean(kind)
@@ -77,6 +82,14 @@ def open_parquet(path: Path, options: Options) -> Source:
         try:
             column = file.read(columns=[key], use_threads=False).column(key).combine_chunks().cast(kind)
             column.validate(full=True)
+            if dates:
+                import polars as pl
+
+                found = from_dates(pl.Series(column.to_pylist(), dtype=pl.String))
+                if found is None:
+                    raise LogError(f"{path}: column {key!r} holds words that are no dates, not numbers")
+                table.notes.append(found[1])
+                return found[0]
             if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
                 column = column.cast(pa.int64())
             if pa.types.is_boolean(kind):
@@ -85,10 +98,13 @@ def open_parquet(path: Path, options: Options) -> Source:
             values = np.array(values * scale if scale != 1.0 else values, np.float64)
             values[column.is_null().to_numpy(zero_copy_only=False)] = ABSENT
             return values
+        except LogError:
+            raise
         except damage as e:
             raise LogError(f"{path}: column {key!r} cannot be read ({str(e)[:160]})") from None
 
-    return Table(list(schema.names), load, 1, time_column(path, list(schema.names), options.mapping))
+    table = Table(list(schema.names), load, 1, time, {})
+    return table
 
 
 def write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:

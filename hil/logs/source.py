@@ -74,6 +74,7 @@ class Options:
 
     dbc: Path | None
     mapping: Mapping[str, str]
+    guess: bool = False  # the time may have a name that says it in other words
 
 
 # A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.

@@ -5,28 +5,36 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.logs.source import Channel, LogError, Series, close_names, names_held
+from hil.logs.names import is_time
+from hil.logs.source import Channel, LogError, Options, Series, close_names, names_held
+from hil.logs.times import guess_column
 
-__all__ = ["NoTime", "Table", "polars_table", "split_unit", "time_column"]
+__all__ = ["NoTime", "Table", "Time", "polars_table", "split_unit", "time_column"]
 
 _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 
 
 class Table:
-    """Columns of a CSV or Parquet file. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`."""
+    """Columns of a CSV or Parquet file. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`; so may a row of its own,
+    ``units``.
+    """
 
     kind = "column"
     sorted = False
 
-    def __init__(self, headers: list[str], load: Callable[[str], np.ndarray], first: int, time: str):
-        self.notes: list[str] = []
-        self._load, self._first, self.time = load, first, time
+    def __init__(
+        self, headers: list[str], load: Callable[[str], np.ndarray], first: int, time: Time, units: Mapping[str, str]
+    ):
+        self.notes = list(time.notes)
+        self.guessed = time.sure  # how surely the column is the time, where that is guessed; 0 where it is stated
+        self._load, self._first, self.time, self._units = load, first, time.name, units
+        self.time_unit = units.get(time.name) or split_unit(time.name)[1] or time.unit
         self._t: np.ndarray | None = None
-        self.names = {h: tuple(dict.fromkeys((h, h.strip(), split_unit(h)[0]))) for h in headers if h != time}
+        self.names = {h: tuple(dict.fromkeys((h, h.strip(), split_unit(h)[0]))) for h in headers if h != time.name}
 
     def has(self) -> str:
         return names_held(self.kind, [self.time, *self.names])
@@ -35,12 +43,17 @@ class Table:
         return ""
 
     def series(self, key: str) -> Series:
+        t, values = self.times(), self._load(key)
+        if values.size != t.size:
+            raise LogError(f"column {key!r} has {values.size} rows, the time column {self.time!r} has {t.size}")
+        unit = self._units.get(key) or split_unit(key)[1]
+        return Series(t, values, unit, self.time_unit, "row", self._first)
+
+    def times(self) -> np.ndarray:
+        """The time column's numbers as they stand."""
         if self._t is None:
             self._t = self._load(self.time)
-        values = self._load(key)
-        if values.size != self._t.size:
-            raise LogError(f"column {key!r} has {values.size} rows, the time column {self.time!r} has {self._t.size}")
-        return Series(self._t, values, split_unit(key)[1], split_unit(self.time)[1], "row", self._first)
+        return self._t
 
 
 def split_unit(header: str) -> tuple[str, str]:
@@ -57,19 +70,41 @@ class NoTime(LogError):
         self.headers = headers
 
 
-def time_column(path: Path, headers: list[str], mapping: Mapping[str, str]) -> str:
-    """The column of a table that holds the time: mapped to t, called t, or called like it."""
-    asked = next((name for name, signal in mapping.items() if signal == "t"), None)
+class Time(NamedTuple):
+    """The time column of a table, the unit that its name states (beyond a bracket), and what was guessed of it."""
+
+    name: str
+    unit: str = ""
+    notes: tuple[str, ...] = ()
+    sure: float = 0.0
+
+
+def time_column(path: Path, headers: list[str], options: Options) -> Time:
+    """The column of a table that holds the time: mapped to t, called t, or called like it; else one that says time in
+    other words, if guesses are wanted.
+    """
+    asked = next((name for name, signal in options.mapping.items() if signal == "t"), None)
     for fold in (str, str.casefold):
         for name in _TIME_NAMES if asked is None else (fold(asked),):
             for h in headers:
                 if name in (fold(h), fold(h.strip()), fold(split_unit(h)[0])):
-                    return h
+                    return Time(h)
     if asked is not None:
         raise NoTime(
             f"{path}: no column {asked!r} to map to t{close_names(asked, headers)}{names_held('column', headers)}",
             headers,
         )
+    found, sure = guess_column(headers) if options.guess else ([], 0.0)
+    if len(found) == 1:
+        unit = is_time(found[0])[1]
+        why = f"its name says time{' in ' + unit if unit else ''}"
+        note = (
+            f"t: guessed to be {found[0]!r}, {100 * sure:.0f} % sure ({why}); --map NAME=t takes another, --no-guess "
+        )
+        note += "none"
+        return Time(found[0], unit, (note,), sure)
+    if found:
+        raise NoTime(f"{path}: the time may be {' or '.join(map(repr, found[:4]))}: --map NAME=t takes one", headers)
     text = (
         f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names "
         f"another){names_held('column', headers)}"

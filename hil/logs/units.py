@@ -15,7 +15,7 @@ import numpy as np
 from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
-__all__ = ["Units"]
+__all__ = ["NO_UNIT", "Units", "factor_of"]
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
@@ -41,7 +41,7 @@ def _registry() -> Any:
 
 
 @functools.lru_cache(maxsize=256)
-def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
+def factor_of(unit: str, into: str) -> tuple[float, float] | None | str:
     """(a, b) with value_in_into = a * value_in_unit + b; None where ``unit`` is no unit, its name where it cannot be
     converted.
 
@@ -81,7 +81,7 @@ def _factor(unit: str, into: str) -> tuple[float, float] | None | str:
     return b - a, a
 
 
-_NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
+NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
 
 
 @dataclass(frozen=True)
@@ -98,10 +98,14 @@ class Units:
         own = self.signals.get(signal, "s")
         stated = signal in self.stated
         unit = self.stated.get(signal, unit).strip()
-        if signal == "state" or unit == own or unit.casefold() in _NO_UNIT or (unit == "1" and not stated):
+        if signal == "state" or unit == own or unit.casefold() in NO_UNIT or (unit == "1" and not stated):
             return values
-        factor = _factor(unit, own)
+        sign = -1.0 if stated and unit.startswith("-") and len(unit) > 1 else 1.0  # counts the other way
+        unit = unit.removeprefix("-") if sign < 0.0 else unit
+        factor = factor_of(unit, own)
         if isinstance(factor, tuple):
+            if sign < 0.0:
+                return -values * factor[0] + factor[1]
             return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
         if factor is None and not stated:
             self.notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
@@ -109,13 +113,13 @@ class Units:
         allowed = f"{own} or what converts to it"
         if signal in _SPEED:
             allowed = "%, or rpm, Hz, rad/s with the design speed"
-            speed = _factor(unit, "rpm")
+            speed = factor_of(unit, "rpm")
             if isinstance(speed, tuple):
                 if self.design_rpm is None:
                     way = f"--design-rpm R gives the design speed, --unit {signal}=% says that it is % already"
                     raise LogError(
                         f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}"
                     )
-                return values * (speed[0] * 100.0 / self.design_rpm)
+                return values * (sign * speed[0] * 100.0 / self.design_rpm)
         what = "unit is not known" if factor is None else "unit does not convert"
         raise LogError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed} (--unit {signal}=...)")

@@ -88,11 +88,11 @@ def builtin(name: str) -> Demand:
     return Demand(points[:, 0] - points[0, 0], points[:, 1])
 
 
-def read_profile(path: str | Path, **options: Any) -> Demand:
+def read_profile(path: str | Path, tell: Callable[[list[str]], None] | None = None, **options: Any) -> Demand:
     """Read a profile: TOML with the lists ``t`` (s) and ``n_dem`` (%), or any log with n_dem (CSV: a header
     ``t,n_dem``).
 
-    ``options`` say how to read a log (`hil.logs.read_log`).
+    ``options`` say how to read a log (`hil.logs.read_log`), ``tell`` gets what there is to note on it.
 
     Straight lines between the points; a step is two points close to each other. Raises InputError in one line.
     """
@@ -118,7 +118,10 @@ def read_profile(path: str | Path, **options: Any) -> Demand:
         return _checked(Demand(columns["t"], columns["n_dem"]), path)
     from hil.logs import read_log
 
-    channel = read_log(path, **options).channels["n_dem"]
+    log = read_log(path, **options)
+    if tell is not None:
+        tell(log.notes)
+    channel = log.channels["n_dem"]
     return _checked(Demand(channel.t, channel.values), path)
 
 

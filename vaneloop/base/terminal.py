@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import InputError, meant
 
 __all__ = [
     "DEFECT",
@@ -40,7 +40,14 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, **kwargs)
 
     def error(self, message: str) -> NoReturn:
-        """Print the complaint in one line and exit 2."""
+        """Print the complaint in one line, with what was probably meant, and exit 2."""
+        import re
+
+        if (choice := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)$", message)) is not None:
+            message += meant(choice[1], [c.strip(" '") for c in choice[2].split(",")])
+        elif message.startswith("unrecognized arguments: "):
+            wrong = next((w for w in message.split()[2:] if w.startswith("-")), "")
+            message += meant(wrong.partition("=")[0], self._option_string_actions) if wrong else ""
         self.exit(2, f"{self.prog}: {message} ({self.prog} --help explains)\n")
 
 
@@ -65,7 +72,8 @@ def pairs(
         if not (eq and key.strip() and value.strip()):
             raise InputError(f"--{name} {option!r} must look like NAME=value")
         if allowed is not None and not allowed(key.strip()):
-            raise InputError(f"--{name} {option!r}: {key.strip()!r} is not known; allowed: {known}")
+            near = meant(key.strip(), known.split(", "))
+            raise InputError(f"--{name} {option!r}: {key.strip()!r} is not known{near}; allowed: {known}")
         before = out.setdefault(key.strip(), value.strip())
         if before != value.strip():
             raise InputError(f"--{name} {option!r}: {key.strip()!r} has been given {before!r} before; allowed: once")

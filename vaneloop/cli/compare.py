@@ -43,12 +43,14 @@ def command(args: argparse.Namespace) -> int:
     report, args.report = args.report, None
     stages: list[dict[str, object]] = []
     floors: dict[str, float] = {}
+    said: list[str] = []
     try:
         chain = chain_of(args)
     except LogError as e:
         terminal.say(args, f"note: no stage by stage comparison: {e}")
         extra["not_observed"] = {"all": str(e)}
     else:
+        said = chain.notes
         answer = Stages(chain, locate_stages(chain.stages), args.log)
         located = answer.located
         figures = [f for x in located for f in x.signals]
@@ -79,7 +81,7 @@ def command(args: argparse.Namespace) -> int:
             terminal.say(args, f"page: {answer.report(report, words)}")
             report = None
     args.report = report
-    return replay.replayed(args, {"stages": stages, **extra}, floors)
+    return replay.replayed(args, {"stages": stages, **extra}, floors, said)
 
 
 def _own(args: argparse.Namespace) -> int:

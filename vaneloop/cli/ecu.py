@@ -75,20 +75,28 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
+def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = None) -> Any:
     """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed
-    one.
+    one. What there is to note on reading it is said, and goes into ``notes``.
     """
     from hil.loop import ecu
-    from vaneloop.base.errors import InputError
+    from vaneloop.base.errors import InputError, meant
     from vaneloop.base.tables import load_toml
 
     if args.profile and args.log:
         raise InputError("--profile and --log exclude each other")
     table = args.profile if args.profile and Path(args.profile).suffix.lower() not in ("", ".toml") else None
     reading = options.log_options(args, table)
+
+    def tell(said: list[str]) -> None:
+        notes.extend(said)
+        for note in said:
+            terminal.say(args, f"note: {note}")
+
     if args.log:
-        return ecu.demand_of_log(options.read_log_of(args))
+        log = options.read_log_of(args)
+        tell(log.notes)
+        return ecu.demand_of_log(log)
     name = args.profile or default
     if name is None:
         return None
@@ -103,10 +111,12 @@ def demand_of(args: argparse.Namespace, default: str | None = None) -> Any:
         n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
     if not path.suffix:
+        near = meant(name, [*ecu.BUILTIN, "engine-test"])
         raise InputError(
-            f"--profile {name!r} is not known; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file (.toml, .csv)"
+            f"--profile {name!r} is not known{near}; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file "
+            "(.toml, .csv)"
         )
-    return ecu.read_profile(path, **reading)
+    return ecu.read_profile(path, tell, **reading)
 
 
 def command(args: argparse.Namespace) -> int:
@@ -128,7 +138,8 @@ def command(args: argparse.Namespace) -> int:
             "--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own"
         )
     machine = options.machine_of(args).plant
-    demand = demand_of(args)
+    read_notes: list[str] = []
+    demand = demand_of(args, read_notes)
     typed = Typed() if demand is None else None
     source: Any = typed if demand is None else demand
     station.warm_nodes(args)
@@ -206,7 +217,7 @@ def command(args: argparse.Namespace) -> int:
         "schema": 1, "bus": name, "ended": report.ended or "done", "demand_s": ecu.t, "state": state, "values": values,
         "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost,
         "lost_by_reader": port.lost},
-        **station.realtime_json(report), "notes": notes, "complaint": complaint,
+        **station.realtime_json(report), "notes": [*read_notes, *notes], "complaint": complaint,
     })  # fmt: skip
     return 1 if complaint else 0
 

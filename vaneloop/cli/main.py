@@ -6,6 +6,7 @@ import importlib
 import sys
 
 from vaneloop.base import terminal
+from vaneloop.base.errors import meant
 
 __all__ = ["COMMANDS", "main", "run"]
 
@@ -15,6 +16,7 @@ COMMANDS = {
         "vaneloop.cli.replay",
         "run a logged engine run through firmware and plant; errors in figures and pictures",
     ),
+    "map": ("vaneloop.cli.map", "which name of a log is which signal, guessed and shown; writes a mapping file"),
     "compare": (
         "vaneloop.cli.compare",
         "the model against a log: the whole loop, and each stage on its own logged inputs",
@@ -61,6 +63,7 @@ COMMANDS = {
         "a project of a controller of your own in C, which every command above runs with --controller",
     ),
     "design": ("vaneloop.cli.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
+    "completion": ("vaneloop.cli.completion", "completion of commands and options for bash, zsh and fish"),
     "web": ("vaneloop.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }
 
@@ -91,7 +94,8 @@ def main(argv: list[str]) -> int:
         return 0
     name = argv[0]
     if name not in COMMANDS:
-        print(f"vaneloop: {name!r} is not a command; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
+        near = meant(name, COMMANDS)
+        print(f"vaneloop: {name!r} is not a command{near}; allowed: {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
     # a command's imports take half a second, in which Ctrl-C may come, too
     return terminal.start(f"vaneloop {name}", lambda: importlib.import_module(COMMANDS[name][0]), argv[1:])

@@ -33,6 +33,7 @@ __all__ = [
     "say_tested",
     "tables_of",
     "tell_search",
+    "warm_up_for",
 ]
 
 
@@ -117,6 +118,10 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--design-rpm", metavar="R", type=float, help="rotor speed that is 100 %%; needed for speeds in rpm"
+    )
+    group.add_argument("--mapping", metavar="F.toml", help="mapping file of the bench, written by vaneloop map --out")
+    group.add_argument(
+        "--no-guess", action="store_true", help="guess no name and no unit that neither the log nor an option states"
     )
 
 
@@ -229,7 +234,8 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
 
     Raises InputError for options without a file to read.
     """
-    given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm}
+    given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm,
+             "--mapping": args.mapping, "--no-guess": args.no_guess or None}  # fmt: skip
     if (source or args.log) is None and (idle := next((k for k, v in given.items() if v not in (None, [])), None)):
         raise InputError(f"{idle} says how to read a log, but none is given (--log LOG)")
     return {
@@ -237,6 +243,8 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
         "mapping": _mapping(args.map),
         "units": terminal.pairs(args.unit, "unit"),
         "design_rpm": args.design_rpm,
+        "guess": not args.no_guess,
+        "mapping_file": args.mapping,
     }
 
 
@@ -248,8 +256,13 @@ def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",))
     from hil.logs import read_log
 
     options = log_options(args)
+    warm_up_for(args)
+    return read_log(args.log, **options, require=require)
+
+
+def warm_up_for(args: argparse.Namespace) -> None:
+    """Compile what cuts signals out of frames, and say so, where the log holds frames."""
     if str(args.log).lower().endswith(CAN_SUFFIXES):
         from hil.logs.columns import warm_up
 
         warm_up(lambda text: terminal.say(args, text))
-    return read_log(args.log, **options, require=require)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hil.replay import STAGE, STATISTICS, ReplayResult
@@ -77,10 +77,13 @@ def _crash_again(args: argparse.Namespace) -> int:
 
 
 def replayed(
-    args: argparse.Namespace, extra: dict[str, Any] | None = None, floors: Mapping[str, float] | None = None
+    args: argparse.Namespace,
+    extra: dict[str, Any] | None = None,
+    floors: Mapping[str, float] | None = None,
+    said: Sequence[str] = (),
 ) -> int:
-    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`. Return the exit
-    code.
+    """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`, notes that have been
+    ``said`` are not said again. Return the exit code.
     """
     from pathlib import Path
 
@@ -112,7 +115,7 @@ def replayed(
     terminal.print_table(
         args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows
     )
-    for note in result.notes:
+    for note in (n for n in result.notes if n not in said):
         terminal.say(args, f"note: {note}")
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
@@ -137,7 +140,7 @@ def _figure(v: float | None) -> str:
 
 def _limits(options: list[str]) -> dict[tuple[str, str], float]:
     """Parse ``--tolerance`` into {(signal, statistic): limit}."""
-    from vaneloop.base.errors import InputError
+    from vaneloop.base.errors import InputError, meant
 
     out = {}
     for key, text in terminal.pairs(options, "tolerance").items():
@@ -145,7 +148,8 @@ def _limits(options: list[str]) -> dict[tuple[str, str], float]:
         statistic = statistic or "rms"
         if signal not in STAGE or statistic not in STATISTICS:
             allowed = f"{', '.join(STAGE)}, each also with .{', .'.join(STATISTICS)}"
-            raise InputError(f"--tolerance {key}={text}: {key!r} is not known; allowed: {allowed}")
+            near = meant(key, [*STAGE, *(f"{s}.{k}" for s in STAGE for k in STATISTICS)])
+            raise InputError(f"--tolerance {key}={text}: {key!r} is not known{near}; allowed: {allowed}")
         try:
             value = float(text)
         except ValueError:

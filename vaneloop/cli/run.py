@@ -265,7 +265,8 @@ def _in_lockstep(args: argparse.Namespace) -> int:
     from hil.loop.node import Ecu, replay
     from vaneloop.cli.ecu import demand_of
 
-    demand = demand_of(args, default="ramp")
+    notes: list[str] = []
+    demand = demand_of(args, notes, default="ramp")
     profile = demand.per_frame()
     machine = options.machine_of(args)
     node = _node(args, machine)
@@ -304,7 +305,7 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         "wall_s": run.wall_s,
         "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames},
         **_node_json(node),
-        "record": record, "exceeded": [],
+        "record": record, **({"notes": notes} if args.log or args.profile else {}), "exceeded": [],
     })  # fmt: skip
     return 0
 

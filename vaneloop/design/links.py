@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from plant import Geometry, Schedules
 from plant.geometry import WORKING_SPEED, Stage, vane_angles
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE, check_assembly
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import InputError, meant
 from vaneloop.design.stroke_tables import schedules_at_design
 
 __all__ = ["CRITERIA", "Criterion", "LinkChange", "ScheduleOptions", "adjust_links", "geometry_with"]
@@ -61,7 +61,8 @@ class ScheduleOptions:
         if not 0.0 < self.limit <= 180.0:
             raise InputError(f"--limit (={self.limit:g} deg) must be in (0, 180]")
         if self.criterion not in CRITERIA:
-            raise InputError(f"--criterion (={self.criterion!r}) must be one of {', '.join(CRITERIA)}")
+            near = meant(self.criterion, CRITERIA)
+            raise InputError(f"--criterion (={self.criterion!r}) must be one of {', '.join(CRITERIA)}{near}")
         for name in self.adjust:
             if name not in ("lb", "lc"):
                 raise InputError(f"--adjust: {name!r} is not a length that can be adjusted; allowed: lb, lc, none")

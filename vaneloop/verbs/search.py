@@ -184,11 +184,11 @@ class Experiment(Answer):
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop experiment``."""
-        e = self.recommended
+        e, notes = self.recommended, self.diagnosed.diagnosis.notes
         if e is None:
-            return {"schema": 1, "log": self.log, "recommended": None, "profiles": []}
+            return {"schema": 1, "log": self.log, "recommended": None, "profiles": [], "notes": notes}
         best = {"nats": e["score"], **{k: e[k] for k in ("profile", "repeats", "separates", "text")}}
-        return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"]}
+        return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"], "notes": notes}
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""

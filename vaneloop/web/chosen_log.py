@@ -65,7 +65,7 @@ class ChosenLog:
                         self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
                     )
                     self.live.complaint("log")
-                    self.live.progress("offers", "preview")
+                    self.live.progress("offers", "look", "preview")
                     self.live.part(self._about, "log", shows=lambda: (s.preview,))
                 with ui.element("div").classes("stackc"):
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
@@ -104,8 +104,12 @@ class ChosenLog:
     def _about(self) -> None:
         s = self.s
         if s.preview is not None:
-            for note in s.preview["notes"][:6]:
+            guesses = [n for n in s.preview["notes"] if "guessed to be" in n]
+            for note in [n for n in s.preview["notes"] if n not in guesses][:6]:
                 ui.label(f"note: {note}").classes("note")
+            if guesses:
+                what = "1 name or unit is" if len(guesses) == 1 else f"{len(guesses)} names and units are"
+                ui.label(f"note: {what} guessed; see below").classes("note")
 
     def _channels(self) -> None:
         s = self.s
@@ -120,7 +124,7 @@ class ChosenLog:
         rows = []
         for name, (unit, t, v) in s.preview["channels"].items():
             step = f"{1.0 / ((t[-1] - t[0]) / (len(t) - 1)):.4g}" if len(t) > 1 and t[-1] > t[0] else "-"
-            given = s.choice.mapping.get(name, name)
+            given = s.seen["signals"].get(name, (name,))[0] if s.seen else name
             rows.append([name, given, unit, f"{len(t):,}", step, f"{t[-1]:.1f}", f"{v.min():.4g} to {v.max():.4g}"])
         table(["signal", "in the log", "unit", "samples", "per s", "until s", "range"], rows, numbers=(3, 4, 5))
         absent = [n for n in UNITS if n not in s.preview["channels"]]
@@ -136,7 +140,10 @@ class ChosenLog:
             c.file,
             c.dbc,
             c.model,
+            c.bench,
             tuple(s.offered),
+            repr(s.seen),
+            c.guess,
             tuple(c.mapping.items()),
             tuple(c.units.items()),
             c.design_rpm,
@@ -145,54 +152,92 @@ class ChosenLog:
 
     def _form(self) -> None:
         s = self.s
-        if s.choice.file is None or not s.offered:
+        if s.choice.file is None or not s.offered or s.seen is None or s.seen["damaged"]:
             return
-        choice = s.choice
-        with opened(s, "Names and units", self._wrong()).classes("names"):
+        choice, seen, draft = s.choice, s.seen, s.draft
+        guessed = any(row[2] == "guessed" for row in seen["signals"].values())
+
+        def apply() -> None:
+            choice.mapping, choice.units = (
+                {k: v for k in ("t", *UNITS) if (v := draft.get(f"{what} {k}", of.get(k, "")).strip())}
+                for what, of in (("name", choice.mapping), ("unit", choice.units))
+            )
+            choice.design_rpm = draft.get("rpm", choice.design_rpm)
+            draft.clear()
+            s.read()
+
+        def field(key: str, now: str, hint: str, label: str) -> ui.input:
+            """A field whose text is kept while it is typed, and read on Enter."""
+
+            def typed(e: events.ValueChangeEventArguments[Any]) -> None:
+                draft[key] = str(e.value or "")
+
+            out = ui.input(value=draft.get(key, now), placeholder=hint, on_change=typed)
+            out.props(f'outlined dense stack-label aria-label="{label}"')
+            return out.on("keydown.enter", apply)
+
+        with opened(s, "Names and units", self._wrong() or guessed or bool(seen["open"])).classes("names"):
             ui.label(
-                "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, and the unit "
-                "that the log states."
+                "Where the log calls a signal otherwise, or has it in another unit. Empty: our own name, or the guess "
+                "in grey, and the unit that the log states. Enter reads the log again."
             ).classes("soft small")
-            names: dict[str, ui.select] = {}
-            units: dict[str, ui.input] = {}
+            with ui.element("datalist").props("id=names-of-the-log"):
+                for name in s.offered[:500]:
+                    ui.element("option").props["value"] = name
             with ui.element("div").style(
                 "display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"
             ):
                 for signal in ("t", *UNITS):
+                    name, unit, how, sure, why, curve = seen["signals"].get(signal, ("", "", "", 0.0, "", []))
                     with ui.element("div").style(
-                        "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:8px;align-items:center"
+                        "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:2px 8px;"
+                        "align-items:center;align-content:start"
                     ):
                         ui.label(signal).classes("mono")
-                        options = ["", *s.offered]
-                        value = choice.mapping.get(signal, "")
-                        names[signal] = ui.select(
-                            options, value=value if value in options else "", with_input=True
-                        ).props(f'outlined dense options-dense clearable aria-label="name of {signal} in the log"')
-                        hint = UNITS.get(signal, "s")
-                        units[signal] = ui.input(value=choice.units.get(signal, ""), placeholder=hint).props(
-                            f'outlined dense aria-label="unit of {signal} in the log"'
-                        )
+                        label = f"name of {signal} in the log"
+                        box = field(f"name {signal}", choice.mapping.get(signal, ""), name, label)
+                        box.props("list=names-of-the-log")
+                        own = unit or UNITS.get(signal, "s")
+                        field(f"unit {signal}", choice.units.get(signal, ""), own, f"unit of {signal} in the log")
+                        if how or signal in seen["open"]:
+                            ui.html(_curve(curve), sanitize=False)
+                            said = f"guessed, {100 * sure:.0f} % sure" if how == "guessed" else how
+                            about = ui.label(said or seen["open"][signal]).classes("soft small guess")
+                            about.style("grid-column:span 2")
+                            if why:
+                                about.tooltip(why)
             with ui.element("div").classes("rowc"):
-                rpm = (
-                    ui.input("design speed [rpm]", value=choice.design_rpm).props("outlined dense").style("width:170px")
-                )
-                beside = [f for f in (choice.dbc, choice.model) if f is not None]
+                hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
+                rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")
+                rpm.props('label="design speed [rpm]"')
+                beside = [f for f in (choice.dbc, choice.model, choice.bench) if f is not None]
                 ui.label(
                     "with " + " and ".join(f.name for f in beside)
                     if beside
-                    else "a .dbc or a model .toml: drop it above"
+                    else "a .dbc, a mapping .toml or a model .toml: drop it above"
                 ).classes("soft small")
 
-                def apply() -> None:
-                    choice.mapping = {k: str(v.value) for k, v in names.items() if v.value}
-                    choice.units = {k: str(v.value).strip() for k, v in units.items() if (v.value or "").strip()}
-                    choice.design_rpm = str(rpm.value or "")
-                    s.read()
-
                 def plain() -> None:
-                    choice.dbc = choice.model = None
+                    choice.dbc = choice.model = choice.bench = None
                     choice.mapping, choice.units, choice.design_rpm = {}, {}, ""
+                    draft.clear()
                     s.read()
 
+                def guessing(e: events.ValueChangeEventArguments[Any]) -> None:
+                    choice.guess = bool(e.value)
+                    apply()
+
+                ui.checkbox("guess what is not stated", value=choice.guess, on_change=guessing)
                 ui.button("Read again", icon="refresh", on_click=apply).props("unelevated dense padding='4px 14px'")
                 ui.button("Forget all of it", on_click=plain).props("flat dense padding='4px 14px'")
+
+
+def _curve(values: list[float]) -> str:
+    """A small picture of a signal over time, as SVG."""
+    low, span = (min(values), (max(values) - min(values)) or 1.0) if values else (0.0, 1.0)
+    points = " ".join(
+        f"{58.0 * k / max(len(values) - 1, 1) + 1.0:.1f},{15.0 - 14.0 * (v - low) / span:.1f}"
+        for k, v in enumerate(values)
+    )
+    line = f'<polyline points="{points}" fill="none" stroke="currentColor" stroke-width="1.2"/>'
+    return f'<svg class="spark" width="60" height="16" viewBox="0 0 60 16" aria-hidden="true">{line}</svg>'

@@ -43,9 +43,11 @@ class Choice:
     file: LogFile | None = None
     dbc: LogFile | None = None
     model: LogFile | None = None
+    bench: LogFile | None = None  # mapping file
     mapping: dict[str, str] = field(default_factory=dict)  # signal -> name in the log
     units: dict[str, str] = field(default_factory=dict)  # signal -> unit in the log
     design_rpm: str = ""
+    guess: bool = True
     tables: str | None = None
 
     def words(self, real: bool) -> list[str]:
@@ -66,6 +68,10 @@ class Choice:
             out += ["--unit", f"{signal}={unit}"]
         if self.design_rpm.strip():
             out += ["--design-rpm", self.design_rpm.strip()]
+        if self.bench is not None:
+            out += ["--mapping", place(self.bench)]
+        if not self.guess:
+            out += ["--no-guess"]
         if self.model is not None:
             out += ["--model", place(self.model)]
         if self.tables is not None:
@@ -108,6 +114,8 @@ class Session:
         self.extra: dict[str, Any] = {}  # what other pages keep
         self.choice = Choice(tables=tables)
         self.offered: list[str] = []
+        self.seen: dict[str, Any] | None = None  # what is known of its names and units (worker.look)
+        self.draft: dict[str, str] = {}  # what is typed in the form and not yet read
         self.saved: dict[str, Path] = {}
         self._clear_log()
 
@@ -163,7 +171,7 @@ class Session:
 
     def clean(self, text: str) -> str:
         """Name files as the user does, not by their private folder."""
-        beside = [x for x in (self.choice.dbc, self.choice.model) if x is not None]
+        beside = [x for x in (self.choice.dbc, self.choice.model, self.choice.bench) if x is not None]
         for f in [*self.files, *beside]:
             text = text.replace(str(f.path), f.name)
         return text.replace(str(self.folder) + "/", "")
@@ -196,10 +204,12 @@ class Session:
         if file.path.suffix.lower() == ".dbc":
             self.choice.dbc = file
         elif file.path.suffix.lower() == ".toml":
-            self.choice.model = file
+            mapping = re.search(rb"(?m)^\[(names|units)\]", file.path.read_bytes()) is not None
+            setattr(self.choice, "bench" if mapping else "model", file)
         else:
             dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
             self.choice = Choice(file=file, dbc=dbc, tables=self.tables)
+            self.offered, self.seen, self.draft = [], None, {}
         if self.choice.file is not None:
             self.read()
         self.touch("log")
@@ -218,6 +228,7 @@ class Session:
         words = self.choice.words(real=True)
         dbc = str(self.choice.dbc.path) if self.choice.dbc else None
         self.offered = await self.search.call("offers", "opening the file", path=words[0], dbc=dbc)
+        self.seen = await self.search.call("look", "looking at its names", words=words)
         self.touch("log")
         self.preview = await self.search.call("preview", "reading the log", words=words)
         self.curves["log"] = of_log(self.preview["channels"], words[0])

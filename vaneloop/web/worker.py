@@ -82,6 +82,20 @@ def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
     return offered(path, dbc=dbc)
 
 
+def look(progress: Progress, words: list[str]) -> dict[str, Any]:
+    """What the form of names and units shows: the survey of the log, or why there is none."""
+    from hil.logs.survey import survey
+    from hil.logs.table import NoTime
+
+    args = parsed("diagnose", words)
+    try:
+        seen = survey(args.log, **options.log_options(args))
+    except NoTime as e:
+        return {"signals": {}, "open": {"t": str(e).partition(": ")[2]}, "suggested_rpm": None, "damaged": False}
+    rows = {r.signal: (r.name, r.unit, r.how, r.confidence, r.why, r.curve.tolist()) for r in seen.rows}
+    return {"signals": rows, "open": seen.open, "suggested_rpm": seen.suggested_rpm, "damaged": seen.damaged}
+
+
 def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Read the log: its channels in our names and units."""
     from hil.logs.columns import warm_up
@@ -314,6 +328,7 @@ TASKS: dict[str, Callable[..., Any]] = {
         f.__name__: f
         for f in (
             offers,
+            look,
             preview,
             compare,
             diagnose,

@@ -1,0 +1,183 @@
+"""A log is opened: which of its names is which signal, stated by the user or by a mapping file, called as ours, or
+guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hil.logs import plausible
+from hil.logs.formats import format_of
+from hil.logs.guess import Guesses, design_speed, withdrawn
+from hil.logs.guess import guess as guess_names
+from hil.logs.mapping import Bench, read_mapping
+from hil.logs.names import unit_in_name
+from hil.logs.source import LogError, Options, Source, close_names, find
+from hil.logs.table import Table
+from hil.logs.times import guess_unit
+from hil.logs.units import Units, factor_of
+from vaneloop.base.signals import UNITS
+
+__all__ = ["Opened", "is_ours", "open_log", "wanted_design_speed"]
+
+
+def is_ours(name: str, signals: Mapping[str, str]) -> bool:
+    """Whether ``name`` is one of the product's signals: a system of a user's own may give its name to something
+    else.
+    """
+    return name in plausible.RANGES and signals.get(name) == UNITS[name]
+
+
+def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, str] = UNITS) -> dict[str, str]:
+    """Mapping as signal -> name in the log; both directions are understood, {"N1": "n_dem"} and {"n_dem": "N1"}."""
+    known = {*signals, "t"}
+    out: dict[str, str] = {}
+    for a, b in (mapping or {}).items():
+        if b in known:
+            name, signal = a, b
+        elif a in known:
+            name, signal = b, a
+        else:
+            raise LogError(
+                f"{path}: map {a}={b}: {b!r} is not a signal{close_names(b, known)}; allowed: {', '.join(signals)}, t"
+            )
+        if signal in out and out[signal] != name:
+            raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
+        out[signal] = name
+    return out
+
+
+@dataclass
+class Opened:
+    """A log whose names are known, before its samples are taken: what `read_log` reads and `hil.logs.survey` shows.
+
+    named    signal -> name in the log, where that is not our own: mapped or guessed
+    units    signal -> unit in the log, where the user, a mapping file or a guess says it
+    absent   signals of the mapping file that the log does not have
+    """
+
+    source: Source
+    named: dict[str, str]
+    units: dict[str, str]
+    design_rpm: float | None
+    guesses: Guesses
+    notes: list[str]
+    taken: set[str]
+    dbc: Path | None
+    absent: dict[str, str]
+
+
+def open_log(
+    path: Path,
+    dbc: str | Path | None,
+    mapping: Mapping[str, str] | None,
+    units: Mapping[str, str] | None,
+    design_rpm: float | None,
+    signals: Mapping[str, str],
+    guess: bool,
+    mapping_file: str | Path | None,
+) -> Opened:
+    """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`."""
+    bench = read_mapping(mapping_file, signals) if mapping_file is not None else Bench()
+    guess = guess and mapping_file is None  # a mapping file says it all
+    dbc, design_rpm = dbc or bench.dbc, design_rpm or bench.design_rpm
+    stated = {**bench.units, **(units or {})}
+    given = _pairs(path, mapping, signals)
+    named = {**bench.names, **given}
+    options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)
+    source = format_of(path).read(path, options)
+    absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
+    for signal in absent:
+        del named[signal]
+    notes = [f"{s}: {mapping_file} calls it {n!r}, which the log does not have" for s, n in absent.items()]
+    keys = {s: find(source, named.get(s, s), s in named) for s in signals}
+    out = Opened(
+        source,
+        named,
+        stated,
+        design_rpm,
+        Guesses(),
+        notes,
+        {k for ks in keys.values() for k in ks},
+        options.dbc,
+        absent,
+    )
+    if guess:
+        _guess_time(path, out)
+        out.guesses = guess_names(
+            source,
+            [s for s in signals if is_ours(s, signals) and s not in named and not keys[s]],
+            out.taken,
+            stated,
+            design_rpm,
+        )
+    if out.guesses.made:
+        sketch = _sketch(path, out, signals)
+        withdrawn(out.guesses, sketch)
+    for signal, g in out.guesses.made.items():
+        named[signal] = g.name
+        out.units.setdefault(signal, g.unit)
+        notes.append(g.note())
+    return out
+
+
+def _guess_time(path: Path, out: Opened) -> None:
+    """The unit of a table's time where neither the file nor the user states one and it cannot be seconds."""
+    source = out.source
+    if not isinstance(source, Table) or source.time_unit or "t" in out.units:
+        return
+    try:
+        t = source.times()
+    except LogError as e:
+        raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
+    unit, why = guess_unit(t[np.isfinite(t)])
+    if unit:
+        out.units["t"] = unit
+        out.notes.append(
+            f"t ({source.time}): guessed to be in {unit} ({why}); --unit t=UNIT states another, --no-guess none"
+        )
+
+
+def _sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Channels as they will be read, without care for single samples: t (s), values (own unit)."""
+    unit = Units(path, {**{s: g.unit for s, g in out.guesses.made.items()}, **out.units}, out.design_rpm, [], signals)
+    sketch = {}
+    for signal in signals:
+        g = out.guesses.made.get(signal)
+        keys = [g.name] if g else find(out.source, out.named.get(signal, signal), signal in out.named)
+        if len(keys) != 1:
+            continue
+        try:
+            s = out.source.series(keys[0])
+            with np.errstate(all="ignore"):
+                t, v = unit.convert("t", "t", s.t, s.t_unit), unit.convert(signal, keys[0], s.values, s.unit)
+        except LogError:
+            continue  # reading it says why
+        good = np.isfinite(t) & np.isfinite(v)
+        if np.count_nonzero(good) > 1:
+            order = np.argsort(t[good], kind="stable")
+            sketch[signal] = t[good][order], v[good][order]
+    return sketch
+
+
+def wanted_design_speed(path: Path, out: Opened) -> tuple[str, float, str]:
+    """A guessed rotor speed that needs the design speed: signal, the design speed (rpm) that the log suggests,
+    words.
+    """
+    signal, name = next(iter(out.guesses.rpm.items()))
+    s = out.source.series(name)
+    unit = out.units.get(signal) or s.unit or unit_in_name(name)[1] or "rpm"
+    factor = factor_of(unit, "rpm")
+    t = Units(path, out.units, None, [], UNITS).convert("t", "t", s.t, s.t_unit)
+    good = np.isfinite(t) & np.isfinite(s.values)
+    sketch = _sketch(path, out, UNITS)
+    speed = t[good], s.values[good] * (factor[0] if isinstance(factor, tuple) else 1.0)
+    rpm, why = design_speed(speed, sketch.get("x_lvdt", sketch.get("x_dem")))
+    words = (
+        f"{name!r} is in {unit} and needs the design speed to become %: --design-rpm {rpm:g}, if that is 100 % ({why})"
+    )
+    return signal, rpm, words

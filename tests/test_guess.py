@@ -1,0 +1,505 @@
+"""A log maps itself: names and units of other benches are guessed, shown, and never guessed wrong."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hil.logs import LogError, read_log
+from hil.logs.guess import ENOUGH, contradictions
+from hil.logs.mapping import Bench, read_mapping, write_mapping
+from hil.logs.mdf import write_groups
+from hil.logs.names import is_time, meaning
+from hil.logs.survey import sparkline, survey
+from tests.conftest import ROOT
+from tests.test_logs import DATA, data
+from vaneloop.base.errors import InputError
+from vaneloop.base.signals import UNITS
+from vaneloop.cli.main import main
+
+ROWS = 3000
+SIGNALS = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2")
+ALL = tuple(UNITS)
+
+
+@pytest.fixture(scope="module")
+def run() -> dict[str, np.ndarray]:
+    """Thirty seconds of the example on one raster, by our own names, with a supply and an oil that are not exact."""
+    log = read_log(ROOT / "examples" / "hidden_effect.parquet").channels
+    t = log["n_r"].t[:ROWS]
+    return {"t": t - t[0], **{s: np.interp(t, log[s].t, log[s].values) for s in SIGNALS}}
+
+
+def table(
+    path: Path,
+    columns: dict[str, np.ndarray | list[str]],
+    separator: str = ",",
+    comma: bool = False,
+    units: list[str] | None = None,
+    encoding: str = "utf-8",
+) -> Path:
+    """Write a CSV as a bench would."""
+
+    def cell(x: float | str) -> str:
+        text = x if isinstance(x, str) else f"{x:.10g}"
+        return text.replace(".", ",") if comma and not isinstance(x, str) else text
+
+    lines = [separator.join(columns)] + ([separator.join(units)] if units else [])
+    lines += [separator.join(map(cell, row)) for row in zip(*columns.values(), strict=True)]
+    path.write_bytes(("\n".join(lines) + "\n").encode(encoding))
+    return path
+
+
+def same(path: Path, run: dict[str, np.ndarray], signals: tuple[str, ...] = SIGNALS, **reading: Any) -> list[str]:
+    """Assert that the log reads as the run does; its notes."""
+    log = read_log(path, **reading)
+    for s in signals:
+        assert s in log.channels, (s, log.notes)
+        np.testing.assert_allclose(log.channels[s].values, run[s], rtol=1e-6, atol=1e-6, err_msg=s)
+        np.testing.assert_allclose(log.channels[s].t, run["t"], atol=2e-6, err_msg=s)
+    assert set(log.channels) == set(signals)
+    return log.notes
+
+
+# ---- names as tools write them: signal -> (name, factor, offset) -----------------------------------------------------
+
+Style = dict[str, tuple[str, float, float]]
+GERMAN: Style = {
+    "n_dem": ("Drehzahl_Soll", 1, 0), "n_r": ("Drehzahl_Ist", 1, 0), "x_dem": ("Kolbenweg_Soll_mm", 1, 0),
+    "x_lvdt": ("Kolbenweg_Ist_mm", 1, 0), "i_cmd": ("Ventilstrom_Soll_mA", 1, 0),
+    "p_s": ("Versorgungsdruck_bar", 10, 0),
+    "t_oil": ("\u00d6ltemperatur_\u00b0C", 1, 0), "vigv": ("VIGV_Winkel_Grad", 1, 0),
+    "vgv1": ("VGV1_Winkel_Grad", 1, 0), "vgv2": ("VGV2_Winkel_Grad", 1, 0),
+}  # fmt: skip
+INCA: Style = {
+    "n_dem": ("nEngSetp\\ETKC:1", 1, 0), "n_r": ("nEngAct\\ETKC:1", 1, 0), "x_dem": ("xDem\\ETKC:1", 1e-3, 0),
+    "x_lvdt": ("xLvdt\\ETKC:1", 1e-3, 0), "i_cmd": ("iServoCmd\\ETKC:1", 1e-3, 0), "p_s": ("pSup\\ETKC:1", 1e6, 0),
+    "t_oil": ("tOil\\ETKC:1", 1, 273.15), "vigv": ("angVigv\\ETKC:1", 1, 0), "vgv1": ("angVgv1\\ETKC:1", 1, 0),
+    "vgv2": ("angVgv2\\ETKC:1", 1, 0),
+}  # fmt: skip
+DSPACE: Style = {
+    s: (f'"Model Root"/"VGV"/"{name}"', 1, 0)
+    for s, name in {
+        "n_dem": "Rotor Speed Demand", "n_r": "Rotor Speed Measured", "x_dem": "Stroke Demand", "x_lvdt": "LVDT Stroke",
+        "i_cmd": "Servo Valve Current", "p_s": "Supply Pressure", "t_oil": "Oil Temperature", "vigv": "VIGV Angle",
+        "vgv1": "VGV1 Angle", "vgv2": "VGV2 Angle",
+    }.items()
+}  # fmt: skip
+SIMULINK: Style = {
+    "n_dem": ("<SpeedRef>:1", 1, 0), "n_r": ("<SpeedFbk>:1", 1, 0), "x_dem": ("<PosCmd>:1", 1, 0),
+    "x_lvdt": ("<PosFbk>:1", 1, 0), "i_cmd": ("<ValveCurrentCmd>:1", 1, 0), "p_s": ("<SupplyPress>:1", 1, 0),
+    "t_oil": ("<OilTemp>:1", 1, 0), "vigv": ("<IGV>:1", 1, 0), "vgv1": ("<VSV1>:1", 1, 0), "vgv2": ("<VSV2>:1", 1, 0),
+}  # fmt: skip
+CANAPE: Style = {
+    s: (f"ECU1.{name}", 1, 0)
+    for s, name in {
+        "n_dem": "N1_DEM", "n_r": "N1_ACT", "x_dem": "ACT_POS_DMD", "x_lvdt": "ACT_POS_MEAS", "i_cmd": "SV_CURR_CMD",
+        "p_s": "HYD_PRESS", "t_oil": "OIL_TEMP", "vigv": "VIGV_POT", "vgv1": "VGV_1", "vgv2": "VGV_2",
+    }.items()
+}  # fmt: skip
+CANAPE["vigv"] = ("ECU1.VIGV_ANG", 1, 0)
+STYLES = {"german": GERMAN, "inca": INCA, "dspace": DSPACE, "simulink": SIMULINK, "canape": CANAPE}
+
+
+def styled(run: dict[str, np.ndarray], style: Style) -> dict[str, np.ndarray | list[str]]:
+    return {name: run[s] * factor + offset for s, (name, factor, offset) in style.items()}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_log_with_the_names_of_a_tool_maps_itself(tmp_path: Path, run: dict[str, np.ndarray], style: str) -> None:
+    file = table(tmp_path / "a.csv", {"time": run["t"], **styled(run, STYLES[style])}, separator=";")
+    notes = same(file, run)
+    for s, (name, _, _) in STYLES[style].items():
+        (note,) = [n for n in notes if n.startswith(f"{s}: guessed")]
+        assert name[-6:] in note and "% sure" in note and "--no-guess" in note
+    with pytest.raises(LogError, match="no n_dem"):
+        read_log(file, guess=False)
+
+
+def test_a_german_bench_with_decimal_comma_rpm_and_a_row_of_units_maps_itself(
+    tmp_path: Path, run: dict[str, np.ndarray]
+) -> None:
+    columns = {"Zeit_s": run["t"], **styled(run, {**GERMAN, "n_dem": ("Drehzahl_Soll", 380, 0),
+                                                  "n_r": ("Drehzahl_Ist", 380, 0)})}  # fmt: skip
+    units = ["s", "U/min", "1/min", "mm", "mm", "mA", "bar", "\u00b0C", "\u00b0", "\u00b0", "\u00b0"]
+    file = table(tmp_path / "a.csv", columns, ";", True, units, "cp1252")
+    with pytest.raises(LogError) as e:
+        read_log(file)
+    assert "'Drehzahl_Soll' is in U/min" in str(e.value) and "--design-rpm 38000, if that is 100 %" in str(e.value)
+    notes = same(file, run, design_rpm=38000)
+    assert any(n.startswith("t: guessed to be 'Zeit_s'") for n in notes)
+    # the same with the units in the header
+    heads = {"n_dem": ("Drehzahl Soll [U/min]", 380, 0), "n_r": ("Drehzahl (Ist)", 380, 0)}
+    file = table(
+        tmp_path / "b.csv", {"Zeit [s]": run["t"], **styled(run, {**GERMAN, **heads})}, ";", True, None, "cp1252"
+    )
+    same(file, run, design_rpm=38000)
+
+
+def test_channels_of_an_mdf_map_themselves_by_name_and_unit(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    fast = {name: (run[s] * f, u) for s, name, f, u in (("n_dem", "NSetp", 380, "rpm"), ("n_r", "NAct", 380, "1/min"),
+            ("x_dem", "StrokeSetp", 1e-3, "m"), ("x_lvdt", "StrokeAct", 1, "mm"))}  # fmt: skip
+    slow = {"OilTemp": (run["t_oil"][::10] + 273.15, "K"), "FuelPress": (run["p_s"][::10], "MPa")}
+    write_groups(tmp_path / "a.mf4", [(run["t"], fast), (run["t"][::10], slow)])
+    log = read_log(tmp_path / "a.mf4", design_rpm=38000)
+    assert set(log.channels) == {"n_dem", "n_r", "x_dem", "x_lvdt", "t_oil"}
+    np.testing.assert_allclose(log.channels["x_dem"].values, run["x_dem"], rtol=1e-9)
+    np.testing.assert_allclose(log.channels["n_r"].values, run["n_r"], rtol=1e-9)
+    np.testing.assert_allclose(log.channels["t_oil"].values, run["t_oil"][::10], atol=1e-9)
+
+
+def test_a_comment_of_a_database_says_what_its_name_does_not(tmp_path: Path) -> None:
+    (tmp_path / "a.dbc").write_text(
+        'VERSION ""\nNS_ :\nBS_:\nBU_: A\nBO_ 100 M: 4 A\n SG_ S17 : 0|16@1+ (0.01,0) [0|600] "%" A\n'
+        ' SG_ S18 : 16|16@1+ (0.01,0) [0|600] "bar" A\nCM_ SG_ 100 S17 "rotor speed demand";\n'
+        'CM_ SG_ 100 S18 "brake pressure";\n'
+    )
+    (tmp_path / "a.log").write_text(
+        "".join(f"({k * 0.01:.6f}) can0 064#{int(6000 + k).to_bytes(2, 'little').hex()}0852\n" for k in range(300))
+    )
+    log = read_log(tmp_path / "a.log", dbc=tmp_path / "a.dbc")
+    assert set(log.channels) == {"n_dem"} and log.channels["n_dem"].values[1] == pytest.approx(60.01)
+    assert any("its comment: 'rotor speed demand'" in n for n in log.notes)
+
+
+# ---- time ------------------------------------------------------------------------------------------------------------
+
+
+def dates(t: np.ndarray, form: str, start: dt.datetime) -> list[str]:
+    return [(start + dt.timedelta(microseconds=round(1e6 * s))).strftime(form) for s in t]
+
+
+NIGHT = dt.datetime(2026, 11, 22, 23, 59, 50)  # midnight is in the run
+EPOCH = NIGHT.replace(tzinfo=dt.UTC).timestamp()
+TIMES: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
+    "seconds": ("Zeit_s", lambda t: t), "ms": ("Time_ms", lambda t: t * 1e3), "us": ("t_us", lambda t: t * 1e6),
+    "minutes": ("Zeit [min]", lambda t: t / 60), "elapsed": ("Elapsed Time (s)", lambda t: t),
+    "epoch": ("epoch", lambda t: t + EPOCH), "epoch ms": ("Timestamp", lambda t: (t + EPOCH) * 1e3),
+    "epoch us": ("time", lambda t: (t + EPOCH) * 1e6),
+    "iso": ("Zeitstempel", lambda t: dates(t, "%Y-%m-%dT%H:%M:%S.%fZ", NIGHT)),
+    "iso with a blank": ("time", lambda t: dates(t, "%Y-%m-%d %H:%M:%S.%f", NIGHT)),
+    "german": ("Datum/Uhrzeit", lambda t: [x.replace(";", ",") for x in dates(t, "%d.%m.%Y %H:%M:%S.%f", NIGHT)]),
+    "clock": ("Uhrzeit", lambda t: dates(t, "%H:%M:%S.%f", NIGHT)),
+    "american": ("DateTime", lambda t: dates(t, "%m/%d/%Y %H:%M:%S.%f", NIGHT)),
+    "excel": ("Datum", lambda t: [f"{46348 + (86390 + s) / 86400:.11f}" for s in t]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_a_time_of_every_usual_kind_is_taken(tmp_path: Path, run: dict[str, np.ndarray], kind: str) -> None:
+    name, made = TIMES[kind]
+    few = {k: v[:1500] for k, v in run.items()}
+    when = made(few["t"])
+    cells = when if isinstance(when, list) else [f"{x:.12g}" if abs(x) < 1e9 else f"{x:.3f}" for x in when]
+    file = table(tmp_path / "a.csv", {"extra": few["p_s"], name: cells, "n_dem": few["n_dem"]})
+    log = read_log(file)
+    np.testing.assert_allclose(log.channels["n_dem"].t - log.channels["n_dem"].t[0], few["t"], atol=3e-6)
+    if kind not in ("iso", "iso with a blank"):
+        assert all("dates" not in n for n in log.notes) or kind in ("german", "american")
+    assert kind == "minutes" or log.notes, "a guess is shown"
+    if name not in ("time", "Timestamp", "Zeit [min]", "epoch"):
+        with pytest.raises(LogError, match="time column"):
+            read_log(file, guess=False)
+
+
+def test_a_date_and_a_clock_beside_it_are_one_time(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    t = run["t"][:500]
+    columns = {
+        "Datum": dates(t, "%d.%m.%Y", NIGHT),
+        "Uhrzeit": dates(t, "%H:%M:%S.%f", NIGHT),
+        "n_dem": run["n_dem"][:500],
+    }
+    log = read_log(table(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(log.channels["n_dem"].t, t, atol=2e-6)
+
+
+def test_two_times_that_are_alike_are_named_and_not_guessed(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"abs_time": run["t"], "rel_time": run["t"], "n_dem": run["n_dem"]}
+    with pytest.raises(LogError, match="'abs_time' or 'rel_time': --map NAME=t"):
+        read_log(table(tmp_path / "a.csv", columns))
+
+
+def test_days_and_months_that_cannot_be_told_apart_are_no_time_beyond_a_day(tmp_path: Path) -> None:
+    rows = {"Datum_Zeit": ["03/04/2026 23:59:59", "04/04/2026 00:00:00"], "n_dem": [60.0, 61.0]}
+    with pytest.raises(LogError, match="is not a number"):
+        read_log(table(tmp_path / "a.csv", rows))  # type: ignore[arg-type]
+
+
+def test_milliseconds_from_the_start_are_never_guessed(tmp_path: Path) -> None:
+    """A row every 10 may be a row in 10 s: the name has to say it."""
+    file = table(tmp_path / "a.csv", {"t": np.arange(200) * 10.0, "n_dem": np.full(200, 60.0)})
+    assert read_log(file).channels["n_dem"].t[-1] == 1990.0
+
+
+# ---- properties ------------------------------------------------------------------------------------------------------
+
+NAMES: dict[str, list[str]] = {
+    "n_dem": ["N_Demand", "Solldrehzahl", "speed_setpoint", "RotorSpeedCmd", "N1_REF", "nSoll", "Engine Speed Target"],
+    "n_r": ["N_Meas", "Istdrehzahl", "speed_actual", "RotorSpeed", "N1_ACT", "nIst", "Engine Speed Feedback"],
+    "x_dem": ["Stroke_Cmd", "Sollweg", "actuator_position_demand", "xSoll", "HubSoll", "VGV_Stroke_Req"],
+    "x_lvdt": ["LVDT", "Istweg", "actuator_position", "xIst", "Kolbenhub", "Ram Position Measured"],
+    "i_cmd": ["SV_Current_Cmd", "Servoventilstrom_Soll", "valve_current_demand", "iServoSoll"],
+    "p_s": ["Supply_Pressure", "Versorgungsdruck", "p_sys", "HydPress", "Systemdruck"],
+    "t_oil": ["Oil_Temp", "Oeltemperatur", "TempOil", "fluid temperature"],
+}
+SCALES: dict[str, list[tuple[str, float, float]]] = {
+    "n_dem": [("", 1, 0), ("[%]", 1, 0)], "n_r": [("", 1, 0), ("(%)", 1, 0)],
+    "x_dem": [("", 1, 0), ("", 1e-3, 0), ("[m]", 1e-3, 0), ("_mm", 1, 0), (" [inch]", 1 / 25.4, 0)],
+    "x_lvdt": [("", 1, 0), ("", 1e-3, 0), ("[um]", 1e3, 0), ("_mm", 1, 0), ("_inch", 1 / 25.4, 0)],
+    "i_cmd": [("", 1, 0), ("", 1e-3, 0), ("_A", 1e-3, 0), (" (mA)", 1, 0)],
+    "p_s": [("", 1, 0), ("", 10, 0), ("", 1e6, 0), ("_psi", 145.0377377, 0), (" [kPa]", 1e3, 0)],
+    "t_oil": [("", 1, 0), ("", 1, 273.15), ("_degF", 1.8, 32.0), ("[K]", 1, 273.15)],
+}  # fmt: skip
+FOREIGN = ["fuel_flow", "T3", "EGT", "room_temperature", "coolant_pressure", "wheel_speed", "motor_current", "op", "u"]
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(draw=st.data())
+def test_names_units_order_and_other_columns_do_not_change_what_is_read(
+    tmp_path: Path, run: dict[str, np.ndarray], draw: st.DataObject
+) -> None:
+    columns: dict[str, np.ndarray | list[str]] = {"Zeit_s": run["t"]}
+    for s, names in NAMES.items():
+        tail, factor, offset = draw.draw(st.sampled_from(SCALES[s]))
+        name = draw.draw(st.sampled_from(names))
+        columns[(name + tail) if tail[:1] != "_" or " " not in name else name + " " + tail[1:]] = (
+            run[s] * factor + offset
+        )
+    for k, name in enumerate(draw.draw(st.lists(st.sampled_from(FOREIGN), unique=True))):
+        columns[name] = run["x_lvdt"] * (k + 1) + k
+    order = draw.draw(st.permutations(list(columns)))
+    same(table(tmp_path / "a.csv", {k: columns[k] for k in order}), run, tuple(NAMES))
+
+
+# ---- never wrong -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*FOREIGN, "fuel_pressure", "ENGINE_OIL_PRESSURE", "Raumtemperatur", "valve_position",
+    "Ventilstrom_Ist", "n_corr", "vehicle speed", "gear_position", "tank_temp", "brake_pressure", "battery_current",
+    "pump_current", "x_rear", "Servo_Motor_Position", "throttle position demand", "pressure", "Druck", "temp", "vgv",
+    "vgv1_demand", "status", "state", "counter", "CRC", "x", "n", "s", "S17", "X2", "", "position_x",
+    "   ", "12", "%", "\u00b0", "[rpm]", "u", "y"])  # fmt: skip
+def test_a_name_that_says_something_else_is_no_guess(name: str) -> None:
+    m = meaning(name, ALL)
+    assert m is None or m.confidence < ENOUGH, m
+
+
+@given(st.text(max_size=40))
+def test_no_name_breaks_the_dictionary(name: str) -> None:
+    m = meaning(name, ALL)
+    assert m is None or (m.signal in UNITS and 0.0 <= m.confidence <= 1.0)
+    assert 0.0 <= is_time(name)[0] <= 1.0
+
+
+def test_two_rotors_are_named_and_neither_is_guessed(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "N1_Dem": run["n_dem"], "N2_Dem": run["n_dem"] * 0.9, "x_lvdt": run["x_lvdt"]}
+    file = table(tmp_path / "a.csv", columns)
+    with pytest.raises(LogError) as e:
+        read_log(file)
+    assert "may be 'N1_Dem' or 'N2_Dem': not guessed" in str(e.value)
+    log = read_log(file, mapping={"N2_Dem": "n_dem"})
+    np.testing.assert_allclose(log.channels["n_dem"].values, run["n_dem"] * 0.9, rtol=1e-8)
+    assert not log.guesses
+
+
+def test_the_measured_speed_is_of_the_rotor_of_the_demand(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "N1_DEM": run["n_dem"], "N2_ACT": run["n_r"] * 0.95, "N1_ACT": run["n_r"]}
+    log = read_log(table(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(log.channels["n_r"].values, run["n_r"], rtol=1e-8)
+    del columns["N1_ACT"]
+    log = read_log(table(tmp_path / "a.csv", columns))
+    assert set(log.channels) == {"n_dem"} and any("another rotor than that of 'N1_DEM'" in n for n in log.notes)
+    columns = {"t": run["t"], "NH_CMD": run["n_dem"], "NL_FBK": run["n_r"], "HP Speed Measured": run["n_r"] * 0.98}
+    log = read_log(table(tmp_path / "a.csv", columns))
+    np.testing.assert_allclose(log.channels["n_r"].values, run["n_r"] * 0.98, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "name", ["timeout", "dead_time", "date_of_test", "uptime", "Zeitkonstante", "rise_time_s", "T1"]
+)
+def test_a_name_with_time_in_it_is_not_yet_the_time(name: str) -> None:
+    assert is_time(name) == (0.0, "")
+
+
+def test_what_contradicts_the_other_signals_is_withdrawn(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "n_dem": run["n_dem"], "x_lvdt": run["x_lvdt"], "VGV1_Winkel": -run["vgv1"],
+               "Valve_Current_Cmd": -run["i_cmd"], "Stroke_Demand": 50.0 - run["x_dem"]}  # fmt: skip
+    file = table(tmp_path / "a.csv", columns)
+    log = read_log(file)
+    assert set(log.channels) == {"n_dem", "x_lvdt"}
+    said = " ".join(log.notes)
+    assert "'VGV1_Winkel' would be it by name, but it runs against x_lvdt; --unit vgv1=-deg" in said
+    assert "drives the stroke backwards" in said
+    log = read_log(file, units={"vgv1": "-deg", "i_cmd": "-mA"})  # what the notes propose mends it
+    np.testing.assert_allclose(log.channels["vgv1"].values, run["vgv1"], rtol=1e-8)
+    np.testing.assert_allclose(log.channels["i_cmd"].values, run["i_cmd"], rtol=1e-8)
+    log = read_log(file, mapping={"VGV1_Winkel": "vgv1"}, units={"vgv1": "-deg"})
+    np.testing.assert_allclose(log.channels["vgv1"].values, run["vgv1"], rtol=1e-8)
+
+
+def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:
+    assert contradictions({s: (run["t"], run[s]) for s in SIGNALS}, set(SIGNALS)) == {}
+
+
+def test_values_that_no_unit_explains_are_not_guessed(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "n_dem": run["n_dem"], "Versorgungsdruck": run["p_s"] * 0 + 0.4,
+               "Oil_Temp": run["t_oil"] * 0,
+               "Stroke_Cmd": run["x_dem"] * 0.03, "Supply_Pressure_2_bar": run["p_s"] * 1e6}  # fmt: skip
+    log = read_log(table(tmp_path / "a.csv", columns))
+    assert set(log.channels) == {"n_dem"} and not log.guesses
+    assert sum("not guessed" in n for n in log.notes) == 3
+
+
+def test_our_own_names_stay_as_they_are(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    """An own name in a wrong unit is refused as ever, and what is called as ours goes before what could be meant."""
+    with pytest.raises(LogError, match="--unit p_s=bar"):
+        read_log(table(tmp_path / "a.csv", {"t": run["t"], "n_dem": run["n_dem"], "p_s": run["p_s"] * 10}))
+    log = read_log(
+        table(tmp_path / "a.csv", {"t": run["t"], "Speed_Demand": run["n_dem"] * 0.5, "n_dem": run["n_dem"]})
+    )
+    np.testing.assert_allclose(log.channels["n_dem"].values, run["n_dem"], rtol=1e-8)
+    assert not log.notes
+
+
+EXAMPLES = ["examples/engine_run.blf", "examples/hidden_effect.parquet", "examples/four_stages/worn_vgv3.parquet"]
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_nothing_is_guessed_in_the_shipped_examples(name: str) -> None:
+    plain, log = read_log(ROOT / name, guess=False), read_log(ROOT / name)
+    assert not log.guesses and log.notes == plain.notes and set(log.channels) == set(plain.channels)
+    for s, c in plain.channels.items():
+        assert np.array_equal(c.t, log.channels[s].t) and np.array_equal(c.values, log.channels[s].values)
+
+
+def test_nothing_is_guessed_wrong_in_recordings_of_other_things() -> None:
+    """Cars, a truck, valves of a process, a micro gas turbine: no signal of vanes is in them."""
+    files = [*DATA.glob("*/*.csv"), data("can_honda/revlog.log"), data("can_j1939/log.mf4")]
+    assert len(files) > 5
+    for p in files:
+        dbc = next(p.parent.glob("*.dbc"), None)
+        try:
+            seen = survey(p, dbc=dbc)
+        except LogError as e:
+            assert "no time column" in str(e)
+            continue
+        assert [r.signal for r in seen.rows if r.how == "guessed" and r.signal != "t"] == [], p
+
+
+def test_a_rotor_that_needs_its_design_speed_gets_the_one_of_the_schedule(
+    tmp_path: Path, run: dict[str, np.ndarray]
+) -> None:
+    for rpm in (12_500.0, 38_000.0):
+        columns = {"Zeit_s": run["t"], "NSoll": run["n_dem"] * rpm / 100, "LVDT": run["x_lvdt"]}
+        seen = survey(table(tmp_path / "a.csv", columns))
+        assert (
+            seen.suggested_rpm == pytest.approx(rpm, rel=0.02)
+            and f"--design-rpm {seen.suggested_rpm:g}" in seen.complaint
+        )
+
+
+# ---- mapping files ---------------------------------------------------------------------------------------------------
+
+
+def test_a_mapping_file_reads_as_the_guesses_it_keeps(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    file = table(tmp_path / "a.csv", {"Zeit_s": run["t"], **styled(run, GERMAN)})
+    assert main(["map", str(file), "--out", str(tmp_path / "bench.toml"), "--quiet"]) == 0
+    notes = same(file, run, mapping_file=tmp_path / "bench.toml")
+    assert notes == []  # nothing is guessed any more
+    # a log of this bench that lacks a channel says so; an option goes before the file
+    less = table(tmp_path / "b.csv", {k: v for k, v in {"Zeit_s": run["t"], **styled(run, GERMAN)}.items()
+                                      if k != GERMAN["p_s"][0]})  # fmt: skip
+    log = read_log(
+        less, mapping_file=tmp_path / "bench.toml", mapping={"Drehzahl_Ist": "n_dem", "n_r": "Drehzahl_Soll"}
+    )
+    assert any(n.startswith("p_s: ") and "which the log does not have" in n for n in log.notes)
+    np.testing.assert_allclose(log.channels["n_dem"].values, run["n_r"], rtol=1e-6)
+
+
+@given(
+    st.dictionaries(st.sampled_from(ALL), st.text(min_size=1, max_size=20).filter(lambda s: s.strip()), max_size=4),
+    st.none() | st.floats(1.0, 1e6),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_mapping_file_gives_back_any_names(tmp_path: Path, names: dict[str, str], rpm: float | None) -> None:
+    write_mapping(tmp_path / "m.toml", Bench(names, {"t": "ms"}, rpm), dict.fromkeys(names, "guessed\nas ever"), "a\nb")
+    assert read_mapping(tmp_path / "m.toml") == Bench(names, {"t": "ms"}, rpm)
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [("names = 3", "must be a table"), ("[names]\nn_den = 'a'", "close: n_dem"), ("[units]\nt = 3", "quotation marks"),
+     ("design_rpm = 0", "above 0"), ("design_rpm = true", "above 0"), ("dbc = 1", "file name"),
+     ("nams = 1", "close: names"),
+     ("[names", "not a TOML table")],
+)  # fmt: skip
+def test_a_wrong_mapping_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(InputError, match=said) as e:
+        read_log(ROOT / EXAMPLES[1], mapping_file=tmp_path / "m.toml")
+    assert "m.toml" in str(e.value) and "\n" not in str(e.value)
+
+
+# ---- commands --------------------------------------------------------------------------------------------------------
+
+COMMANDS = [
+    ["replay", "{log}"],
+    ["compare", "{log}"],
+    ["locate", "{log}"],
+    ["diagnose", "{log}"],
+    ["experiment", "{log}"],
+    ["extend", "{log}", "--effect", "valve_dead_band", "--out", "{folder}/m.toml"],
+    ["schedule", "--log", "{log}"],
+    ["run", "--bus", "lockstep", "--log", "{log}"],
+    ["run", "--bus", "lockstep", "--profile", "{log}"],
+]
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=[" ".join(w) for w in COMMANDS])
+def test_every_guess_is_in_text_and_json_of_a_command(
+    tmp_path: Path, run: dict[str, np.ndarray], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = table(tmp_path / "a.csv", {"Zeit_s": run["t"], **styled(run, GERMAN)})
+    out = tmp_path / "a.json"
+    assert main([w.format(log=file, folder=tmp_path) for w in words] + ["--json", str(out)]) in (0, 1)
+    said = capsys.readouterr().out
+    guesses = [g.note() for g in read_log(file).guesses]
+    notes = json.loads(out.read_text())["notes"]
+    assert len(guesses) == len(SIGNALS)
+    for note in guesses:
+        assert said.count(note) == 1 and note in notes
+    assert main([w.format(log=file, folder=tmp_path) for w in words] + ["--no-guess"]) == 2
+    assert "no time column" in capsys.readouterr().err
+
+
+def test_map_shows_what_is_in_a_log(
+    tmp_path: Path, run: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rpm = {**GERMAN, "n_dem": ("Drehzahl_Soll_U_min", 380.0, 0.0)}
+    file = table(tmp_path / "a.csv", {"Zeit_s": run["t"], **styled(run, rpm), "Fuel": run["t"]})
+    assert main(["map", str(file), "--json", str(tmp_path / "a.json")]) == 1
+    said = capsys.readouterr().out
+    assert "--design-rpm 38000" in said and "Kolbenweg_Ist_mm" in said and "not used: " in said and "Fuel" in said
+    answer = json.loads((tmp_path / "a.json").read_text())
+    assert answer["suggested_rpm"] == 38000 and {s["signal"] for s in answer["signals"]} == {"t", *SIGNALS} - {"n_dem"}
+    assert main(["map", str(file), "--design-rpm", "38000"]) == 0
+    assert main(["map", str(table(tmp_path / "b.csv", {"t": run["t"], "Fuel": run["t"]}))]) == 1
+    assert "none of its names is a signal of ours" in capsys.readouterr().out
+    (tmp_path / "c.csv").write_text("t;n_dem\n")
+    assert main(["map", str(tmp_path / "c.csv")]) == 1 and "has no sample" in capsys.readouterr().out
+
+
+def test_a_sparkline_rises_with_its_curve() -> None:
+    assert (
+        sparkline(np.arange(8.0)) == "".join(sorted(sparkline(np.arange(8.0))))
+        and len(sparkline(np.arange(99.0))) == 16
+    )
+    assert sparkline(np.zeros(3)) and sparkline(np.empty(0)) == ""

@@ -1,0 +1,66 @@
+"""``vaneloop map``: which name of a log is which signal, in which unit, how surely; written down as a mapping file."""
+
+from __future__ import annotations
+
+import argparse
+
+from vaneloop.base import terminal
+from vaneloop.cli import options
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Show what is in a log: the name and unit of each signal, stated or guessed, how surely, and how it
+looks. Every command that takes the log guesses the same (docs/logs.md). A mapping file keeps what is right: edit it,
+and give it to any command with --mapping.
+
+examples:
+  vaneloop map examples/hidden_effect.parquet
+  vaneloop map BENCH.csv --design-rpm 38000 --out bench.toml
+  vaneloop replay BENCH.csv --mapping bench.toml
+
+exit codes: 0 the log can be read so, 1 a line says what is missing, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    options.add_log_options(parser)
+    terminal.add_output_options(parser)
+    parser.add_argument("--out", metavar="F.toml", help="write the mapping file")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from hil.logs.mapping import write_mapping
+    from hil.logs.survey import sparkline, survey
+
+    reading = options.log_options(args)
+    options.warm_up_for(args)
+    seen = survey(args.log, **reading)
+    rows = [
+        [
+            r.signal, r.name, r.unit, f"{100 * r.confidence:.0f} %" if r.how == "guessed" else r.how,
+            f"{r.low:.4g} to {r.high:.4g}", sparkline(r.curve),
+        ]
+        for r in seen.rows
+    ]  # fmt: skip
+    terminal.print_table(
+        args, f"{args.log}: {len(rows)} names are known, {len(seen.other)} are not",
+        ["signal", "in the log", "unit", "sure", "range", "over time"], rows,
+    )  # fmt: skip
+    for signal, why in seen.open.items():
+        terminal.say(args, f"open: {signal}: {why}")
+    if seen.other:
+        more = f" and {len(seen.other) - 20} more" if len(seen.other) > 20 else ""
+        terminal.say(args, f"not used: {', '.join(seen.other[:20])}{more}")
+    for note in seen.notes:
+        if "guessed to be" not in note and not any(note.startswith(f"{s}: {w}") for s, w in seen.open.items()):
+            terminal.say(args, f"note: {note}")
+    if seen.complaint:
+        terminal.say(args, f"cannot be read so: {seen.complaint}")
+    terminal.write_json(args, seen.to_dict())
+    if args.out:
+        head = f"How VaneLoop reads the logs of this bench (--mapping). Written by vaneloop map from {args.log}."
+        remarks = {r.signal: f"guessed, {100 * r.confidence:.0f} % sure" for r in seen.rows if r.how == "guessed"}
+        write_mapping(args.out, seen.bench(), remarks, head)
+        terminal.say(args, f"mapping: {args.out}")
+    return 1 if seen.complaint else 0
