@@ -23,10 +23,12 @@ __all__ = ["COEFFICIENTS", "Evidence", "terms", "trust"]
 
 Evidence = Mapping[str, float]  # left, fall, share: see `terms`
 
-# constant, left, fall, share; by the criterion that named the law
+# Constant, left, fall, share; by the criterion that named the law. Fitted to the names of development seeds: 37 of 60
+# logs of hidden-effect (seed 7), 73 of 117 diagnoses of hidden-law (seeds 1 and 2). With so few, the vane chain's names
+# differ by nothing yet: nine in ten are right.
 COEFFICIENTS: dict[str, tuple[float, float, float, float]] = {
-    "noise_floor": (3.0, -1.0, 0.0, 0.0),
-    "error_share": (3.0, -1.0, 0.0, 0.0),
+    "noise_floor": (1.99, -0.01, 0.05, 0.0),
+    "error_share": (0.57, -0.93, 1.23, 0.23),
 }
 MOST_LEFT, MOST_FALL = 100.0, 30.0  # beyond what blind answers have shown, more says no more
 
