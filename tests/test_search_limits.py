@@ -269,8 +269,9 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
         return SimpleNamespace(stage=stage, fit=lambda *_: nothing, errors=lambda _: np.ones((1, 1, len(stage.t))))
 
     monkeypatch.setattr(diagnose, "Judge", judge)
+    monkeypatch.setattr(diagnose, "recalibrate", lambda _: nothing)
     for n in (59_999, 60_000, 200_000):
-        whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, neutral=lambda: np.zeros(1))
+        whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, coarse={})
         whole.excerpt = lambda at: SimpleNamespace(t=at)
         diagnose.diagnose_stage(whole, np.ones(1))
     assert seen == [59_999, 40_000, 40_000]
@@ -348,7 +349,7 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
     squares[:n] = 1.0 + float(norm.isf(chance / 8)) * np.sqrt(2.0 * correlation / n)
     stage = SimpleNamespace(
         name="s", outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)}, regime_units={},
-        neutral=lambda: np.zeros(1),
+        neutral=lambda: np.zeros(1), lost=None,
     )  # fmt: skip
     return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
