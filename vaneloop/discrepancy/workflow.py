@@ -145,7 +145,7 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
                 for m in f.fits
             }
             options = [f.effect, *f.rivals]
-            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m])]
+            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, _doubt(o, m)) for o in elsewhere[m])]
             if not left:
                 left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
             beside = {
@@ -182,6 +182,11 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
                 f, effect=name, rivals=left[1:], shares={m: v / whole for m, v in shares.items()},
                 parameters=parameters_of(stages[d.stage], fit, name),
             )  # fmt: skip
+
+
+def _doubt(other: StageDiagnosis, effect: str) -> float:
+    """By what share of its size a stage that names an effect too may be wrong about it: errors of form are its own."""
+    return NEAR if any(effect in (g.effect, *g.rivals) for g in other.effects) else 0.0
 
 
 NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
