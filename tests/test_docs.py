@@ -86,6 +86,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop diagnose DATA_EMPS.mat": DATA,
     "vaneloop diagnose 0.5Hz36lbtension1amplitude.json": DATA,
     "vaneloop diagnose ex_1.csv": DATA,
+    "vaneloop diagnose SNLS80mV.csv": DATA,
     "vaneloop replay revlog.log --dbc": DATA,
     "vaneloop replay log.mf4 --dbc": DATA,
     "vaneloop replay rig.mf4": "a file with several groups of one channel name; tests/test_logs.py writes one",

@@ -29,6 +29,17 @@ def find(folder: Path, *patterns: str) -> list[str]:
     return out
 
 
+@pytest.fixture(scope="module")
+def silverbox(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The oscillator: a part of one multisine to fit, another one to test."""
+    (log,) = find(data_dir, "silverbox/SNLS80mV.csv")
+    out = tmp_path_factory.getbasetemp() / "silverbox.json"
+    words = ["diagnose", log, "--fit", "66.45:73.00", "--test", "94.95:109.15", "--json", str(out), "--quiet"]
+    assert main([*words, "--system", str(ROOT / "examples" / "silverbox.py")]) == 1
+    data: dict[str, Any] = json.loads(out.read_text())
+    return data
+
+
 @cache
 def answer(example: str, fit: tuple[str, ...], test: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """``vaneloop diagnose`` of an example: its JSON."""
@@ -116,3 +127,14 @@ def test_the_turbine_lacks_a_rate_limit_and_no_dead_time(turbine: dict[str, Any]
     test = [e["rms"] for e in turbine["together"] if e["logs"] == "test"]
     assert test[0] > 350.0
     assert test[-1] <= 151.0
+
+
+def test_the_hardening_spring_of_the_oscillator_is_found(silverbox: dict[str, Any]) -> None:
+    assert silverbox["effects"][0]["effect"] == "speed.cubic_spring"
+    own = {p["parameter"]: p["value"] for p in silverbox["parameters"]}
+    assert (own["spring"] ** 0.5) / (2.0 * 3.14159) == pytest.approx(68.3, rel=0.02)  # Hz, its resonance
+
+
+def test_the_oscillator_s_free_run_is_as_good_as_published_ones(silverbox: dict[str, Any]) -> None:
+    assert error(silverbox, "94.95", 0)["rms"] > 6.6e-3
+    assert error(silverbox, "94.95")["rms"] <= 0.45e-3  # V; published: 0.26 to 0.36 mV

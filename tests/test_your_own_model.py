@@ -237,7 +237,7 @@ def test_a_channel_that_the_log_lacks_is_named(page: Path, tmp_path: Path, capsy
         ({"outputs": {}}, "outputs is empty"),
         ({"inputs": {"my input": "V"}}, "'my input' must be a Python name"),
         ({"places": ["somewhere"]}, "'somewhere' is not known"),
-        ({"between": "spline"}, "between (='spline')"),
+        ({"between": "spline"}, "between (='spline') must be one of hold, line, smooth"),
         ({"start_force": "zero"}, "start_force (='zero')"),
         ({"parameters": [Parameter("gain", 1.0, "-"), Parameter("gain", 2.0, "-")]}, "share a name"),
     ],
@@ -248,8 +248,27 @@ def test_a_system_that_cannot_be_is_refused(change: dict[str, Any], said: str) -
         System(name="map", model=line, **given)
 
 
+def test_a_smooth_input_between_few_samples_is_followed() -> None:
+    # y' = (u - y)/T under a sine of five samples a period: its closed form is amplitude and phase of a first-order lag
+    step, late = 0.2, 0.3
+    t = step * np.arange(400)
+    omega = 2.0 * np.pi
+    phase = np.arctan(omega * late)
+    true = (np.sin(omega * t - phase) + np.sin(phase) * np.exp(-t / late)) / np.hypot(1.0, omega * late)
+    left = {}
+    for between in ("hold", "line", "smooth"):
+        system = System(
+            "lag", "simulate", lambda x, u, p: (u.u - x.y) / p.late, outputs={"y": "V"}, inputs={"u": "V"},
+            states={"y": "V"}, parameters=[Parameter("late", late, "s")], between=between,
+        )  # fmt: skip
+        bound = system.bind([Record("sine", t, {"u": np.sin(omega * t), "y": true})])
+        left[between] = float(np.sqrt(np.mean((bound.run(bound.stage.neutral()[None])[0, 0] - true)[20:-20] ** 2)))
+    assert left["smooth"] < 0.1 * left["line"] < 0.1 * left["hold"]
+    assert left["smooth"] < 0.01 * float(np.std(true))
+
+
 def test_shipped_examples_load() -> None:
-    for name in ("emps", "friction_damper", "micro_gas_turbine"):
+    for name in ("emps", "friction_damper", "micro_gas_turbine", "silverbox"):
         assert load_system(PAGE.parent.parent / "examples" / f"{name}.py").parameters
 
 

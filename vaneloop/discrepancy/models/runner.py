@@ -21,6 +21,7 @@ from vaneloop.discrepancy.stage import Array, StageError
 __all__ = ["STARTS_LOADED", "Placed", "Runner"]
 
 SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
+FEW = 4  # samples that a cubic spline needs
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
@@ -63,6 +64,7 @@ class Runner:
         self.ready = like is not None  # the model ran with the user's own values
         self.placed: list[Placed] = []
         self.free_starts: list[tuple[int, int]] = []
+        self.slopes: dict[int, Array] = {}  # of the inputs as logged, see `_slopes`
         self.steps: int = like.steps if like else 1
         self.small: float = like.small if like else 0.0
         self.smalls: Array = like.smalls if like else np.zeros(len(s.states))
@@ -215,6 +217,22 @@ class Runner:
                 y[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
         return y
 
+    def _slopes(self, log: int, t: Array, u: Array) -> Array:
+        """Rates of the inputs at the samples where they run in a smooth curve between them: those of a cubic spline,
+        float64[inputs, samples]; else none.
+        """
+        from scipy.interpolate import CubicSpline
+
+        if self.system.between != "smooth" or not len(u) or len(t) < FEW:
+            return np.zeros((0, len(t)))
+        as_logged = u.base is self.data.u[log] and len(t) == len(self.data.times[log])
+        if as_logged and log in self.slopes:
+            return self.slopes[log]
+        out = np.ascontiguousarray(CubicSpline(t, u, axis=1)(t, 1))
+        if as_logged:
+            self.slopes[log] = out
+        return out
+
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
     ) -> Array:
@@ -254,7 +272,7 @@ class Runner:
         arguments = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
             rows, position, gap,
-            asymmetry, self.smalls, mass, steps, s.between == "line", loop,
+            asymmetry, self.smalls, mass, steps, s.between != "hold", self._slopes(log, t, u), loop,
             len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip

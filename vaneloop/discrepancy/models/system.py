@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["Record", "System", "unknown"]
 
 KINDS = ("static", "force", "simulate", "closed_loop")
+BETWEEN = ("hold", "line", "smooth")
 
 
 def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: float = np.inf) -> Parameter:
@@ -78,7 +79,7 @@ class System:
     start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
                 rates at rest, and what is not measured is fitted
     window      s: start anew from the measured states after each window of this length (for what integrates)
-    between     "hold" or "line": what an input does between two samples
+    between     simulate: what an input does between two samples: "hold", "line", or "smooth", a curve (a cubic spline)
     control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs
                         after the sensors' laws
     places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
@@ -176,8 +177,8 @@ class System:
                         f"output {o!r} is not a state; name it like one of {', '.join(self.states)}, or give output=, "
                         f"a function (x, u, p)"
                     )
-        if self.between not in ("hold", "line"):
-            raise wrong(f"between (={self.between!r}) must be 'hold' or 'line'")
+        if self.between not in BETWEEN:
+            raise wrong(f"between (={self.between!r}) must be one of {', '.join(BETWEEN)}")
         if self.start_force not in ("unloaded", "measured"):
             raise wrong(f"start_force (={self.start_force!r}) must be 'unloaded' or 'measured'")
         for what, size in (("window", self.window), ("cutoff", self.cutoff)):
