@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from vaneloop import Record, System, unknown
+from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.motion import low_pass
 from vaneloop.discrepancy.models.stairs import steps_seen
 from vaneloop.discrepancy.promise import Slopes, along, followed, out_of, within
+from vaneloop.discrepancy.search import Search
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 
 N = 600
@@ -128,3 +130,42 @@ def test_a_system_that_forgets_slowly_has_its_starts_fitted():
     assert float(np.sqrt(fit.cost.sum() / (2 * len(slow.t)))) == pytest.approx(1.0, abs=0.06)
     assert fit.theta[3] == pytest.approx(1.0, abs=0.01)  # the reading is off by some 0.03
     assert not system(3.0).bind([log(3.0, 12000)]).read_starts
+
+
+def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first():
+    rng = np.random.default_rng(5)
+    command, at, moved = 10.0 * np.sin(0.05 * np.arange(N)), 0.0, []
+    for x in command:
+        at = min(max(at, x - 2.0), x + 2.0)
+        moved.append(at)
+    system = System(
+        "valve", "static", lambda u, p: p.gain * u.command, inputs={"command": "%"}, outputs={"flow": "-"},
+        parameters=[unknown("gain", 1.0, "-")], places=["command"],
+    )  # fmt: skip
+    flow = 3.0 * np.array(moved) + 0.1 * rng.standard_normal(N)
+    bound = system.bind([Record("valve", T, {"command": command, "flow": flow})])
+    judge = Judge(bound.thinned, bound.floor)
+    search = Search(ErrorShare(judge))
+    first = judge.stage.neutral()
+    first[judge.stage.index()["command.stiction"]] = 30.0, 1.0, 0.0  # wider than the motion: it never moves
+    search.fits[frozenset(["command.stiction"])] = judge.fit(("command.stiction",), first, 1)
+    play, stiction = search.single("command.play"), search.single("command.stiction")
+    assert judge.total_of(play) < 1.2 * N
+    assert judge.total_of(stiction) <= judge.total_of(play) * (1.0 + 1e-9)
+
+
+def test_what_cannot_be_told_apart_is_followed_by_the_least_step():
+    # an offset and a gain of a signal that stands still
+    stage = linear_stage()
+
+    def run(theta: np.ndarray) -> np.ndarray:
+        return (theta[:, :1] + 3.0 * theta[:, 1:2] + 0.0 * theta[:, 2:3] + np.zeros(N))[:, None]
+
+    still = Stage("still", ("y",), ("-",), stage.parameters, stage.effects, run, T, run(np.array([[4.0, 1.0, 0.0]]))[0])
+    judge = Judge(still, np.array([1e-12]))
+    first = judge.fit((), still.neutral(), 1)
+    (theta,), (left,) = (lambda sets: (sets, followed(judge, sets, first.free, 0.0 * first.prior)[1]))(
+        [still.neutral()]
+    )
+    assert np.isfinite(theta).all()
+    assert left < 1e-6 * float(np.sum(judge.errors(still.neutral()[None]) ** 2))

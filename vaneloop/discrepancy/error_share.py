@@ -292,9 +292,11 @@ class ErrorShare:
             mine = score(judge, fit)
             # what has more parameters and does no better holds the named effect within it
             alternatives = {m: f for m, f in alternatives.items() if m == name or size[m] <= size[name]}
+            # a law that holds the named one within it is that one at some of its sizes: no log could tell them apart
+            same = [m for m in holding if m in alternatives and judge.total_of(alternatives[m]) <= judge.total_of(fit)]
             rivals = [
                 m for m, f in alternatives.items()
-                if m != name and score(judge, f) < mine + RIVAL and self.earns(rest, f)
+                if m != name and (m in same or (score(judge, f) < mine + RIVAL and self.earns(rest, f)))
             ]  # fmt: skip
             others = [f for m, f in alternatives.items() if m == name or m not in rivals]
             wins = np.mean(np.argmin([[score(judge, f, d) for d in draws] for f in others], axis=0) == 0)

@@ -44,7 +44,7 @@ class Slopes:
         """Steps of the free parameters, in their scales, and what is left."""
         errors = errors.reshape(-1, self.error.size)
         pull = errors @ self._flat.T
-        step = np.clip(np.linalg.solve(self._normal, pull.T).T, *self._room)
+        step = np.clip(_solved(self._normal, pull.T).T, *self._room)
         left = np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ self._normal) * step, axis=1)
         return step, [float(v) for v in left]
 
@@ -55,13 +55,21 @@ class Slopes:
         e0 = self.error.ravel()
         d = errors.reshape(-1, self.error.size) - e0
         pull, pull0 = d @ self._flat.T, self._flat @ e0
-        followed = np.linalg.solve(self._normal, pull.T).T
+        followed = _solved(self._normal, pull.T).T
         size = np.sum(d * d, axis=1) - np.sum(pull * followed, axis=1)
         down = -(d @ e0 - followed @ pull0)
-        here = float(e0 @ e0 - pull0 @ np.linalg.solve(self._normal, pull0))
+        here = float(e0 @ e0 - pull0 @ _solved(self._normal, pull0))
         good = size > 1e-9 * np.maximum(np.sum(d * d, axis=1), 1e-300)
         share = np.clip(np.where(good, down / np.where(good, size, 1.0), 0.0), *LINE)
         return share, here - 2.0 * share * down + share**2 * size
+
+
+def _solved(a: Array, b: Array) -> Array:
+    """The x of a x = b; of many that do, the least: where a law lets nothing through, an offset and a gain are one."""
+    try:
+        return np.asarray(np.linalg.solve(a, b))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.lstsq(a, b)[0])
 
 
 def followed(judge: Judge, thetas: list[Array], free: Array, prior: Array) -> tuple[Array, list[float]]:

@@ -270,8 +270,9 @@ class Search:
                 task = self.judge.fitting((name,), best, 30 if turns else 8)
                 best = yield from self._finished(task, self.criterion.roams)
                 best = yield from self._refine(name, best)
-            self.fits[key] = yield from self._no_worse(best)
+            self.fits[key] = best
             self.tick()
+        self.fits[key] = yield from self._no_worse(self.fits[key])  # what it holds may have been fitted since
         return self.fits[key]
 
     def _no_worse(self, fit: Fit) -> Task[Fit]:
