@@ -365,6 +365,30 @@ def test_clean_data_fail_nowhere() -> None:
         assert not any(r.significant.any() for r in found)
 
 
+def uneven(where: np.ndarray) -> Stage:
+    """Three gauges, the first of which errs by one and a half noise floors more ``where`` that is true."""
+    stage = gauges([linear("drift", (1.0, 0.0, 0.0), W)], [0.0])
+    more = 1.5 * GAUGE_FLOOR[0] * np.random.default_rng(11).standard_normal(N)
+    stage.measured[0] += np.where(where, more, 0.0)
+    return stage
+
+
+def test_what_the_whole_log_hides_is_unknown_where_one_condition_shows_it() -> None:
+    found = diagnose([uneven(np.abs(U - np.quantile(U, 0.75)) < 0.03)], workers=1)
+    (d,) = found.stages
+    assert d.excess < 1.05 and found.verdict == "unknown" and not d.effects
+    assert "fails at a: " in d.refused[0] and " at u " in d.refused[0]
+
+
+def test_one_stretch_of_the_log_is_no_condition() -> None:
+    stage = uneven(np.abs(T - 33.0) < 1.0)
+    judge = Judge(stage, GAUGE_FLOOR)
+    found = {r.condition: r for r in regimes(judge, judge.fit((), stage.neutral()), 2.0) if r.output == "a"}
+    assert found["time"].ratio.max() > 1.1  # one bin has it, and no other of these samples says so
+    assert not any(r.significant.any() for r in found.values())
+    assert diagnose([stage], workers=1).verdict == "none"
+
+
 # ---- samples that are not there --------------------------------------------------------------------------------------
 
 

@@ -5,11 +5,14 @@ too easily.
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 
-from tests.rig import load_geometry
+from tests.rig import WITH_MOTOR, load_geometry
+from vaneloop.base.tables import path
 from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case
+from vaneloop.cli.main import main
 
 N = 200
 
@@ -33,6 +36,32 @@ def test_every_machine_has_its_own_links_a_fifth_has_gaps_and_a_fifth_another_mo
 def test_the_same_seed_draws_the_same_case():
     for i in range(5):
         assert repr(draw_case(3, i)) == repr(draw_case(3, i))
+
+
+def test_a_machine_with_a_motor_hides_what_it_can_have_and_is_judged_by_its_own_model():
+    cases = [draw_case(7, i, 60.0, "electromechanical") for i in range(N)]
+    single = {h.name for c in cases if c["kind"] in ("single", "pair") for h in c["hidden"]}
+    assert single <= set(WITH_MOTOR) and {"gear_backlash", "aero_load", "pot_gain"} <= single
+    outside = {h.name for c in cases if c["kind"] == "outside" for h in c["hidden"]}
+    assert not outside & {"piston_cushion", "supply_dips", "valve_silting", "area_growth", "driver_oscillation"}
+    seed, index = next((s, i) for s in range(9) for i in range(9) if _clean(draw_case(s, i, 40.0, "electromechanical")))
+    row = judge_case(seed, index, 40.0, 100, machine="electromechanical")
+    assert row["machine"] == "electromechanical" and row["verdict"] == "none" and row["processor_s"] > 0.0
+    notes = json.loads(row["answer"])["notes"]
+    assert not any("p_s" in n for n in notes)
+
+
+def _clean(case) -> bool:
+    return case["kind"] == "clean" and not case["gaps"] and not case["modes"]
+
+
+def test_a_machine_that_the_rig_does_not_have_is_refused_in_one_line(tmp_path, capsys):
+    table = path("plant.toml").read_text()
+    other = tmp_path / "other.toml"
+    other.write_text(re.sub(r"(flow_gain = \{ value = )[0-9.]+", r"\g<1>5.5", table, count=1))
+    assert main(["hidden-effect", "--plant", str(other), "--out", str(tmp_path / "x.parquet")]) == 2
+    said = capsys.readouterr().err
+    assert str(other) in said and "the rig has the machines of plant.toml and" in said and "Traceback" not in said
 
 
 def test_a_row_says_what_was_done_to_the_log():

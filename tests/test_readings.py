@@ -15,7 +15,7 @@ from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.discrepancy.diagnose import diagnose_stage
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_per_output
 
 
 def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
@@ -132,3 +132,15 @@ def test_many_effects_that_leave_much_are_an_imitation() -> None:
         return NoiseFloor(judge).conclude(before, replace(after, effects=effects), [], [], []).verdict
 
     assert verdict("a") == "missing" and verdict("a", "b", "c") == "unknown"
+
+
+def test_a_stroke_far_behind_is_smoothed_no_rounder_than_it_was() -> None:
+    """The linkage takes the lag off the smoothed stroke: what smoothing cut off its corners would ask for more laws."""
+    stage = chain_of(recorded([Hidden("lvdt_lag", {"time_constant": 0.0267})], 55, 100)).stage("linkage")
+    assert stage.floor is not None
+    judge, start = Judge(stage, stage.floor), stage.neutral()
+    lag = stage.index()["lvdt_lag"].start
+    start[lag] = 0.03
+    fit = judge.fit(("lvdt_lag",), start, 8)
+    assert fit.theta[lag] == pytest.approx(0.0267, rel=0.02)
+    assert np.all(rms_per_output(judge, fit) < 1.03 * stage.floor)

@@ -353,7 +353,7 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
     )  # fmt: skip
     return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
-        lost=lambda: np.ones((1, 8 * n)),
+        lost=lambda: np.ones((1, 8 * n)), block_start=np.arange(0, 8 * n, 50),
     )  # fmt: skip
 
 

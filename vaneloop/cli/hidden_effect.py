@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.cli.blind import from_checkout, print_shares, run, share
 
@@ -29,6 +30,7 @@ the controller is for some seconds in another mode.
 examples:
   vaneloop hidden-effect --logs 40 --out out/blind.parquet
   vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
+  vaneloop hidden-effect --plant plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
 
@@ -36,6 +38,7 @@ KINDS = ("clean", "outside", "pair", "single")
 SHARES = (0.25, 0.25, 0.20, 0.30)
 GAPS = 0.2  # of the logs lack rows
 MODES = 0.2  # of the logs have seconds in another mode
+MACHINES = {"hydraulic": "plant.toml", "electromechanical": "plant_electromechanical.toml"}  # that the rig has
 LIKELY = 0.5  # a name less probable than this needs a rival
 
 
@@ -49,6 +52,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--experiments",
         action="store_true",
         help="where rivals remain, run the recommended experiment too, and see whether it decides",
+    )
+    parser.add_argument(
+        "--plant",
+        metavar="F.toml",
+        default=MACHINES["hydraulic"],
+        help="plant's table of the machine, one of the two that the rig has: plant.toml (default) or "
+        "plant_electromechanical.toml",
     )
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
     parser.add_argument(
@@ -64,22 +74,27 @@ def _rig() -> Any:
     return from_checkout(("tests.rig", "tests.firmware_on_rig"), "hidden-effect needs the independent rig in tests/rig")
 
 
-def draw_case(seed: int, index: int, duration: float = 300.0) -> dict[str, Any]:
+def draw_case(seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic") -> dict[str, Any]:
     """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing
     simulated yet.
+
+    machine  of `MACHINES`: what can be hidden in it
     """
     import numpy as np
 
     rig, _ = _rig()
+    motor = machine == "electromechanical"
+    library = list(rig.WITH_MOTOR if motor else rig.EFFECTS)
+    outside = [k for k, e in rig.OUTSIDE.items() if not motor or e.stage != "actuator" or e.site == "lvdt"]
     rng = np.random.default_rng([seed, index])
     kind = str(rng.choice(KINDS, p=SHARES))
     hidden = []
     if kind == "single":
-        hidden = [rig.draw(str(rng.choice(list(rig.EFFECTS))), int(rng.integers(0, 5)), rng)]
+        hidden = [rig.draw(str(rng.choice(library)), int(rng.integers(0, 5)), rng)]
     elif kind == "outside":
-        hidden = [rig.draw(str(rng.choice(list(rig.OUTSIDE))), int(rng.integers(1, 5)), rng)]
+        hidden = [rig.draw(str(rng.choice(outside)), int(rng.integers(1, 5)), rng)]
     elif kind == "pair":
-        two = rng.choice(list(rig.EFFECTS), size=2, replace=False)
+        two = rng.choice(library, size=2, replace=False)
         hidden = [rig.draw(str(name), int(rng.integers(2, 5)), rng) for name in two]
     machine_seed = int(rng.integers(1, 2**31))
     geometry = rig.load_geometry(rng=rng)
@@ -117,15 +132,15 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
             continue
         sizes = dict(h.parameters)
         which = int(sizes["stage"]) if "stage" in sizes else -1
-        key = VANES[which] if which >= 0 else rig.EFFECTS[h.name].main
+        key = VANES[which] if which >= 0 else rig.CATALOGUE[h.name].main
         declared = next((p for p in EFFECTS[h.name].parameters if p.name == key), None)
         if declared is not None:
-            truth = sizes[rig.EFFECTS[h.name].main] / declared.si
+            truth = sizes[rig.CATALOGUE[h.name].main] / declared.si
             out.append({"effect": h.name, "parameter": key, "truth": truth, **named["parameters"][key]})
     return out
 
 
-def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
+def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
     """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
     from dataclasses import replace
 
@@ -134,7 +149,7 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
     from vaneloop.discrepancy.models.experiment import recommend
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
-    e = recommend(d)
+    e = recommend(d, chain=chain)
     if e is None:
         return None
     out = {"profile": e["profile"], "nats": e["score"], "separable": e["separates"], "resolved": False}
@@ -155,17 +170,21 @@ def _experiment(d: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict
     return out
 
 
-def judge_case(seed: int, index: int, duration: float, rate: int, experiments: bool = False) -> dict[str, Any]:
-    """Simulate, write, diagnose and score one log; a flat record."""
+def judge_case(
+    seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic"
+) -> dict[str, Any]:
+    """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
     import numpy as np
 
     from hil.logs import Channel, read_log, write_log
+    from plant import build_plant
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.models.vanes import build_chain
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
     rig, on_rig = _rig()
-    case = draw_case(seed, index, duration)
+    case = draw_case(seed, index, duration, machine)
+    plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
 
     def stages_of(hidden: list[Any], test: Any = test) -> Any:
@@ -173,16 +192,18 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
             test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"],
             gaps=case["gaps"],
             spells=case["modes"],
+            motor=motor,
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "log.parquet"
-            write_log(path, {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
-            return build_chain(read_log(path, require=()))
+            without = ("t", "p_s") if motor else ("t",)  # there is no oil
+            write_log(path, {k: Channel(run.log["t"], v) for k, v in run.log.items() if k not in without})
+            return build_chain(read_log(path, require=()), plant)
 
     chain = stages_of(case["hidden"])
-    started = time.perf_counter()
+    started, used = time.perf_counter(), time.process_time()
     d = diagnose(chain.stages, chain.not_observed, workers=1)
-    elapsed = time.perf_counter() - started
+    elapsed, used = time.perf_counter() - started, time.process_time() - used
     answer = diagnosis_json(d, f"case {index}")
     truth = [h.name for h in case["hidden"]]
     # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3
@@ -206,11 +227,13 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
     named = [e["effect"] for e in answer["effects"]]
     rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
     tried = (
-        _experiment(d, case, test, stages_of) if experiments and any(h in _all_named(answer) for h in truth) else None
+        _experiment(d, chain, case, test, stages_of)
+        if experiments and any(h in _all_named(answer) for h in truth)
+        else None
     )
     ratios = [s["error_after"] / s["noise_floor"] for s in answer["stages"] if s["verdict"] == "missing"]
     return {
-        "seed": seed, "index": index, "kind": case["kind"], "truth": truth,
+        "seed": seed, "index": index, "machine": machine, "kind": case["kind"], "truth": truth,
         "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
         "geometry": json.dumps(asdict(case["geometry"])),
         "gaps": json.dumps(case["gaps"]), "modes": json.dumps([asdict(s) for s in case["modes"]]),
@@ -218,6 +241,7 @@ def judge_case(seed: int, index: int, duration: float, rate: int, experiments: b
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
         "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed,
+        "processor_s": used,
         "answer": json.dumps(terminal.plain(answer)),
         "intervals": json.dumps(terminal.plain(_intervals(case["hidden"], answer))),
         "experiment": json.dumps(terminal.plain(tried)),
@@ -236,7 +260,8 @@ def _too_easy(effect: dict[str, Any]) -> bool:
         return True
     if effect["effect"] not in EFFECTS:
         return False
-    for p in build_plant().parameters_of(effect["effect"]).values():
+    kind = next(k for k in MACHINES if k in EFFECTS[effect["effect"]].kinds)
+    for p in build_plant(MACHINES[kind]).parameters_of(effect["effect"]).values():
         value = effect["parameters"].get(p.name, {}).get("value", p.neutral)
         near = 1e-6 * (p.high - p.low)
         if (
@@ -283,6 +308,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     pairs = [r for r in rows if r["kind"] == "pair" and all(r["detectable"])]
     outside = [r for r in rows if r["kind"] == "outside"]
     intervals = [i for r in rows for i in json.loads(r["intervals"])]
+    used = sorted(t for r in rows if (t := r.get("processor_s")) is not None)  # older files have none
     tried = [e for r in rows if (e := json.loads(r["experiment"]))]
     found = [r for r in single if _hit(r["truth"][0], r) and r["after_over_floor"] is not None]
     return {
@@ -307,6 +333,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             [_too_easy(e) for r in rows for e in json.loads(r["answer"])["effects"]]
         ),
         "median seconds": sorted(r["elapsed_s"] for r in rows)[len(rows) // 2] if rows else None,
+        "median processor seconds": used[len(used) // 2] if used else None,
+        "longest processor seconds": used[-1] if used else None,
     }  # fmt: skip
 
 
@@ -375,6 +403,21 @@ def misses(rows: list[dict[str, Any]]) -> list[str]:
     return out
 
 
+def _machine(table: str) -> str:
+    """Which of `MACHINES` a plant's table describes; InputError for one that the rig does not have."""
+    import numpy as np
+
+    from plant import build_plant
+
+    plant = build_plant(table)
+    if not np.array_equal(plant.p, build_plant(MACHINES[plant.kind]).p):
+        raise InputError(
+            f"--plant {table}: its numbers are not those of {MACHINES[plant.kind]}; the rig has the machines of "
+            f"{' and '.join(MACHINES.values())} only"
+        )
+    return plant.kind
+
+
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     import secrets
@@ -382,12 +425,11 @@ def command(args: argparse.Namespace) -> int:
     import polars as pl
 
     from hil.loop.lockstep import warm_up
-    from vaneloop.base.errors import InputError
 
     _rig()
     if not 1 <= args.logs <= 100_000 or not 1 <= args.workers <= 64 or not 30.0 <= args.duration <= 1e5:
         raise InputError("--logs must be in [1, 100000], --workers in [1, 64], --duration in [30, 100000]")
-    path = Path(args.out)
+    machine, path = _machine(args.plant), Path(args.out)
     rows: list[dict[str, Any]] = []
     if path.exists():
         try:
@@ -397,13 +439,18 @@ def command(args: argparse.Namespace) -> int:
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
     if rows and "gaps" not in rows[0]:
         raise InputError(f"{path}: written by an older version, with one geometry for all; give another --out")
-    rows = [r for r in rows if r["seed"] == seed]
+    rows = [r for r in rows if r["seed"] == seed and r.get("machine", "hydraulic") == machine]
     terminal.say(args, f"seed {seed}; {len(rows)} logs done before")
     path.parent.mkdir(parents=True, exist_ok=True)
     warm_up(lambda text: terminal.say(args, text))
-    run(args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments)
+    run(args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine)
     s = summary(rows)
-    print_shares(args, f"{len(rows)} logs, {s['median seconds']:.1f} s a diagnosis", s)
+    spent = f"{s['median seconds']:.1f} s a diagnosis"
+    if s["median processor seconds"] is not None:
+        spent += (
+            f", {s['median processor seconds']:.1f} s of processor time, at most {s['longest processor seconds']:.1f}"
+        )
+    print_shares(args, f"{len(rows)} logs, {spent}", s)
     terminal.print_table(args, "what was hidden, what was said", ["hidden", "said", "logs"], confusion(rows))
     terminal.print_table(
         args, "are the probabilities right?", ["stated", "mean", "right", "share", "90 % interval"], reliability(rows)

@@ -219,14 +219,19 @@ def bins_of(
 
 
 def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
-    """Error of every output against every condition of the stage, most telling first."""
+    """Error of every output against every condition of the stage, most telling first.
+
+    A bin is significant where what is left of it without its worst block of the log is too: one slam that the equations
+    do not hold to a micrometre is no condition.
+    """
     from scipy.stats import norm
 
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
     known = (1.0 + KNOWN_TO) ** 2 if stage.lost is not None else 1.0  # drawn floors are as uneven as that is known
     raw = []
-    looks = 0
+    looks, blocks = 0, len(judge.block_start)
+    block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=e.shape[1]))
     for k, output in enumerate(stage.outputs):
         valid = judge.valid[k]
         for name, values in stage.regimes.items():
@@ -235,16 +240,23 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
                 continue
             edges = _edges(values[use])
             bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
-            n = np.bincount(bin_of, minlength=len(edges) - 1)
-            ms, floor = (
-                np.bincount(bin_of, x[k, use], minlength=len(edges) - 1) / np.maximum(n, 1) for x in (e**2, lost)
+            many, cell = len(edges) - 1, bin_of * blocks + block_of[use]
+            n, square, floor = (
+                np.bincount(cell, x, minlength=many * blocks).reshape(many, blocks)
+                for x in (np.ones(len(cell)), e[k, use] ** 2, lost[k, use])
             )
-            looks += len(n)
-            raw.append((k, output, name, edges, n, ms / np.maximum(floor, 1.0)))
+            worst = (np.arange(many), np.argmax(square - floor, axis=1))
+            looks += many
+            others = [x.sum(axis=1) - x[worst] for x in (n, square, floor)]
+            raw.append(
+                (k, output, name, edges, *_mean(n.sum(axis=1), square.sum(axis=1), floor.sum(axis=1)), *_mean(*others))
+            )
     out = []
     z_limit = norm.isf(LEVEL / max(looks, 1))
-    for k, output, name, edges, n, ms in raw:
-        z = (ms / known - 1.0) * np.sqrt(np.maximum(n, 1) / (2.0 * correlation))
+    for k, output, name, edges, n, ms, other, rest in raw:
+        z, confirmed = (
+            (x / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, x in ((n, ms), (other, rest))
+        )
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)
         share = excess / excess.sum() if excess.sum() > 0 else np.full(len(n), 1.0 / len(n))
@@ -253,11 +265,16 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
         out.append(
             Regime(
                 output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * floor, ratio, n,
-                (z > z_limit) & (n > 20) & (ratio > 1.05), contrast,
+                (z > z_limit) & (confirmed > norm.isf(LEVEL)) & (n > 20) & (ratio > 1.05), contrast,
             )
         )  # fmt: skip
     out.sort(key=lambda r: (-float(r.significant.any()), -r.contrast))
     return out
+
+
+def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:
+    """How many samples; mean square of their error over that of the noise to be expected of them."""
+    return n.astype(int), squares / np.maximum(np.maximum(floor, n), 1.0)
 
 
 def onset(judge: Judge, fit: Fit) -> float | None:

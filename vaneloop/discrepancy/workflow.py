@@ -62,7 +62,17 @@ _JUDGED: list[Judged] = [NoiseFloor]  # of the work
 def _one(i: int, tick: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0]))
+    if d.verdict == "none" and d.criterion == "noise_floor":
+        d = _under_every_condition(stage, d)
     return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
+
+
+def _under_every_condition(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The answer "none", or "unknown" where `locate` finds a condition under which the stage fails: over the whole log
+    little is above the noise, in one place it is.
+    """
+    hot = locate(Judge(stage, d.floor), d.final).hot
+    return replace(d, verdict="unknown", refused=[f"fails at {hot[0].worst()}"]) if hot else d
 
 
 def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.signal import lfilter, savgol_coeffs, savgol_filter
 
 from hil.figures import noise_floor
 from plant import Plant, chain, places
@@ -20,6 +20,7 @@ __all__ = ["SMOOTH", "Smooth", "without_noise"]
 SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
 SMOOTH_ORDER = 3
 AROUND = 1.0  # s: over which what smoothing bends is told from noise
+LAGS = (0.01, 0.03, 0.1)  # s: lags of valve and LVDT by which the motion may trail the model's, as a sum of them
 BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
 
 
@@ -60,11 +61,13 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
     actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out)
-    # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lag, null
+    # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lags, null
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
     bends = [0.0, *np.quantile(np.abs(step), BENDS)]
     sides = [np.maximum(side * step - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
-    parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [np.ones(len(t))])
+    shares = [1.0 - np.exp(-dt / lag) for lag in LAGS]
+    late = [lfilter([share], [1.0, share - 1.0], step) for share in shares]
+    parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [*late, np.ones(len(t))])
     logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
     whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
     calibrated = parts @ np.linalg.lstsq(parts[whole], logged[whole], rcond=None)[0]
