@@ -1,0 +1,51 @@
+"""Smooth curves: the compiled spline against scipy's, and a basis that is what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import BSpline
+
+from vaneloop.base.spline import spline
+from vaneloop.discrepancy.curves import basis_of
+
+
+def a_log(seed: int, n: int = 3000) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.cumsum(rng.standard_normal(n)) * 10.0 ** rng.uniform(-6, 6) + rng.normal()
+
+
+@given(st.integers(0, 200))
+def test_the_compiled_spline_is_scipys_and_stays_beyond_its_ends(seed: int) -> None:
+    basis = basis_of(a_log(seed))
+    assert basis is not None
+    c = basis.coefficients(np.random.default_rng(seed).standard_normal(len(basis.bend)))
+    x = np.linspace(basis.low, basis.high, 501)[:-1]
+    ours = [spline(v, basis.knots, c, len(c)) for v in x]
+    assert np.allclose(ours, BSpline(basis.knots, c, 3)(x), rtol=1e-9, atol=1e-9 * np.abs(c).max())
+    span = basis.high - basis.low
+    assert spline(basis.low - span, basis.knots, c, len(c)) == pytest.approx(c[0])
+    assert spline(basis.high + span, basis.knots, c, len(c)) == pytest.approx(c[-1])
+
+
+@given(st.integers(0, 200))
+def test_functions_have_unit_size_stand_apart_and_bend_more_and_more(seed: int) -> None:
+    x = a_log(seed)
+    basis = basis_of(x)
+    assert basis is not None
+    inside = x[(x >= basis.low) & (x <= basis.high)]
+    functions = np.array([basis.values(inside, e) for e in np.eye(len(basis.bend))])
+    assert np.allclose(functions @ functions.T / len(inside), np.eye(len(functions)), atol=0.05)
+    assert np.ptp(functions[0]) < 1e-9
+    line = np.polyfit(inside, functions[1], 1)
+    assert np.allclose(np.polyval(line, inside), functions[1], atol=1e-6)
+    assert basis.bend[0] == basis.bend[1] == 0.0 and basis.bend[2] == 1.0 and (np.diff(basis.bend[2:]) >= 0.0).all()
+    straight = basis.values(inside, np.array([0.3, -2.0] + [0.0] * (len(functions) - 2)))
+    assert np.allclose(np.polyval(np.polyfit(inside, straight, 1), inside), straight, atol=1e-6)
+
+
+@pytest.mark.parametrize("x", [np.zeros(100), np.tile([1.0, 2.0], 500), np.full(100, np.nan), np.arange(5.0)])
+def test_a_quantity_that_has_hardly_moved_has_no_basis(x: np.ndarray) -> None:
+    assert basis_of(x) is None
