@@ -46,6 +46,6 @@ def test_functions_have_unit_size_stand_apart_and_bend_more_and_more(seed: int) 
     assert np.allclose(np.polyval(np.polyfit(inside, straight, 1), inside), straight, atol=1e-6)
 
 
-@pytest.mark.parametrize("x", [np.zeros(100), np.tile([1.0, 2.0], 500), np.full(100, np.nan), np.arange(5.0)])
+@pytest.mark.parametrize("x", [np.zeros(100), np.full(100, np.nan), np.arange(5.0)])
 def test_a_quantity_that_has_hardly_moved_has_no_basis(x: np.ndarray) -> None:
     assert basis_of(x) is None

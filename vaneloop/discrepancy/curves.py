@@ -16,14 +16,15 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import eigh
 
-from vaneloop.base.spline import DEGREE
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
 __all__ = ["Basis", "basis_of"]
 
+DEGREE = 3
 COUNT = 10  # splines of a curve
 LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
+LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
 EDGE = 0.001  # share of the visited values beyond the first and the last knot
 
 
@@ -60,18 +61,25 @@ class Basis:
         inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
         return np.asarray(BSpline(self.knots, self.coefficients(amplitudes), DEGREE)(inside))
 
-    def effect(self, name: str, unit: str, size: float, wiggle: float) -> Effect:
+    def design(self, x: Array) -> Array:
+        """The B-splines themselves at ``x``, float64[len(x), splines]; beyond the ends as there."""
+        inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
+        return np.asarray(BSpline(self.knots, np.eye(len(self.turn)), DEGREE)(inside))
+
+    def effect(self, name: str, unit: str, size: float, wiggle: float, mean: bool = True) -> Effect:
         """The curve as an effect: amplitudes in ``unit``, ``size`` large in usual, bends known to be within ``wiggle``.
 
         wiggle  standard deviation of the amplitude of function 2, in ``size``; others by how much they bend
+        mean    whether it may have a mean: where a parameter that is fitted does the same, it must not
         """
-        out = [Parameter(n, 0.0, unit, scale=size) for n in ("mean", "slope")]
+        # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
+        first, wide = ("mean", "slope") if mean else ("slope",), float(np.sqrt(3.0) * LEVEL * size)
+        out = [Parameter(n, 0.0, unit, scale=size, tolerance=wide) for n in first]
         for k in range(2, len(self.bend)):
             deviation = wiggle * size / np.sqrt(self.bend[k])
-            # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
             out.append(Parameter(f"bend_{k - 1}", 0.0, unit, scale=size, tolerance=float(np.sqrt(3.0) * deviation)))
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
-                       for k in range(1, 3) for sign in (-0.3, 0.3))  # fmt: skip
+                       for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
         return Effect(name, tuple(out), starts)
 
 
@@ -83,6 +91,8 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     x = np.sort(np.asarray(visited, dtype=float)[np.isfinite(visited)])
     if len(x) < 4 * LEAST:
         return None
+    if len(few := np.unique(x)) in (2, 3):
+        return _straight(x, float(few[0]), float(few[-1]))
     low, high = (float(np.quantile(x, q)) for q in (EDGE, 1.0 - EDGE))
     if not high - low > 1e-12 * max(abs(low), abs(high), 1e-300):
         return None
@@ -111,6 +121,13 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     line /= np.sqrt(line @ gram @ line)
     turn = np.column_stack([one, line, turn[:, 2:]])
     return Basis(low + (high - low) * knots, turn, np.concatenate([[0.0, 0.0], bends[2:] / bends[2]]))
+
+
+def _straight(x: Array, low: float, high: float) -> Basis:
+    """The basis for a quantity of two or three values, such as a direction: it cannot bend."""
+    knots = np.concatenate([np.full(4, low), np.full(4, high)])
+    line = _greville(knots) - x.mean()
+    return Basis(knots, np.column_stack([np.ones(4), line / np.sqrt(np.mean((x - x.mean()) ** 2))]), np.zeros(2))
 
 
 def _greville(knots: Array) -> Array:
