@@ -12,7 +12,7 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.discrepancy.curves import Basis, basis_of
-from vaneloop.discrepancy.library import Law
+from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.nominal import nominal_course
@@ -20,9 +20,8 @@ from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect
 
-__all__ = ["Candidate", "Quantity", "candidates", "curve_law", "quantities", "with_curves"]
+__all__ = ["Candidate", "Quantity", "candidates", "quantities", "with_curves"]
 
-curve_law = Law("curve", 0, "a function of one quantity", lambda _: ((), ()))
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Candidate:
         """The same with another function from so many parameters to its table."""
         q = self.quantity
         curve = Curve(self.how, self.place, q.of, q.name, self.basis.low, self.basis.high, table)
-        return Placed(self.name, curve_law, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
+        return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
     def effect(self, wiggle: float) -> Effect:
         """What the search is told."""
