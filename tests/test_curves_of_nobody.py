@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
-
 from vaneloop.base.spline import spline
+
 from vaneloop.discrepancy.curves import basis_of
 
 

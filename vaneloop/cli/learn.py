@@ -54,8 +54,7 @@ def command(args: argparse.Namespace) -> int:
         own_model.show(args, answer.by_log)
     for law in answer.laws:
         rows = [
-            [f"{law.x[k]:.4g}", *(f"{v[k]:.4g}" for v in (law.y, law.low, law.high))]
-            for k in range(0, len(law.x), 32)
+            [f"{law.x[k]:.4g}", *(f"{v[k]:.4g}" for v in (law.y, law.low, law.high))] for k in range(0, len(law.x), 32)
         ]
         unit = "" if law.unit == "-" else f" [{law.unit}]"
         columns = [f"{law.of} [{law.of_unit}]", f"curve{unit}", "90 % from", "to"]

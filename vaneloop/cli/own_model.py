@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
 from vaneloop.base import terminal
@@ -66,7 +67,7 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
     from vaneloop.verbs import learn, search
     from vaneloop.verbs.parts import split
 
-    verbs = {"learn": learn.learn}
+    ask_it: Callable[..., Any] = learn.learn if verb == "learn" else getattr(search, verb)
     try:
         system = load_system(args.system)
         added = load_model_of(args.model, system) if args.model else None
@@ -80,7 +81,7 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
         logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
         fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
         test = [*parts, *(_record(args, system, p) for p in others)]
-        return verbs.get(verb, getattr(search, verb, None))(logs, model=system, fit=fit, test=test, added=added, **more)
+        return ask_it(logs, model=system, fit=fit, test=test, added=added, **more)
     except StageError as e:
         raise InputError(str(e)) from None
 

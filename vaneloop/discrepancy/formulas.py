@@ -99,9 +99,7 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
     if not total > 0.0:
         return None
     units = {"per": 1.0 / span, "share": span, "plain": 1.0, "kelvin": 1e4}
-    grids = [
-        [low + v * span if kind == "at" else v * units[kind] for v in values] for kind, values in form.inner
-    ]
+    grids = [[low + v * span if kind == "at" else v * units[kind] for v in values] for kind, values in form.inner]
     best: tuple[float, Array] | None = None
 
     def left(inner: Array) -> tuple[float, float, Array]:
@@ -116,7 +114,7 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
         inner = start
         if len(start):
             size = np.maximum(np.abs(start), 1e-3 * np.array([units.get(k, span) for k, _ in form.inner]))
-            got = least_squares(lambda z: left(z * size)[2], start / size, max_nfev=30)
+            got = least_squares(lambda z, size=size: left(z * size)[2], start / size, max_nfev=30)
             inner = got.x * size
         a, cost, _ = left(inner)
         if np.isfinite(cost) and (best is None or cost < best[0]):

@@ -40,7 +40,7 @@ def curve_figure(law: LearnedLaw) -> Figure:
 def visited_figure(law: LearnedLaw) -> Figure:
     """How much of the logs was where."""
     middle = 0.5 * (law.edges[1:] + law.edges[:-1])
-    return bars([f"{v:.3g}" for v in middle], {"share of samples": 100.0 * law.visited}, "%")
+    return bars([f"{v:.3g}" for v in middle], {"share of samples": (100.0 * law.visited).tolist()}, "%")
 
 
 def learned_page(answer: Learned, command: str = "") -> Page:
@@ -55,8 +55,8 @@ def learned_page(answer: Learned, command: str = "") -> Page:
         text = law.sentence()
         page.section(
             law.name,
-            f"{text[0].upper()}{text[1:]}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no log "
-            "has been there, and the curve stays as at its end.",
+            f"{text[0].upper()}{text[1:]}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no "
+            "log has been there, and the curve stays as at its end.",
         )
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
         page.plot(visited_figure(law), f"Where the logs have been, {law.of} in {law.of_unit or '-'}.")

@@ -56,9 +56,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
         forms = {f.name: f for f in FORMS}
         if law.form not in forms or len(forms[law.form].numbers) != len(law.values):
             allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
-            raise StageError(
-                f"curves.{name}: form (={law.form!r}, {len(law.values)} values) must be one of {allowed}"
-            )
+            raise StageError(f"curves.{name}: form (={law.form!r}, {len(law.values)} values) must be one of {allowed}")
         form = forms[law.form]
         names = form.numbers
         curve = Curve(

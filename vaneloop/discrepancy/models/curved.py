@@ -12,16 +12,15 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.discrepancy.curves import Basis, basis_of
-from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
+from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["Candidate", "Quantity", "candidates", "quantities", "with_curves"]
-
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,9 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
                 continue
             if allowed("force" if name in s.rates else "state", name):
                 pairs = zip(states[i], bound.data.records, strict=True)
-                rate = max(float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300)
+                rate = max(
+                    float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300
+                )
                 mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass)
     if s.kind == "force" and allowed("force", "force"):

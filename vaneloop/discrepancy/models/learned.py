@@ -1,4 +1,6 @@
-"""What is said of a law that was learned: its curve with a band, where the log has been, what it trades with, formulas."""
+"""What is said of a law that was learned: its curve and band, where the logs have been, what it trades with, and its
+formulas.
+"""
 
 from __future__ import annotations
 
@@ -203,11 +205,13 @@ def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Form
 
 # forms that are laws of the library, where the curve is of what is at its own place
 OF_STATE = {
-    "constant": "offset", "line": "leak", "root": "square_root", "signed square": "quadratic_drag", "cube": "cubic",
+    "constant": "offset",
+    "line": "leak",
+    "root": "square_root",
+    "signed square": "quadratic_drag",
+    "cube": "cubic",
 }
-OF_FORCE = {
-    "constant": "force_offset", "line": "viscous", "signed square": "quadratic_drag", "sign": "coulomb",
-}
+OF_FORCE = {"constant": "force_offset", "line": "viscous", "signed square": "quadratic_drag", "sign": "coulomb"}
 OF_POSITION = {"line": "spring", "cube": "cubic_spring"}
 OF_SIGNAL = {"constant": "bias", "line": "gain", "cube": "cubic", "magnitude": "asymmetric_gain"}
 

@@ -219,7 +219,9 @@ class Learner:
 
     def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, float, Array]:
         fit, jac = current.fit, slopes.jac
-        bound = with_curves(self.logs.fitted, (), (*current.curves, (candidate.placed(), candidate.effect(WIGGLES[-1]))))
+        bound = with_curves(
+            self.logs.fitted, (), (*current.curves, (candidate.placed(), candidate.effect(WIGGLES[-1])))
+        )
         judge = Judge(bound.thinned, self.logs.fitted.floor)
         theta = np.concatenate([fit.theta, np.zeros(len(candidate.effect(1.0).parameters))])
         own = np.arange(len(fit.theta), len(theta))

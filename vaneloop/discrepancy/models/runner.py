@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -292,7 +293,7 @@ class Runner:
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
         kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves()
         out = np.full((len(s.outputs), len(t)), np.nan)
-        arguments = (
+        arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
             rows, position, gap,
             asymmetry, self.smalls, mass, steps, s.between == "line", loop,
