@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["Basis", "basis_of"]
+__all__ = ["COUNT", "DEGREE", "LEVEL", "Basis", "basis_of"]
 
 DEGREE = 3
 COUNT = 10  # splines of a curve

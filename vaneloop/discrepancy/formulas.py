@@ -6,6 +6,7 @@ tanh, magnitudes, dead zones, limits, quotients, Arrhenius' law, sines. ``comple
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,7 +27,8 @@ class Form:
     numbers   its names; the first multiplies the whole
     inner     sizes of the numbers inside f to begin from, as shares: of q's range (``per``: of one over it, ``at``: of
               the way from lowest to highest, ``kelvin``: of 10,000 K, ``plain``: as they are)
-    positive  only for a quantity that stays above 0
+    positive  only for a quantity that stays above 0; ``signed``: only for one that does not, else it is another form
+    magnitudes  which of the numbers have a sign that changes nothing
     """
 
     name: str
@@ -36,6 +38,14 @@ class Form:
     numbers: tuple[str, ...] = ("a",)
     inner: tuple[tuple[str, tuple[float, ...]], ...] = ()
     positive: bool = False
+    signed: bool = False
+    magnitudes: tuple[int, ...] = ()
+
+    def plain(self, numbers: Array) -> Array:
+        """The same numbers, without signs that change nothing."""
+        out = np.array(numbers, dtype=float)
+        out[list(self.magnitudes)] = np.abs(out[list(self.magnitudes)])
+        return out
 
 
 def _power(q: Array, n: Array) -> Array:
@@ -53,10 +63,10 @@ _WIDTH = ("share", (0.05, 0.15, 0.3))
 FORMS: tuple[Form, ...] = (
     Form("constant", "a", 1, lambda q, n: n[0] + 0.0 * q),
     Form("line", "a q", 2, lambda q, n: n[0] * q),
-    Form("magnitude", "a |q|", 3, lambda q, n: n[0] * np.abs(q)),
-    Form("sign", "a sign(q)", 3, lambda q, n: n[0] * np.sign(q)),
+    Form("magnitude", "a |q|", 3, lambda q, n: n[0] * np.abs(q), signed=True),
+    Form("sign", "a sign(q)", 3, lambda q, n: n[0] * np.sign(q), signed=True),
     Form("square", "a q^2", 3, lambda q, n: n[0] * q * q),
-    Form("signed square", "a q |q|", 4, lambda q, n: n[0] * q * np.abs(q)),
+    Form("signed square", "a q |q|", 4, lambda q, n: n[0] * q * np.abs(q), signed=True),
     Form("cube", "a q^3", 3, lambda q, n: n[0] * q**3),
     Form("root", "a sign(q) sqrt(|q|)", 4, lambda q, n: n[0] * np.sign(q) * np.sqrt(np.abs(q))),
     Form("inverse", "a / q", 3, lambda q, n: n[0] / np.maximum(q, 1e-12), positive=True),
@@ -67,15 +77,20 @@ FORMS: tuple[Form, ...] = (
          ("a", "b"), (("per", (0.3, 1.0, 5.0)),)),
     Form("above", "a max(q - b, 0)", 4, lambda q, n: n[0] * np.maximum(q - n[1], 0.0), ("a", "b"), (_AT,)),
     Form("below", "a min(q - b, 0)", 4, lambda q, n: n[0] * np.minimum(q - n[1], 0.0), ("a", "b"), (_AT,)),
-    Form("step", "a (q > b)", 4, lambda q, n: n[0] * (q > n[1]), ("a", "b"), (_AT,)),
+    Form("step", "a (q > b)", 4, lambda q, n: n[0] * (q > n[1]), ("a", "b"),
+         (("at", tuple(np.linspace(0.02, 0.98, 97))),)),
     Form("gentle step", "a / (1 + exp(-(q - b)/c))", 6,
          lambda q, n: n[0] / (1.0 + np.exp(np.clip(-(q - n[1]) / max(abs(n[2]), 1e-9), -50.0, 50.0))),
-         ("a", "b", "c"), (_AT, _WIDTH)),
+         ("a", "b", "c"), (_AT, _WIDTH), magnitudes=(2,)),
     Form("dead zone", "a sign(q) max(|q| - b, 0)", 5,
-         lambda q, n: n[0] * np.sign(q) * np.maximum(np.abs(q) - abs(n[1]), 0.0), ("a", "b"), (_WIDTH,)),
+         lambda q, n: n[0] * np.sign(q) * np.maximum(np.abs(q) - abs(n[1]), 0.0), ("a", "b"), (_WIDTH,),
+         signed=True, magnitudes=(1,)),
+    Form("limit to one side", "a clip(q, min(b, 0), max(b, 0))", 4,
+         lambda q, n: n[0] * np.clip(q, min(n[1], 0.0), max(n[1], 0.0)), ("a", "b"),
+         (("share", (0.05, 0.15, 0.3, -0.05, -0.15, -0.3)),)),
     Form("limit", "a clip(q, -b, b)", 4, lambda q, n: n[0] * np.clip(q, -abs(n[1]), abs(n[1])), ("a", "b"),
-         (("share", (0.1, 0.2, 0.35)),)),
-    Form("Arrhenius", "a exp(-b/(q + 273.15))", 6,
+         (("share", (0.1, 0.2, 0.35)),), magnitudes=(1,)),
+    Form("Arrhenius", "a exp(b/300 - b/(q + 273.15))", 6,
          lambda q, n: n[0] * np.exp(np.clip(-n[1] / (q + KELVIN) + n[1] / 300.0, -50.0, 50.0)), ("a", "b"),
          (("kelvin", (0.1, 0.5, -0.3)),)),
     Form("sine", "a sin(b q + c)", 5, lambda q, n: n[0] * np.sin(n[1] * q + n[2]), ("a", "b", "c"),
@@ -88,7 +103,7 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
 
     level  a constant may be added: what the model does with a parameter that is fitted
     """
-    if form.positive and not q.min() > 0.0:
+    if (form.positive and not q.min() > 0.0) or (form.signed and not q.min() < 0.0 < q.max()):
         return None
     if form.name == "Arrhenius" and not q.min() > -200.0:
         return None
@@ -112,7 +127,7 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
 
     for start in np.array(np.meshgrid(*grids)).reshape(len(grids), -1).T if grids else [np.zeros(0)]:
         inner = start
-        if len(start):
+        if len(start) and form.name != "step":  # which has no slope
             size = np.maximum(np.abs(start), 1e-3 * np.array([units.get(k, span) for k, _ in form.inner]))
             got = least_squares(lambda z, size=size: left(z * size)[2], start / size, max_nfev=30)
             inner = got.x * size
@@ -121,13 +136,12 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
             best = cost, np.concatenate([[a], inner])
     if best is None or not np.all(np.isfinite(best[1])):
         return None
-    return best[1], best[0] / total
+    return form.plain(best[1]), best[0] / total
 
 
-def text_of(form: Form, numbers: Array, quantity: str) -> str:
-    """The formula with its numbers."""
-    import re
-
+def text_of(form: Form, numbers: Array, quantity: str, above_zero: bool = False) -> str:
+    """The formula with its numbers; ``above_zero``: its quantity never turns negative."""
     values = dict(zip(form.numbers, numbers, strict=True))
-    text = re.sub(r"\b([abc])\b", lambda m: f"{values[m.group(1)]:.4g}", form.text)
-    return re.sub(r"\bq\b", quantity, text).replace("+ -", "- ").replace("- -", "+ ")
+    text = form.text.replace("sign(q) ", "").replace("|q|", "q") if above_zero else form.text
+    text = re.sub(r"\b([abc])\b", lambda m: f"{values[m.group(1)]:.4g}", text)
+    return re.sub(r"\bq\b", quantity, text).replace("+ -", "- ").replace("- -", "+ ").replace("(--", "(")

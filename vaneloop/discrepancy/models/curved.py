@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vaneloop.base.curve import POINTS
-from vaneloop.discrepancy.curves import Basis, basis_of
+from vaneloop.discrepancy.curves import COUNT, Basis, basis_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
@@ -21,6 +21,9 @@ from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["Candidate", "Quantity", "candidates", "quantities", "with_curves"]
+
+
+IN_TIME = 24  # splines of a curve over time: what swings with time does so often
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,11 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
     """Every curve that may be missing: each place with each quantity."""
     s = bound.system
     moves = s.kind in ("simulate", "closed_loop")
-    known = [(q, b) for q in quantities(bound, values) if (b := basis_of(q.visited)) is not None]
+    known = [
+        (q, b)
+        for q in quantities(bound, values)
+        if (b := basis_of(q.visited, IN_TIME if q.name == TIME else COUNT)) is not None
+    ]
     out: list[Candidate] = []
 
     def put(how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True) -> None:

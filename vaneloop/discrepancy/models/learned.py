@@ -25,6 +25,8 @@ BAND = 0.90
 REFITTED = 5  # formulas that are fitted in the simulation
 NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
 SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
+DEGREES = ("degC", "°C", "C")
+SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 BINS = 24
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
@@ -167,7 +169,9 @@ def _formulas(logs: Logs, tried: Tried, y: Array) -> list[Formula]:
     visited = np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
     at_visited = np.interp(visited, x, y)
     shaped = []
-    for form in FORMS:
+    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line
+    warm = c.quantity.unit in DEGREES
+    for form in [f for f in FORMS if (not few or f.name == "line") and (warm or f.name != "Arrhenius")]:
         got = begin(form, visited, at_visited, not c.mean)
         if got is not None and got[1] < SHAPED:
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
@@ -178,7 +182,18 @@ def _formulas(logs: Logs, tried: Tried, y: Array) -> list[Formula]:
     fitted.sort(key=lambda f: np.log(f.error) + PER_NUMBER * len(f.numbers))
     limit = min(f.error for f in fitted) * (1.0 + NEAR)
     limit = max(limit, min(rms_of(tried.judge, tried.fit), 1.0) * (1.0 + NEAR))
-    return sorted((f for f in fitted if f.error <= limit), key=lambda f: (f.complexity, f.error))
+    out: list[Formula] = []
+    for f in sorted((f for f in fitted if f.error <= limit), key=lambda f: (f.complexity, f.error)):
+        y = values_of(f, visited)
+        if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):
+            out.append(f)
+    return out
+
+
+def values_of(formula: Formula, q: Array) -> Array:
+    """A formula at values of its quantity."""
+    form = next(f for f in FORMS if f.name == formula.form)
+    return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)
 
 
 def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Formula | None:
@@ -197,10 +212,17 @@ def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Form
     fit = with_held_out(judge, judge.fit(tuple(e.name for e in judge.stage.effects), theta, 12))
     if not np.isfinite(score(judge, fit)):
         return None
-    values = fit.theta[-len(numbers) :]
+    values = form.plain(fit.theta[-len(numbers) :])
     said = dict(zip(form.numbers, (float(v) for v in values), strict=True))
     law = library_name(c, form)
-    return Formula(form.name, text_of(form, values, c.quantity.name), said, rms_of(judge, fit), form.complexity, law)
+    return Formula(
+        form.name,
+        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0)),
+        said,
+        rms_of(judge, fit),
+        form.complexity,
+        law,
+    )
 
 
 # forms that are laws of the library, where the curve is of what is at its own place

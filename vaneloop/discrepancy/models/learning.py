@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.error_share import HARM, LEAST_USE, MOST_LEFT, RIVAL, UNKNOWN, ErrorShare, score, worth
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
@@ -22,7 +23,7 @@ from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curved import Candidate, candidates, with_curves
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
-from vaneloop.discrepancy.stage import Array, Effect, Stage
+from vaneloop.discrepancy.stage import Array, Effect
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
 __all__ = ["Learner", "Outcome", "Tried"]
@@ -31,7 +32,7 @@ MOST_CURVES = 2
 WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
 QUICK, FINISHED = 10, 4  # candidates that are fitted for a few steps, and of these to the end
 SHORTER = (1.0, 0.5, 0.2)  # of the step that the slopes promise, which are simulated
-ROUND = 2.0  # samples of a block that a bend must be worth; below it a law is noise
+FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
 Placings = tuple[tuple[Placed, Effect], ...]
 
 
@@ -196,7 +197,27 @@ class Learner:
             options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
             done.append(min(options, key=lambda o: score(self.judge, o.fit)))
             self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
-        return sorted(done, key=lambda t: score(self.judge, t.fit))
+        done.sort(key=lambda t: score(self.judge, t.fit))
+        if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
+            finer = [f for t in done[:FINER] if (f := self._finer(current, t)) is not None]
+            done = sorted([*done, *finer], key=lambda t: score(self.judge, t.fit))
+            best = {t.candidate.name: t for t in reversed(done)}
+            done = [t for t in done if best[t.candidate.name] is t]
+        return done
+
+    def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
+        """The same curve with `SPLINES` splines."""
+        c = coarse.candidate
+        basis = basis_of(c.quantity.visited, SPLINES)
+        if basis is None or len(basis.bend) <= len(c.basis.bend):
+            return None
+        fine = replace(c, basis=basis)
+        turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
+        curve = c.basis.design(fine.grid) @ (turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
+        own = basis.turn if c.mean else basis.turn[:, 1:]
+        amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ own, curve, rcond=None)[0]
+        theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
+        return self._fitted(current, fine, WIGGLES[-1], theta, 12)
 
     def _fitted(self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int) -> Tried:
         curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
@@ -285,8 +306,3 @@ def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
     """The model with these curves on all its logs."""
     test = with_curves(logs.test, (), curves) if logs.test is not None else None
     return Logs(with_curves(logs.fitted, (), curves), test)
-
-
-def stage_of(tried: Tried) -> Stage:
-    """The stage with its curves."""
-    return tried.judge.stage
