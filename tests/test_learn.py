@@ -302,12 +302,15 @@ def test_the_command_learns_the_law_and_another_log_confirms_it(tmp_path: Path) 
     assert json.loads((tmp_path / "c.json").read_text())["stages"][0]["signals"][0]["rms"] < 0.075  # its noise is 0.05
 
 
+OWN = ("--system", "tank.py")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("learn", "cold.csv"), "needs --system"),
         (("learn", "cold.csv", "--system", "tank.py", "--out", "no/law.toml"), "no/law.toml: cannot be written"),
-        (("extend", "cold.csv", "--system", "tank.py", "--effect", "plain.toml", "--out", "m.toml"), "has no table curves"),
+        (("extend", "cold.csv", *OWN, "--effect", "plain.toml", "--out", "m.toml"), "has no table curves"),
     ],
 )  # fmt: skip
 def test_bad_input_gets_one_line(tmp_path: Path, words: tuple[str, ...], said: str) -> None:

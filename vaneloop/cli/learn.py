@@ -20,9 +20,9 @@ and the simplest formulas that fit it. A law must earn its place on data that it
 and do clearly better than laws with names. Where no honest law is there, it says so. docs/learn.md
 
 examples:
-  vaneloop learn tank.csv --test other.csv --system tank.py --out law.toml --report law.html
-  vaneloop extend new.csv --system tank.py --effect law.toml --out better.toml
-  vaneloop compare new.csv --system tank.py --model better.toml
+  vaneloop learn LOG --test OTHER --system MY.py --out LAW.toml --report LAW.html
+  vaneloop extend NEW --system MY.py --effect LAW.toml --out BETTER.toml
+  vaneloop compare NEW --system MY.py --model BETTER.toml
 
 exit codes: 0 nothing is missing, or laws with names say it; 1 a law was learned, or something is missing and no honest
 law was found; 2 bad input"""

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import numpy as np
 
+from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
+from vaneloop.discrepancy.models.learning import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import number
 
-if TYPE_CHECKING:
-    from vaneloop.verbs.learn import Learned
-
 __all__ = ["curve_figure", "learned_page", "visited_figure"]
 
+TONES: dict[str, Literal["good", "neutral", "bad"]] = {
+    "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
+}  # fmt: skip
 BEYOND = 0.15  # of the range, drawn beyond its ends
 
 
@@ -43,15 +46,22 @@ def visited_figure(law: LearnedLaw) -> Figure:
     return bars([f"{v:.3g}" for v in middle], {"share of samples": (100.0 * law.visited).tolist()}, "%")
 
 
-def learned_page(answer: Learned, command: str = "") -> Page:
-    """The page of ``vaneloop learn``."""
-    tone = {"learned": "good", "none": "good", "named": "neutral", "unknown": "bad"}[answer.verdict]
-    title = f"A law learned from {Path(answer.log).name}" if answer.laws else f"Learning from {Path(answer.log).name}"
-    page = Page(title, answer.sentence(), tone=tone, command=command, log=answer.log)  # type: ignore[arg-type]
-    for law in answer.laws:
+def learned_page(
+    laws: Sequence[LearnedLaw],
+    outcome: Outcome,
+    said: str,
+    notes: Sequence[str],
+    by_log: ByLog | None = None,
+    command: str = "",
+    log: str = "",
+) -> Page:
+    """The page of ``vaneloop learn``; ``said``: the answer in one sentence."""
+    title = f"A law learned from {Path(log).name}" if laws else f"Learning from {Path(log).name}"
+    page = Page(title, said, tone=TONES[outcome.verdict], command=command, log=log)
+    for law in laws:
         figures = f"{number(law.error_before)} to {number(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
-    for law in answer.laws:
+    for law in laws:
         text = law.sentence()
         page.section(
             law.name,
@@ -66,14 +76,14 @@ def learned_page(answer: Learned, command: str = "") -> Page:
                 [[f.text, f.error, f.law or "-"] for f in law.formulas],
                 "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first.",
             )
-    if answer.outcome.nearest and not answer.laws:
+    if outcome.nearest and not laws:
         page.section("What came nearest")
-        page.text(", ".join(answer.outcome.nearest) + ".")
-    if answer.by_log is not None:
-        log_by_log(page, answer.by_log)
-        curves_by_log(page, answer.by_log)
-    if answer.notes:
+        page.text(", ".join(outcome.nearest) + ".")
+    if by_log is not None:
+        log_by_log(page, by_log)
+        curves_by_log(page, by_log)
+    if notes:
         page.section("Notes")
-        for note in answer.notes:
+        for note in notes:
             page.text(f"{note[0].upper()}{note[1:]}.")
     return page

@@ -84,7 +84,7 @@ class Learned(Answer):
         """The answer as a page."""
         from vaneloop.pages.learned import learned_page
 
-        return learned_page(self, command)
+        return learned_page(self.laws, self.outcome, self.sentence(), self.notes, self.by_log, command, self.log)
 
     def write(self, path: str | Path) -> Path:
         """Write the model with its laws, a file that ``extend --effect`` and ``--model`` take; return its path."""
