@@ -21,6 +21,7 @@ from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curved import Candidate, candidates, with_curves
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array, Effect
@@ -134,13 +135,15 @@ class Learner:
             good = [t for t in finalists if self._earns(fit, t)]
             if not good:
                 break
-            best = good[0]
+            # reversals follow from every quantity that turns: a plain one that does as well is meant
+            near = [t for t in good if score(self.judge, t.fit) < score(self.judge, good[0].fit) + RIVAL]
+            best = next((t for t in near if not t.candidate.quantity.name.startswith((WAY, DISTANCE, SINCE))), good[0])
             why = self._harmful(current, best)
             if why:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
                 break
             limit = score(self.judge, best.fit) + RIVAL
-            out.rivals.append([t.candidate.name for t in good[1:] if score(self.judge, t.fit) < limit])
+            out.rivals.append([t.candidate.name for t in good if t is not best and score(self.judge, t.fit) < limit])
             out.tried.append(best)
             current, fit = best, best.fit
         return self._concluded(out, named)
