@@ -12,6 +12,15 @@ command as ``--model``.
 
     [effects.valve_dead_band]               # in the units of docs/effects.md; what is not named stays neutral
     half_width = 1.2
+
+    [curves."outflow.gain_of_oil"]          # of a user's own system, written by `vaneloop learn`: a law that nobody
+    how = "parameter times"                 # listed, its numbers as learned; those of now are in its table of effects
+    at = "outflow"
+    of = "oil"
+    low = 15.2
+    high = 64.9
+    knots = [15.2, 15.2, 15.2, 15.2, 64.9, 64.9, 64.9, 64.9]
+    values = [-0.61, -0.2, 0.2, 0.29]
 """
 
 from __future__ import annotations
@@ -36,9 +45,31 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, vane_in
 
-__all__ = ["Model", "load_model", "write_model"]
+__all__ = ["Learned", "Model", "load_model", "write_model"]
 
 FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
+
+
+class Learned(Table):
+    """A law that was learned: a function of one quantity at one place of a user's own model.
+
+    how, at, of  what it does, where, of what (docs/learn.md)
+    low, high    where its quantity has been; beyond, the function stays as at its end
+    knots        of a cubic B-spline with ``values`` as coefficients; or
+    form         name of a formula with ``values`` as numbers
+    size         how large such a function is in usual, in ``unit``
+    """
+
+    how: str
+    at: str
+    of: str
+    low: Finite
+    high: Finite
+    values: list[Finite] = Field(min_length=1, max_length=100)
+    knots: list[Finite] = Field(default_factory=list, max_length=104)
+    form: str = ""
+    unit: str = ""
+    size: Finite = 1.0
 
 
 class Model(Table):
@@ -47,11 +78,13 @@ class Model(Table):
     parameters  name of a nominal parameter (`plant.parameters.nominal`) -> value in its table's unit
     effects     name of an effect -> its parameters, in their declared units
     meta        free text and lists of it
+    curves      of a user's own system: effects that are functions which were learned
     """
 
     parameters: dict[str, Finite] = Field(default_factory=dict)
     effects: dict[str, dict[str, Finite]] = Field(default_factory=dict)
     meta: dict[str, str | bool | int | float | list[str]] = Field(default_factory=dict)
+    curves: dict[str, Learned] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod
@@ -71,6 +104,8 @@ class Model(Table):
         """Refuse what is not in the library or out of bounds: InputError in one line, naming ``source``."""
         if system := self.meta.get("system"):
             raise InputError(f"{source}: is a model of the system {system!r}; --system says where that is")
+        if self.curves:
+            raise InputError(f"{source}: curves: {next(iter(self.curves))!r} is a law of a user's own system")
         known = {n.name: n for n in nominal(plant.table, plant.geometry)}
         for name, value in self.parameters.items():
             if name not in known:
@@ -149,6 +184,9 @@ def write_model(path: str | Path, model: Model) -> None:
             *(f"{_key(k)} = {float(v)!r}{f'  # {units[k]}' if k in units else ''}" for k, v in values.items()),
             "",
         ]
+    for name, curve in model.curves.items():
+        of = curve.model_dump(exclude_defaults=True)
+        lines += [f"[curves.{_key(name)}]", *(f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in of.items()), ""]
     try:
         Path(path).write_text("\n".join(lines), encoding="utf-8")
     except OSError as e:

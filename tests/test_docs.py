@@ -40,6 +40,12 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
         "my_model.py": ("tank.py", "the page's own example"),
         "u.dead_zone": ("level.square_root", "a law that the example lacks"),
     },
+    "docs/learn.md": {
+        "LOG": ("cold.csv", "the page's own example"),
+        "OTHER": ("warm.csv", "the page's own example"),
+        "NEW": ("warm.csv", "the page's own example"),
+        "my_model.py": ("tank.py", "the page's own example"),
+    },
     "docs/diagnosis.md": {
         "LOG": (EXAMPLE, "any log"),
         "--logs 200": ("--logs 1 --duration 60", "200 logs of 300 s take an hour"),
@@ -126,6 +132,10 @@ LONG: dict[str, str] = {
     "vaneloop diagnose tank.csv --test": "tests/test_your_own_model.py",
     "vaneloop diagnose tank.csv --fit": "tests/test_parts.py",
     "vaneloop diagnose worn.csv": "tests/test_own_laws.py",
+    "vaneloop learn cold.csv": "tests/test_learn.py",
+    "vaneloop extend warm.csv": "tests/test_learn.py",
+    "vaneloop compare warm.csv": "tests/test_learn.py",
+    "vaneloop compare cold.csv": "tests/test_learn.py",
     "vaneloop schedule --geometry": "tests/test_schedule.py",
     "vaneloop engine-test --tables": "tests/test_schedule.py",
     "vaneloop diagnose examples/four_stages/worn_vgv3.parquet": "tests/test_machines.py",
@@ -332,6 +342,8 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
             log_of(folder, OWN)
     if page == "docs/your_own_model.md" and not (folder / "tank.csv").is_file():
         run_command("python make_logs.py")
+    if page == "docs/learn.md" and not (folder / "cold.csv").is_file():
+        run_command("python make_oil.py")
     if page == "docs/your_own_model.md" and "record = " in text:
         from vaneloop.discrepancy import Record
 

@@ -129,7 +129,8 @@ EXPORTS: dict[str, list[str]] = {
             "compare",
             "diagnose",
         ),
-        *("experiment", "extend", "load_system", "locate", "open_bus", "read_log", "replay", "unknown", "write_log"),
+        *("experiment", "extend", "learn", "load_system", "locate", "open_bus", "read_log", "replay", "unknown"),
+        "write_log",
     ],
     "vaneloop.discrepancy": [
         "Effect",

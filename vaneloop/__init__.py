@@ -10,7 +10,7 @@ The names below are the public interface, for notebooks and tests of your own; e
     better = vaneloop.extend(log, answer.effects)
     better.write("better.toml")
 
-Every verb (`replay`, `compare`, `locate`, `diagnose`, `extend`, `experiment`) returns such an answer.
+Every verb (`replay`, `compare`, `locate`, `diagnose`, `extend`, `experiment`, `learn`) returns such an answer.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.models.own_laws import Law
     from vaneloop.discrepancy.models.system import Record, System, unknown
     from vaneloop.discrepancy.stage import Parameter
+    from vaneloop.verbs.learn import learn
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import replay
     from vaneloop.verbs.search import compare, diagnose, experiment, extend, locate
@@ -45,6 +46,7 @@ _HOME = {
     "diagnose": "vaneloop.verbs.search",
     "experiment": "vaneloop.verbs.search",
     "extend": "vaneloop.verbs.search",
+    "learn": "vaneloop.verbs.learn",
     "load_system": "vaneloop.discrepancy.models.load",
     "locate": "vaneloop.verbs.search",
     "open_bus": "hil.bus.port",
@@ -68,6 +70,7 @@ __all__ = [
     "diagnose",
     "experiment",
     "extend",
+    "learn",
     "load_system",
     "locate",
     "open_bus",

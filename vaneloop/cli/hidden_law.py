@@ -27,6 +27,7 @@ answers are judged.
 examples:
   vaneloop hidden-law --systems 32 --seed 1 --out out/hidden_law.parquet
   vaneloop hidden-law --systems 200 --seed 1 --out out/hidden_law.parquet      (continues where it was stopped)
+  vaneloop hidden-law --systems 32 --seed 1 --learn --out out/learned.parquet
   vaneloop hidden-law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/variants.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -50,6 +51,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "other starts, logs cut in two: is the answer the same?",
     )
     parser.add_argument(
+        "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
+    )
+    parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
     )
     parser.add_argument(
@@ -67,20 +71,39 @@ def _systems() -> Any:
     return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
 
 
-def _said(system: Any, records: list[Any], test: list[Any]) -> dict[str, Any]:
-    """What `diagnose` answers, or the error that it raised; with its processor seconds."""
-    from vaneloop.verbs import search
+def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None) -> dict[str, Any]:
+    """What `diagnose` answers, or the error that it raised; with its processor seconds.
+
+    floors  true noise of every output: `learn` is asked, too, and its errors on the test log are held against it
+    """
+    from vaneloop.verbs import learn, search
 
     started = time.process_time()
+    learned: dict[str, Any] = {}
     try:
-        answer = terminal.plain(search.diagnose(records, system, test=test).to_dict())
+        if floors is None:
+            said = search.diagnose(records, system, test=test)
+        else:
+            asked = learn.learn(records, system, test=test)
+            said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors)
+        answer = terminal.plain(said.to_dict())
         out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
     except Exception as e:  # one system must not end the run; it counts as a miss
         out = {"verdict": "error", "effects": [], "answer": {}, "error": " ".join(f"{type(e).__name__}: {e}".split())}
-    return {**out, "seconds": time.process_time() - started}
+    return {**out, "learned": learned, "seconds": time.process_time() - started}
 
 
-def judge_case(seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False) -> Row:
+def _as_learned(asked: Any, test: str, floors: Any) -> dict[str, Any]:
+    """What `learn` answers: each law with its rivals and formulas, and the error on the test log in noise floors."""
+    by = list(asked.by_log.steps.values())[-1] if asked.by_log else {}
+    error = float(((by[test] / floors) ** 2).mean() ** 0.5) if test in by else None
+    laws = [{"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas]} for law in asked.laws]
+    return {"verdict": asked.verdict, "laws": laws, "error": error, "nearest": asked.outcome.nearest}
+
+
+def judge_case(
+    seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False, learn: bool = False
+) -> Row:
     """Draw, simulate and diagnose one system; a flat record."""
     import logging
 
@@ -91,7 +114,10 @@ def judge_case(seed: int, index: int, families: tuple[str, ...] = (), variants: 
     case = rig.draw_case(seed, index, families)
     left = rig.left_over(case)
     records = [Record(f"log {k + 1}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
-    said = _said(nominal.nominal(case.family, case.values, case.factors), records[:-1], records[-1:])
+    said = _said(
+        nominal.nominal(case.family, case.values, case.factors), records[:-1], records[-1:],
+        case.floors if learn else None,
+    )  # fmt: skip
     tried: dict[str, Any] = {}
     if variants and not said["error"]:
         for name, (system, fitted, test) in changes.variants(case, records, nominal.nominal):
@@ -118,7 +144,8 @@ def judge_case(seed: int, index: int, families: tuple[str, ...] = (), variants: 
         "verdict": said["verdict"], "named": [e["effect"] for e in said["effects"]],
         "rivals": json.dumps({e["effect"]: e["rivals"] for e in said["effects"]}), "error": said["error"],
         "seconds": said["seconds"], "intervals": json.dumps(intervals), "variants": json.dumps(tried),
-        "answer": json.dumps(said["answer"]),
+        "answer": json.dumps(said["answer"]), "learned": json.dumps(said["learned"]),
+        "curves": json.dumps(sorted({c for h in case.hidden for c in rig.LEARNED.get((case.family.name, h.name), ())})),
     }  # fmt: skip
 
 
@@ -187,10 +214,38 @@ def summary(rows: list[Row]) -> dict[str, Any]:
         "median processor seconds": sorted(r["seconds"] for r in rows)[len(rows) // 2] if rows else None,
         "most processor seconds": max((r["seconds"] for r in rows), default=None),
     }
+    out |= learned_summary(rows)
     tried = [json.loads(r["variants"]) for r in rows]
     for name in sorted({name for t in tried for name in t}):
         out[f"same answer: {name}"] = share([t[name]["same"] for t in tried if name in t])
     return out
+
+
+def learned_summary(rows: list[Row]) -> dict[str, Any]:
+    """Count what was learned, of rows where that was asked."""
+    asked = [(r, json.loads(r.get("learned") or "{}")) for r in rows]
+    asked = [(r, said) for r, said in asked if said]
+    if not asked:
+        return {}
+    outside = [(r, said) for r, said in asked if r["kind"] == "outside" and _seen(r)]
+    right = [(r, said) for r, said in outside if _learned_right(r, said)]
+    return {
+        "learned: outside the library, right place and quantity": share([_learned_right(r, s) for r, s in outside]),
+        "learned: of these, error on the test log within 1.5 noise floors": share(
+            [s["error"] is None or s["error"] <= 1.5 for _, s in right]
+        ),
+        "learned: nothing hidden, nothing learned": share([not s["laws"] for r, s in asked if r["kind"] == "clean"]),
+    }
+
+
+def _learned_right(row: Row, said: dict[str, Any]) -> bool:
+    """Whether a curve that was learned, or a rival of it, is what is hidden; or laws of the library that amount to it
+    are named.
+    """
+    if said["verdict"] == "named":
+        return _right(row)
+    curves = set(json.loads(row["curves"]))
+    return bool(said["laws"]) and any(curves & set(law["names"]) for law in said["laws"])
 
 
 def by_size(rows: list[Row]) -> list[list[str]]:
@@ -272,12 +327,14 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"{path}: drawn with seed {others[0]['seed']}; allowed: that --seed, or another --out")
     if args.variants and any(r["variants"] == "{}" and not r["error"] for r in rows):
         raise InputError(f"{path}: has rows without variants; allowed: no --variants, or another --out")
+    if args.learn and any((r.get("learned") or "{}") == "{}" and not r["error"] for r in rows):
+        raise InputError(f"{path}: has rows without --learn; allowed: no --learn, or another --out")
     terminal.say(args, f"seed {seed}; {len(rows)} systems done before")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{path.parent}: cannot be made ({e.strerror})") from None
-    run(args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants)
+    run(args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants, args.learn)
     _print(args, rows)
     tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}
     terminal.write_json(args, {"schema": 1, "seed": seed, "summary": summary(rows), **tables})

@@ -23,6 +23,7 @@ COMMANDS = {
     ),
     "locate": ("vaneloop.cli.locate", "which stage fails, under which conditions, since when"),
     "diagnose": ("vaneloop.cli.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
+    "learn": ("vaneloop.cli.learn", "a law that the library does not have: where it acts, its curve, its formula"),
     "engine-test": (
         "vaneloop.cli.engine_test",
         "a 3,000 s engine test under one mean curve and under dual curves, beside the paper's figures",

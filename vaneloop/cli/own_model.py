@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
 from vaneloop.base import terminal
@@ -58,20 +59,29 @@ def asked(args: argparse.Namespace) -> bool:
 
 
 def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
-    """Ask ``verb`` of `vaneloop.verbs.search` of the user's model on the logs that ``args`` name; return its answer."""
+    """Ask ``verb`` of `vaneloop.verbs` of the user's model on the logs that ``args`` name; return its answer."""
+    from plant import Model
     from vaneloop.base.errors import InputError
     from vaneloop.discrepancy import StageError, load_system
     from vaneloop.discrepancy.models.by_log import load_model_of
-    from vaneloop.verbs import search
+    from vaneloop.verbs import learn, search
     from vaneloop.verbs.parts import split
 
+    ask_it: Callable[..., Any] = learn.learn if verb == "learn" else getattr(search, verb)
     try:
         system = load_system(args.system)
         added = load_model_of(args.model, system) if args.model else None
+        for path in [e for e in more.get("effects", ()) if e.endswith(".toml")]:  # laws that were learned
+            law = load_model_of(path, system)
+            if not law.curves:
+                raise InputError(f"--effect {path}: has no table curves; allowed: a law file of vaneloop learn")
+            before = added or Model(meta=law.meta)
+            added = before.model_copy(update={"curves": {**before.curves, **law.curves}})
+            more["effects"] = [n for e in more["effects"] for n in (law.curves if e == path else [e])]
         logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
         fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
         test = [*parts, *(_record(args, system, p) for p in others)]
-        return getattr(search, verb)(logs, model=system, fit=fit, test=test, added=added, **more)
+        return ask_it(logs, model=system, fit=fit, test=test, added=added, **more)
     except StageError as e:
         raise InputError(str(e)) from None
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from plant.model import Learned
 from vaneloop.discrepancy import laws
+from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.data import Data, noise_of_channel
 from vaneloop.discrepancy.models.nominal import Course, nominal_course
 from vaneloop.discrepancy.models.places import places
@@ -39,6 +41,7 @@ class Bound:
     like      take sizes, fitted parameters and cut-off from an earlier one (for test logs)
     values    parameters fitted before, by name
     present   laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
+    curves    laws that were learned, effect name -> what its file says
 
     stage     the model on all samples; the logs follow each other in time
     thinned   the same on fewer samples, where there are many; ``stages``: it, which is what the search works on
@@ -61,8 +64,10 @@ class Bound:
         like: Bound | None = None,
         values: Mapping[str, float] | None = None,
         present: Mapping[str, Mapping[str, float]] | None = None,
+        curves: Mapping[str, Learned] | None = None,
     ):
         self.system, self.like = system, like
+        self.curves: Mapping[str, Learned] = (curves or {}) if like is None else like.curves
         self.values: dict[str, float] = dict(values or {}) if like is None else like.values
         self.present: dict[str, dict[str, float]]
         self.present = {k: dict(v) for k, v in (present or {}).items()} if like is None else like.present
@@ -108,6 +113,10 @@ class Bound:
                 course = nominal_course(self.runner, fitted)
                 self.runner.smalls = course.smalls
             self.placed, self.effects = places(self.data, course, self.runner.dispatch)
+            for name, curve in self.curves.items():
+                one, effect = from_file(name, curve, self.data)
+                self.placed.append(one)
+                self.effects.append(effect)
             parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
             if self._starts_matter(fitted):
                 parameters += self._read_starts()
@@ -139,9 +148,7 @@ class Bound:
                     )
             else:
                 searched.append(e)
-            placed.append(
-                Placed(q.effect, q.law, q.place, q.at, q.constant, slice(at, at + len(e.parameters)), q.neutral)
-            )
+            placed.append(replace(q, columns=slice(at, at + len(e.parameters))))
             at += len(e.parameters)
         self.placed = self.runner.placed = placed
         if self.like is None:

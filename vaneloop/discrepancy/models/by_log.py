@@ -59,7 +59,7 @@ class Logs:
 def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), model: Model | None = None) -> Logs:
     """Put logs into a system, with what a model file says of it."""
     m = model or Model()
-    bound = system.bind(list(logs), values=m.parameters, present=m.effects)
+    bound = system.bind(list(logs), values=m.parameters, present=m.effects, curves=m.curves)
     return Logs(bound, system.bind(list(test), like=bound) if test else None)
 
 
@@ -107,11 +107,14 @@ class ByLog:
             parameters=dict(m.parameters),
             effects={k: dict(v) for k, v in m.effects.items()},
             meta={"system": bound.system.name, **m.meta},
+            curves={k: v for k, v in m.curves.items() if k in m.effects},
         )
         for p, v in zip(bound.stage.parameters, final.theta, strict=False):
             law, _, parameter = p.name.rpartition(".")
             (out.model.effects[law] if law else out.model.parameters)[parameter if law else p.name] = float(v)
         for f in d.effects:
+            if f.effect in bound.curves:
+                out.model.curves[f.effect] = bound.curves[f.effect]
             out.model.effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items()}
         return out
 

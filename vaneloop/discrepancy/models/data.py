@@ -9,6 +9,7 @@ import numpy as np
 from scipy.signal import welch
 
 from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass, motion, smoothed, uses
+from vaneloop.discrepancy.models.quantities import column_of
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
 
@@ -54,6 +55,7 @@ class Data:
         self._prepare()
         self.window = system.window
         self._restart_cache: dict[tuple[int, float], tuple[Array, Array]] = {}
+        self._columns: dict[tuple[int, str], Array] = {}
 
     def _checked(self, r: Record) -> Record:
         s = self.system
@@ -209,6 +211,12 @@ class Data:
             self._restart_cache[log, self.window] = first, values
         first, values = self._restart_cache[log, self.window]
         return first[:n], np.ascontiguousarray(values[:, :n])
+
+    def column(self, log: int, name: str) -> Array:
+        """A quantity that is known before the model runs (`vaneloop.discrepancy.models.quantities`)."""
+        if (log, name) not in self._columns:
+            self._columns[log, name] = column_of(self.records[log], self.times[log], name)
+        return self._columns[log, name]
 
     def held(self, log: int) -> float:
         """Measured force at the start of a log."""

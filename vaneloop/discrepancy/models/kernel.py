@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from vaneloop.base.curve import on_table
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.models.dispatch import Dispatch, compiled_code
 from vaneloop.discrepancy.models.user_code import UserCode
@@ -18,8 +19,11 @@ __all__ = ["Kernel", "build_kernels"]
 Kernel = Callable[..., Any]
 
 
-def build_kernels(code: UserCode, dispatch: Dispatch) -> tuple[Kernel, Kernel]:
-    """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled."""
+def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> tuple[Kernel, Kernel]:
+    """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled.
+
+    curved  it takes curves (`vaneloop.discrepancy.models.curved`), too: seven arguments more, `_CURVED`
+    """
     s = code.system
     rates = "\n".join(f"dx[{i}] = d" if code.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
     u = (", ".join(f"u[{i}]" for i in range(len(code.U._fields))) + ",") if s.inputs or s.commands else "0.0,"
@@ -29,12 +33,18 @@ def build_kernels(code: UserCode, dispatch: Dispatch) -> tuple[Kernel, Kernel]:
         indent, at, to = match.groups()
         states = ", ".join(f"AT[{i}]" for i in range(len(s.states))) + ","
         own = _OWN_RATE if dispatch.rate is not None else ""
-        text = _RHS.format(x=states, u=u, p=p, rates=rates, own=own).strip()
+        at_u, at_p = (u.replace("u[", "ub["), p.replace("p[", "pb[")) if curved else (u, p)
+        text = _RHS.format(
+            x=states, u=at_u, p=at_p, rates=rates, own=own, bend=_BEND if curved else "", bent=_BENT if curved else ""
+        ).strip()
         text = re.sub(r"\bAT\b", at, re.sub(r"\bdx\b", to, text))
         return textwrap.indent(text, indent)
 
     source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
     source = source.replace("{own}", _OWN_HELD if dispatch.rate is not None else "")
+    source = source.replace("{curved}", _CURVED_FUNCTIONS if curved else "")
+    source = source.replace("{more}", f", {_CURVED}" if curved else "").replace("{rooms}", _ROOMS if curved else "")
+    source = source.replace("shown(x, u, p, y)", f"shown(x, u, p, k, {_CURVED}, ub, pb, add, y)" if curved else _PLAIN)
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
     def build(jit: Callable[[Any], Any]) -> Kernel:
@@ -43,7 +53,7 @@ def build_kernels(code: UserCode, dispatch: Dispatch) -> tuple[Kernel, Kernel]:
             "model": jit(s.model),
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
-            "own_rate": dispatch.rate, "MEMORY": dispatch.memory,
+            "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
         }  # fmt: skip
@@ -92,7 +102,7 @@ def _control_source(code: UserCode) -> str:
 # what stands for "rhs x k": the derivative k at x. Written out in place, since handing fifteen arrays to a function
 # costs more
 _RHS = """
-d = model(X({x}), U({u}), P({p}))
+{bend}d = model(X({x}), U({u}), P({p}))
 {rates}
 if len(code) > 0:
     for i in range(len(code)):
@@ -109,6 +119,70 @@ if len(code) > 0:
         if code[i] == STATE_RATE_LIMIT:
             w = where[i]
             dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
+{bent}"""
+
+# curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of), from
+# low to high, and the other columns that they may be of
+_PLAIN = "outputs(x, u, p, y)"
+_CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, columns"
+_BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
+_BENT = "for w in range(m):\n    dx[w] -= add[w] / mass[w]\n"
+_ROOMS = "ub, pb, add, bent = np.zeros(len(u)), np.zeros(len(p)), np.zeros(m), np.zeros(len(out))"
+_CURVED_FUNCTIONS = f"""
+@jit
+def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
+    for j in range(len(u)):
+        ub[j] = u[j]
+    for j in range(len(p)):
+        pb[j] = p[j]
+    for j in range(len(x)):
+        add[j] = 0.0
+    for i in range(len(c_how)):
+        of = c_of[i]
+        if c_how[i] > 4:
+            continue
+        if of < 100:
+            q = x[of]
+        elif of < 200:
+            q = u[of - 100]
+        elif of < 300:
+            outputs(x, u, p, y)
+            q = y[of - 200]
+        else:
+            q = columns[of - 300, k]
+        c = on_table(q, c_low[i], c_high[i], c_table[i])
+        if c_how[i] == 1:
+            pb[c_at[i]] *= 1.0 + c
+        elif c_how[i] == 2:
+            ub[c_at[i]] += c
+        elif c_how[i] == 3:
+            ub[c_at[i]] *= 1.0 + c
+        else:
+            add[c_at[i]] += c
+
+
+@jit
+def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
+    bend(x, u, p, k, {_CURVED}, ub, pb, add, y)
+    outputs(x, ub, pb, y)
+    for i in range(len(c_how)):
+        if c_how[i] > 4:
+            of = c_of[i]
+            if of < 100:
+                q = x[of]
+            elif of < 200:
+                q = u[of - 100]
+            elif of < 300:
+                q = y[of - 200]
+            else:
+                q = columns[of - 300, k]
+            c = on_table(q, c_low[i], c_high[i], c_table[i])
+            if c_how[i] == 5:
+                y[c_at[i]] += c
+            else:
+                y[c_at[i]] *= 1.0 + c
+
+
 """
 
 _OWN_RATE = """if c > 100:
@@ -138,10 +212,10 @@ def bend(u, slope, t, k, part):
     return part * (1.0 - part) * ((1.0 - part) * (h * slope[k] - rise) - part * (h * slope[k + 1] - rise))
 
 
-@jit
+{curved}@jit
 def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps,
         line, slopes, loop,
-        n_commands, e_code, e_at, e_out, e_rows, out):
+        n_commands, e_code, e_at, e_out, e_rows, out{more}):
     n, m = len(t), len(x0)
     x = x0.copy()
     u = np.zeros(max(n_commands if loop else len(inputs), 1))
@@ -154,6 +228,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
     none = np.zeros(MEMORY)
     held = np.zeros(m)
     k1, k2, k3, k4, z = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
+    {rooms}
     first = True
     for k in range(n):
         if restart[k]:
@@ -163,7 +238,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
         if loop:
             for j in range(len(inputs)):
                 r[j] = inputs[j, k]
-            outputs(x, u, p, y)
+            shown(x, u, p, y)
             for j in range(len(out)):
                 seen[j] = y[j]
             for i in range(len(e_code)):
@@ -171,7 +246,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                     e_past[i, k] = seen[e_at[i]]
                     seen[e_at[i]] = transform(e_code[i], k, t, e_past[i], e_rows[i], e_memory[i])
             controls(r, seen, p, u)
-            outputs(x, u, p, y)
+            shown(x, u, p, y)
             for j in range(len(out)):
                 out[j, k] = y[j]
             for i in range(len(e_code)):
@@ -183,7 +258,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
         else:
             for j in range(len(inputs)):
                 u[j] = inputs[j, k]
-            outputs(x, u, p, y)
+            shown(x, u, p, y)
             for j in range(len(out)):
                 out[j, k] = y[j]
         if k == n - 1:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.library import Law
+from vaneloop.discrepancy.models.curve import COLUMN, SENSED, Curve, bent, curves_for_kernel
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.dispatch import Dispatch, dispatch_of
 from vaneloop.discrepancy.models.kernel import Kernel, build_kernels
@@ -27,15 +29,19 @@ STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried b
 
 @dataclass
 class Placed:
-    """A law at a place: effect name, law, kind of place, index of the signal or state there, constant."""
+    """A law at a place: effect name, law, kind of place, index of the signal or state there, constant.
+
+    curve  what it does, where it is a function of some quantity that nobody named; its place is then "curve"
+    """
 
     effect: str
     law: Law
-    place: str  # input, output, force, state
+    place: str  # input, output, force, state; curve
     at: int
     constant: float
     columns: slice = field(default_factory=lambda: slice(0, 0))
     neutral: Array = field(default_factory=lambda: np.zeros(0))
+    curve: Curve | None = None
 
 
 class Runner:
@@ -61,6 +67,8 @@ class Runner:
         self.trying = False  # whether numba can compile the model
         self.kernel: Kernel
         self.slow: Kernel  # the same, not compiled
+        # both with curves, made when they are first needed; every runner of these logs shares them
+        self.curved: list[tuple[Kernel, Kernel]] = like.curved if like else []
         self.ready = like is not None  # the model ran with the user's own values
         self.placed: list[Placed] = []
         self.free_starts: list[tuple[int, int]] = []
@@ -125,7 +133,9 @@ class Runner:
         out = []
         for q in self.placed:
             values = theta[q.columns]
-            if not np.array_equal(values, q.neutral):
+            if q.curve is not None and values.any():
+                out.append((q, q.curve.table(values)))
+            elif q.curve is None and not np.array_equal(values, q.neutral):
                 row = np.zeros(self.dispatch.parameters + 1)
                 row[: len(values)] = values
                 row[len(values)] = q.constant
@@ -173,12 +183,29 @@ class Runner:
         """Put a state that starts at its sensor's reading to where the sensor, with its law, reads that."""
         names, s = list(self.system.states), self.system
         for q, row in active:
+            if q.curve is not None and q.curve.how in SENSED and (name := list(s.outputs)[q.curve.place]) in names:
+                self._read_back_curve(x0, log, names.index(name), q.curve, row)
+                continue
             name = list(s.outputs)[q.at] if q.place == "output" else ""
             if q.law.memory or name not in names or name in s.start:
                 continue
             m = names.index(name)
             if np.isfinite(self.data.first_state(log, name, np.nan)):
                 x0[m] = self.dispatch.argument(q.law.code, x0[m], row)
+
+    def _read_back_curve(self, x0: Array, log: int, m: int, curve: Curve, row: Array) -> None:
+        """`_read_back` of a sensor whose reading a curve changes: the reading less what the curve makes of it."""
+        name = list(self.system.states)[m]
+        if name in self.system.start or not np.isfinite(self.data.first_state(log, name, np.nan)):
+            return
+        reading = x0[m]
+        for _ in range(8):
+            u = self.data.u[log][:, 0] if self.data.u[log].size else np.zeros(1)
+            q = x0[curve.of] if curve.of < 100 else u[curve.of - 100] if curve.of < 200 else reading
+            if curve.of >= COLUMN:
+                q = self.data.column(log, curve.quantity)[0]
+            c = float(curve.at(np.array([q]), row)[0])
+            x0[m] = reading - c if curve.how == "output adds" else reading / max(1.0 + c, 0.1)
 
     def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
         t, u = self.data.times[log], self.data.u[log]
@@ -189,7 +216,9 @@ class Runner:
             u = u.copy()
             for q, row in inputs:
                 u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
-        y = self.code.static(p, u, t)
+        curves = [(q.curve, row) for q, row in active if q.curve is not None]
+        driven, known = bent(curves, self.data, log, u, p) if curves else (u, p)
+        y = self.code.static(known, driven, t)
         forces = [(q, row) for q, row in active if q.place == "force"]
         if forces:
             gap = sum(row[0] for q, row in forces if q.law.code == laws.BACKLASH_GAP)
@@ -210,6 +239,10 @@ class Runner:
                 for q, row in springs
             ]
             y[0] += np.sum(parts, axis=0)
+        for curve, row in curves:
+            if curve.how.startswith(("force", "output")):
+                c = curve.at(curve.values(self.data, log, u, y), row)
+                y[curve.place] = y[curve.place] * (1.0 + c) if curve.how == "output times" else y[curve.place] + c
         if self.data.cutoff:
             y = np.array([low_pass(t, row, self.data.cutoff) for row in y])
         for q, row in active:
@@ -232,6 +265,13 @@ class Runner:
         if as_logged:
             self.slopes[log] = out
         return out
+
+    def _kernels_for_curves(self) -> tuple[Kernel, Kernel]:
+        """The kernel that takes curves, as `_tried` has it, and not compiled."""
+        if not self.curved:
+            fast, slow = build_kernels(self.code, self.dispatch, curved=True)
+            self.curved.append((slow if self.kernel is self.slow else fast, slow))
+        return self.curved[0]
 
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
@@ -268,24 +308,28 @@ class Runner:
         if np.isin(code, laws.SWITCHING).any() or np.any((code >= FIRST_CODE["force"]) & (code < FIRST_CODE["state"])):
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
+        curves = [(q.curve, row) for q, row in active if q.curve is not None]
+        kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves()
         out = np.full((len(s.outputs), len(t)), np.nan)
-        arguments = (
+        arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
             rows, position, gap,
             asymmetry, self.smalls, mass, steps, s.between != "hold", self._slopes(log, t, u), loop,
             len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
+        if curves:
+            arguments += curves_for_kernel(curves, self.data, log, len(t))
         try:
             with np.errstate(all="ignore"):
-                self.kernel(*arguments)
+                kernel(*arguments)
         except Exception as e:  # with the user's own values that is told; what a search tries may be far off
             if self.trying:
                 raise
             out[:] = np.nan
             if not self.ready:
                 with np.errstate(all="ignore"):
-                    self.code.call("model", self.slow, *arguments)  # says in which line
+                    self.code.call("model", slow, *arguments)  # says in which line
                 raise StageError(f"system {s.name!r}: the model failed: {type(e).__name__}: {e}") from None
         if not loop:
             for q, row in active:

@@ -25,6 +25,7 @@ from vaneloop.discrepancy.models.own_laws import Law, check_parameters, is_name
 from vaneloop.discrepancy.stage import Array, Parameter, StageError
 
 if TYPE_CHECKING:
+    from plant.model import Learned
     from vaneloop.discrepancy.models.bound import Bound
 
 __all__ = ["Record", "System", "unknown"]
@@ -215,6 +216,7 @@ class System:
         like: Bound | None = None,
         values: Mapping[str, float] | None = None,
         present: Mapping[str, Mapping[str, float]] | None = None,
+        curves: Mapping[str, Learned] | None = None,
     ) -> Bound:
         """Put logs into this system: its stage for the search, its parameters' starts. Raises StageError for a log that
         cannot be.
@@ -222,7 +224,8 @@ class System:
         like     a bound whose noise and scales to use: that of the fitted logs, for test logs
         values   values of the system's parameters from a model file
         present  laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
+        curves   laws that were learned, by name: they may be present, or asked for
         """
         from vaneloop.discrepancy.models.bound import Bound
 
-        return Bound(self, records, like, values, present)
+        return Bound(self, records, like, values, present, curves)

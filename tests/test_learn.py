@@ -1,0 +1,331 @@
+"""Laws that nobody listed: curves inside the simulation against other integrators, quantities, formulas, the law file,
+and the command from logs to a law that another log confirms.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from plant import Model, load_model, write_model
+from plant.model import Learned
+from vaneloop import InputError, Record, System, unknown
+from vaneloop.base.curve import on_table
+from vaneloop.base.tables import read
+from vaneloop.discrepancy import StageError
+from vaneloop.discrepancy.curves import basis_of
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.formulas import FORMS, begin, text_of
+from vaneloop.discrepancy.models.curved import candidates, with_curves
+from vaneloop.discrepancy.models.learning import held_out
+from vaneloop.discrepancy.models.quantities import column_of
+
+OIL = np.linspace(20.0, 60.0, 5)
+
+
+def tank(x, u, p):
+    return p.inflow * u.pump - p.outflow * x.level
+
+
+TANK = System(
+    "tank", "simulate", tank, inputs={"pump": "V", "oil": "degC"}, states={"level": "cm"}, outputs={"level": "cm"},
+    parameters=[unknown("inflow", 0.2, "cm/(V s)", low=0.0), unknown("outflow", 0.05, "1/s", low=0.0)],
+    start={"level": 20.0}, between="line",
+)  # fmt: skip
+
+
+def run_of_a_tank(n: int = 400) -> Record:
+    t = np.arange(float(n))
+    rng = np.random.default_rng(0)
+    pump = 4.0 + 2.0 * np.sin(t / 30.0) + np.sin(t / 7.0)
+    oil = 40.0 + 20.0 * np.sin(t / 50.0)
+    level = 20.0 + np.cumsum(rng.standard_normal(n)) * 0.05
+    return Record("run", t, {"pump": pump, "oil": oil, "level": level})
+
+
+@pytest.fixture(scope="module")
+def bound():
+    return TANK.bind([run_of_a_tank()])
+
+
+def bent(how: str, at: str, q: str):
+    """A smooth curve of some size, as the candidate of that place and quantity has it."""
+    size = {"parameter times": 0.3, "input adds": 0.5, "state adds": 0.1, "output adds": 0.4}.get(how, 0.2)
+    return lambda z: size * np.sin(z / {"oil": 12.0, "level": 4.0, "pump": 1.5, "time": 90.0}[q])
+
+
+@pytest.mark.parametrize(
+    ("how", "at", "q"),
+    [
+        ("parameter times", "outflow", "oil"), ("parameter times", "inflow", "level"), ("input adds", "pump", "pump"),
+        ("input times", "pump", "level"), ("state adds", "level", "level"), ("state adds", "level", "time"),
+        ("output adds", "level_sensor", "level"), ("output times", "level_sensor", "oil"),
+    ],
+)  # fmt: skip
+def test_a_curve_does_what_its_place_says(bound, how: str, at: str, q: str) -> None:
+    """Against scipy's integrator of the equations with the curve written out."""
+    values = bound.stage.neutral()[:2]
+    c = next(c for c in candidates(bound, values) if (c.how, c.at, c.quantity.name) == (how, at, q))
+    curve = bent(how, at, q)
+    table = curve(c.grid)
+    placed = c.placed_as(lambda n: n[0] * table, 1)
+    effect = c.basis.effect(c.name, "", 1.0, 1.0)
+    one = type(effect)(c.name, effect.parameters[:1], ((1.0,),))
+    w = with_curves(bound, (), [(placed, one)])
+    w.runner.steps = 8
+    inflow, outflow = 0.2, 0.05
+    ours = w.run(np.array([[inflow, outflow, 1.0]]))[0, 0]
+    r = bound.data.records[0]
+
+    def of(z: float) -> float:
+        return float(curve(np.clip(z, c.grid[0], c.grid[-1])))
+
+    def drive(t: float, x: float) -> dict[str, float]:
+        held = r.t[min(int(t + 1e-12), len(r.t) - 1)]  # a column holds from sample to sample
+        return {"pump": np.interp(t, r.t, r.columns["pump"]), "oil": np.interp(t, r.t, r.columns["oil"]),
+                "level": x, "time": held}  # fmt: skip
+
+    def rate(t: float, x: np.ndarray) -> list[float]:
+        d = drive(t, x[0])
+        y, pump, a, b = of(d[q]), d["pump"], inflow, outflow
+        a *= 1.0 + y if at == "inflow" else 1.0
+        b *= 1.0 + y if at == "outflow" else 1.0
+        pump = pump + y if how == "input adds" else pump * (1.0 + y) if how == "input times" else pump
+        return [a * pump - b * x[0] - (y if how == "state adds" else 0.0)]
+
+    theirs = [20.0]
+    for k in range(len(r.t) - 1):
+        s = solve_ivp(rate, (r.t[k], r.t[k + 1] - 1e-9), [theirs[-1]], rtol=1e-8, atol=1e-9)
+        theirs.append(float(s.y[0, -1]))
+    x = np.array(theirs)
+    y = np.array([of(drive(t, z)[q]) for t, z in zip(r.t, x, strict=True)])
+    shown = x + y if how == "output adds" else x * (1.0 + y) if how == "output times" else x
+    plain = bound.run(np.array([[inflow, outflow, *bound.stage.neutral()[2:]]]))[0, 0]
+    assert np.sqrt(np.mean((shown - plain) ** 2)) > 0.05  # it does something
+    assert np.max(np.abs(ours - shown)) < 4e-3
+
+
+def test_a_curve_of_nothing_changes_not_a_bit(bound) -> None:
+    c = candidates(bound, bound.stage.neutral()[:2])[0]
+    w = with_curves(bound, (), [(c.placed(), c.effect(1.0))])
+    theta = w.stage.neutral()
+    assert np.array_equal(w.run(theta[None]), bound.run(bound.stage.neutral()[None]))
+
+
+@given(st.floats(-5.0, 5.0), st.integers(0, 50))
+def test_a_table_is_straight_between_points_and_stays_beyond_its_ends(x: float, seed: int) -> None:
+    table = np.random.default_rng(seed).standard_normal(9)
+    assert on_table(x, -2.0, 3.0, table) == pytest.approx(np.interp(x, np.linspace(-2.0, 3.0, 9), table), abs=1e-12)
+
+
+def test_what_follows_from_reversals_of_a_triangle() -> None:
+    t = np.arange(4000) * 0.01  # up and down with 1/s, turning each 5 s
+    y = 2.5 - np.abs(t % 10.0 - 5.0)
+    r = Record("r", t, {"y": y})
+    way, far, since = (
+        column_of(r, t, f"{n}_of_y") for n in ("direction", "distance_since_reversal", "time_since_reversal")
+    )
+    inside = (t > 6.0) & (np.abs(t % 5.0 - 2.5) < 2.2)  # away from the turns, which a filter rounds
+    assert np.array_equal(way[inside], np.where(t[inside] % 10.0 < 5.0, 1.0, -1.0))
+    assert np.allclose(far[inside], t[inside] % 5.0, atol=0.1)
+    assert np.allclose(since[inside], t[inside] % 5.0, atol=0.1)
+    assert np.array_equal(column_of(r, t + 7.0, "time"), t + 7.0)
+
+
+NUMBERS = {
+    "power": (0.3, 1.7), "exponential": (0.2, 0.9), "tanh": (2.0, 1.1), "quotient": (0.5, 0.8), "above": (1.5, 0.4),
+    "below": (1.5, 0.4), "step": (1.0, 0.3), "gentle step": (2.0, 0.5, 0.4), "dead zone": (1.2, 0.5),
+    "limit": (0.7, 1.1), "limit to one side": (0.7, 1.1), "Arrhenius": (0.8, 3000.0), "sine": (0.6, 2.2, 0.4),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS, ids=lambda f: f.name)
+def test_a_formula_is_found_in_its_own_values(form) -> None:
+    q = np.linspace(0.2, 3.0, 257) if form.positive else np.linspace(-2.0, 3.0, 257)
+    if form.name == "Arrhenius":
+        q = np.linspace(-10.0, 90.0, 257)
+    numbers = np.array(NUMBERS.get(form.name, (0.7,)))
+    y = form.value(q, numbers)
+    got = begin(form, q, y, level=False)
+    assert got is not None
+    assert got[1] < (0.05 if form.name == "step" else 1e-3)
+    if form.name not in ("step", "sine"):  # anywhere between two points; several phases are one
+        assert np.allclose(got[0], numbers, rtol=0.02, atol=0.01)
+    assert "a" not in text_of(form, numbers, "Q").replace("tanh", "").replace("max", "")
+    if form.name != "constant":  # a parameter that is fitted takes a constant off
+        shifted = begin(form, q, y + 5.0, level=True)
+        assert shifted is not None
+        assert shifted[1] < (0.05 if form.name == "step" else 1e-3)
+
+
+def test_what_is_left_out_is_what_a_refit_leaves() -> None:
+    """Held-out errors of a linear model with a prior, against fits with one block left out each."""
+    rng = np.random.default_rng(1)
+    blocks, n, k = 8, 30, 4
+    a = rng.standard_normal((blocks, n, k))
+    y = a @ np.array([1.0, -2.0, 0.5, 0.0]) + 0.3 * rng.standard_normal((blocks, n))
+    prior = np.array([2.0, 0.5, 3.0, 40.0])
+    normals, pulls = np.einsum("bni,bnj->bij", a, a), np.einsum("bni,bn->bi", a, y)
+    theta = np.linalg.solve(normals.sum(axis=0) + np.diag(prior), pulls.sum(axis=0))
+    e = y - a @ theta
+    cost, gradients = np.sum(e * e, axis=1), np.einsum("bni,bn->bi", a, e)
+    mine = np.ones(k, dtype=bool)
+    held = held_out(cost, gradients, normals, mine, prior, theta)
+    for b in range(blocks):
+        rest = np.arange(blocks) != b
+        without = np.linalg.solve(normals[rest].sum(axis=0) + np.diag(prior), pulls[rest].sum(axis=0))
+        assert held[b] == pytest.approx(np.sum((y[b] - a[b] @ without) ** 2), rel=1e-6)
+
+
+# ---- the law file ----------------------------------------------------------------------------------------------------
+
+NAME = "outflow.gain_of_oil"
+BASIS = basis_of(run_of_a_tank().columns["oil"])
+assert BASIS is not None
+LAW = Learned(
+    how="parameter times", at="outflow", of="oil", low=BASIS.low, high=BASIS.high, knots=BASIS.knots.tolist(),
+    values=(0.01 * np.arange(len(BASIS.turn))).tolist(), unit="-", size=0.5,
+)  # fmt: skip
+
+
+def test_a_law_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    model = Model(meta={"system": "tank"}, effects={NAME: {"c1": 0.5}}, curves={NAME: LAW})
+    write_model(tmp_path / "law.toml", model)
+    assert read(tmp_path / "law.toml", Model) == model
+    with pytest.raises(InputError, match="system 'tank'"):
+        load_model(tmp_path / "law.toml")
+    write_model(tmp_path / "law.toml", model.model_copy(update={"meta": {}}))
+    with pytest.raises(InputError, match="is a law of a user's own system"):
+        load_model(tmp_path / "law.toml")
+
+
+def test_a_model_with_a_law_says_what_the_curve_says(bound) -> None:
+    values = {f"c{k + 1}": v for k, v in enumerate(LAW.values)}
+    own = TANK.bind(
+        [run_of_a_tank()], values={"inflow": 0.2, "outflow": 0.05}, present={NAME: values}, curves={NAME: LAW}
+    )
+    c = next(c for c in candidates(bound, bound.stage.neutral()[:2]) if c.name == NAME)
+    w = with_curves(bound, (), [(c.placed(np.eye(len(LAW.values))), own.effects[0])])
+    w.runner.steps = own.runner.steps
+    theta = np.concatenate([[0.2, 0.05], bound.stage.neutral()[2:], LAW.values])
+    assert np.allclose(own.run(own.stage.neutral()[None]), w.run(theta[None]), rtol=1e-9)
+    form = Learned(how="state adds", at="level", of="level", low=0.0, high=50.0, form="power", values=[0.1, 0.5])
+    n = {"a": 0.1, "b": 0.5}
+    own = TANK.bind(
+        [run_of_a_tank()], values={"inflow": 0.2, "outflow": 0.05}, present={"p.q": n}, curves={"p.q": form}
+    )
+    assert own.run(own.stage.neutral()[None])[0, 0, -1] < w.run(theta[None])[0, 0, -1]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"how": "adds"}, "how .='adds'.*allowed: parameter times"),
+        ({"at": "inflw"}, "at .='inflw'.*allowed: inflow, outflow"),
+        ({"of": "speed"}, "of .='speed'.*allowed: level, pump, oil, time"),
+        ({"low": 70.0, "high": 60.0}, "low .=70. must be below high"),
+        ({"knots": [0.0, 1.0]}, "knots .2 of them. must rise"),
+        ({"form": "cosine"}, "form .='cosine'.*must be one of constant"),
+    ],
+)
+def test_a_wrong_law_gets_one_line(change: dict[str, object], said: str) -> None:
+    with pytest.raises(StageError, match=said) as e:
+        TANK.bind([run_of_a_tank()], curves={NAME: LAW.model_copy(update=change)})
+    assert "\n" not in str(e.value)
+
+
+# ---- from logs to a law ----------------------------------------------------------------------------------------------
+
+
+def logs_of_a_tank(folder: Path) -> None:
+    """Two logs of a tank whose outflow grows with the warmth of the oil; nobody listed that."""
+    rng = np.random.default_rng(3)
+    for name in ("cold.csv", "warm.csv"):
+        t = np.arange(0.0, 1500.0, 1.0)
+        pump = np.repeat(rng.uniform(0.0, 8.0, 30), 50)
+        oil = 40.0 + 25.0 * np.sin(2.0 * np.pi * t / 1100.0 + rng.uniform(0.0, 6.0))
+        level, rows = 20.0, []
+        for k in range(len(t)):
+            rows.append((t[k], pump[k], oil[k], level + 0.05 * rng.standard_normal()))
+            for _ in range(10):
+                level += 0.1 * (0.2 * pump[k] - true_outflow(oil[k]) * level)
+        np.savetxt(folder / name, rows, delimiter=",", header="t,pump,oil,level", comments="", fmt="%.5f")
+    (folder / "tank.py").write_text(
+        "from vaneloop import System, unknown\n\n\n"
+        "def f(x, u, p):\n    return p.inflow * u.pump - p.outflow * x.level\n\n\n"
+        'system = System("tank", "simulate", f, inputs={"pump": "V", "oil": "degC"}, states={"level": "cm"},\n'
+        '    outputs={"level": "cm"}, parameters=[unknown("inflow", 0.1, "cm/(V s)", low=0.0),\n'
+        '    unknown("outflow", 0.01, "1/s", low=0.0)])\n'
+    )
+
+
+def true_outflow(oil: np.ndarray) -> np.ndarray:
+    return 0.02 + 0.05 / (1.0 + np.exp(-(oil - 35.0) / 6.0))
+
+
+def vaneloop(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "vaneloop", *words], cwd=folder, capture_output=True, text=True, timeout=600, check=False
+    )
+
+
+def test_the_command_learns_the_law_and_another_log_confirms_it(tmp_path: Path) -> None:
+    logs_of_a_tank(tmp_path)
+    own = ("--system", "tank.py")
+    done = vaneloop(tmp_path, "learn", "cold.csv", *own, "--out", "law.toml", "--json", "a.json", "--report", "a.html")
+    assert done.returncode == 1, done.stderr
+    answer = json.loads((tmp_path / "a.json").read_text())
+    assert answer["verdict"] == "learned"
+    (law,) = answer["laws"]
+    assert (law["at"], law["of"], law["how"]) == ("outflow", "oil", "parameter times")
+    x, y, low, high = (np.array(law[k]) for k in ("x", "y", "low", "high"))
+    truth = true_outflow(x) / true_outflow(x[16]) * (1.0 + y[16])  # the outflow itself is fitted, so its size is free
+    assert np.max(np.abs(1.0 + y - truth)) < 0.03
+    assert np.all(low <= y) and np.all(y <= high)
+    assert law["formulas"][0]["form"] == "gentle step"
+    assert abs(law["formulas"][0]["numbers"]["b"] - 35.0) < 0.5
+    assert "outflow.gain_of_oil" in (tmp_path / "a.html").read_text()
+    done = vaneloop(tmp_path, "extend", "warm.csv", *own, "--effect", "law.toml", "--out", "m.toml", "--json", "b.json")
+    assert done.returncode in (0, 1), done.stderr
+    stage = json.loads((tmp_path / "b.json").read_text())["stages"][0]
+    assert stage["signals"][0]["error_after"] < 0.02 * stage["signals"][0]["error_before"]
+    done = vaneloop(tmp_path, "compare", "warm.csv", *own, "--model", "law.toml", "--json", "c.json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "c.json").read_text())["stages"][0]["signals"][0]["rms"] < 0.075  # its noise is 0.05
+
+
+OWN = ("--system", "tank.py")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("learn", "cold.csv"), "needs --system"),
+        (("learn", "cold.csv", "--system", "tank.py", "--out", "no/law.toml"), "no/law.toml: cannot be written"),
+        (("extend", "cold.csv", *OWN, "--effect", "plain.toml", "--out", "m.toml"), "has no table curves"),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_one_line(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+    import re
+
+    logs_of_a_tank(tmp_path)
+    write_model(tmp_path / "plain.toml", Model(meta={"system": "tank"}))
+    done = vaneloop(tmp_path, *words)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert re.search(said, done.stderr)
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_judge_of_a_curve_counts_its_amplitudes_as_effects(bound) -> None:
+    c = candidates(bound, bound.stage.neutral()[:2])[0]
+    w = with_curves(bound, (), [(c.placed(), c.effect(1.0))])
+    judge = Judge(w.thinned, bound.floor)
+    assert len(judge.columns((c.name,))) == len(judge.columns(())) + len(c.effect(1.0).parameters)

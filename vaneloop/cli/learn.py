@@ -1,0 +1,75 @@
+"""``vaneloop learn``: a law that nobody listed, from logs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.cli import options, own_model
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Learn a law that the library does not have, from logs of a model of your own.
+
+Where diagnose says "unknown", learn looks for the law itself: at every place of the model, as a function of every
+quantity that the logs or the model know. It says where the law acts, of what it is a function, its curve with a band,
+and the simplest formulas that fit it. A law must earn its place on data that it was not fitted to, harm no test log,
+and do clearly better than laws with names. Where no honest law is there, it says so. docs/learn.md
+
+examples:
+  vaneloop learn LOG --test OTHER --system MY.py --out LAW.toml --report LAW.html
+  vaneloop extend NEW --system MY.py --effect LAW.toml --out BETTER.toml
+  vaneloop compare NEW --system MY.py --model BETTER.toml
+
+exit codes: 0 nothing is missing, or laws with names say it; 1 a law was learned, or something is missing and no honest
+law was found; 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    options.add_log_options(parser)
+    parser.add_argument("--model", metavar="M.toml", help="model file: what the model has by now")
+    parser.add_argument("--out", metavar="LAW.toml", help="law file to write, a model file with the learned laws in it")
+    own_model.add_options(parser)
+    terminal.add_output_options(parser, report=True)
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from vaneloop.verbs.learn import with_path
+
+    if not args.system:
+        raise InputError("learn needs --system MY.py, a model of your own (docs/learn.md)")
+    if args.out and (Path(args.out).is_dir() or not Path(args.out).parent.is_dir()):
+        raise InputError(f"{args.out}: cannot be written")
+    words = " ".join(["vaneloop learn", *sys.argv[2:]])
+    with terminal.progress_bar(args, "learning what nobody listed") as tell:
+        answer = own_model.ask(args, "learn", progress=tell)
+    if answer.model is not None and args.out:
+        answer = with_path(answer, args.out, words)
+    if answer.by_log is not None:
+        own_model.show(args, answer.by_log)
+    for law in answer.laws:
+        rows = [
+            [f"{law.x[k]:.4g}", *(f"{v[k]:.4g}" for v in (law.y, law.low, law.high))] for k in range(0, len(law.x), 32)
+        ]
+        unit = "" if law.unit == "-" else f" [{law.unit}]"
+        columns = [f"{law.of} [{law.of_unit}]", f"curve{unit}", "90 % from", "to"]
+        terminal.print_table(args, f"{law.name}", columns, rows)
+        for f in law.formulas:
+            name = f", {f.law} of the library" if f.law else ""
+            terminal.say(args, f"formula: {f.text}{name}; held-out error {f.error:.3g} noise floors")
+    for note in answer.notes:
+        terminal.say(args, f"note: {note}")
+    if answer.outcome.nearest and not answer.laws:
+        terminal.say(args, f"nearest: {', '.join(answer.outcome.nearest)}")
+    terminal.say(args, answer.sentence())
+    if answer.path:
+        terminal.say(args, f"law: {answer.path}")
+    terminal.write_json(args, answer.to_dict())
+    if args.report:
+        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    return 1 if answer.verdict in ("learned", "unknown") else 0

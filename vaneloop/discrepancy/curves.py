@@ -1,0 +1,135 @@
+"""Smooth curves as effects: a basis whose first two functions are a constant and a straight line, and whose others bend
+more and more.
+
+A curve that nobody named is a sum of cubic B-splines with knots where the log has been. Their coefficients mean nothing
+one by one, and a fit needs to be told that a curve is smooth. So the basis is turned (Demmler and Reinsch 1975): its
+functions are orthonormal over the values that the log visited, and ordered by how much they bend. An amplitude's prior
+is then one number for each function, which is what `vaneloop.discrepancy.fit` knows; the number of knots hardly
+matters, and the mean and the slope can be held at zero, to see what the curve says beyond a gain and an offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import eigh
+
+from vaneloop.discrepancy.stage import Array, Effect, Parameter
+
+__all__ = ["COUNT", "DEGREE", "LEVEL", "Basis", "basis_of"]
+
+DEGREE = 3
+COUNT = 10  # splines of a curve
+LEAST = 5  # with fewer it could hardly bend
+RESOLVED = 1e-3  # of the range: knots do not stand closer
+LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
+EDGE = 0.001  # share of the visited values beyond the first and the last knot
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Functions of one quantity.
+
+    knots   float64[splines + 4]
+    turn    float64[splines, functions]: B-spline coefficients of each function; function 0 is a constant, 1 a straight
+            line, both and all others with mean square 1 over the visited values
+    bend    float64[functions]: mean square of the second derivative over the range, as a share of that of function 2
+    """
+
+    knots: Array
+    turn: Array
+    bend: Array
+
+    @property
+    def low(self) -> float:
+        """Where it begins; below, curves stay as here."""
+        return float(self.knots[0])
+
+    @property
+    def high(self) -> float:
+        """Where it ends; above, curves stay as here."""
+        return float(self.knots[-1])
+
+    def coefficients(self, amplitudes: Array) -> Array:
+        """B-spline coefficients of the curve with these amplitudes of the functions."""
+        return self.turn @ amplitudes
+
+    def values(self, x: Array, amplitudes: Array) -> Array:
+        """The curve at ``x``."""
+        inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
+        return np.asarray(BSpline(self.knots, self.coefficients(amplitudes), DEGREE)(inside))
+
+    def design(self, x: Array) -> Array:
+        """The B-splines themselves at ``x``, float64[len(x), splines]; beyond the ends as there."""
+        inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
+        return np.asarray(BSpline(self.knots, np.eye(len(self.turn)), DEGREE)(inside))
+
+    def effect(self, name: str, unit: str, size: float, wiggle: float, mean: bool = True) -> Effect:
+        """The curve as an effect: amplitudes in ``unit``, ``size`` large in usual, bends known to be within ``wiggle``.
+
+        wiggle  standard deviation of the amplitude of function 2, in ``size``; others by how much they bend
+        mean    whether it may have a mean: where a parameter that is fitted does the same, it must not
+        """
+        # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
+        first, wide = ("mean", "slope") if mean else ("slope",), float(np.sqrt(3.0) * LEVEL * size)
+        out = [Parameter(n, 0.0, unit, scale=size, tolerance=wide) for n in first]
+        for k in range(2, len(self.bend)):
+            deviation = wiggle * size / np.sqrt(self.bend[k])
+            out.append(Parameter(f"bend_{k - 1}", 0.0, unit, scale=size, tolerance=float(np.sqrt(3.0) * deviation)))
+        starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
+                       for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
+        return Effect(name, tuple(out), starts)
+
+
+def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
+    """The basis for a quantity that has been at these values; None where there are too few different ones.
+
+    Knots stand at their quantiles: a curve is as fine as the log tells.
+    """
+    x = np.sort(np.asarray(visited, dtype=float)[np.isfinite(visited)])
+    if len(x) < 4 * LEAST:
+        return None
+    if len(few := np.unique(x)) in (2, 3):
+        return _straight(x, float(few[0]), float(few[-1]))
+    low, high = (float(np.quantile(x, q)) for q in (EDGE, 1.0 - EDGE))
+    if not high - low > 1e-12 * max(abs(low), abs(high), 1e-300):
+        return None
+    z = (x[(x >= low) & (x <= high)] - low) / (high - low)
+    inner = np.quantile(np.unique(z), np.linspace(0.0, 1.0, count - DEGREE + 1)[1:-1])
+    inner = np.unique(np.round(inner / RESOLVED)) * RESOLVED
+    inner = inner[(inner > RESOLVED) & (inner < 1.0 - RESOLVED)]
+    if len(np.unique(z)) < LEAST or len(inner) + DEGREE + 1 < LEAST:
+        return None
+    knots = np.concatenate([np.zeros(4), inner, np.ones(4)])
+    n = len(knots) - DEGREE - 1
+    some = z[np.linspace(0, len(z) - 1, min(len(z), 10_000)).astype(int)]
+    values = BSpline.design_matrix(some, knots, DEGREE).toarray()
+    gram = values.T @ values / len(some) + 1e-9 * np.eye(n)
+    # cubic pieces: the second derivative is straight in each, so that Simpson's rule takes its square exactly
+    edges = np.unique(knots)
+    at = np.concatenate([edges[:-1], 0.5 * (edges[1:] + edges[:-1]), edges[1:]])
+    weight = np.concatenate([np.full(len(edges) - 1, w) for w in (1.0, 4.0, 1.0)]) * np.tile(np.diff(edges), 3) / 6.0
+    second = BSpline(knots, np.eye(n), DEGREE).derivative(2)(np.minimum(at, np.nextafter(1.0, 0.0))).T
+    bending = (second * weight) @ second.T
+    bends, turn = eigh(bending, gram)
+    # the first two do not bend: a constant, and the straight line that is orthogonal to it
+    one = np.ones(n) / np.sqrt(gram.sum())
+    line = _greville(knots)
+    line = line - one * (one @ gram @ line)
+    line /= np.sqrt(line @ gram @ line)
+    turn = np.column_stack([one, line, turn[:, 2:]])
+    return Basis(low + (high - low) * knots, turn, np.concatenate([[0.0, 0.0], bends[2:] / bends[2]]))
+
+
+def _straight(x: Array, low: float, high: float) -> Basis:
+    """The basis for a quantity of two or three values, such as a direction: it cannot bend."""
+    knots = np.concatenate([np.full(4, low), np.full(4, high)])
+    line = _greville(knots) - x.mean()
+    return Basis(knots, np.column_stack([np.ones(4), line / np.sqrt(np.mean((x - x.mean()) ** 2))]), np.zeros(2))
+
+
+def _greville(knots: Array) -> Array:
+    """Coefficients of the straight line y = x: the means of each spline's inner knots (Greville abscissae)."""
+    return np.array([knots[i + 1 : i + 4].mean() for i in range(len(knots) - DEGREE - 1)])

@@ -1,0 +1,85 @@
+"""A law that was learned, from its table in a model file: put where it acts."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from plant.model import Learned
+from vaneloop.base.curve import POINTS
+from vaneloop.discrepancy.curves import DEGREE, LEVEL
+from vaneloop.discrepancy.formulas import FORMS
+from vaneloop.discrepancy.library import Law
+from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
+from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.stage import Effect, Parameter, StageError
+
+__all__ = ["CURVE_LAW", "from_file"]
+
+CURVE_LAW = Law("curve", 0, "a function of one quantity", lambda _: ((), ()))
+FAR = 1e3  # usual sizes: bound of a curve's values
+
+
+def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
+    """What runs, and what the search is told of it. Raises StageError, one line, for what the system does not have."""
+    s = data.system
+
+    def wrong(what: str, value: object, allowed: str) -> StageError:
+        return StageError(f"curves.{name}: {what} (={value!r}) is not one of system {s.name!r}; allowed: {allowed}")
+
+    if law.how not in HOW:
+        raise wrong("how", law.how, ", ".join(HOW))
+    signals = list(s.commands) if s.kind == "closed_loop" else data.in_names
+    where = law.how.split()[0]
+    named = {
+        "parameter": [p.name for p in s.parameters], "input": signals, "state": list(s.states),
+        "force": ["force"] if s.kind == "force" else [],
+        "output": [o if o not in s.inputs and o not in s.states else f"{o}_sensor" for o in s.outputs],
+    }[where]  # fmt: skip
+    if law.at not in named:
+        raise wrong("at", law.at, ", ".join(named) or f"nothing, with how = {law.how!r}")
+    moves = s.kind in ("simulate", "closed_loop")
+    known = {o: OUTPUT + i for i, o in enumerate(s.outputs)}
+    known |= {u: INPUT + i for i, u in enumerate(signals)}
+    known |= {x: i for i, x in enumerate(s.states)} if moves else {}
+    columns = set.intersection(*(set(r.columns) for r in data.records))
+    shaped = {prefix + c for c in columns for prefix in (WAY, DISTANCE, SINCE)}
+    of = known.get(law.of, COLUMN)
+    if of == COLUMN and law.of not in (TIME, *columns, *shaped):
+        raise wrong("of", law.of, ", ".join([*known, TIME, *sorted(columns - set(known))]))
+    if not law.low < law.high:
+        raise StageError(f"curves.{name}: low (={law.low:g}) must be below high (={law.high:g})")
+    x = np.linspace(law.low, law.high, POINTS)
+    if law.form:
+        forms = {f.name: f for f in FORMS}
+        if law.form not in forms or len(forms[law.form].numbers) != len(law.values):
+            allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
+            raise StageError(f"curves.{name}: form (={law.form!r}, {len(law.values)} values) must be one of {allowed}")
+        form = forms[law.form]
+        names = form.numbers
+        curve = Curve(
+            law.how, named.index(law.at), of, law.of, law.low, law.high,
+            lambda v: np.broadcast_to(form.value(x, v), x.shape).astype(float),
+        )  # fmt: skip
+        sizes = [max(abs(v), 1e-9) for v in law.values]
+    else:
+        if len(law.knots) != len(law.values) + DEGREE + 1 or np.any(np.diff(law.knots) < 0.0):
+            raise StageError(
+                f"curves.{name}: knots ({len(law.knots)} of them) must rise, and be {DEGREE + 1} more than the "
+                f"{len(law.values)} values"
+            )
+        knots = np.asarray(law.knots, dtype=float)
+        inside = np.clip(x, knots[DEGREE], knots[-DEGREE - 1])
+        design = BSpline(knots, np.eye(len(law.values)), DEGREE)(inside)
+        curve = Curve(law.how, named.index(law.at), of, law.of, law.low, law.high, design.__matmul__)
+        names = tuple(f"c{k + 1}" for k in range(len(law.values)))
+        sizes = [abs(law.size) or 1.0] * len(names)
+    wide = np.sqrt(3.0) * LEVEL if not law.form else 0.0  # a curve's values are known to be of its size
+    ps = tuple(
+        Parameter(n, 0.0, law.unit, -FAR * z, FAR * z, scale=z, tolerance=float(wide * z))
+        for n, z in zip(names, sizes, strict=True)
+    )
+    effect = Effect(name, ps, (tuple(float(v) for v in law.values),), "a function that was learned")
+    return Placed(name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(len(ps)), curve=curve), effect

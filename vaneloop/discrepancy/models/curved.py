@@ -1,0 +1,207 @@
+"""Curves that nobody named, at every place of a user's own model, of every quantity that its logs or it know; and the
+model with some of them as effects.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vaneloop.base.curve import POINTS
+from vaneloop.discrepancy.curves import COUNT, Basis, basis_of
+from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
+from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
+from vaneloop.discrepancy.models.curve_file import CURVE_LAW
+from vaneloop.discrepancy.models.nominal import nominal_course
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.stage import Array, Effect
+
+__all__ = ["Candidate", "Quantity", "candidates", "quantities", "with_curves"]
+
+
+IN_TIME = 24  # splines of a curve over time: what swings with time does so often
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had."""
+
+    name: str
+    unit: str
+    of: int
+    visited: Array
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A curve that may be missing.
+
+    name   place.curve_of_QUANTITY where it adds, place.gain_of_QUANTITY where it multiplies
+    how, place, unit   as `Curve` has them; ``at``: the place's name; ``unit``: of the curve
+    size   how large such a curve is in usual
+    mean   whether it may have a mean
+    """
+
+    name: str
+    how: str
+    place: int
+    at: str
+    unit: str
+    size: float
+    mean: bool
+    quantity: Quantity
+    basis: Basis
+
+    @property
+    def grid(self) -> Array:
+        """Where a curve's table has its points."""
+        return np.linspace(self.basis.low, self.basis.high, POINTS)
+
+    def placed(self, turn: Array | None = None) -> Placed:
+        """What runs; ``turn``: B-spline coefficients of each function, by default those of the basis."""
+        if turn is None:
+            turn = self.basis.turn if self.mean else self.basis.turn[:, 1:]
+        design = self.basis.design(self.grid) @ turn
+        return self.placed_as(design.__matmul__, design.shape[1])
+
+    def placed_as(self, table: Callable[[Array], Array], parameters: int) -> Placed:
+        """The same with another function from so many parameters to its table."""
+        q = self.quantity
+        curve = Curve(self.how, self.place, q.of, q.name, self.basis.low, self.basis.high, table)
+        return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
+
+    def effect(self, wiggle: float) -> Effect:
+        """What the search is told."""
+        return self.basis.effect(self.name, self.unit, self.size, wiggle, self.mean)
+
+
+def quantities(bound: Bound, values: Array) -> list[Quantity]:
+    """Every quantity that is known, with the values that it has in the fitted logs; ``values``: the model's own
+    parameters, and starts.
+    """
+    s, data = bound.system, bound.data
+    out: list[Quantity] = []
+    moves = s.kind in ("simulate", "closed_loop")
+    if moves:
+        states = nominal_course(bound.runner, values).states
+        out += [Quantity(n, u, i, np.concatenate(states[i])) for i, (n, u) in enumerate(s.states.items())]
+    if s.kind == "closed_loop":
+        for i, (name, unit) in enumerate(s.commands.items()):
+            if all(name in r.columns for r in data.records):
+                out.append(Quantity(name, unit, INPUT + i, np.concatenate([r.columns[name] for r in data.records])))
+    else:
+        unit = s.units.get("position", "m")
+        units = {"position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2", **s.inputs}
+        for i, name in enumerate(data.in_names):
+            out.append(Quantity(name, units[name], INPUT + i, np.concatenate([u[i] for u in data.u])))
+    for i, (name, unit) in enumerate(s.outputs.items()):
+        if name not in s.states and name not in s.inputs and name not in s.commands:
+            out.append(Quantity(name, unit, OUTPUT + i, bound.measured[i]))
+
+    def column(name: str, unit: str) -> None:
+        rows = [data.column(k, name) for k in range(len(data.records))]
+        out.append(Quantity(name, unit, COLUMN, np.concatenate(rows)))
+
+    column(TIME, "s")
+    known = {q.name for q in out} | {s.position, s.velocity}
+    shared = set.intersection(*(set(r.columns) for r in data.records))
+    for name in sorted(shared - known):
+        column(name, s.inputs.get(name, ""))
+    all_units = {**s.inputs, **s.outputs, **({s.position: s.units.get("position", "m")} if s.position else {})}
+    for name, unit in all_units.items():
+        if name in shared:
+            column(WAY + name, "-")
+            column(DISTANCE + name, unit)
+            column(SINCE + name, "s")
+    return out
+
+
+def candidates(bound: Bound, values: Array) -> list[Candidate]:
+    """Every curve that may be missing: each place with each quantity."""
+    s = bound.system
+    moves = s.kind in ("simulate", "closed_loop")
+    known = [
+        (q, b)
+        for q in quantities(bound, values)
+        if (b := basis_of(q.visited, IN_TIME if q.name == TIME else COUNT)) is not None
+    ]
+    out: list[Candidate] = []
+
+    def put(how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True) -> None:
+        for q, basis in known:
+            if q.name == but or (not moves and q.of // 100 * 100 == OUTPUT and not how.startswith("output")):
+                continue
+            name = f"{at}.{'gain' if how.endswith('times') else 'curve'}_of_{q.name}"
+            if not mean and len(basis.bend) < 2:
+                continue
+            out.append(Candidate(name, how, place, at, unit, size, mean, q, basis))
+
+    def allowed(place: str, name: str) -> bool:
+        return s.places is None or place in s.places or name in s.places
+
+    def half(rows: Array) -> float:
+        good = rows[np.isfinite(rows)]
+        return max(0.5 * float(np.ptp(good)) if len(good) else 0.0, 1e-300)
+
+    for i, p in enumerate(s.parameters):
+        if allowed("parameter", p.name):
+            put("parameter times", i, p.name, "-", 0.5, mean=p.tolerance == 0.0)
+    if moves:
+        states = nominal_course(bound.runner, values).states
+        for i, (name, unit) in enumerate(s.states.items()):
+            if name in s.rates.values() and name not in s.rates:
+                continue
+            if allowed("force" if name in s.rates else "state", name):
+                pairs = zip(states[i], bound.data.records, strict=True)
+                rate = max(
+                    float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300
+                )
+                mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
+                put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass)
+    if s.kind == "force" and allowed("force", "force"):
+        y = bound.measured[0]
+        put("force adds", 0, "force", next(iter(s.outputs.values())), 0.5 * float(np.sqrt(np.nanmean(y**2))))
+    signals = s.commands if s.kind == "closed_loop" else s.inputs
+    for i, (name, unit) in enumerate(signals.items()):
+        if allowed("input", name):
+            k = i + (3 if s.kind == "force" else 0)
+            rows = next((q.visited for q, _ in known if q.of == INPUT + k), np.array([-1.0, 1.0]))
+            put("input adds", k, name, unit, 0.3 * half(rows))
+            put("input times", k, name, "-", 0.3, but=name)
+    for i, (name, unit) in enumerate(s.outputs.items()):
+        if name in s.commands or not allowed("output", name) or not np.isfinite(bound.measured[i]).any():
+            continue
+        at = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
+        if s.kind != "force":
+            put("output adds", i, at, unit, 0.3 * half(bound.measured[i]))
+        put("output times", i, at, "-", 0.3, but=name)
+    return out
+
+
+def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]]) -> Bound:
+    """The model on the same logs with only these laws of the library, and these curves, as effects."""
+    out = copy.copy(bound)
+    runner = out.runner = copy.copy(bound.runner)
+    out.run = runner.run
+    n_present = sum(e.name in bound.present for e in bound.effects)
+    both = list(zip(bound.placed, bound.effects, strict=True))
+    kept = both[:n_present] + [b for name in laws for b in both if b[1].name == name] + list(curves)
+    at = len(bound.stage.parameters) - sum(len(e.parameters) for _, e in both[:n_present])
+    placed = []
+    for q, e in kept:
+        placed.append(replace(q, columns=slice(at, at + len(e.parameters))))
+        at += len(e.parameters)
+    out.placed = runner.placed = placed
+    out.effects = [e for _, e in kept]
+    effects = tuple(out.effects[n_present:])
+    stride = max(1, len(bound.t) // MOST_SAMPLES)
+    out.stage = replace(bound.stage, effects=effects, run=runner.run, begins=None)
+    out.thinned = replace(
+        bound.thinned, effects=effects, run=lambda thetas: runner.run(thetas)[:, :, ::stride], begins=None
+    )
+    out.stages = [out.thinned]
+    return out

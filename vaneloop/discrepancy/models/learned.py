@@ -1,0 +1,253 @@
+"""What is said of a law that was learned: its curve and band, where the logs have been, what it trades with, and its
+formulas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vaneloop.base.curve import POINTS
+from vaneloop.discrepancy.error_share import RIVAL, score
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.formulas import FORMS, Form, begin, text_of
+from vaneloop.discrepancy.models.by_log import Logs
+from vaneloop.discrepancy.models.curved import Candidate, with_curves
+from vaneloop.discrepancy.models.learning import Tried, with_held_out
+from vaneloop.discrepancy.stage import Array, Effect, Parameter
+from vaneloop.discrepancy.stage_answer import rms_of
+
+__all__ = ["Formula", "LearnedLaw", "law_of"]
+
+DRAWS = 400
+BAND = 0.90
+REFITTED = 5  # formulas that are fitted in the simulation
+NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
+SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
+DEGREES = ("degC", "°C", "C")
+SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
+BINS = 24
+PER_NUMBER = 0.005  # log error that a number of a formula costs
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula fitted inside the simulation.
+
+    text     with its numbers
+    numbers  name -> value; ``error``: held-out RMS, in noise floors, with it in the curve's place
+    law      name of the law of the library that it is; "": none
+    """
+
+    form: str
+    text: str
+    numbers: dict[str, float]
+    error: float
+    complexity: int
+    law: str = ""
+
+
+@dataclass(frozen=True)
+class LearnedLaw:
+    """A law that was learned.
+
+    name, how, at, of   of the effect; what it does (`vaneloop.discrepancy.models.curve`), at which place, of what
+    x, y, low, high     the curve, at places of its quantity, with its 90 % band
+    edges, visited      of a histogram: where the logs have been, as shares
+    trades   nominal parameters that leave their intervals where the curve may have neither mean nor slope
+    rivals   curves at other places or of other quantities that do as well
+    """
+
+    name: str
+    how: str
+    at: str
+    of: str
+    unit: str
+    of_unit: str
+    x: Array
+    y: Array
+    low: Array
+    high: Array
+    edges: Array
+    visited: Array
+    error_before: float
+    error_after: float
+    knots: Array = field(repr=False)
+    coefficients: Array = field(repr=False)
+    formulas: list[Formula] = field(default_factory=list)
+    trades: list[str] = field(default_factory=list)
+    rivals: list[str] = field(default_factory=list)
+
+    def sentence(self) -> str:
+        """What it is, in words."""
+        does = {
+            "parameter times": f"{self.at} is multiplied by 1 + a function of {self.of}",
+            "input adds": f"a function of {self.of} is added to {self.at}",
+            "input times": f"{self.at} is multiplied by 1 + a function of {self.of}",
+            "state adds": f"a function of {self.of} is taken off the derivative of {self.at}",
+            "force adds": f"a function of {self.of} is added to the force",
+            "output adds": f"a function of {self.of} is added to the reading {self.at}",
+            "output times": f"the reading {self.at} is multiplied by 1 + a function of {self.of}",
+        }[self.how]
+        best = self.formulas[0] if self.formulas else None
+        said = f", {best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
+        return f"{does}{said}"
+
+
+def law_of(logs: Logs, before: tuple[Judge, Fit], tried: Tried, rivals: list[str]) -> LearnedLaw:
+    """Everything that is said of the last curve of ``tried``."""
+    c, judge, fit = tried.candidate, tried.judge, tried.fit
+    amplitudes = fit.theta[judge.stage.index()[c.name]]
+    placed = tried.curves[-1][0]
+    assert placed.curve is not None
+    grid = c.grid
+    y = placed.curve.table(amplitudes)
+    low, high = _band(tried, placed.curve.table)
+    visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
+    counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
+    turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
+    return LearnedLaw(
+        c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
+        counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots, turn @ amplitudes,
+        _formulas(logs, tried, y), _trades(logs, tried), rivals,
+    )  # fmt: skip
+
+
+def _band(tried: Tried, table: object) -> tuple[Array, Array]:
+    """90 % band of a curve: blocks of the log drawn anew, each draw solved by the slopes of the fit."""
+    judge, fit, c = tried.judge, tried.fit, tried.candidate
+    scale = judge.scale[fit.free]
+    prior = fit.prior * scale**2
+    n = judge.n_blocks
+    weights = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), DRAWS)
+    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    at = judge.stage.index()[c.name]
+    mine = np.flatnonzero((fit.free >= at.start) & (fit.free < at.stop))
+    curves = []
+    for w in weights:
+        a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
+        step = np.linalg.solve(a, w @ fit.gradients - prior * deviation)
+        curves.append(table((fit.theta[fit.free] + step * scale)[mine]))  # type: ignore[operator]
+    edge = 50.0 * (1.0 - BAND)
+    low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
+    y = table(fit.theta[at])  # type: ignore[operator]
+    return np.minimum(low, y), np.maximum(high, y)
+
+
+def _trades(logs: Logs, tried: Tried) -> list[str]:
+    """Nominal parameters that stand elsewhere where the curve may only bend."""
+    c, fit = tried.candidate, tried.fit
+    bending = c.basis.turn[:, 2:]
+    if not bending.shape[1]:
+        return []
+    whole = c.effect(tried.wiggle)
+    effect = Effect(c.name, whole.parameters[-bending.shape[1] :], tuple(s[-bending.shape[1] :] for s in whole.starts))
+    bound = with_curves(logs.fitted, (), (*tried.curves[:-1], (c.placed(bending), effect)))
+    judge = Judge(bound.thinned, logs.fitted.floor)
+    names = tuple(e.name for e in judge.stage.effects)
+    theta = np.concatenate([fit.theta[: tried.judge.stage.index()[c.name].start], fit.theta[-bending.shape[1] :]])
+    other = with_held_out(judge, judge.fit(names, theta, 8))
+    if score(judge, other) > score(judge, fit) + RIVAL:
+        return []  # the logs tell its mean and slope
+    out = []
+    for k, column in enumerate(fit.free):
+        if column < len(judge.stage.parameters):
+            value = other.theta[column]
+            if not fit.low[k] <= value <= fit.high[k]:
+                out.append(judge.stage.parameters[column].name)
+    return out
+
+
+# ---- formulas --------------------------------------------------------------------------------------------------------
+
+
+def _formulas(logs: Logs, tried: Tried, y: Array) -> list[Formula]:
+    """Formulas that come within `NEAR` of the best, simplest first, each fitted in the simulation."""
+    c = tried.candidate
+    x = c.grid
+    visited = np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
+    at_visited = np.interp(visited, x, y)
+    shaped = []
+    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line
+    warm = c.quantity.unit in DEGREES
+    for form in [f for f in FORMS if (not few or f.name == "line") and (warm or f.name != "Arrhenius")]:
+        got = begin(form, visited, at_visited, not c.mean)
+        if got is not None and got[1] < SHAPED:
+            shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
+    shaped.sort(key=lambda s: s[0])
+    fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(logs, tried, form, numbers))]
+    if not fitted:
+        return []
+    fitted.sort(key=lambda f: np.log(f.error) + PER_NUMBER * len(f.numbers))
+    limit = min(f.error for f in fitted) * (1.0 + NEAR)
+    limit = max(limit, min(rms_of(tried.judge, tried.fit), 1.0) * (1.0 + NEAR))
+    out: list[Formula] = []
+    for f in sorted((f for f in fitted if f.error <= limit), key=lambda f: (f.complexity, f.error)):
+        y = values_of(f, visited)
+        if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):
+            out.append(f)
+    return out
+
+
+def values_of(formula: Formula, q: Array) -> Array:
+    """A formula at values of its quantity."""
+    form = next(f for f in FORMS if f.name == formula.form)
+    return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)
+
+
+def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Formula | None:
+    """A formula in the curve's place, fitted with the model's own parameters."""
+    c = tried.candidate
+    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
+    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
+    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
+    grid = c.grid
+    placed = c.placed_as(lambda n: np.broadcast_to(form.value(grid, n), grid.shape).astype(float), len(numbers))
+    bound = with_curves(logs.fitted, (), (*tried.curves[:-1], (placed, effect)))
+    judge = Judge(bound.thinned, logs.fitted.floor)
+    theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
+    if not np.all(np.isfinite(bound.run(theta[None]))):
+        return None
+    fit = with_held_out(judge, judge.fit(tuple(e.name for e in judge.stage.effects), theta, 12))
+    if not np.isfinite(score(judge, fit)):
+        return None
+    values = form.plain(fit.theta[-len(numbers) :])
+    said = dict(zip(form.numbers, (float(v) for v in values), strict=True))
+    law = library_name(c, form)
+    return Formula(
+        form.name,
+        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0)),
+        said,
+        rms_of(judge, fit),
+        form.complexity,
+        law,
+    )
+
+
+# forms that are laws of the library, where the curve is of what is at its own place
+OF_STATE = {
+    "constant": "offset",
+    "line": "leak",
+    "root": "square_root",
+    "signed square": "quadratic_drag",
+    "cube": "cubic",
+}
+OF_FORCE = {"constant": "force_offset", "line": "viscous", "signed square": "quadratic_drag", "sign": "coulomb"}
+OF_POSITION = {"line": "spring", "cube": "cubic_spring"}
+OF_SIGNAL = {"constant": "bias", "line": "gain", "cube": "cubic", "magnitude": "asymmetric_gain"}
+
+
+def library_name(c: Candidate, form: Form) -> str:
+    """Name of the law of the library that a form is at this place; "": none."""
+    where, own = c.how.split()[0], c.quantity.name == c.at.removesuffix("_sensor")
+    if c.how.endswith("times"):
+        return ""
+    if where == "state":
+        table = OF_STATE if own and "/s" in c.unit else OF_FORCE if own else {}
+    elif where == "force":
+        table = OF_FORCE if c.quantity.name == "velocity" else OF_POSITION if c.quantity.name == "position" else {}
+    else:
+        table = OF_SIGNAL if own else {}
+    name = table.get(form.name, "")
+    return f"{c.at}.{name}" if name else ""

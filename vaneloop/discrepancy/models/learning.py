@@ -1,0 +1,311 @@
+"""A law that nobody listed: where it acts, of which quantity it is a function, and its curve.
+
+Every place of the model is tried with every quantity that the logs or the model know. The slopes of a curve's functions
+at the model as it is say what each could do, one linear solve a candidate; the most promising are fitted inside the
+simulation, with the model's own parameters. What earns a curve its place is what earns it for a law with a name
+(`vaneloop.discrepancy.error_share`): the error of blocks that it was not fitted to, and no harm to a test log. Beside
+laws with names it must do clearly better than the best of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vaneloop.discrepancy.curves import basis_of
+from vaneloop.discrepancy.error_share import HARM, LEAST_USE, MOST_LEFT, RIVAL, UNKNOWN, ErrorShare, score, worth
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.locate import agrees
+from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.by_log import Logs
+from vaneloop.discrepancy.models.curved import Candidate, candidates, with_curves
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, WAY
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.promise import Slopes
+from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
+
+__all__ = ["Learner", "Outcome", "Tried"]
+
+MOST_CURVES = 2
+WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
+QUICK, FINISHED = 10, 4  # candidates that are fitted for a few steps, and of these to the end
+SHORTER = (1.0, 0.5, 0.2)  # of the step that the slopes promise, which are simulated
+FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
+Placings = tuple[tuple[Placed, Effect], ...]
+
+
+@dataclass
+class Tried:
+    """A curve fitted beside the model, and curves before it.
+
+    curves  each as it runs and as the search has it, the new one last
+    """
+
+    candidate: Candidate
+    wiggle: float
+    bound: Bound
+    judge: Judge
+    fit: Fit
+    curves: Placings
+
+
+@dataclass
+class Outcome:
+    """What learning says.
+
+    verdict  learned; named: laws of the library do as well; none: nothing is missing; unknown: no honest law is there
+    tried    the model with its curves, curve by curve; ``rivals``: candidates that do as well in the last one's place
+    nearest  the candidates that come nearest, where nothing was learned
+    base     the model with nothing added
+    why      in words, where nothing was learned
+    """
+
+    verdict: str
+    base: Fit
+    judge: Judge
+    tried: list[Tried] = field(default_factory=list)
+    rivals: list[list[str]] = field(default_factory=list)
+    nearest: list[str] = field(default_factory=list)
+    why: str = ""
+    notes: list[str] = field(default_factory=list)
+
+
+def held_out(cost: Array, gradients: Array, normals: Array, mine: Array, prior: Array, deviation: Array) -> Array:
+    """Cost of each block with a curve's parameters (``mine``, of all free ones) fitted to the other blocks, within its
+    prior. All in the parameters' scales.
+    """
+    g, a = gradients[:, mine], normals[:, mine][:, :, mine]
+    p = prior[mine]
+    pull = g.sum(axis=0) - p * deviation[mine]
+    total = a.sum(axis=0) + np.diag(p + 1e-9 * np.maximum(np.diag(a.sum(axis=0)), 1e-12))
+    step = np.linalg.solve(total - a, (pull - g)[:, :, None])[:, :, 0]
+    out = cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step)
+    return np.asarray(np.maximum(out, 0.5 * cost))
+
+
+def with_held_out(judge: Judge, fit: Fit) -> Fit:
+    """The fit with the held-out errors of its curves within their priors."""
+    scale = judge.scale[fit.free]
+    mine = fit.free >= len(judge.stage.parameters)
+    if not mine.any():
+        return fit
+    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    held = held_out(fit.cost, fit.gradients, fit.normals, mine, fit.prior * scale**2, deviation)
+    return replace(fit, held_out=held)
+
+
+class Learner:
+    """The search for curves on one system.
+
+    logs      the model on its logs
+    d         what `diagnose` says of them
+    progress  called with the share that is done
+    """
+
+    def __init__(self, logs: Logs, d: StageDiagnosis, progress: Callable[[float], None] | None = None):
+        self.logs, self.d, self.progress = logs, d, progress or (lambda _: None)
+        self.bound = with_curves(logs.fitted, (), ())
+        self.judge = Judge(self.bound.thinned, logs.fitted.floor)
+        columns = len(self.bound.stage.parameters)
+        self.base = self.judge.fit((), d.base.theta[:columns], 4)
+        self.form = ErrorShare(self.judge)
+        self.form.begin(self.base)
+        starts = len(logs.fitted.system.parameters) + len(logs.fitted.runner.free_starts)
+        self.candidates = candidates(self.bound, self.base.theta[:starts])
+
+    def learned(self) -> Outcome:
+        """Curves one after the other, each earning its place; at most two."""
+        out = Outcome("none", self.base, self.judge)
+        if not self.form.fails(self.base):
+            out.why = "the model comes down to the noise of its samples: nothing is missing"
+            return out
+        named = self._named()
+        if named is not None and self.d.effects and agrees(rms_of(*named), 1.0):
+            out.verdict = "named"
+            out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
+            return out
+        current = Tried(self.candidates[0], 0.0, self.bound, self.judge, self.base, ()) if self.candidates else None
+        fit = self.base
+        while current is not None and len(out.tried) < MOST_CURVES and self.form.fails(fit):
+            finalists = self._finalists(current)
+            out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
+            good = [t for t in finalists if self._earns(fit, t)]
+            if not good:
+                break
+            # reversals follow from every quantity that turns: a plain one that does as well is meant
+            near = [t for t in good if score(self.judge, t.fit) < score(self.judge, good[0].fit) + RIVAL]
+            best = next((t for t in near if not t.candidate.quantity.name.startswith((WAY, DISTANCE, SINCE))), good[0])
+            why = self._harmful(current, best)
+            if why:
+                out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
+                break
+            limit = score(self.judge, best.fit) + RIVAL
+            out.rivals.append([t.candidate.name for t in good if t is not best and score(self.judge, t.fit) < limit])
+            out.tried.append(best)
+            current, fit = best, best.fit
+        return self._concluded(out, named)
+
+    def _named(self) -> tuple[Judge, Fit] | None:
+        """The best laws of the library, fitted with their held-out errors, where there are any."""
+        effects = self.d.final.effects or tuple(self.d.nearest[:1])
+        if not effects:
+            return None
+        bound = with_curves(self.logs.fitted, effects, ())
+        judge = Judge(bound.thinned, self.logs.fitted.floor)
+        theta = bound.stage.neutral()
+        whole, part = self.logs.fitted.stage.index(), bound.stage.index()
+        theta[: len(self.base.theta)] = self.d.final.theta[: len(self.base.theta)]
+        for e in effects:
+            if self.d.final.effects:
+                theta[part[e]] = self.d.final.theta[whole[e]]
+            else:
+                theta[part[e]] = self.logs.fitted.stage.effect(e).starts[0]
+        return judge, judge.fit(effects, theta, 8)
+
+    def _concluded(self, out: Outcome, named: tuple[Judge, Fit] | None) -> Outcome:
+        if not out.tried:
+            out.verdict = "named" if self.d.effects else "unknown"
+            out.why = "no curve of one quantity, at any place, explains enough of the error on data left out"
+            return out
+        last = out.tried[-1]
+        left, was = rms_of(last.judge, last.fit), rms_of(self.judge, self.base)
+        share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
+        if left > UNKNOWN and share > MOST_LEFT:
+            out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
+        elif named is not None and self.d.effects and not worth(self.judge, named[1], last.fit, self.form.form).good:
+            out.verdict = "named"
+            out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
+        else:
+            out.verdict = "learned"
+        return out
+
+    def _earns(self, before: Fit, tried: Tried) -> bool:
+        return worth(self.judge, before, tried.fit, self.form.form).good
+
+    # ---- candidates --------------------------------------------------------------------------------------------------
+
+    def _finalists(self, current: Tried) -> list[Tried]:
+        """The candidates that promise most, fitted; best first."""
+        promised = self._screened(current)
+        quick = []
+        for k, (_, candidate, wiggle, theta) in enumerate(promised[:QUICK]):
+            quick.append(self._fitted(current, candidate, wiggle, theta, 3))
+            self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
+        quick.sort(key=lambda t: score(self.judge, t.fit))
+        done = []
+        for k, t in enumerate(quick[:FINISHED]):
+            options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
+            done.append(min(options, key=lambda o: score(self.judge, o.fit)))
+            self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
+        done.sort(key=lambda t: score(self.judge, t.fit))
+        if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
+            finer = [f for t in done[:FINER] if (f := self._finer(current, t)) is not None]
+            done = sorted([*done, *finer], key=lambda t: score(self.judge, t.fit))
+            best = {t.candidate.name: t for t in reversed(done)}
+            done = [t for t in done if best[t.candidate.name] is t]
+        return done
+
+    def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
+        """The same curve with `SPLINES` splines."""
+        c = coarse.candidate
+        basis = basis_of(c.quantity.visited, SPLINES)
+        if basis is None or len(basis.bend) <= len(c.basis.bend):
+            return None
+        fine = replace(c, basis=basis)
+        turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
+        curve = c.basis.design(fine.grid) @ (turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
+        own = basis.turn if c.mean else basis.turn[:, 1:]
+        amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ own, curve, rcond=None)[0]
+        theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
+        return self._fitted(current, fine, WIGGLES[-1], theta, 12)
+
+    def _fitted(self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int) -> Tried:
+        curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
+        bound = with_curves(self.logs.fitted, (), curves)
+        judge = Judge(bound.thinned, self.logs.fitted.floor)
+        names = tuple(e.name for _, e in curves)
+        fit = with_held_out(judge, judge.fit(names, theta, iterations))
+        return Tried(candidate, wiggle, bound, judge, fit, curves)
+
+    def _screened(self, current: Tried) -> list[tuple[float, Candidate, float, Array]]:
+        """Each candidate with what it would leave, how much it may bend, and parameters to begin from; best first."""
+        fit, judge = current.fit, current.judge
+        slopes = Slopes(judge, fit.theta, fit.free, fit.prior)
+        out = []
+        have = {q.effect for q, _ in current.curves}
+        for candidate in self.candidates:
+            if candidate.name not in have:
+                out.append(self._promise(current, candidate, slopes))
+        return sorted(out, key=lambda o: o[0])
+
+    def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, float, Array]:
+        fit, jac = current.fit, slopes.jac
+        bound = with_curves(
+            self.logs.fitted, (), (*current.curves, (candidate.placed(), candidate.effect(WIGGLES[-1])))
+        )
+        judge = Judge(bound.thinned, self.logs.fitted.floor)
+        theta = np.concatenate([fit.theta, np.zeros(len(candidate.effect(1.0).parameters))])
+        own = np.arange(len(fit.theta), len(theta))
+        moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
+        rows = np.concatenate([jac, derivative(judge.errors(moved))[1]])
+        cost, gradients, normals = judge._blocks(slopes.error, rows)
+        free = np.concatenate([fit.free, own])
+        scale, neutral = judge.scale[free], judge.stage.neutral()
+        mine = np.arange(len(free)) >= len(fit.free)
+        best: tuple[float, float, Array] | None = None
+        for wiggle in WIGGLES:
+            tolerance = np.array([p.tolerance for p in candidate.effect(wiggle).parameters])
+            prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
+            deviation = (theta - neutral)[free] / scale
+            a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
+            step = np.linalg.solve(a, g)
+            g_at = gradients - normals @ step
+            c_at = cost - 2.0 * gradients @ step + np.einsum("i,bij,j->b", step, normals, step)
+            held = held_out(np.maximum(c_at, 0.0), g_at, normals, mine, prior, deviation + step)
+            promised = float(held.sum())
+            if best is None or promised < best[0]:
+                best = promised, wiggle, step
+        assert best is not None
+        trials = np.repeat(theta[None], len(SHORTER), axis=0)
+        low, high = judge.bounds()
+        for row, share in zip(trials, SHORTER, strict=True):
+            row[free] = np.clip(row[free] + share * best[2] * scale, low[free], high[free])
+        left = judge.totals(judge.errors(trials), trials)
+        k = int(np.argmin(left))
+        # what slopes promise is held out; what was simulated is true: between them
+        value = float(np.sqrt(max(best[0], 1e-300) * left[k]))
+        return value, candidate, best[1], trials[k]
+
+    # ---- other logs --------------------------------------------------------------------------------------------------
+
+    def figures(self, tried: Tried) -> dict[str, Array]:
+        """RMS error of each output, log by log, test logs too."""
+        return on_logs(self.logs, tried.curves).figures(tried.fit.theta)
+
+    def _harmful(self, before: Tried, tried: Tried) -> str:
+        """Why the logs speak against a curve; "": they do not."""
+        floor = self.logs.fitted.floor
+
+        def levels(of: Tried) -> dict[str, float]:
+            by = self.figures(of)
+            good = {log: v for log, v in by.items() if np.isfinite(v).all()}
+            return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in good.items()}
+
+        was, now = levels(before), levels(tried)
+        tests = set(self.logs.test.logs if self.logs.test else ())
+        change = {log: now[log] - was[log] for log in was if log in now}
+        worst = max((log for log in change if log in tests), key=lambda log: change[log], default=None)
+        if worst is not None and change[worst] > HARM:
+            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
+        if change and min(change.values()) > -LEAST_USE:
+            return f"no log is better by {LEAST_USE:.0%} for it"
+        return ""
+
+
+def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
+    """The model with these curves on all its logs."""
+    test = with_curves(logs.test, (), curves) if logs.test is not None else None
+    return Logs(with_curves(logs.fitted, (), curves), test)

@@ -1,0 +1,89 @@
+"""The page of a law that was learned: its curve with band, where the log has been, formulas, the error falling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from vaneloop.discrepancy.models.by_log import ByLog
+from vaneloop.discrepancy.models.learned import LearnedLaw
+from vaneloop.discrepancy.models.learning import Outcome
+from vaneloop.pages.by_log import curves_by_log, log_by_log
+from vaneloop.pages.figures import Figure, Line, bars, loop
+from vaneloop.pages.page import Page
+from vaneloop.pages.style import number
+
+__all__ = ["curve_figure", "learned_page", "visited_figure"]
+
+TONES: dict[str, Literal["good", "neutral", "bad"]] = {
+    "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
+}  # fmt: skip
+BEYOND = 0.15  # of the range, drawn beyond its ends
+
+
+def curve_figure(law: LearnedLaw) -> Figure:
+    """The curve with its band; dashed where no log has been."""
+    span = float(law.x[-1] - law.x[0])
+    below = np.array([law.x[0] - BEYOND * span, law.x[0]])
+    above = np.array([law.x[-1], law.x[-1] + BEYOND * span])
+    lines = [
+        Line("90 % band, from", law.x, law.low, "other", 1.0), Line("to", law.x, law.high, "other", 1.0),
+        Line("learned", law.x, law.y, "model", 2.0),
+        Line("beyond the logs", below, np.full(2, law.y[0]), "model", 1.4, "dash"),
+        Line("beyond the logs, above", above, np.full(2, law.y[-1]), "model", 1.4, "dash"),
+    ]  # fmt: skip
+    unit = "" if law.unit == "-" else f" [{law.unit}]"
+    of_unit = "" if law.of_unit == "-" else f" [{law.of_unit}]"
+    return loop(lines, f"{law.of}{of_unit}", f"{law.name}{unit}")
+
+
+def visited_figure(law: LearnedLaw) -> Figure:
+    """How much of the logs was where."""
+    middle = 0.5 * (law.edges[1:] + law.edges[:-1])
+    return bars([f"{v:.3g}" for v in middle], {"share of samples": (100.0 * law.visited).tolist()}, "%")
+
+
+def learned_page(
+    laws: Sequence[LearnedLaw],
+    outcome: Outcome,
+    said: str,
+    notes: Sequence[str],
+    by_log: ByLog | None = None,
+    command: str = "",
+    log: str = "",
+) -> Page:
+    """The page of ``vaneloop learn``; ``said``: the answer in one sentence."""
+    title = f"A law learned from {Path(log).name}" if laws else f"Learning from {Path(log).name}"
+    page = Page(title, said, tone=TONES[outcome.verdict], command=command, log=log)
+    for law in laws:
+        figures = f"{number(law.error_before)} to {number(law.error_after)}"
+        page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
+    for law in laws:
+        text = law.sentence()
+        page.section(
+            law.name,
+            f"{text[0].upper()}{text[1:]}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no "
+            "log has been there, and the curve stays as at its end.",
+        )
+        page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
+        page.plot(visited_figure(law), f"Where the logs have been, {law.of} in {law.of_unit or '-'}.")
+        if law.formulas:
+            page.table(
+                ["formula", "held-out error, noise floors", "law of the library"],
+                [[f.text, f.error, f.law or "-"] for f in law.formulas],
+                "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first.",
+            )
+    if outcome.nearest and not laws:
+        page.section("What came nearest")
+        page.text(", ".join(outcome.nearest) + ".")
+    if by_log is not None:
+        log_by_log(page, by_log)
+        curves_by_log(page, by_log)
+    if notes:
+        page.section("Notes")
+        for note in notes:
+            page.text(f"{note[0].upper()}{note[1:]}.")
+    return page
