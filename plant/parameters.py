@@ -345,7 +345,9 @@ _LOAD_ROWS = np.array(
     + [ROW["valve_flow_saturation"] + 1]  # a round corner is worked out where the load is
 )
 _VANE_ROWS = np.array(rows_at("linkage", "pot"))
-_VALVE_LAG, _LVDT_LAG, _POT_LAG, _AMPLIFIER_LAG = (ROW[e] for e in ("valve_lag", "lvdt_lag", "pot_lag", "amplifier_lag"))
+_VALVE_LAG, _LVDT_LAG, _POT_LAG, _AMPLIFIER_LAG = (
+    ROW[e] for e in ("valve_lag", "lvdt_lag", "pot_lag", "amplifier_lag")
+)
 
 
 def derive(p: np.ndarray, dt: float, tick: float) -> None:

@@ -55,7 +55,10 @@ def translate(ir: str, entry: str, name: str) -> str:
     The arguments of ``entry`` stay as they are: numba puts a place for the answer and one for an error before them, and
     it returns 0 where all is well.
     """
-    bodies = {m[2].strip('"'): m for m in re.finditer(rf"^define ([^@\n]*)@({_NAME})\((.*)\)[^\n]*\{{\n((?s:.)*?)^\}}", ir, re.M)}
+    bodies = {
+        m[2].strip('"'): m
+        for m in re.finditer(rf"^define ([^@\n]*)@({_NAME})\((.*)\)[^\n]*\{{\n((?s:.)*?)^\}}", ir, re.M)
+    }
     names: dict[str, str] = {}
     waiting, texts, used = [entry], [], set()
     names[entry] = name
@@ -125,7 +128,9 @@ class _Function:
         """Lines of each block without comments and notes; a switch in one line."""
         out: dict[str, list[str]] = {}
         now: list[str] = []
-        for line in re.sub(r"\[\n((?:\s+i\d+ .*\n)+)\s*\]", lambda m: "[" + m[1].replace("\n", ";") + "]", body).split("\n"):
+        for line in re.sub(r"\[\n((?:\s+i\d+ .*\n)+)\s*\]", lambda m: "[" + m[1].replace("\n", ";") + "]", body).split(
+            "\n"
+        ):
             line = re.sub(r"(, ![\w.]+ !\d+)+$|\s+#\d+$|\s+;.*$", "", line.rstrip())
             line = re.sub(r"(, ![\w.]+ !\d+)+$", "", re.sub(r"\s+#\d+$", "", line))
             if label := re.fullmatch(rf"({_NAME}):", line):
@@ -164,10 +169,11 @@ class _Function:
         if text in ("true", "false"):
             return "1" if text == "true" else "0"
         if kind == "double":
-            bits = int(text, 16) if text.startswith("0x") else None
-            v = struct.unpack("<d", struct.pack("<Q", bits))[0] if bits is not None else float(text)
+            bits = int(text, 16) if text.startswith("0x") else 0
+            v = struct.unpack("<d", struct.pack("<Q", bits))[0] if text.startswith("0x") else float(text)
             if not math.isfinite(v):
-                return f"as_double({bits:#x})" if bits is not None and bits < 1 << 63 else f"(-as_double({bits & ~(1 << 63):#x}))"
+                sign, rest = bits >> 63, bits & ~(1 << 63)
+                return f"(-as_double({rest:#x}))" if sign else f"as_double({rest:#x})"
             return f"({v.hex()})" if v < 0 or str(v)[0] == "-" else v.hex()
         if kind == "i64" and int(text) == -(1 << 63):
             return "INT64_MIN"
@@ -257,7 +263,10 @@ class _Function:
             raise NotImplementedError(args)
         kind, name, given = m[2], m[3].strip('"'), _split(m[4])
         kinds = [a.split()[0] for a in given]
-        values = [self._value(a.split()[-1] if "getelementptr" not in a else a.split(" ", 1)[1], k) for a, k in zip(given, kinds, strict=True)]
+        values = [
+            self._value(a.split()[-1] if "getelementptr" not in a else a.split(" ", 1)[1], k)
+            for a, k in zip(given, kinds, strict=True)
+        ]
         if name.startswith("llvm."):
             short = name.split(".")[1]
             if short in ("memcpy", "memmove", "memset"):

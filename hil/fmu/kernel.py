@@ -13,9 +13,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
-from numba.np.arrayobj import make_array, populate_array
+from numba.np import arrayobj
 
-from controller import Calibration, new_state
+from controller import Calibration, new_inputs, new_state
 from controller.records import SLOW, as_inputs, as_outputs
 from hil.fmu.memory import FED, SHOWN, Shape, places_of
 from hil.loop.lockstep import WARM_UP
@@ -32,7 +32,9 @@ PARTS = ("plant", "controller", "loop")
 F_POTS, S_VANES = len(FED), len(SHOWN)
 NEXT, OWN_ENGINE, HELD_N_DEM, HELD_N_R = range(4)
 SUBSTEP = chain.TICK / chain.SUBSTEPS
-_NEW = new_state()
+_types: Any = types  # numba's own have no types
+_arrays: Any = arrayobj
+_NEW, _NO_INPUTS = new_state(), new_inputs()
 
 
 def _view_code(context: Any, memory: Any, offset: Any, shape: Any) -> Any:
@@ -41,19 +43,29 @@ def _view_code(context: Any, memory: Any, offset: Any, shape: Any) -> Any:
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         pointer, begin, sizes = values
-        array = make_array(kind)(context, builder)
+        array = _arrays.make_array(kind)(context, builder)
         size = ir.Constant(ir.IntType(64), 8)
         strides = [size]
         shapes = [builder.extract_value(sizes, i) for i in range(len(shape))]
         for n in shapes[:0:-1]:
             strides.insert(0, builder.mul(n, strides[0]))
-        populate_array(array, builder.gep(pointer, [begin]), shapes, strides, size, None)
+        _arrays.populate_array(array, builder.gep(pointer, [begin]), shapes, strides, size, None)
         return array._getvalue()
 
-    return kind(memory, types.int64, types.UniTuple(types.int64, len(shape))), code
+    return kind(memory, types.int64, _types.UniTuple(types.int64, len(shape))), code
 
 
 _view: Any = intrinsic(_view_code)
+
+
+@inlined
+def _change(a: Loop) -> None:
+    """Take over changed parameters: what follows from them, and the calibration."""
+    derive_lane(a.p, 0, SUBSTEP, chain.TICK)
+    for q in range(a.built.k.shape[0]):
+        a.calibration.k[q] = a.built.k[q]
+    a.flash[0] = np.nan
+    reflash(a)
 
 
 @inlined
@@ -65,12 +77,13 @@ def _start(a: Loop, clock: np.ndarray, fed: np.ndarray) -> None:
         a.z[q] = _NEW[q]
     for q in range(a.outputs.shape[0]):
         a.outputs[q] = 0.0
+    a.mean[0], a.mean[1] = 0.0, 0.0
     for q in range(a.sent.shape[0]):
         for r in range(a.sent.shape[1]):
             a.sent[q, r] = np.nan
-    a.flash[0] = np.nan
-    derive_lane(a.p, 0, SUBSTEP, chain.TICK)
-    reflash(a)
+    for q in range(a.inputs.shape[0]):
+        a.inputs[q] = _NO_INPUTS[q]
+    _change(a)
     n_dem = fed[F_N_DEM]
     n_r = n_dem if clock[OWN_ENGINE] > 0.5 else fed[F_N_R]
     chain.rest(a.s, a.p, 0, mean_stroke(a.calibration.table, n_r), n_dem, fed[F_T_OIL])
@@ -83,9 +96,7 @@ def _hear(k: int, a: Loop, clock: np.ndarray, fed: np.ndarray) -> None:
     if k % SLOW == 0:
         n_r = np.nan if clock[OWN_ENGINE] > 0.5 else fed[F_N_R]
         clock[HELD_N_DEM] = fed[F_N_DEM]
-        clock[HELD_N_R] = hear(
-            a, fed[F_N_DEM], n_r, fed[F_FRESH], fed[F_REJECTED], fed[F_MODE_REQUEST], k, 0.0
-        )
+        clock[HELD_N_R] = hear(a, fed[F_N_DEM], n_r, fed[F_FRESH], fed[F_REJECTED], fed[F_MODE_REQUEST], k, 0.0)
     else:
         inputs = as_inputs(a.inputs)
         inputs.demand_fresh = inputs.demand_rejected = 0.0
@@ -144,16 +155,6 @@ def _show(a: Loop, fed: np.ndarray, shown: np.ndarray) -> None:
         shown[S_VANES + q] = a.s[places.POT + q, 0]
 
 
-@inlined
-def _change(a: Loop) -> None:
-    """Take over changed parameters: what follows from them, and the calibration."""
-    derive_lane(a.p, 0, SUBSTEP, chain.TICK)
-    for q in range(a.built.k.shape[0]):
-        a.calibration.k[q] = a.built.k[q]
-    a.flash[0] = np.nan
-    reflash(a)
-
-
 START, RUN, SHOW, WAKE, CHANGE = range(5)
 
 
@@ -169,13 +170,12 @@ def entry(part: str, shape: Shape) -> Callable[..., None]:
     stages, points, strokes = shape
     n_in, n_out, n_z, n_k = (at[name].shape[0] for name in ("inputs", "outputs", "z", "k"))
     n_s, n_p, n_sent, n_fed, n_shown = (at[name].shape[0] for name in ("s", "p", "sent", "fed", "shown"))
-    o_clock, o_fed, o_shown, o_in, o_out, o_z = (
-        at[n].at for n in ("clock", "fed", "shown", "inputs", "outputs", "z")
-    )
+    o_clock, o_fed, o_shown, o_in, o_out, o_z = (at[n].at for n in ("clock", "fed", "shown", "inputs", "outputs", "z"))
     o_bk, o_bt, o_ba, o_k, o_t = (at[n].at for n in ("built_k", "built_table", "built_angles", "k", "table"))
     o_flash, o_s, o_p, o_sigma, o_still = (at[n].at for n in ("flash", "s", "p", "sigma", "still"))
     o_mean, o_angles, o_sent = (at[n].at for n in ("mean", "angles", "sent"))
     run_part: Any = {"plant": plant_run, "controller": controller_run, "loop": loop_run}[part]
+    absent: Any = None  # the rows of a state hash
     warm_up = WARM_UP if part == "loop" else 0
 
     @inlined
@@ -190,8 +190,8 @@ def entry(part: str, shape: Shape) -> Callable[..., None]:
             _view(m, o_flash, (3,)),
             _view(m, o_s, (n_s, 1)),
             _view(m, o_p, (n_p, 1)),
-            None,
-            None,
+            absent,
+            absent,
             _view(m, o_sigma, (2 + stages,)),
             _view(m, o_mean, (2,)),
             _view(m, o_angles, (stages,)),
