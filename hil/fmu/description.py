@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 from hil.fmu.variables import FIXED, INPUT, OUTPUT, REAL, Variable
 
-__all__ = ["OPTIONS", "SOURCES", "build_description", "model_description"]
+__all__ = ["OPTIONS", "SOURCES", "base_unit", "build_description", "model_description"]
 
 OPTIONS = "-std=c99 -O2 -ffp-contract=off"
 SOURCES = {
@@ -37,7 +37,7 @@ def _units() -> Any:
     return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
 
 
-def _base_unit(unit: str) -> dict[str, str]:
+def base_unit(unit: str) -> dict[str, str]:
     """Attributes of FMI's BaseUnit: exponents of the SI's base units, factor and offset."""
     if unit == "%":
         return {"factor": "0.01"}
@@ -63,7 +63,7 @@ def _unit_definitions(variables: Sequence[Variable]) -> ET.Element:
     shown = {v.unit: v.shown for v in variables if v.shown}
     for unit in dict.fromkeys(["s", *(v.unit for v in variables if v.unit)]):
         element = ET.SubElement(out, "Unit", name=unit)
-        ET.SubElement(element, "BaseUnit", _base_unit(unit))
+        ET.SubElement(element, "BaseUnit", base_unit(unit))
         if border := shown.get(unit):
             ET.SubElement(element, "DisplayUnit", name=border, factor=repr(_SHOWN[border]))
     return out

@@ -43,10 +43,10 @@ def kept_source(part: str, shape: Shape) -> Path:
 def _digest() -> str:
     """Of the sources that the C text follows from."""
     root = Path(__file__).parents[2]
-    h = hashlib.sha256(numba.__version__.encode())
-    here = [root / "hil" / "fmu" / name for name in ("kernel.py", "memory.py", "ir_to_c.py")]
-    folders = ("controller", "plant", "hil/loop", "hil/native", "vaneloop/base")
-    for f in [*here, *(f for folder in folders for f in sorted((root / folder).rglob("*.py")))]:
+    h = hashlib.sha256(f"{numba.__version__} {WARM_UP}".encode())
+    own = ("hil/fmu/kernel.py", "hil/fmu/memory.py", "hil/fmu/ir_to_c.py", "hil/loop/tick.py", "hil/native/call.py")
+    rooms = (f for room in ("controller", "plant", "vaneloop/base") for f in sorted((root / room).rglob("*.py")))
+    for f in (*(root / name for name in own), *rooms):
         h.update(f.name.encode() + f.read_bytes())
     return h.hexdigest()[:16]
 
