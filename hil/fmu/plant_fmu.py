@@ -64,11 +64,9 @@ class PlantFmu:
         described = _described(fmpy, path)
         inputs = _join(path, described, "input", INPUTS, ("i_cmd",), mapping or {}, self.notes)
         outputs = _join(path, described, "output", (*OUTPUTS, *vanes), ("x_lvdt", *vanes), mapping or {}, self.notes)
-        unknown = [s for s in (mapping or {}).values() if s not in (*INPUTS, *OUTPUTS, *vanes)]
-        if unknown:
-            raise InputError(
-                f"--plant-map: {unknown[0]!r} is no signal of a plant; allowed: {', '.join((*INPUTS, *OUTPUTS, *vanes))}"
-            )
+        known = (*INPUTS, *OUTPUTS, *vanes)
+        if unknown := [s for s in (mapping or {}).values() if s not in known]:
+            raise InputError(f"--plant-map: {unknown[0]!r} is no signal of a plant; allowed: {', '.join(known)}")
         self._inputs, self._outputs = inputs, outputs
         self._out_refs = [v.reference for v in outputs]
         self._in_refs = [v.reference for v in inputs]
