@@ -29,7 +29,7 @@ from vaneloop.cli.main import main
 fmpy = pytest.importorskip("fmpy")
 DEG = 180.0 / np.pi
 WORN = Model(
-    parameters={"actuator.flow_gain": 0.147, "linkage.vgv1_play": 0.31},
+    parameters={"actuator.flow_gain": 0.147, "linkage.vgv1_play": 1.05},
     effects={
         "valve_dead_band": {"half_width": 1.2},
         "valve_hysteresis": {"width": 0.8},
