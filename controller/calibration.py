@@ -316,6 +316,30 @@ class AngleTable(Staged, Bounded):
         return self
 
 
+class Scalar(NamedTuple):
+    """A scalar as ``calibration.toml`` has it: ``si`` turns ``value`` and its bounds, in ``unit``, into SI."""
+
+    section: str
+    key: str
+    value: float
+    unit: str
+    low: float
+    high: float
+    si: float
+
+
+def scalars_in(table: CalibrationTable) -> list[Scalar]:
+    """Return the scalars of a calibration table in their order; the choices in words are not among them."""
+    out = []
+    for section in type(table).model_fields:
+        fields = type(getattr(table, section)).model_fields
+        for key, q in getattr(table, section):
+            if isinstance(q, Quantity):
+                bound = next(m for m in fields[key].metadata if isinstance(m, Bound))
+                out.append(Scalar(section, key, q.value, q.unit, bound.low, bound.high, _SI.get(q.unit, 1.0)))
+    return out
+
+
 def load_calibration(
     calibration: str | Path = "calibration.toml",
     strokes: str | Path = "stroke_tables.toml",
@@ -336,10 +360,7 @@ def load_calibration(
         "strategy": float(STRATEGIES.index(strategy or cal.schedule.strategy)),
         "table_input": 0.0 if cal.schedule.table_input == "n_r" else 1.0,
     }
-    for section in cal.__class__.model_fields:
-        for key, q in getattr(cal, section):
-            if isinstance(q, Quantity):
-                values[key] = q.value * _SI.get(q.unit, 1.0)
+    values |= {s.key: s.value * s.si for s in scalars_in(cal)}
     values |= {f"play_{v}": getattr(angle, f"play_{v}").value * _DEG for v in angle.vanes}
     values["stages"] = float(len(angle.vanes))
     k = np.array([values.get(name, 0.0) if vane_in(name) else values[name] for name in SCALARS])

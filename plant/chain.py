@@ -27,6 +27,7 @@ from plant.effects import (
     lvdt_gain,
     lvdt_nonlinearity,
     lvdt_thermal_drift,
+    oil_compressibility,
     oil_viscosity,
     rotor_lag_error,
     valve_gain_asymmetry,
@@ -93,6 +94,7 @@ from plant.places import (
     LVDT_NONLINEARITY,
     LVDT_THERMAL_DRIFT,
     N_R,
+    OIL_COMPRESSIBILITY,
     OIL_VISCOSITY,
     POT,
     READING,
@@ -119,6 +121,7 @@ __all__ = [
     "TICK",
     "drive_step",
     "measured_stroke",
+    "rest",
     "rotor_step",
     "sample_lvdt",
     "stem_angle",
@@ -211,6 +214,30 @@ def _motor_step(
             z = electromechanical.step(z, d, i_cmd, load, friction, h, True)
         z = electromechanical.sense(z, d)
     electromechanical.stored(s, j, z)
+
+
+@in_place
+def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil: float) -> None:
+    """Put lane ``j`` to rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of its
+    play. What it remembered is forgotten.
+    """
+    for row in range(s.shape[0]):
+        s[row, j] = 0.0
+    s[N_R, j] = n_r
+    s[X, j] = s[X_LVDT, j] = s[READING, j] = stroke
+    load = aero_load.step(n_r, p[AERO_LOAD, j])
+    s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+    for q in range(4):
+        s[CURRENT + q, j] = p[VALVE_NULL_BIAS, j]
+    s[LAGGED, j] = p[VALVE_NULL_BIAS, j]
+    if p[KIND, j] != 0.0:
+        electromechanical.rest(p, s, j, 0.0, load, t_oil)
+    g = GEOMETRY
+    c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+    for k in range(int(p[VANE_COUNT, j])):
+        s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
+        stage = stem.prepare(p, j, k)
+        s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
 
 
 @in_place

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plant import chain, electromechanical, places
-from plant.effect import KINDS, T_REF, Parameter
-from plant.effects import EFFECTS, ROW, aero_load, linkage_backlash, oil_compressibility, pot_bias, pot_gain, states_of
+from plant import chain, places
+from plant.effect import T_REF, Parameter
+from plant.effects import EFFECTS, ROW, linkage_backlash, pot_bias, pot_gain, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import (
     G_L,
@@ -92,18 +92,8 @@ class Plant:
         """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of
         its play.
         """
-        p = self.p[:, 0]
         s = np.zeros((chain.N_STATE, 1))
-        s[places.N_R, 0] = n_r
-        s[places.X, 0] = s[places.X_LVDT, 0] = s[places.READING, 0] = stroke
-        load = aero_load.step(n_r, p[places.AERO_LOAD])
-        s[places.GIVE, 0] = oil_compressibility.step(load, 0.0, *p[places.OIL_COMPRESSIBILITY :][:2])
-        s[places.CURRENT : places.CURRENT + 4, 0] = s[places.LAGGED, 0] = p[places.VALVE_NULL_BIAS]
-        if self.kind != KINDS[0]:
-            electromechanical.rest(self.p, s, 0, 0.0, load, t_oil)
-        for k, ring in enumerate(self._rings(stroke, n_r, t_oil)):
-            s[places.RING + k, 0] = s[places.DRIVEN + k, 0] = ring
-            s[places.POT + k, 0] = self._reading(ring, k)
+        chain.rest(s, self.p, 0, stroke, n_r, t_oil)
         return s
 
     def place_rings(self, s: np.ndarray, angles: tuple[float, ...], n_r: float = 0.0, t_oil: float = T_REF) -> None:

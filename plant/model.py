@@ -40,12 +40,12 @@ from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import PLAY
 from plant.machine import Plant, build_plant
-from plant.parameters import derive, nominal
+from plant.parameters import Nominal, derive, nominal
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, vane_in
 
-__all__ = ["Learned", "Model", "load_model", "write_model"]
+__all__ = ["Learned", "Model", "allowed_of", "load_model", "write_model"]
 
 FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
 
@@ -112,10 +112,8 @@ class Model(Table):
                 raise InputError(
                     f"{source}: parameters: {name!r} is {_not(name, plant, known)}; allowed: {', '.join(known)}"
                 )
-            n, bound = known[name], _bound(plant, name)
-            low, high = bound.low, bound.high
-            if n.tolerance > 0.0:
-                low, high = max(low, n.value - FAR * n.tolerance), min(high, n.value + FAR * n.tolerance)
+            n = known[name]
+            low, high = allowed_of(plant, n)
             _within(value, low, high, n.unit, f"{source}: parameters: {name}")
         for effect, values in self.effects.items():
             if effect not in EFFECTS:
@@ -217,6 +215,14 @@ def _meant(name: str, known: Iterable[str]) -> str:
 def _within(value: float, low: float, high: float, unit: str, what: str) -> None:
     if not (math.isfinite(value) and low <= value <= high):
         raise InputError(f"{what} (={value:g} {unit}) must be in [{low:g}, {high:g}]")
+
+
+def allowed_of(plant: Plant, n: Nominal) -> tuple[float, float]:
+    """Return the least and the greatest value, in its table's unit, that a model may give a nominal parameter."""
+    bound = _bound(plant, n.name)
+    if n.tolerance <= 0.0:
+        return bound.low, bound.high
+    return max(bound.low, n.value - FAR * n.tolerance), min(bound.high, n.value + FAR * n.tolerance)
 
 
 def _bound(plant: Plant, name: str) -> Bound:

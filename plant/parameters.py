@@ -43,7 +43,7 @@ from plant.layout import (
 from plant.linkage import G_HYSTERESIS, G_L, G_LC, G_LDP, N_CRANK, N_PER_STAGE
 from plant.sensors import lag_factor
 from plant.valve import valve_matrix
-from vaneloop.base.compiled import compiled
+from vaneloop.base.compiled import compiled, in_place
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, load_toml, read
 from vaneloop.base.vanes import VANES, own_rows
@@ -106,6 +106,7 @@ __all__ = [
     "Nominal",
     "PlantTable",
     "derive",
+    "derive_lane",
     "load_plant",
     "motor_steps",
     "names_of",
@@ -337,11 +338,16 @@ def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
     return out
 
 
-_NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])[:, None]
-_DRIVE_ROWS = rows_at("valve", "supply", "actuator", "lvdt")
-_LOAD_ROWS = [r for r in rows_at("supply", "actuator") if r not in (ROW["oil_viscosity"], ROW["end_stop_shift"])]
-_LOAD_ROWS.append(ROW["valve_flow_saturation"] + 1)  # a round corner is worked out where the load is
-_VANE_ROWS = rows_at("linkage", "pot")
+_NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])
+_DRIVE_ROWS = np.array(rows_at("valve", "supply", "actuator", "lvdt"))
+_LOAD_ROWS = np.array(
+    [r for r in rows_at("supply", "actuator") if r not in (ROW["oil_viscosity"], ROW["end_stop_shift"])]
+    + [ROW["valve_flow_saturation"] + 1]  # a round corner is worked out where the load is
+)
+_VANE_ROWS = np.array(rows_at("linkage", "pot"))
+_VALVE_LAG, _LVDT_LAG, _POT_LAG, _AMPLIFIER_LAG = (
+    ROW[e] for e in ("valve_lag", "lvdt_lag", "pot_lag", "amplifier_lag")
+)
 
 
 def derive(p: np.ndarray, dt: float, tick: float) -> None:
@@ -349,21 +355,38 @@ def derive(p: np.ndarray, dt: float, tick: float) -> None:
     ``tick`` (s).
     """
     for j in range(p.shape[1]):
-        if p[KIND, j] == 0.0:  # a motor has no valve
-            p[VALVE_A11 : VALVE_A22 + 1, j] = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
-        p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
-        p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
-        p[VALVE_SHARE, j] = lag_factor(p[ROW["valve_lag"], j], dt)
-        p[LVDT_SHARE, j] = lag_factor(p[ROW["lvdt_lag"], j], dt)
-        for k in range(int(p[VANE_COUNT, j])):
-            p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[ROW["pot_lag"] + k, j]), tick)
-        if p[KIND, j] != 0.0:
-            h = dt / motor_steps(dt)
-            p[CURRENT_SHARE, j] = lag_factor(1.0 / (2.0 * math.pi * p[CURRENT_BANDWIDTH, j]), h)
-            p[AMPLIFIER_SHARE, j] = lag_factor(p[ROW["amplifier_lag"], j], h)
-    for flag, rows in ((DRIVE_EFFECTS, _DRIVE_ROWS), (DRIVE_LOADED, _LOAD_ROWS), (VANE_EFFECTS, _VANE_ROWS)):
-        p[flag] = np.any(p[rows] != _NEUTRAL[rows], axis=0)
-    p[DRIVE_EFFECTS] = np.where(p[KIND] != 0.0, 1.0, p[DRIVE_EFFECTS])  # a motor has no short way
+        derive_lane(p, j, dt, tick)
+
+
+@in_place
+def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
+    """`derive` of lane ``j``."""
+    if p[KIND, j] == 0.0:  # a motor has no valve
+        a11, a12, a21, a22 = valve_matrix(p[BANDWIDTH, j], p[DAMPING, j], dt)
+        p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j], p[VALVE_A22, j] = a11, a12, a21, a22
+    p[LVDT_FACTOR, j] = lag_factor(p[LVDT_LAG, j], dt)
+    p[POT_FACTOR, j] = lag_factor(p[POT_LAG, j], tick)
+    p[VALVE_SHARE, j] = lag_factor(p[_VALVE_LAG, j], dt)
+    p[LVDT_SHARE, j] = lag_factor(p[_LVDT_LAG, j], dt)
+    for k in range(int(p[VANE_COUNT, j])):
+        p[POT_SHARE + k, j] = lag_factor(pot_lag.step(p[POT_LAG, j], p[_POT_LAG + k, j]), tick)
+    if p[KIND, j] != 0.0:
+        h = dt / motor_steps(dt)
+        p[CURRENT_SHARE, j] = lag_factor(1.0 / (2.0 * math.pi * p[CURRENT_BANDWIDTH, j]), h)
+        p[AMPLIFIER_SHARE, j] = lag_factor(p[_AMPLIFIER_LAG, j], h)
+    # a motor has no short way
+    p[DRIVE_EFFECTS, j] = 1.0 if p[KIND, j] != 0.0 else _changed(p, j, _DRIVE_ROWS)
+    p[DRIVE_LOADED, j] = _changed(p, j, _LOAD_ROWS)
+    p[VANE_EFFECTS, j] = _changed(p, j, _VANE_ROWS)
+
+
+@in_place
+def _changed(p: np.ndarray, j: int, rows: np.ndarray) -> float:
+    """Return 1 where any of these rows is not neutral, else 0."""
+    for row in rows:
+        if p[row, j] != _NEUTRAL[row]:
+            return 1.0
+    return 0.0
 
 
 @compiled

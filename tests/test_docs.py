@@ -371,6 +371,9 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
             pytest.skip("no C compiler: gcc or make is not installed")
         subprocess.run(["make", "-C", str(folder / "my_controller")], check=True, capture_output=True)
         shutil.copy(folder / "my_controller" / "reactions.toml", folder)
+    if page == "docs/fmu.md":
+        pytest.importorskip("fmpy")
+        (folder / "extended.toml").write_text("[effects.valve_dead_band]\nhalf_width = 1.2\n", encoding="utf-8")
     if page == "docs/tables.md":
         shutil.copy(ROOT / "tables" / "calibration.toml", folder / "my_calibration.toml")
     if page == "docs/scheduling.md":

@@ -87,6 +87,7 @@ EXPORTS: dict[str, list[str]] = {
         *("Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "TRANSITIONS", "Trace"),
         *("judge", "library", "load_scenario", "run"),
     ],
+    "hil.fmu": ["is_made", "write_fmu"],
     "hil.native": ["Program"],
     "hil.logs": ["Channel", "Log", "LogError", "offered", "read_log", "write_log"],
     "plant": [

@@ -435,7 +435,7 @@ def run_lockstep(
     started = time.perf_counter()
     while vgv.k < ticks:
         noise, row = vgv.noise()
-        n = min(len(noise) - row, ticks - vgv.k)
+        n = min(len(noise) - row, ticks - vgv.k, vgv.stride)
         some = np.empty((16 * n if keep else 0, 3), np.int64)
         states = np.empty((n if hashed else 0, len(vgv.loop.z) + len(vgv.loop.s)))
         m = run_loop(
@@ -461,6 +461,7 @@ def run_lockstep(
             digest.update(memoryview(states))  # type: ignore[arg-type]
         vgv.k += n
         ecu.k += n
+        vgv.moved()
         if progress is not None:
             progress(vgv.k / ticks)
     wall = time.perf_counter() - started

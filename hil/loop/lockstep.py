@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from controller import STATE, Calibration, load_calibration
 from controller.records import SLOW, as_inputs, as_outputs
-from hil.loop.tick import FRAME, Loop, arrive, control, mean_current, move, new_loop
+from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free
 from vaneloop.base.vanes import own_rows
@@ -122,15 +122,11 @@ def advance(
         m = i if noisy else 0
         frame = min(max(k // SLOW, 0), last_frame)
         if k % SLOW == 0:
-            n_dem = stimulus[frame, S_N_DEM]
-            n_r = stimulus[frame, S_N_R]
-            if n_r != n_r:  # not logged: the plant's engine
-                n_r = s[places.N_R, 0] + a.sigma[1 + stages] * noise[m, 1 + stages]
-            fresh = stimulus[frame, S_FRESH]
-            inputs.demand_fresh = fresh
-            inputs.demand_rejected = stimulus[frame, S_REJECTED]
-            if fresh > 0.5:
-                arrive(k, a, n_dem, n_r, stimulus[frame, S_MODE_REQUEST])
+            now = stimulus[frame]
+            n_dem = now[S_N_DEM]
+            n_r = hear(
+                a, n_dem, now[S_N_R], now[S_FRESH], now[S_REJECTED], now[S_MODE_REQUEST], k, noise[m, 1 + stages]
+            )
         else:
             inputs.demand_fresh = 0.0
             inputs.demand_rejected = 0.0

@@ -199,9 +199,12 @@ class Node:
     p_s, t_oil  supply pressure (Pa) and oil temperature (degC); change ``arrays.supply`` later
     seed     of the sensors' noise; None = noise-free
     k        the next tick (1 ms each)
+    stride   ticks that may be run before `moved` is called
     plant    the machine
     loop     what its tick works on: the firmware's inputs, state and calibration, the plant's state and parameters
     """
+
+    stride = BLOCK
 
     def __init__(
         self,
@@ -241,7 +244,11 @@ class Node:
         noise, row = self.noise()
         m = node_tick(k, received, len(received) if n is None else n, noise, row, self.arrays, self._sent)
         self.k = k + 1
+        self.moved()
         return self._sent[:m]
+
+    def moved(self) -> None:
+        """Called after every `stride` ticks: a plant that is simulated elsewhere moves on."""
 
     @property
     def mode(self) -> str:
@@ -324,12 +331,13 @@ def replay(node: Node, at: np.ndarray, received: np.ndarray, ticks: int) -> tupl
     at, received = np.ascontiguousarray(at, np.int64), np.ascontiguousarray(received, np.int64).reshape(-1, 2)
     end = node.k + ticks
     while node.k < end:
-        n = min(BLOCK - node.k % BLOCK, end - node.k)
+        n = min(BLOCK - node.k % BLOCK, end - node.k, node.stride)
         noise, row = node.noise()
         most = MOST_SENT * (n // SLOW + 1)
         some, some_at = np.empty((most, 2), np.int64), np.empty(most, np.int64)
         m, first = run_ticks(node.k, n, at, received, first, noise, row, node.arrays, some, some_at, node._sent)
         node.k += n
+        node.moved()
         out.append(some[:m])
         out_at.append(some_at[:m])
     return np.concatenate(out_at or [np.empty(0, np.int64)]), np.concatenate(out or [np.empty((0, 2), np.int64)])

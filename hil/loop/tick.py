@@ -25,7 +25,20 @@ from plant.effects import can_delay, controller_gain_error, frame_hold, schedule
 from vaneloop.base.compiled import in_place, inlined
 from vaneloop.base.vanes import same_stages
 
-__all__ = ["FRAME", "Loop", "arrive", "control", "flashed", "mean_current", "move", "new_loop"]
+__all__ = [
+    "FRAME",
+    "KEPT",
+    "Loop",
+    "arrive",
+    "control",
+    "flashed",
+    "hear",
+    "mean_current",
+    "mean_stroke",
+    "move",
+    "new_loop",
+    "reflash",
+]
 
 FRAME = 1e-2  # s, period of the ECU's frame
 KEPT = 256  # contents of frames kept: can_delay and frame_hold together reach back 2 s
@@ -105,7 +118,7 @@ def new_loop(
     stages = len(plant.vanes)
     cal = flashed(calibration, plant)
     foreign = () if calibration.program is None else calibration.program.start(cal)
-    stroke = float(np.interp(n_r, cal.table[0], cal.table[3]))
+    stroke = mean_stroke(cal.table, n_r)
     return Loop(
         new_inputs(),
         new_outputs(),
@@ -153,6 +166,21 @@ def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarra
 
 
 @in_place
+def mean_stroke(table: np.ndarray, n_r: float) -> float:
+    """Return the stroke (m) that the mean curve of a `Calibration.table` has at the speed ``n_r`` (%): where a machine
+    starts.
+    """
+    last = table.shape[1] - 1
+    if not n_r > table[0, 0]:
+        return table[3, 0]
+    for i in range(last):
+        if n_r < table[0, i + 1]:
+            slope = (table[3, i + 1] - table[3, i]) / (table[0, i + 1] - table[0, i])
+            return slope * (n_r - table[0, i]) + table[3, i]
+    return table[3, last]
+
+
+@in_place
 def _last_by(sent: np.ndarray, then: int, now: int) -> int:
     """Return the row of the last frame that came in the 10 ms ``then`` or before; of the first one kept if there is
     none.
@@ -186,18 +214,44 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
 
 
 @inlined
-def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
-    """Sample the sensors and run the firmware at tick ``k``.
-
-    noise  float64[:, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed), this tick's in ``row``
-    """
-    s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
+def reflash(a: Loop) -> None:
+    """Flash the calibration anew where the parameters of an effect that changes it are others than those flashed."""
+    p = a.p
     if (
         p[places.SCHEDULE_ERROR, 0] != a.flash[0]
         or p[places.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
         or p[places.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
     ):
         _flash(a.built, a.calibration, a.flash, p)
+
+
+@inlined
+def hear(
+    a: Loop, n_dem: float, n_r: float, fresh: float, rejected: float, mode_request: float, k: int, noise: float
+) -> float:
+    """Let the ECU's frame of tick ``k``, a multiple of 10, come; return the measured speed (%) in it.
+
+    n_r    %, measured; NaN: the speed of the plant's own engine, with ``noise`` (standard normal)
+    fresh  1: a good frame; 0: none came.  rejected: frames refused
+    """
+    if n_r != n_r:
+        n_r = a.s[places.N_R, 0] + a.sigma[a.sigma.shape[0] - 1] * noise
+    inputs = as_inputs(a.inputs)
+    inputs.demand_fresh = fresh
+    inputs.demand_rejected = rejected
+    if fresh > 0.5:
+        arrive(k, a, n_dem, n_r, mode_request)
+    return n_r
+
+
+@inlined
+def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
+    """Sample the sensors and run the firmware at tick ``k``.
+
+    noise  float64[:, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed), this tick's in ``row``
+    """
+    s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
+    reflash(a)
     inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
     for q in range(a.angles.shape[0]):
         a.angles[q] = s[places.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]

@@ -63,6 +63,7 @@ COMMANDS = {
         "vaneloop.cli.new_controller",
         "a project of a controller of your own in C, which every command above runs with --controller",
     ),
+    "export-fmu": ("vaneloop.cli.export_fmu", "plant, controller or their loop as an FMU for other simulators"),
     "design": ("vaneloop.cli.design", "servo loop: margins, step response, limit cycles, against the time simulation"),
     "completion": ("vaneloop.cli.completion", "completion of commands and options for bash, zsh and fish"),
     "web": ("vaneloop.web.command", "the workbench in the browser: missing physics, schedule, run"),

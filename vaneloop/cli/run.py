@@ -56,6 +56,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
     options.add_machine_options(parser)
+    parser.add_argument(
+        "--plant-map",
+        metavar="NAME=signal",
+        action="append",
+        default=[],
+        help="with --plant X.fmu, a plant of your own (docs/fmu.md): the FMU's NAME is our signal",
+    )
     options.add_controller_options(parser)
     parser.add_argument(
         "--start-speed",
@@ -92,6 +99,13 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--start-speed (={args.start_speed:g} %) must be in [0, 120]")
     if args.seed is not None and args.seed < 0:
         raise InputError(f"--seed (={args.seed}) must be 0 or more")
+    args.plant_fmu = None
+    if args.plant is not None and args.plant.lower().endswith(".fmu"):
+        if args.model:
+            raise InputError(f"--model {args.model}: is about the plant here, which {args.plant} replaces")
+        args.plant_fmu, args.plant = args.plant, None
+    elif args.plant_map:
+        raise InputError("--plant-map names variables of an FMU: it needs --plant X.fmu")
     if args.record:
         from hil.logs.recorder import check_name
 
@@ -118,6 +132,14 @@ def _node(args: argparse.Namespace, machine: Any = None) -> Any:
 
     machine = machine or options.machine_of(args)
     station.warm_nodes(args)
+    if args.plant_fmu is not None:
+        from hil.fmu.plant_fmu import PlantFmu, PlantNode
+
+        mapping = terminal.pairs(args.plant_map, "plant-map")
+        fmu = PlantFmu(args.plant_fmu, machine.plant.vanes, mapping, n_r=args.start_speed)
+        for note in fmu.notes:
+            terminal.say(args, f"note: {note}")
+        return PlantNode(fmu, machine.plant, machine.calibration, n_r=args.start_speed, seed=args.seed)
     return Node(machine.plant, machine.calibration, n_r=args.start_speed, seed=args.seed)
 
 

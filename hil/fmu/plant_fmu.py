@@ -1,0 +1,243 @@
+"""A plant of the user's own, as an FMU, under the controller here: in lockstep and in real time.
+
+The node runs as it always does, but the machine's state that the sensors are read from is what the FMU gives after each
+tick of 1 ms. FMPy loads the FMU.
+"""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from controller import Calibration
+from hil.fmu.description import base_unit
+from hil.loop.node import Node
+from plant import Plant, chain, places
+from plant.parameters import LVDT_STEP
+from vaneloop.base.errors import InputError, meant
+
+__all__ = ["INPUTS", "OUTPUTS", "PlantFmu", "PlantNode"]
+
+_SI = {"i_cmd": "A", "n_dem": "%", "n_r": "%", "p_s": "Pa", "t_oil": "degC", "x_lvdt": "m", "n_engine": "%"}
+INPUTS = ("i_cmd", "n_dem", "n_r", "p_s", "t_oil")  # all but the first may be absent
+OUTPUTS = ("x_lvdt", "n_engine")  # and the stages; n_engine may be absent
+
+
+class _Joined(NamedTuple):
+    """A variable of the FMU and our signal: ours = theirs * factor + offset."""
+
+    signal: str
+    reference: int
+    factor: float
+    offset: float
+
+
+class PlantFmu:
+    """A running FMU that is the plant.
+
+    path     of the FMU, 2.0 or 3.0, for co-simulation
+    vanes    stages whose angles it must give
+    mapping  name in the FMU -> our signal, where they differ
+    n_r      %, speed at the start
+    notes    what was assumed
+
+    Raises InputError for an FMU that cannot be this plant, in one line.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        vanes: tuple[str, ...],
+        mapping: Mapping[str, str] | None = None,
+        *,
+        n_r: float = 60.0,
+        p_s: float = 21e6,
+        t_oil: float = 40.0,
+    ):
+        self.path, self.notes = path, list[str]()
+        fmpy = _fmpy(path)
+        self._failure = fmpy.fmi1.FMICallException
+        described = _described(fmpy, path)
+        inputs = _join(path, described, "input", INPUTS, ("i_cmd",), mapping or {}, self.notes)
+        outputs = _join(path, described, "output", (*OUTPUTS, *vanes), ("x_lvdt", *vanes), mapping or {}, self.notes)
+        known = (*INPUTS, *OUTPUTS, *vanes)
+        if unknown := [s for s in (mapping or {}).values() if s not in known]:
+            raise InputError(f"--plant-map: {unknown[0]!r} is no signal of a plant; allowed: {', '.join(known)}")
+        self._inputs, self._outputs = inputs, outputs
+        self._out_refs = [v.reference for v in outputs]
+        self._in_refs = [v.reference for v in inputs]
+        folder = tempfile.mkdtemp(prefix="vaneloop-fmu-")
+        self._end = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        new = fmpy.fmi3.FMU3Slave if described.fmiVersion.startswith("3") else fmpy.fmi2.FMU2Slave
+        self._three = described.fmiVersion.startswith("3")
+        try:
+            fmpy.extract(path, folder)
+            self._fmu = new(
+                guid=described.guid,
+                unzipDirectory=folder,
+                modelIdentifier=described.coSimulation.modelIdentifier,
+                instanceName="plant",
+            )
+            self._fmu.instantiate()
+            if not self._three:
+                self._fmu.setupExperiment(startTime=0.0)
+                self._fmu.enterInitializationMode()
+            else:
+                self._fmu.enterInitializationMode(startTime=0.0)
+            self._feed({"i_cmd": 0.0, "n_dem": n_r, "n_r": n_r, "p_s": p_s, "t_oil": t_oil})
+            self._fmu.exitInitializationMode()
+        except InputError:
+            raise
+        except Exception as e:  # the FMU's own refusal, or a library that does not load
+            raise InputError(f"--plant {path}: cannot be started ({_line(e)})") from None
+        self._k = 0
+
+    def _feed(self, signals: Mapping[str, float]) -> None:
+        values = [(signals[v.signal] - v.offset) / v.factor for v in self._inputs]
+        (self._fmu.setFloat64 if self._three else self._fmu.setReal)(self._in_refs, values)
+
+    def outputs(self) -> dict[str, float]:
+        """What it gives now, SI."""
+        values = (self._fmu.getFloat64 if self._three else self._fmu.getReal)(self._out_refs)
+        return {v.signal: x * v.factor + v.offset for v, x in zip(self._outputs, values, strict=True)}
+
+    def step(self, signals: Mapping[str, float]) -> dict[str, float]:
+        """Move on by 1 ms under these inputs (SI); return the outputs. InputError where it fails."""
+        try:
+            self._feed(signals)
+            self._fmu.doStep(currentCommunicationPoint=self._k * chain.TICK, communicationStepSize=chain.TICK)
+            self._k += 1
+            return self.outputs()
+        except self._failure as e:
+            raise InputError(f"--plant {self.path}: failed at t = {self._k * chain.TICK:.3f} s ({_line(e)})") from None
+
+
+class PlantNode(Node):
+    """Controller of ours, or of the user's, with a plant that is an FMU, as one node on the bus."""
+
+    stride = 1
+
+    def __init__(
+        self, fmu: PlantFmu, plant: Plant, calibration: Calibration, *, n_r: float = 60.0, seed: int | None = None
+    ):
+        super().__init__(plant, calibration, n_r=n_r, seed=seed)
+        self.fmu = fmu
+        self.loop.p[LVDT_STEP, 0] = 0.0  # the FMU's converter has its own
+        self._set(fmu.outputs())
+
+    def moved(self) -> None:
+        """Let the FMU move on by a tick under the current of the last one."""
+        p_s, t_oil, n_dem, n_r = (float(v) for v in self.arrays.supply)
+        i_cmd = float(self.loop.given.i_cmd)
+        self._set(self.fmu.step({"i_cmd": i_cmd, "n_dem": n_dem, "n_r": n_r, "p_s": p_s, "t_oil": t_oil}))
+
+    def _set(self, shown: Mapping[str, float]) -> None:
+        s = self.loop.s
+        for row in (places.X, places.X_LVDT, places.READING):
+            s[row, 0] = shown["x_lvdt"]
+        for k, vane in enumerate(self.plant.vanes):
+            s[places.POT + k, 0] = shown[vane]
+        if "n_engine" in shown:
+            s[places.N_R, 0] = shown["n_engine"]
+
+
+def _fmpy(path: str) -> Any:
+    try:
+        import fmpy
+        import fmpy.fmi1
+        import fmpy.fmi2
+        import fmpy.fmi3
+    except ImportError:
+        raise InputError(f"--plant {path}: FMPy loads it and is not installed: pip install 'vaneloop[fmu]'") from None
+    return fmpy
+
+
+def _described(fmpy: Any, path: str) -> Any:
+    """Its model description; what cannot be run here is refused."""
+    try:
+        described = fmpy.read_model_description(path, validate=False)
+    except FileNotFoundError:
+        raise InputError(f"--plant {path}: is not there") from None
+    except Exception as e:
+        raise InputError(f"--plant {path}: is no FMU that can be read ({_line(e)})") from None
+    version = described.fmiVersion
+    if not version.startswith(("2.", "3.")):
+        raise InputError(f"--plant {path}: FMI version (={version}) must be 2.0 or 3.0")
+    if described.coSimulation is None:
+        raise InputError(f"--plant {path}: is for model exchange only; co-simulation is needed")
+    here = {fmpy.platform, fmpy.platform_tuple}
+    offered = fmpy.supported_platforms(path)
+    if not here & set(offered):
+        wanted = fmpy.platform_tuple if version.startswith("3") else fmpy.platform
+        has = ", ".join(p for p in offered if p != "c-code") or "none"
+        raise InputError(f"--plant {path}: has binaries for {has}; this machine ({platform.machine()}) needs {wanted}")
+    return described
+
+
+def _join(
+    path: str,
+    described: Any,
+    causality: str,
+    signals: tuple[str, ...],
+    needed: tuple[str, ...],
+    mapping: Mapping[str, str],
+    notes: list[str],
+) -> list[_Joined]:
+    """Find the FMU's variables for our signals, and how their units turn into ours."""
+    variables = {v.name: v for v in described.modelVariables if v.causality == causality}
+    named = {signal: name for name, signal in mapping.items() if signal in signals}
+    out = []
+    for signal in signals:
+        name = named.get(signal, signal)
+        v = variables.get(name)
+        if v is None:
+            if signal not in needed and signal not in named:
+                continue
+            raise InputError(
+                f"--plant {path}: has no {causality} {name!r}{meant(name, variables)}; it has: "
+                f"{', '.join(variables) or 'none'}; --plant-map NAME={signal} names it"
+            )
+        if v.type not in ("Real", "Float64") or v.dimensions:
+            raise InputError(f"--plant {path}: {name} (type {v.type}) must be a scalar Real or Float64")
+        unit = v.unit or (v.declaredType.unit if v.declaredType is not None else None)
+        ours = _SI.get(signal, "rad")
+        if unit is None:
+            notes.append(f"{path}: {name} has no unit; taken as {ours}")
+        factor, offset = _conversion(path, name, described, unit or ours, ours)
+        out.append(_Joined(signal, v.valueReference, factor, offset))
+    return out
+
+
+def _conversion(path: str, name: str, described: Any, unit: str, ours: str) -> tuple[float, float]:
+    """Factor and offset from ``unit``, as the FMU defines it, into ours; InputError for another quantity."""
+    target = _base(base_unit(ours))
+    defined = next((u.baseUnit for u in described.unitDefinitions if u.name == unit), None)
+    if defined is not None:
+        of = {key: getattr(defined, key, 0) or 0 for key in _DIMENSIONS}
+        source = (of, float(defined.factor or 1.0), float(defined.offset or 0.0))
+    else:
+        try:
+            source = _base(base_unit(unit))
+        except Exception:
+            raise InputError(f"--plant {path}: {name}: unit {unit!r} is not known") from None
+    if any(float(source[0][d]) != float(target[0][d]) for d in _DIMENSIONS if d != "rad"):
+        raise InputError(f"--plant {path}: {name}: unit (={unit!r}) must be one that turns into {ours}")
+    if source[1:] == target[1:]:
+        return 1.0, 0.0
+    return source[1] / target[1], (source[2] - target[2]) / target[1]
+
+
+_DIMENSIONS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+def _base(attributes: Mapping[str, str]) -> tuple[dict[str, float], float, float]:
+    dimensions = {d: float(attributes.get(d, 0)) for d in _DIMENSIONS}
+    return dimensions, float(attributes.get("factor", 1.0)), float(attributes.get("offset", 0.0))
+
+
+def _line(e: Exception) -> str:
+    return " ".join(str(e).split())[:200] or type(e).__name__
