@@ -165,7 +165,8 @@ def _group(name: str, meaning: str, kind: str, members: list[str]) -> str:
 
 
 def _measurements(memory: Memory, methods: _Methods) -> tuple[str, str]:
-    out, groups = [], {}
+    out: list[str] = []
+    groups: dict[str, list[str]] = {}
     for s in memory.signals:
         area, _, name = s.name.partition("_")
         base = s.address & ~0xFFFFFF
@@ -188,7 +189,8 @@ def _limits(e: Element) -> tuple[float, float]:
 
 
 def _values(memory: Memory, methods: _Methods) -> tuple[str, str]:
-    out, groups = [], {}
+    out: list[str] = []
+    groups: dict[str, list[str]] = {}
     for i, e in enumerate(memory.elements):
         if e.table in ("stroke_tables", "vane_angles") and e.section:
             continue

@@ -90,7 +90,8 @@ class Memory:
         self.writes = 0  # writes that took effect
         self._places: list[tuple[Any, ...]] = []
         first = 0
-        for built, flashed in zip(loop.built[:3], loop.calibration[:3], strict=True):
+        for key in ("k", "table", "angles"):
+            built, flashed = getattr(loop.built, key), getattr(loop.calibration, key)
             self._places.append((first, built.reshape(-1), flashed.reshape(-1)))
             first += built.size
         self._places += [(first + i, value) for i, value in enumerate(self._own)]

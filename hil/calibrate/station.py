@@ -50,7 +50,7 @@ class XcpService:
     dropped  commands that came faster than they could be carried out
     """
 
-    idents = (MASTER,)
+    idents: tuple[int, ...] = (MASTER,)
 
     def __init__(self, slave: Slave):
         self.slave = slave
