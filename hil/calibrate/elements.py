@@ -25,7 +25,11 @@ from vaneloop.base.vanes import vane_in
 __all__ = ["CURVES", "Curve", "Element", "complaint", "curves_of", "documents", "elements_of", "write_tables"]
 
 SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3, "deg": pi / 180.0, "deg/s": pi / 180.0}  # as `controller.calibration`
-MODELS: dict[str, type[BaseModel]] = {"calibration": CalibrationTable, "stroke_tables": StrokeTable, "vane_angles": AngleTable}
+MODELS: dict[str, type[BaseModel]] = {
+    "calibration": CalibrationTable,
+    "stroke_tables": StrokeTable,
+    "vane_angles": AngleTable,
+}
 CURVES = ("extension", "retraction", "single")  # rows of the stroke tables behind the speeds
 # What limits the current, watches the loop or chooses another law: not to be changed while the loop is closed.
 GUARDED_SECTIONS = ("fail_safe", "demand_monitor", "lvdt_monitor", "servo_monitor")

@@ -66,7 +66,7 @@ class Area(NamedTuple):
 class Memory:
     """Memory of one running node.
 
-    loop      as the node has it
+    node, loop  the node, and its loop
     elements  what each number of the calibration is (`hil.calibrate.elements.Element`)
     pages     float64[n] working page and reference page
     ecu_page, xcp_page  the page that the firmware uses, and the one that the tool sees
@@ -79,7 +79,7 @@ class Memory:
         )
         node.loop = loop = node.loop._replace(built=built)
         node.arrays = node.arrays._replace(loop=loop)
-        self.loop = loop
+        self.node, self.loop = node, loop
         own = own_scalars(loop.foreign)
         self._own = [o["value"] for o in own.values()]
         self.elements = elements.elements_of(loop.calibration, own)

@@ -32,11 +32,18 @@ class Service(Protocol):
     def hear(self, ident: int, data: bytes) -> None:
         """Take a frame under one of ``idents``."""
 
+    def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """Return what the node gets in place of the first ``n`` rows at tick ``k``."""
+
     def before(self, k: int) -> None:
         """Work before tick ``k``."""
 
     def after(self, k: int) -> np.ndarray | None:
         """Return frames (int64[n, 2]) to send after tick ``k``."""
+
+    @property
+    def silent(self) -> bool:
+        """Whether the node must not send its own frames."""
 
 
 def row_of(ident: int, data: bytes) -> tuple[int, int]:
@@ -51,6 +58,7 @@ class XcpService:
     """
 
     idents: tuple[int, ...] = (MASTER,)
+    silent = False
 
     def __init__(self, slave: Slave):
         self.slave = slave
@@ -64,6 +72,10 @@ class XcpService:
             self._in.append(data)
         else:
             self.dropped += 1
+
+    def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """The ECU's frames are left alone."""
+        return rows, n
 
     def before(self, k: int) -> None:
         """Carry out commands; a tool that floods the slave waits for its answers."""
@@ -104,8 +116,13 @@ class Attended:
                 service.hear(head & IDENT_MASK, raw[: min(head >> 32 & 0xFF, 8)])
         for service in self.services:
             service.before(k)
-        out = self.node.tick(*self._firmware_s(received, n))
-        more = [rows for service in self.services if (rows := service.after(k)) is not None]
+        rows, n = self._firmware_s(received, n)
+        for service in self.services:
+            rows, n = service.change(k, rows, n)
+        out = self.node.tick(rows, n)
+        if any(service.silent for service in self.services):
+            out = NOTHING
+        more = [sent for service in self.services if (sent := service.after(k)) is not None]
         return np.concatenate([out, *more]) if more else out
 
     def _firmware_s(self, received: np.ndarray, n: int) -> tuple[np.ndarray, int]:
