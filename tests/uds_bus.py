@@ -12,8 +12,8 @@ from udsoncan.exceptions import TimeoutException
 from hil.calibrate import Attended, Memory
 from hil.calibrate.station import row_of
 from hil.loop.node import Ecu, Node
-from hil.uds import Server, TroubleMemory, UdsService
-from hil.uds.station import REQUEST, RESPONSE
+from hil.uds import Server, TroubleMemory
+from hil.uds.station import REQUEST, RESPONSE, UdsService
 
 NOTHING = np.zeros((0, 2), np.int64)
 

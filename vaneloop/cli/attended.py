@@ -103,7 +103,8 @@ def attend(args: argparse.Namespace, node: Any) -> Any:
 
 def _uds(args: argparse.Namespace, memory: Any) -> Any:
     """The UDS server, with the trouble codes of ``--uds-memory``."""
-    from hil.uds import Server, TroubleMemory, UdsService
+    from hil.uds import Server, TroubleMemory
+    from hil.uds.station import UdsService
 
     if not args.uds_memory:
         return UdsService(Server(memory))
