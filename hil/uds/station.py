@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from typing import Any
 
@@ -16,6 +17,9 @@ __all__ = ["FUNCTIONAL", "REQUEST", "RESPONSE", "UdsService"]
 
 REQUEST, RESPONSE, FUNCTIONAL = 0x7E0, 0x7E8, 0x7DF  # CAN identifiers
 MOST_WAITING = 64  # frames kept for the next tick
+MOST_ANSWERS = 16  # kept while the tool does not take the ones before
+LOGGER = "hil.uds.isotp"  # can-isotp warns of every wrong frame; a flood of them must not cost a tick its time
+logging.getLogger(LOGGER).setLevel(logging.CRITICAL)
 MOST_SENT = 4  # frames sent after one tick
 
 
@@ -60,7 +64,10 @@ class _Transport(isotp.TransportLayerLogic):
 
 
 class UdsService:
-    """A UDS server behind ISO-TP; requests to all nodes (functional) are single frames."""
+    """A UDS server behind ISO-TP; requests to all nodes (functional) are single frames.
+
+    dropped  answers that the tool did not take in time
+    """
 
     idents: tuple[int, ...] = (REQUEST, FUNCTIONAL)
 
@@ -69,12 +76,19 @@ class UdsService:
         self._in: deque[isotp.CanMessage] = deque()
         self._out: deque[tuple[int, int]] = deque()
         self._all: deque[bytes] = deque()
+        self.dropped = 0
         self._transport = _Transport(
             self,
             rxfn=lambda: self._in.popleft() if self._in else None,
             txfn=lambda m: self._out.append(row_of(m.arbitration_id, bytes(m.data))),
             address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=RESPONSE, rxid=REQUEST),
-            params={"max_frame_size": MOST_REQUEST, "blocksize": 8, "stmin": 1, "tx_padding": 0xCC},
+            params={
+                "max_frame_size": MOST_REQUEST,
+                "blocksize": 8,
+                "stmin": 1,
+                "tx_padding": 0xCC,
+                "logger_name": LOGGER,
+            },
         )
 
     def hear(self, ident: int, data: bytes) -> None:
@@ -105,7 +119,10 @@ class UdsService:
 
     def _answer(self, answers: list[bytes]) -> None:
         for answer in answers:
-            self._transport.send(answer)
+            if self._transport.tx_queue.qsize() < MOST_ANSWERS:
+                self._transport.send(answer)
+            else:
+                self.dropped += 1
         if answers:
             self._transport.process()
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from vaneloop.cli import station
 
-__all__ = ["accepted", "add_service_options", "attend", "check_service_options", "wanted"]
+__all__ = ["accepted", "add_service_options", "attend", "check_service_options", "isotp_is_there", "wanted"]
 
 
 def add_service_options(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,7 @@ def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     if args.uds_memory and not args.uds:
         raise InputError("--uds-memory belongs to --uds")
     if args.uds:
-        _isotp_is_there()
+        isotp_is_there()
     if lockstep and wanted(args) and not args.inputs:
         option = "--xcp" if args.xcp else "--uds"
         raise InputError(
@@ -64,7 +64,8 @@ def accepted(args: argparse.Namespace) -> list[dict[str, int]]:
     return [*station.ACCEPTED, *({"can_id": ident, "can_mask": 0x7FF} for ident in idents)]
 
 
-def _isotp_is_there() -> None:
+def isotp_is_there() -> None:
+    """Refuse UDS where its transport is not installed. Raises InputError."""
     import importlib.util
 
     from vaneloop.base.errors import InputError
