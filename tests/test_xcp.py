@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -24,7 +25,11 @@ from hil.calibrate.memory import CALIBRATION, Refusal
 from hil.calibrate.slave import key_of
 from hil.calibrate.station import MASTER, SLAVE, XcpService, row_of
 from hil.loop.node import Ecu, Node
+from hil.native import Program
+from hil.native.program import own_scalars
 from tests.conftest import ROOT
+from tests.native_builds import build
+from vaneloop.base.tables import path as table_path
 
 NOTHING = np.zeros((0, 2), np.int64)
 
@@ -397,3 +402,32 @@ def test_refusals_say_why() -> None:
     bench = Bench()
     with pytest.raises(Refusal, match=r"kp .* must be in"):
         bench.memory.change({bench.memory.by_name()["kp"]: -1.0})
+
+
+def test_no_identifier_of_the_tools_is_in_the_dbc() -> None:
+    cantools = pytest.importorskip("cantools")
+    own = {m.frame_id for m in cantools.database.load_file(str(table_path("vgv.dbc"))).messages}
+    assert not own & {MASTER, SLAVE, 0x7DF, 0x7E0, 0x7E8}
+
+
+def test_scalars_of_a_controller_in_c_are_calibrated_in_its_own_memory(tmp_path: Path) -> None:
+    if (gcc := shutil.which("gcc")) is None:
+        pytest.skip("no gcc")
+    source = ROOT / "examples" / "own_controller" / "follower.c"
+    library = build(gcc, source, tmp_path / "follower.so", "-O2")
+    node = Node(calibration=load_calibration()._replace(program=Program(library)))
+    memory = Memory(node)
+    own = own_scalars(node.loop.foreign)
+    (name, told), *_ = own.items()
+    i = memory.by_name()[f"own_{name}"]
+    wanted = told["low"] + 0.25 * (told["high"] - told["low"])
+    memory.change({i: wanted})
+    assert own_scalars(node.loop.foreign)[name]["value"][0] == wanted == memory.live()[i]
+    assert memory.read(0, CALIBRATION + 8 * i, 8) == struct.pack("<d", wanted)
+    with pytest.raises(Refusal, match="must be in"):
+        memory.change({i: told["high"] * 2.0 + 1.0})
+    memory.save(tmp_path / "tuned")
+    again = Program(library, str(tmp_path / "tuned" / "own_calibration.toml"))
+    other = Node(calibration=load_calibration()._replace(program=again))
+    assert own_scalars(other.loop.foreign)[name]["value"][0] == wanted
+    assert f"own_{name}" in a2l_of(memory, master=MASTER, slave=SLAVE)
