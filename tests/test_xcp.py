@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller import MODES, load_calibration
+from controller import INPUTS, MODES, load_calibration
 from controller.records import STATE
 from hil.calibrate import Attended, Memory, Slave
 from hil.calibrate.a2l import a2l_of
@@ -95,7 +95,12 @@ def test_nobody_is_answered_before_connect_and_everything_unknown_gets_an_error(
     bench = Bench()
     assert bench.tick(b"\xfd") == [] and bench.tick(b"\xf5\x01") == []
     bench.ask("FF00")
-    assert bench.ask("01") == b"\xfe\x20" and bench.ask("F0") == b"\xfe\x21" and bench.ask("FC") == b"\xfe\x00"
+    assert (
+        bench.tick(b"\x01") == []
+        and bench.ask("C5") == b"\xfe\x20"
+        and bench.ask("F0") == b"\xfe\x21"
+        and bench.ask("FC") == b"\xfe\x00"
+    )
     assert bench.ask("FE") == b"\xff" and bench.tick(b"\xfd") == []
 
 
@@ -230,6 +235,30 @@ def test_an_attended_node_does_what_one_alone_does() -> None:
         bench.tick(b"\xfd", bytes([k & 0xFF]) * 5)
         sent = alone.tick(ecu.tick(sent)).copy()
     assert alone.fingerprint() == bench.node.fingerprint()
+
+
+def test_stimulated_speeds_and_angles_reach_the_firmware_and_end_by_themselves() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    names = ["n_dem", "n_r", "vigv"]
+    for command in ("D6", "D5 00 01 00", "D4 00 00 00 03", *(f"D3 00 00 00 {t:02X} 01" for t in range(3))):
+        assert bench.ask(command) == b"\xff", command
+    for table, name in enumerate(names):
+        bench.ask(f"E2 00 00 00 {table:02X} 00")
+        bench.ask(struct.pack("<BBBBI", 0xE1, 0xFF, 4, 1, 0x10000000 + 4 * INPUTS.index(name)))
+    assert bench.ask("E0 02 00 00 01 00 01 00") == b"\xff"
+    assert bench.ask("DE 01 00 00") == b"\xff\x00"
+    for _ in range(50):
+        bench.tick(*(bytes([pid]) + struct.pack("<f", v) for pid, v in enumerate((81.0, 80.5, 0.25))))
+    fed = bench.node.loop.fed
+    assert (fed.n_dem, fed.n_r) == pytest.approx((81.0, 80.5), abs=0.002) and fed.pots[0] == 0.25
+    assert bench.node.mode == "RUN" and bench.node.counts["wrong_crc"] == 0
+    bench.run(130)
+    assert fed.n_dem == pytest.approx(70.0, abs=0.002) and fed.pots[0] != 0.25
+    bench.ask("DE 00 00 00")
+    bench.ask("E2 00 00 00 00 00")
+    bench.ask(struct.pack("<BBBBI", 0xE1, 0xFF, 4, 1, 0x10000000 + 4 * INPUTS.index("x_lvdt")))
+    assert bench.ask("DE 01 00 00") == b"\xfe\x2a"
 
 
 def test_a_flood_is_bounded() -> None:

@@ -55,6 +55,12 @@ _AML = """
             enum { "NO_OVERLOAD_INDICATION" = 0, "OVERLOAD_INDICATION_PID" = 1, "OVERLOAD_INDICATION_EVENT" = 2 };
             taggedstruct {
               "PRESCALER_SUPPORTED";
+              block "STIM" struct {
+                enum { "GRANULARITY_ODT_ENTRY_SIZE_STIM_BYTE" = 1, "GRANULARITY_ODT_ENTRY_SIZE_STIM_WORD" = 2,
+                       "GRANULARITY_ODT_ENTRY_SIZE_STIM_DWORD" = 4 };
+                uchar;
+                taggedstruct { "BIT_STIM_SUPPORTED"; };
+              };
               block "TIMESTAMP_SUPPORTED" struct {
                 uint;
                 enum { "NO_TIME_STAMP" = 0, "SIZE_BYTE" = 1, "SIZE_WORD" = 2, "SIZE_DWORD" = 4 };
@@ -240,7 +246,7 @@ def _curves(memory: Memory, methods: _Methods) -> tuple[str, str]:
 def _if_data(master: int, slave: int) -> str:
     commands = "".join(f"        OPTIONAL_CMD {name}\n" for name in _COMMANDS)
     events = "".join(
-        f'        /begin EVENT "{name}" "{name}" {i} DAQ 0xFF {period} 6 0 /end EVENT\n'
+        f'        /begin EVENT "{name}" "{name}" {i} DAQ_STIM 0xFF {period} 6 0 /end EVENT\n'
         for i, (name, period) in enumerate(EVENTS)
     )
     return (
@@ -254,6 +260,7 @@ def _if_data(master: int, slave: int) -> str:
         "        IDENTIFICATION_FIELD_TYPE_ABSOLUTE GRANULARITY_ODT_ENTRY_SIZE_DAQ_BYTE "
         f"{PAYLOAD} OVERLOAD_INDICATION_EVENT\n"
         "        PRESCALER_SUPPORTED\n"
+        "        /begin STIM GRANULARITY_ODT_ENTRY_SIZE_STIM_DWORD 4 /end STIM\n"
         "        /begin TIMESTAMP_SUPPORTED 1 SIZE_WORD UNIT_1MS TIMESTAMP_FIXED /end TIMESTAMP_SUPPORTED\n"
         f"{events}      /end DAQ\n"
         "      /begin PAG 1 FREEZE_SUPPORTED /end PAG\n"

@@ -7,11 +7,13 @@ are sampled after the firmware's tick, all in one piece. The time is that of the
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from hil.calibrate.memory import Memory, Refusal
+from hil.calibrate.memory import INPUTS, SHORT, Memory, Refusal
+from hil.calibrate.stim import Stimulus
 from vaneloop.base.compiled import in_place
 
 __all__ = ["EVENTS", "Daq"]
@@ -35,6 +37,8 @@ class DaqList:
     priority: int = 0
     selected: bool = False
     running: bool = False
+    stim: bool = False
+    raw: list[bytes] = field(default_factory=list)
     first_pid: int = 0
     plan: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     heads: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
@@ -59,6 +63,7 @@ class Daq:
         self.step = 0  # 0 free, 1 lists, 2 tables, 3 entries allocated: the order is prescribed
         self.pointer: tuple[int, int, int] | None = None
         self.overloads = 0
+        self.stimulus = Stimulus(memory.node)
         self._running: list[DaqList] = []
         self._out = np.zeros((MOST_FRAMES, 2), np.int64)
 
@@ -66,6 +71,7 @@ class Daq:
 
     def free(self) -> None:
         """Stop and forget all lists."""
+        self.stimulus.clear()
         self.lists, self._running, self.step, self.pointer = [], [], 1, None
 
     def allocate_lists(self, n: int) -> None:
@@ -157,16 +163,16 @@ class Daq:
         own = self._list(at)
         if own.running:
             raise Refusal(ACTIVE, "the list runs")
-        if mode != 0x10:  # with a time, from the slave; neither alternating nor without identifiers
-            raise Refusal(MODE, f"mode (={mode:#x}) must be 0x10")
+        if mode not in (0x10, 0x02):  # measured with a time, or given without; not alternating, with identifiers
+            raise Refusal(MODE, f"mode (={mode:#x}) must be 0x10, or 0x02 for STIM")
         if event >= len(EVENTS) or prescaler < 1:
             raise Refusal(RANGE, f"event (={event}) must be below {len(EVENTS)}, prescaler (={prescaler}) 1 or more")
-        own.event, own.prescaler, own.priority = event, prescaler, priority
+        own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == 0x02
 
     def mode_of(self, at: int) -> tuple[int, int, int, int]:
         """Return mode, event, prescaler and priority of a list."""
         own = self._list(at)
-        mode = 0x10 | own.selected | own.running << 6
+        mode = (0x02 if own.stim else 0x10) | own.selected | own.running << 6
         return mode, max(own.event, 0), own.prescaler, own.priority
 
     def start_list(self, what: int, at: int) -> int:
@@ -208,6 +214,12 @@ class Daq:
                 break
             pid += len(of.tables)
         own.first_pid = pid
+        if own.stim:
+            entries = [e for t in own.tables for e in t if e is not None]
+            if not all(e[0] == 4 and e[1] == SHORT and self.stimulus.allowed((e[2] - INPUTS) // 4) for e in entries):
+                raise Refusal(CONFIG, "STIM takes whole inputs in single precision, but not the LVDT's")
+            own.raw = [b""] * len(own.tables)
+            return
         plan: list[tuple[int, int, int, int]] = []
         heads = []
         for row, table in enumerate(own.tables):
@@ -228,16 +240,36 @@ class Daq:
         self._order()
 
     def _stop(self, own: DaqList) -> None:
+        if own.stim and own.running:
+            self.stimulus.clear()
         own.running = own.selected = False
         self._order()
 
     def _order(self) -> None:
-        self._running = sorted((of for of in self.lists if of.running), key=lambda of: -of.priority)
+        self._running = sorted((of for of in self.lists if of.running and not of.stim), key=lambda of: -of.priority)
 
     @property
     def running(self) -> bool:
         """Whether a list runs."""
-        return bool(self._running)
+        return any(of.running for of in self.lists)
+
+    def stimulate(self, k: int, data: bytes) -> None:
+        """Take a frame of a STIM list; with its last one the inputs are given, from tick ``k`` on."""
+        for own in self.lists:
+            at = data[0] - own.first_pid
+            if own.stim and own.running and 0 <= at < len(own.tables):
+                own.raw[at] = data[1:]
+                if at == len(own.tables) - 1:
+                    values: dict[int, float] = {}
+                    for table, raw in zip(own.tables, own.raw, strict=True):
+                        if len(raw) < 4 * len(table):
+                            return
+                        for i, entry in enumerate(table):
+                            assert entry is not None
+                            values[(entry[2] - INPUTS) // 4] = struct.unpack_from("<f", raw, 4 * i)[0]
+                    own.raw = [b""] * len(own.tables)
+                    self.stimulus.give(k, values)
+                return
 
     def sample(self, k: int) -> np.ndarray:
         """Return the frames (int64[n, 2]) of tick ``k``, whose numbers are in memory now."""

@@ -27,7 +27,7 @@ from hil.calibrate import elements
 from hil.loop.node import Node
 from hil.native.program import own_scalars
 
-__all__ = ["CALIBRATION", "EXACT", "SHORT", "Memory", "Refusal", "Signal"]
+__all__ = ["CALIBRATION", "EXACT", "INPUTS", "SHORT", "Memory", "Refusal", "Signal"]
 
 INPUTS, OUTPUTS, STATE, CALIBRATION = 0x1000_0000, 0x1100_0000, 0x1200_0000, 0x2000_0000
 EXACT, SHORT = 0, 1  # address extensions: double, single precision

@@ -130,6 +130,10 @@ class Slave:
             return [self._refuse(UNKNOWN, "this transport command is not known")] if self.connected else []
         if not self.connected:
             return []
+        if code < 0xC0:  # a frame of a STIM list; it has no answer
+            if not self._locked & RESOURCES["daq"]:
+                self.daq.stimulate(self.k, data)
+            return []
         known = self._commands.get(code)
         if known is None:
             return [self._refuse(UNKNOWN, f"command {code:#04x} is not known")]
@@ -167,7 +171,7 @@ class Slave:
         if not self.connected:
             self._reset()
         self.connected = True
-        resource = 0x01 | 0x04
+        resource = 0x01 | 0x04 | 0x08  # calibration, measurement, STIM
         # Intel byte order, addresses of bytes, blocks from the slave, GET_COMM_MODE_INFO
         return [struct.pack("<BBBBHBB", OK, resource, 0xC0, self.max_cto, 8, 1, 1)]
 
@@ -397,7 +401,7 @@ class Slave:
 
     def _daq_resolution(self, data: bytes) -> list[bytes]:
         # entries of single bytes; times of two bytes, always there, of 1 ms
-        return [struct.pack("<BBBBBBH", OK, 1, PAYLOAD, 1, 0, STAMP | 0x08 | MILLISECOND << 4, 1)]
+        return [struct.pack("<BBBBBBH", OK, 1, PAYLOAD, 4, 4, STAMP | 0x08 | MILLISECOND << 4, 1)]
 
     def _daq_event(self, data: bytes) -> list[bytes]:
         number = struct.unpack_from("<H", data, 2)[0]
@@ -405,7 +409,7 @@ class Slave:
             raise Refusal(RANGE, f"event (={number}) must be below {len(EVENTS)}")
         name, period = EVENTS[number]
         self._mta = name.encode(), EXACT, 0
-        return [struct.pack("<BBBBBBB", OK, 0x04 | 0x80, 0xFF, len(name), period, MILLISECOND, 0)]
+        return [struct.pack("<BBBBBBB", OK, 0x04 | 0x08 | 0x80, 0xFF, len(name), period, MILLISECOND, 0)]
 
     def _daq_free(self, data: bytes) -> list[bytes]:
         self.daq.free()

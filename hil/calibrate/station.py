@@ -74,8 +74,8 @@ class XcpService:
             self.dropped += 1
 
     def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
-        """The ECU's frames are left alone."""
-        return rows, n
+        """Put what a tool gives in place of the ECU's demand into its frames."""
+        return self.slave.daq.stimulus.change(k, rows, n)
 
     def before(self, k: int) -> None:
         """Carry out commands; a tool that floods the slave waits for its answers."""

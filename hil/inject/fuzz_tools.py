@@ -2,7 +2,7 @@
 
 In every tick: current within the calibration's limit and the limit within the reference page's, a mode that exists, the
 monitors as they were while the loop is closed, memory of the services bounded. At the end of each episode the tool is
-gone and good frames of the ECU must have RUN back.
+gone, and with the calibration of the beginning good frames of the ECU must have RUN back.
 """
 
 from __future__ import annotations
@@ -68,6 +68,11 @@ class _Target:
         self.ecu = Ecu(n_dem=70.0)
         self.ecu.set_demand(70.0, mode_request=request)
         self.sent = np.zeros((0, 2), np.int64)
+        self.before = self.memory.live()
+
+    def flash(self) -> None:
+        """Put the calibration back that it began with: a tool may set monitors in STANDBY so that none lets RUN be."""
+        self.memory._load(self.reference, np.arange(len(self.reference)))
         self.before = self.memory.live()
 
     def tick(self, frames: list[tuple[int, bytes]]) -> list[bytes]:
@@ -164,6 +169,7 @@ def fuzz_tools(protocol: str, frames: int, seed: int, progress: Callable[[float]
                     name = answer[:2].hex() if answer[0] in (0xFE, 0xFD) else "answers"
                     campaign.answers[name] = campaign.answers.get(name, 0) + 1
                 campaign.ticks += 1
+            target.flash()
             target.ecu.set_demand(70.0, mode_request=1)
             for _ in range(RECOVERY):
                 target.tick([])
