@@ -65,6 +65,7 @@ class Daq:
         self.overloads = 0
         self.stimulus = Stimulus(memory.node)
         self._running: list[DaqList] = []
+        self._used: set[int] = set()
         self._out = np.zeros((MOST_FRAMES, 2), np.int64)
 
     # ---- allocation --------------------------------------------------------------------------------------------------
@@ -247,6 +248,7 @@ class Daq:
 
     def _order(self) -> None:
         self._running = sorted((of for of in self.lists if of.running and not of.stim), key=lambda of: -of.priority)
+        self._used = {int(i) for of in self._running for i in of.plan[:, 2]}
 
     @property
     def running(self) -> bool:
@@ -283,7 +285,7 @@ class Daq:
                 self.overloads += 1
                 continue
             if not fresh:
-                self.memory.refresh()
+                self.memory.refresh(self._used)
                 fresh = True
             out[n : n + m] = own.heads
             out[n, 1] |= (k & 0xFFFF) << 8

@@ -17,6 +17,7 @@ calls between two ticks.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,13 +138,19 @@ class Memory:
         cal = self.loop.calibration
         return np.concatenate([cal.k, cal.table.reshape(-1), cal.angles.reshape(-1), *self._own])
 
-    def refresh(self) -> None:
-        """Bring the copies up to date: single precision, and the scalars of a controller's own."""
+    def refresh(self, used: Collection[int] | None = None) -> None:
+        """Bring copies up to date: single precision, and the scalars of a controller's own.
+
+        used  which of ``raw`` will be read; None: all
+        """
+        n = len(self.areas)
         if self._own:
             np.concatenate(self._own, out=self.areas[-1].exact)
-        for a in self.areas:
+        short = range(n) if used is None else [i - n for i in used if i >= n]
+        if short:
             with np.errstate(over="ignore", invalid="ignore"):
-                a.short[:] = a.exact
+                for i in short:
+                    self.areas[i].short[:] = self.areas[i].exact
 
     # ---- reading -----------------------------------------------------------------------------------------------------
 
