@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from hil.bus.frames import ERROR, REMOTE
+from hil.calibrate import Memory
 from hil.inject import fuzz
 from hil.inject.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
+from hil.inject.fuzz_tools import fuzz_tools
 from tests.columns import FAIL_SAFE, INIT, RUN, STANDBY
 from tests.conftest import ROOT
 from vaneloop.cli.main import main
@@ -221,3 +223,29 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert main(["fuzz", *options]) == 2
     err = capsys.readouterr().err
     assert said in err and len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("tool", ["xcp", "uds"])
+def test_ten_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
+    hostile(tool, 10_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tool", ["xcp", "uds"])
+def test_a_million_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
+    hostile(tool, 1_000_000)
+
+
+def hostile(tool: str, frames: int) -> None:
+    if tool == "uds":
+        pytest.importorskip("isotp")
+    campaign = fuzz_tools(tool, frames, seed=31)
+    assert not campaign.failure and campaign.frames >= frames
+    refused = [name for name in campaign.answers if name.startswith("fe") or name == "answers"]
+    assert len(refused) > (5 if tool == "xcp" else 0), campaign.answers
+
+
+def test_a_campaign_against_tools_notices_a_monitor_that_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Memory, "_open_only", lambda self, name: None)
+    campaign = fuzz_tools("xcp", 30_000, seed=31)
+    assert "while the loop was closed" in campaign.failure or "RUN is not back" in campaign.failure, campaign

@@ -69,6 +69,7 @@ EXPORTS: dict[str, list[str]] = {
     ],
     "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
     "hil.bus": ["Port", "open_bus"],
+    "hil.calibrate": ["Attended", "Memory", "Slave"],
     "hil.inject": [
         *(
             "ACTIONS",
@@ -89,6 +90,7 @@ EXPORTS: dict[str, list[str]] = {
     ],
     "hil.fmu": ["is_made", "write_fmu"],
     "hil.native": ["Program"],
+    "hil.uds": ["Server", "TroubleMemory"],
     "hil.logs": ["Channel", "Log", "LogError", "offered", "read_log", "write_log"],
     "plant": [
         "Geometry",

@@ -28,7 +28,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import load_toml
 from vaneloop.base.vanes import VANES
 
-__all__ = ["NEEDED", "OPTIONAL", "Program", "observables", "restore", "save"]
+__all__ = ["NEEDED", "OPTIONAL", "Program", "observables", "own_scalars", "restore", "save"]
 
 NEEDED = ("vaneloop_version", "vaneloop_init", "vaneloop_step")
 OPTIONAL = ("vaneloop_observe", "vaneloop_save", "vaneloop_restore", "vaneloop_describe")
@@ -240,6 +240,25 @@ def observables(foreign: Any) -> dict[str, dict[str, Any]]:
     return {
         _text(o.name): {"value": float(o.value[0]), "unit": _text(o.unit), "meaning": _text(o.meaning)}
         for o in told.observable[: told.observables]
+    }
+
+
+def own_scalars(foreign: Any) -> dict[str, dict[str, Any]]:
+    """Calibration scalars of the controller's own, in its own memory: name -> value (float64[1]), unit, meaning, low,
+    high; none of the firmware here.
+    """
+    if not foreign:
+        return {}
+    told = _description(_KEPT[foreign.at_fed][0])
+    return {
+        _text(s.name): {
+            "value": np.ctypeslib.as_array(s.value, (1,)),
+            "unit": _text(s.unit),
+            "meaning": _text(s.meaning),
+            "low": float(s.low),
+            "high": float(s.high),
+        }
+        for s in told.scalar[: told.scalars]
     }
 
 

@@ -37,6 +37,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--replay", metavar="F", help="run this candump log from switch-on instead of random frames")
     parser.add_argument(
+        "--tool",
+        choices=("xcp", "uds"),
+        help="hostile commands of a tool instead: XCP (docs/xcp.md), UDS (docs/uds.md)",
+    )
+    parser.add_argument(
         "--current-limit",
         type=float,
         metavar="mA",
@@ -60,6 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = """examples:
   vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
   vaneloop fuzz --replay fuzz_failure.log
+  vaneloop fuzz --tool xcp --frames 100000
 
 exit codes: 0 everything held, 1 something did not, 2 bad input"""
     terminal.add_output_options(parser)
@@ -74,6 +80,8 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--seed (={args.seed}) must be 0 to 2^63 - 1")
     if not 0.01 <= args.recovery <= 3600:
         raise InputError(f"--recovery (={args.recovery:g}) must be 0.01 to 3600 s")
+    if args.tool:
+        return _tool(args)
     machine = options.machine_of(args)
     k = machine.calibration.scalars
     limits = np.array([k.current_limit, k.stroke_min, k.stroke_max])
@@ -120,6 +128,27 @@ def command(args: argparse.Namespace) -> int:
         except OSError as e:
             raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
     return 0 if campaign.failure is None else 1
+
+
+def _tool(args: argparse.Namespace) -> int:
+    """The campaign against what answers tools."""
+    from hil.inject.fuzz_tools import fuzz_tools
+    from vaneloop.cli.attended import isotp_is_there
+
+    for option in ("replay", "model", "tables", "plant", "controller"):
+        if getattr(args, option, None):
+            raise InputError(f"--{option} is not for --tool")
+    if args.tool == "uds":
+        isotp_is_there()
+    with terminal.progress_bar(args, "frames") as progress:
+        c = fuzz_tools(args.tool, args.frames, args.seed, progress)
+    terminal.say(args, f"{c.frames:,} frames in {c.episodes:,} episodes, {c.ticks * 1e-3:,.0f} simulated s")
+    terminal.say(args, f"FAILED: {c.failure}" if c.failure else "held: limits, monitors, memory, recovery to RUN")
+    terminal.write_json(
+        args, {"schema": 1, "tool": c.protocol, "seed": c.seed, "frames": c.frames, "episodes": c.episodes,
+               "simulated_s": c.ticks * 1e-3, "answers": c.answers, "held": not c.failure, "failure": c.failure},
+    )  # fmt: skip
+    return 1 if c.failure else 0
 
 
 def _tell(args: argparse.Namespace, c: Campaign) -> None:

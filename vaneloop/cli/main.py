@@ -59,6 +59,7 @@ COMMANDS = {
     "run": ("vaneloop.cli.run", "controller and plant as a node on the CAN bus, in real time or in lockstep"),
     "ecu": ("vaneloop.cli.ecu", "the engine control unit on the CAN bus: demand from a profile, a log or the keyboard"),
     "record": ("vaneloop.cli.record", "all frames of a CAN bus into MDF4, BLF, candump or Parquet; survives kill -9"),
+    "a2l": ("vaneloop.cli.a2l", "the firmware's signals and calibration as an A2L file, for tools that speak XCP"),
     "new-controller": (
         "vaneloop.cli.new_controller",
         "a project of a controller of your own in C, which every command above runs with --controller",

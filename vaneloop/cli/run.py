@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.cli import options, station
+from vaneloop.cli import attended, options, station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -20,6 +20,7 @@ examples:
   vaneloop run --bus local --duration 60 --record run.mf4 --limit-late-us 2000
   vaneloop run --bus lockstep --profile slam --record slam.log
   vaneloop run --bus lockstep --inputs run.mf4  the recorded run again: must send the same frames, bit for bit
+  vaneloop run --bus vcan0 --xcp --uds          calibrate it with INCA, CANape or pyxcp, read its trouble codes (docs/xcp.md, uds.md)
 
 exit codes: 0 good (also after Ctrl-C), 1 a limit is exceeded, the repeated run differs or the record is incomplete, 2
 bad input
@@ -78,6 +79,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--profile", metavar="F", help="demand of the run's own ECU: as in vaneloop ecu (default: ramp)")
     group.add_argument("--log", metavar="F", help="demand of the run's own ECU from a log")
     options.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
+    attended.add_service_options(parser)
     station.add_realtime_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument(
@@ -112,6 +114,7 @@ def command(args: argparse.Namespace) -> int:
         check_name(args.record)
     name = station.bus_name(args)
     lockstep = name.partition(":")[0] == "lockstep"
+    attended.check_service_options(args, lockstep)
     for option in ("inputs", "profile", "log"):
         if getattr(args, option) and not lockstep:
             raise InputError(
@@ -199,7 +202,9 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
     node = _node(args, machine)
     _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
-    with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=station.ACCEPTED) as bus:
+    serviced = attended.attend(args, node)
+    accepted = attended.accepted(args)
+    with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=accepted) as bus:
         port = Port(bus)
         live = station.Live(args)
 
@@ -220,7 +225,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
             try:
                 with station.undisturbed(args) as notes:
                     report = run_realtime(
-                        node, port, ticks=ticks, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
+                        serviced, port, ticks=ticks, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
                         put=recorder.put if recorder is not None else None, live=show if live.on else None,
                         watch=station.BusWatch(args, name, port),
                     )  # fmt: skip
@@ -359,7 +364,12 @@ def _repeat(args: argparse.Namespace) -> int:
     )  # a run ends up to 9 ticks after the last frame it sent
     started = time.perf_counter()
     received = noted(record.rows[taken])
-    at, sent = replay(node, tick[taken], received, ticks)
+    if attended.wanted(args):
+        from hil.calibrate.station import replay_attended
+
+        at, sent = replay_attended(attended.attend(args, node), tick[taken], received, ticks)
+    else:
+        at, sent = replay(node, tick[taken], received, ticks)
     wall = time.perf_counter() - started
     held = record.sent & (tick < ticks)
     was_at, was = tick[held], record.rows[held]

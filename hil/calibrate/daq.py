@@ -1,0 +1,294 @@
+"""Measurement lists of XCP (DAQ): which bytes go into which frames, and when; gathered by compiled code.
+
+A list has tables (ODT), one frame each: identifier of the table (1 byte), in the first one the time in ms modulo
+65,536 (2 bytes, little-endian), then the bytes of its entries. Lists run with an event, every 1 ms or every 10 ms, and
+are sampled after the firmware's tick, all in one piece. The time is that of the tick: simulated time.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hil.calibrate.memory import INPUTS, SHORT, Memory, Refusal
+from hil.calibrate.stim import Stimulus
+from vaneloop.base.compiled import in_place
+
+__all__ = ["EVENTS", "Daq"]
+
+EVENTS = (("1 ms", 1), ("10 ms", 10))  # name, period in ticks; the event's number is its place
+PAYLOAD, STAMP = 7, 2  # bytes of a frame behind the table's identifier; of them the time's in a list's first table
+MOST_LISTS, MOST_TABLES, MOST_ENTRIES = 16, 64, 7
+MOST_FRAMES = 32  # of one tick; what is beyond is an overload: the bus carries some four
+SEQUENCE, ACTIVE, CONFIG, FULL, RANGE, MODE = 0x29, 0x11, 0x2A, 0x30, 0x22, 0x27
+
+Entry = tuple[int, int, int]  # size, extension, address
+
+
+@dataclass
+class DaqList:
+    """One list: its tables, and with which event it runs."""
+
+    tables: list[list[Entry | None]] = field(default_factory=list)
+    event: int = -1
+    prescaler: int = 1
+    priority: int = 0
+    selected: bool = False
+    running: bool = False
+    stim: bool = False
+    raw: list[bytes] = field(default_factory=list)
+    first_pid: int = 0
+    plan: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.int64))
+    heads: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+
+
+@in_place
+def gather(raw: tuple[np.ndarray, ...], plan: np.ndarray, out: np.ndarray, first: int) -> None:
+    """Put bytes of memory into frames: row of ``plan`` = frame, bit, array, offset."""
+    for q in range(plan.shape[0]):
+        out[first + plan[q, 0], 1] |= np.int64(raw[plan[q, 2]][plan[q, 3]]) << plan[q, 1]
+
+
+class Daq:
+    """The measurement lists of one slave.
+
+    overloads  lists left out because a tick would have had too many frames
+    """
+
+    def __init__(self, memory: Memory, ident: int):
+        self.memory, self.ident = memory, ident
+        self.lists: list[DaqList] = []
+        self.step = 0  # 0 free, 1 lists, 2 tables, 3 entries allocated: the order is prescribed
+        self.pointer: tuple[int, int, int] | None = None
+        self.overloads = 0
+        self.stimulus = Stimulus(memory.node)
+        self._running: list[DaqList] = []
+        self._used: set[int] = set()
+        self._out = np.zeros((MOST_FRAMES, 2), np.int64)
+
+    # ---- allocation --------------------------------------------------------------------------------------------------
+
+    def free(self) -> None:
+        """Stop and forget all lists."""
+        self.stimulus.clear()
+        self.lists, self._running, self.step, self.pointer = [], [], 1, None
+
+    def allocate_lists(self, n: int) -> None:
+        """Make room for ``n`` lists."""
+        self._in_order(1, 1)
+        if n > MOST_LISTS:
+            raise Refusal(FULL, f"lists (={n}) must be at most {MOST_LISTS}")
+        self.lists, self.step = [DaqList() for _ in range(n)], 2
+
+    def allocate_tables(self, at: int, n: int) -> None:
+        """Make room for ``n`` tables of a list."""
+        self._in_order(2, 3)
+        if self.step == 3 and any(t for of in self.lists for t in of.tables):
+            raise Refusal(SEQUENCE, "tables come before entries")
+        own = self._list(at)
+        if sum(len(of.tables) for of in self.lists) + n > MOST_TABLES:
+            raise Refusal(FULL, f"tables must be at most {MOST_TABLES}")
+        own.tables += [[] for _ in range(n)]
+        self.step = 3
+
+    def allocate_entries(self, at: int, table: int, n: int) -> None:
+        """Make room for ``n`` entries of a table."""
+        self._in_order(3, 4)
+        tables = self._list(at).tables
+        if table >= len(tables):
+            raise Refusal(RANGE, f"table (={table}) must be below {len(tables)}")
+        if len(tables[table]) + n > MOST_ENTRIES:
+            raise Refusal(FULL, f"entries must be at most {MOST_ENTRIES}")
+        tables[table] += [None] * n
+        self.step = 4
+
+    def _in_order(self, low: int, high: int) -> None:
+        if not low <= self.step <= high:
+            raise Refusal(SEQUENCE, "the order is FREE_DAQ, ALLOC_DAQ, ALLOC_ODT, ALLOC_ODT_ENTRY")
+
+    def _list(self, at: int) -> DaqList:
+        if not 0 <= at < len(self.lists):
+            raise Refusal(RANGE, f"list (={at}) must be below {len(self.lists)}")
+        return self.lists[at]
+
+    # ---- what is measured --------------------------------------------------------------------------------------------
+
+    def point(self, at: int, table: int, entry: int) -> None:
+        """Set the pointer to an entry that exists."""
+        tables = self._list(at).tables
+        if table >= len(tables) or entry >= len(tables[table]):
+            raise Refusal(RANGE, f"list {at} has no entry {entry} of table {table}")
+        self.pointer = at, table, entry
+
+    def write(self, bit: int, size: int, ext: int, address: int) -> None:
+        """Say what the entry under the pointer is, and move on to the next."""
+        if self.pointer is None:
+            raise Refusal(SEQUENCE, "SET_DAQ_PTR comes first")
+        at, table, entry = self.pointer
+        own = self._list(at)
+        if own.running:
+            raise Refusal(ACTIVE, "the list runs")
+        entries = own.tables[table]
+        if entry >= len(entries):
+            raise Refusal(RANGE, f"table {table} has {len(entries)} entries")
+        room = PAYLOAD - (STAMP if table == 0 else 0)
+        taken = sum(e[0] for i, e in enumerate(entries) if e is not None and i != entry)
+        if bit != 0xFF or not 1 <= size <= room - taken or self.memory.place(ext, address, size) is None:
+            raise Refusal(RANGE, f"{size} bytes at {address:#x} (extension {ext}) cannot be measured here")
+        entries[entry] = size, ext, address
+        self.pointer = at, table, entry + 1
+
+    def look(self) -> Entry:
+        """Return the entry under the pointer, and move on."""
+        if self.pointer is None:
+            raise Refusal(SEQUENCE, "SET_DAQ_PTR comes first")
+        at, table, entry = self.pointer
+        entries = self._list(at).tables[table]
+        if entry >= len(entries):
+            raise Refusal(RANGE, f"table {table} has {len(entries)} entries")
+        self.pointer = at, table, entry + 1
+        return entries[entry] or (0, 0, 0)
+
+    def clear(self, at: int) -> None:
+        """Stop a list and forget what its entries are."""
+        own = self._list(at)
+        self._stop(own)
+        own.tables = [[None] * len(t) for t in own.tables]
+
+    # ---- running -----------------------------------------------------------------------------------------------------
+
+    def mode(self, at: int, mode: int, event: int, prescaler: int, priority: int) -> None:
+        """Say with which event a list runs."""
+        own = self._list(at)
+        if own.running:
+            raise Refusal(ACTIVE, "the list runs")
+        if mode not in (0x10, 0x02):  # measured with a time, or given without; not alternating, with identifiers
+            raise Refusal(MODE, f"mode (={mode:#x}) must be 0x10, or 0x02 for STIM")
+        if event >= len(EVENTS) or prescaler < 1:
+            raise Refusal(RANGE, f"event (={event}) must be below {len(EVENTS)}, prescaler (={prescaler}) 1 or more")
+        own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == 0x02
+
+    def mode_of(self, at: int) -> tuple[int, int, int, int]:
+        """Return mode, event, prescaler and priority of a list."""
+        own = self._list(at)
+        mode = (0x02 if own.stim else 0x10) | own.selected | own.running << 6
+        return mode, max(own.event, 0), own.prescaler, own.priority
+
+    def start_list(self, what: int, at: int) -> int:
+        """Stop (0), start (1) or select (2) a list; return the identifier of its first table."""
+        own = self._list(at)
+        if what == 0:
+            self._stop(own)
+        elif what == 1:
+            self._start(own)
+        elif what == 2:
+            self._compile(own)
+            own.selected = True
+        else:
+            raise Refusal(MODE, f"mode (={what}) must be 0, 1 or 2")
+        return own.first_pid
+
+    def start_selected(self, what: int) -> None:
+        """Stop all lists (0), start (1) or stop (2) those that are selected."""
+        if what not in (0, 1, 2):
+            raise Refusal(MODE, f"mode (={what}) must be 0, 1 or 2")
+        chosen = [of for of in self.lists if what == 0 or of.selected]
+        if what == 1:
+            for own in chosen:
+                self._compile(own)
+        for own in chosen:
+            own.selected = False
+            if what == 1:
+                self._start(own)
+            else:
+                self._stop(own)
+
+    def _compile(self, own: DaqList) -> None:
+        """Work out which byte goes where. Raises Refusal for a list that is not complete."""
+        if own.event < 0 or not own.tables or any(e is None for t in own.tables for e in t):
+            raise Refusal(CONFIG, "the list has no event, no tables or entries that were not written")
+        pid = 0
+        for of in self.lists:
+            if of is own:
+                break
+            pid += len(of.tables)
+        own.first_pid = pid
+        if own.stim:
+            entries = [e for t in own.tables for e in t if e is not None]
+            if not all(e[0] == 4 and e[1] == SHORT and self.stimulus.allowed((e[2] - INPUTS) // 4) for e in entries):
+                raise Refusal(CONFIG, "STIM takes whole inputs in single precision, but not the LVDT's")
+            own.raw = [b""] * len(own.tables)
+            return
+        plan: list[tuple[int, int, int, int]] = []
+        heads = []
+        for row, table in enumerate(own.tables):
+            at = 1 + (STAMP if row == 0 else 0)
+            for entry in table:
+                assert entry is not None
+                size, ext, address = entry
+                where = self.memory.place(ext, address, size)
+                assert where is not None
+                plan += [(row, 8 * (at + i), where[0], where[1] + i) for i in range(size)]
+                at += size
+            heads.append((self.ident | at << 32, pid + row))
+        own.plan, own.heads = np.array(plan, np.int64).reshape(-1, 4), np.array(heads, np.int64)
+
+    def _start(self, own: DaqList) -> None:
+        self._compile(own)
+        own.running = True
+        self._order()
+
+    def _stop(self, own: DaqList) -> None:
+        if own.stim and own.running:
+            self.stimulus.clear()
+        own.running = own.selected = False
+        self._order()
+
+    def _order(self) -> None:
+        self._running = sorted((of for of in self.lists if of.running and not of.stim), key=lambda of: -of.priority)
+        self._used = {int(i) for of in self._running for i in of.plan[:, 2]}
+
+    @property
+    def running(self) -> bool:
+        """Whether a list runs."""
+        return any(of.running for of in self.lists)
+
+    def stimulate(self, k: int, data: bytes) -> None:
+        """Take a frame of a STIM list; with its last one the inputs are given, from tick ``k`` on."""
+        for own in self.lists:
+            at = data[0] - own.first_pid
+            if own.stim and own.running and 0 <= at < len(own.tables):
+                own.raw[at] = data[1:]
+                if at == len(own.tables) - 1:
+                    values: dict[int, float] = {}
+                    for table, raw in zip(own.tables, own.raw, strict=True):
+                        if len(raw) < 4 * len(table):
+                            return
+                        for i, entry in enumerate(table):
+                            assert entry is not None
+                            values[(entry[2] - INPUTS) // 4] = struct.unpack_from("<f", raw, 4 * i)[0]
+                    own.raw = [b""] * len(own.tables)
+                    self.stimulus.give(k, values)
+                return
+
+    def sample(self, k: int) -> np.ndarray:
+        """Return the frames (int64[n, 2]) of tick ``k``, whose numbers are in memory now."""
+        out, n, fresh = self._out, 0, False
+        for own in self._running:
+            period = EVENTS[own.event][1] * own.prescaler
+            if k % period:
+                continue
+            m = len(own.heads)
+            if n + m > MOST_FRAMES:
+                self.overloads += 1
+                continue
+            if not fresh:
+                self.memory.refresh(self._used)
+                fresh = True
+            out[n : n + m] = own.heads
+            out[n, 1] |= (k & 0xFFFF) << 8
+            gather(self.memory.raw, own.plan, out, n)
+            n += m
+        return out[:n]

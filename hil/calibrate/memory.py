@@ -1,0 +1,304 @@
+"""The firmware's memory as a calibration tool sees it: a view of the arrays that the tick works on.
+
+Addresses are of 32 bits; every number is a double, little-endian::
+
+    0x1000_0000  inputs of the last tick      read only
+    0x1100_0000  outputs of the last tick     read only
+    0x1200_0000  state after the last tick    read only
+    0x2000_0000  the calibration (`hil.calibrate.elements`): segment 0 with two pages
+
+Address extension 1 shows the same numbers in single precision, number i at 4 i instead of 8 i: classic CAN carries one
+of them in a frame. Page 0 is the working page, page 1 the reference page, the calibration as it was loaded.
+
+A write is kept back until all bytes of a number are there, then it is checked and takes effect whole. Whoever writes
+calls between two ticks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from controller.records import INIT, INPUT_FIELDS, OUTPUT_FIELDS, SCALARS, STANDBY, STATE_FIELDS, Field
+from hil.calibrate import elements
+from hil.loop.node import Node
+from hil.native.program import own_scalars
+
+__all__ = ["CALIBRATION", "EXACT", "INPUTS", "SHORT", "Memory", "Refusal", "Signal"]
+
+INPUTS, OUTPUTS, STATE, CALIBRATION = 0x1000_0000, 0x1100_0000, 0x1200_0000, 0x2000_0000
+EXACT, SHORT = 0, 1  # address extensions: double, single precision
+WORKING, REFERENCE = 0, 1
+
+# what `Memory.write` and the pages answer, numbers of XCP's errors
+OUT_OF_RANGE, PROTECTED, DENIED, NO_PAGE, VERIFY = 0x22, 0x23, 0x24, 0x26, 0x32
+
+
+class Refusal(Exception):
+    """A request that changes nothing: XCP's error code, and why."""
+
+    def __init__(self, code: int, why: str):
+        super().__init__(why)
+        self.code = code
+
+
+class Signal(NamedTuple):
+    """A number that may be measured: its address (extension 0) and what it is."""
+
+    name: str
+    unit: str
+    meaning: str
+    address: int
+
+
+class Area(NamedTuple):
+    """Numbers side by side in memory: ``exact`` are the firmware's own, ``short`` a copy in single precision."""
+
+    name: str
+    base: int
+    exact: np.ndarray
+    short: np.ndarray
+
+
+class Memory:
+    """Memory of one running node.
+
+    node, loop  the node, and its loop
+    elements  what each number of the calibration is (`hil.calibrate.elements.Element`)
+    pages     float64[n] working page and reference page
+    ecu_page, xcp_page  the page that the firmware uses, and the one that the tool sees
+    """
+
+    def __init__(self, node: Node):
+        # the tables may be another node's too: what is changed here is this node's own
+        built = node.loop.built._replace(
+            **{key: getattr(node.loop.built, key).copy() for key in ("k", "table", "angles")}
+        )
+        node.loop = loop = node.loop._replace(built=built)
+        node.arrays = node.arrays._replace(loop=loop)
+        self.node, self.loop = node, loop
+        own = own_scalars(loop.foreign)
+        self._own = [o["value"] for o in own.values()]
+        self.elements = elements.elements_of(loop.calibration, own)
+        self.curves = elements.curves_of(loop.calibration)
+        live = self.live()
+        self.pages = [live.copy(), live.copy()]
+        self.ecu_page = self.xcp_page = WORKING
+        self.writes = 0  # writes that took effect
+        self._places: list[tuple[Any, ...]] = []
+        first = 0
+        for key in ("k", "table", "angles"):
+            built, flashed = getattr(loop.built, key), getattr(loop.calibration, key)
+            self._places.append((first, built.reshape(-1), flashed.reshape(-1)))
+            first += built.size
+        self._places += [(first + i, value) for i, value in enumerate(self._own)]
+        self._half: dict[int, tuple[bytearray, int]] = {}
+        spans = [
+            (INPUTS, "input", loop.inputs),
+            (OUTPUTS, "output", loop.outputs),
+            (STATE, "state", loop.z),
+            (CALIBRATION, "scalars", loop.calibration.k),
+            (CALIBRATION + 8 * len(SCALARS), "table", loop.calibration.table.reshape(-1)),
+            (
+                CALIBRATION + 8 * (len(SCALARS) + loop.calibration.table.size),
+                "angles",
+                loop.calibration.angles.reshape(-1),
+            ),
+        ]
+        if own:
+            spans.append((CALIBRATION + 8 * (len(live) - len(own)), "own", np.zeros(len(own))))
+        self.areas = [Area(name, base, a, np.zeros(len(a), np.float32)) for base, name, a in spans]
+        self.raw = tuple(a.exact.view(np.uint8) for a in self.areas) + tuple(a.short.view(np.uint8) for a in self.areas)
+        self.refresh()
+
+    @property
+    def signals(self) -> list[Signal]:
+        """What may be measured: inputs, outputs, and the state that this machine has."""
+        out = []
+        rows = {STATE: set(self.loop.z_rows.tolist())}
+        for base, prefix, fields in (
+            (INPUTS, "input", INPUT_FIELDS),
+            (OUTPUTS, "output", OUTPUT_FIELDS),
+            (STATE, "state", STATE_FIELDS),
+        ):
+            names: list[tuple[str, Field]] = [(n, f) for f in fields for n in (f.each or (f.name,))]
+            out += [
+                Signal(f"{prefix}_{name}", f.unit, f.meaning, base + 8 * i)
+                for i, (name, f) in enumerate(names)
+                if base not in rows or i in rows[base]
+            ]
+        return out
+
+    def live(self) -> np.ndarray:
+        """The calibration that the next tick uses, one row."""
+        cal = self.loop.calibration
+        return np.concatenate([cal.k, cal.table.reshape(-1), cal.angles.reshape(-1), *self._own])
+
+    def refresh(self, used: Collection[int] | None = None) -> None:
+        """Bring copies up to date: single precision, and the scalars of a controller's own.
+
+        used  which of ``raw`` will be read; None: all
+        """
+        n = len(self.areas)
+        if self._own:
+            np.concatenate(self._own, out=self.areas[-1].exact)
+        short = range(n) if used is None else [i - n for i in used if i >= n]
+        if short:
+            with np.errstate(over="ignore", invalid="ignore"):
+                for i in short:
+                    self.areas[i].short[:] = self.areas[i].exact
+
+    # ---- reading -----------------------------------------------------------------------------------------------------
+
+    def place(self, ext: int, address: int, size: int) -> tuple[int, int] | None:
+        """Return which of ``raw`` holds these bytes and from where on; None where that is not one array of it."""
+        if ext not in (EXACT, SHORT) or size < 1:
+            return None
+        width = 4 if ext == SHORT else 8
+        for i, a in enumerate(self.areas):
+            base = (a.base & ~0xFFFFFF) + (a.base & 0xFFFFFF) * width // 8
+            if base <= address and address + size <= base + width * len(a.exact):
+                return i + (len(self.areas) if ext == SHORT else 0), address - base
+        return None
+
+    def read(self, ext: int, address: int, size: int) -> bytes:
+        """Return ``size`` bytes; of the calibration those of the page that the tool sees. Raises `Refusal`."""
+        kind = np.float32 if ext == SHORT else np.float64
+        base = address & ~0xFFFFFF
+        if ext not in (EXACT, SHORT):
+            raise Refusal(OUT_OF_RANGE, f"address extension (={ext}) must be 0 or 1")
+        if base == CALIBRATION:
+            row = self.live() if self.xcp_page == self.ecu_page else self.pages[self.xcp_page]
+        else:
+            row = next((a.exact for a in self.areas if a.base == base), np.empty(0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            image = row.astype(kind).tobytes()
+        at = address - base
+        if size < 0 or at + size > len(image):
+            raise Refusal(OUT_OF_RANGE, f"no memory from {address:#x} to {address + size:#x}")
+        return image[at : at + size]
+
+    # ---- writing -----------------------------------------------------------------------------------------------------
+
+    def forget(self) -> None:
+        """Drop the numbers of which not all bytes have come."""
+        self._half.clear()
+
+    def write(self, ext: int, address: int, data: bytes) -> None:
+        """Write bytes into the working page; numbers that are complete take effect together. Raises `Refusal`, and then
+        nothing has changed.
+        """
+        n, width = len(self.elements), 4 if ext == SHORT else 8
+        first = address - CALIBRATION
+        if ext not in (EXACT, SHORT) or first < 0 or first + len(data) > width * n:
+            known = address & ~0xFFFFFF in (INPUTS, OUTPUTS, STATE)
+            raise Refusal(DENIED if known else OUT_OF_RANGE, f"{address:#x} must be in the calibration")
+        if self.xcp_page != WORKING:
+            raise Refusal(PROTECTED, "the reference page cannot be written")
+        half = {key: (bytearray(raw), mask) for key, (raw, mask) in self._half.items()}
+        values: dict[int, float] = {}
+        for i, byte in enumerate(data, first):
+            number, at = divmod(i, width)
+            raw, mask = half.get(2 * number + ext, (bytearray(width), 0))
+            raw[at] = byte
+            mask |= 1 << at
+            half[2 * number + ext] = raw, mask
+            if mask == (1 << width) - 1:
+                del half[2 * number + ext]
+                values[number] = float(np.frombuffer(bytes(raw), np.float32 if ext == SHORT else np.float64)[0])
+        try:
+            self.change(values)
+        except Refusal:
+            for number in values:
+                self._half.pop(2 * number + ext, None)
+            raise
+        self._half = half
+
+    def change(self, values: dict[int, float]) -> None:
+        """Give numbers of the working page other values, all or none. Raises `Refusal`."""
+        page = self.pages[WORKING]
+        active = self.ecu_page == WORKING
+        now = self.live() if active else page
+        new = {i: v for i, v in values.items() if not _same(float(now[i]), v)}
+        for i, v in new.items():
+            e = self.elements[i]
+            if not (math.isfinite(v) and e.low <= v <= e.high) or (e.whole and v != math.floor(v)):
+                raise Refusal(OUT_OF_RANGE, f"{e.name} (={v:g} {e.unit}) must be in [{e.low:g}, {e.high:g}]")
+            if e.fixed:
+                raise Refusal(PROTECTED, f"{e.name} belongs to the machine")
+            if e.name == "current_limit" and v > self.pages[REFERENCE][i]:
+                raise Refusal(OUT_OF_RANGE, f"current_limit (={v:g} A) must not exceed the reference page's")
+            if active and e.guarded:
+                self._open_only(e.name)
+        if not new:
+            return
+        row = now.copy()
+        row[list(new)] = list(new.values())
+        if active:
+            self._judge(row, {self.elements[i].table for i in new})
+            self._load(row, np.array(list(new)))
+        page[list(new)] = list(new.values())
+        self.writes += 1
+
+    def _open_only(self, name: str) -> None:
+        if int(self.loop.given.mode) not in (INIT, STANDBY):
+            raise Refusal(PROTECTED, f"{name} may be changed in INIT and STANDBY only")
+
+    def _judge(self, row: np.ndarray, tables: set[str]) -> None:
+        if why := elements.complaint(self.elements, row, tuple(sorted(tables - {""}))):
+            raise Refusal(OUT_OF_RANGE, why)
+
+    def _load(self, row: np.ndarray, numbers: np.ndarray) -> None:
+        """Put numbers of a row into the arrays that the firmware reads, and into what an injected effect starts
+        from.
+        """
+        for first, *places in self._places:
+            mine = numbers[(numbers >= first) & (numbers < first + len(places[0]))]
+            for to in places:
+                to[mine - first] = row[mine]
+
+    # ---- pages -------------------------------------------------------------------------------------------------------
+
+    def use(self, page: int, *, ecu: bool, xcp: bool) -> None:
+        """Choose the page that the firmware uses, the one that the tool sees, or both. Raises `Refusal`."""
+        if page not in (WORKING, REFERENCE):
+            raise Refusal(NO_PAGE, f"page (={page}) must be 0 or 1")
+        if ecu and page != self.ecu_page:
+            row, now = self.pages[page], self.live()
+            for i in np.flatnonzero(row != now).tolist():
+                if self.elements[i].guarded:
+                    self._open_only(self.elements[i].name)
+            self._judge(row, {e.table for e in self.elements})
+            self._load(row, np.arange(len(row)))
+            self.ecu_page = page
+        if xcp:
+            self.xcp_page = page
+            self.forget()
+
+    def copy(self, source: int, target: int) -> None:
+        """Copy the reference page over the working page, whole. Raises `Refusal`."""
+        if (source, target) != (REFERENCE, WORKING):
+            raise Refusal(PROTECTED if target == REFERENCE else NO_PAGE, "only page 1 can be copied to page 0")
+        self.change(dict(enumerate(self.pages[REFERENCE].tolist())))
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write the working page as tables that ``--tables`` takes; return the files. Raises `Refusal`."""
+        page = self.pages[WORKING]
+        if why := elements.complaint(self.elements, page, tuple(elements.MODELS)):
+            raise Refusal(VERIFY, why)
+        try:
+            return elements.write_tables(folder, self.elements, page)
+        except OSError as e:
+            raise Refusal(DENIED, f"{folder}: {e.strerror}") from None
+
+    def by_name(self) -> dict[str, int]:
+        """Number of each element, by name."""
+        return {e.name: i for i, e in enumerate(self.elements)}
+
+
+def _same(a: float, b: float) -> bool:
+    return a == b or (a != a and b != b)

@@ -1,0 +1,150 @@
+"""A node on the bus with the tools that attend to it: frames of theirs are kept from the firmware, and answered.
+
+The tools' commands are carried out before a tick, in order of arrival; answers and measurements are sent after it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Protocol
+
+import numpy as np
+
+from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, NOTE, REMOTE
+from hil.calibrate.slave import Slave
+from hil.loop.node import Node
+
+__all__ = ["MASTER", "SLAVE", "Attended", "Service", "XcpService", "replay_attended"]
+
+MASTER, SLAVE = 0x6E0, 0x6E1  # CAN identifiers of XCP: commands, answers with measurements
+MOST_COMMANDS = 8  # carried out before one tick
+MOST_WAITING = 256  # commands and answers kept; what is beyond is dropped
+MOST_ANSWERS = 4  # sent after one tick: about what the bus carries
+_KIND = EXTENDED | REMOTE | ERROR | FD | NOTE
+NOTHING = np.zeros((0, 2), np.int64)
+
+
+class Service(Protocol):
+    """What attends to a node: an XCP slave, a UDS server."""
+
+    idents: tuple[int, ...]
+
+    def hear(self, ident: int, data: bytes) -> None:
+        """Take a frame under one of ``idents``."""
+
+    def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """Return what the node gets in place of the first ``n`` rows at tick ``k``."""
+
+    def before(self, k: int) -> None:
+        """Work before tick ``k``."""
+
+    def after(self, k: int) -> np.ndarray | None:
+        """Return frames (int64[n, 2]) to send after tick ``k``."""
+
+    @property
+    def silent(self) -> bool:
+        """Whether the node must not send its own frames."""
+
+
+def row_of(ident: int, data: bytes) -> tuple[int, int]:
+    """Return a frame of up to eight bytes as a row."""
+    return ident | len(data) << 32, int.from_bytes(data.ljust(8, b"\0"), "little", signed=True)
+
+
+class XcpService:
+    """An XCP slave on CAN.
+
+    dropped  commands that came faster than they could be carried out
+    """
+
+    idents: tuple[int, ...] = (MASTER,)
+    silent = False
+
+    def __init__(self, slave: Slave):
+        self.slave = slave
+        self.dropped = 0
+        self._in: deque[bytes] = deque()
+        self._out: deque[bytes] = deque()
+
+    def hear(self, ident: int, data: bytes) -> None:
+        """Keep a command for the next tick."""
+        if len(self._in) < MOST_WAITING:
+            self._in.append(data)
+        else:
+            self.dropped += 1
+
+    def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """Put what a tool gives in place of the ECU's demand into its frames."""
+        return self.slave.daq.stimulus.change(k, rows, n)
+
+    def before(self, k: int) -> None:
+        """Carry out commands; a tool that floods the slave waits for its answers."""
+        self.slave.k = k
+        for _ in range(min(MOST_COMMANDS, len(self._in))):
+            if len(self._out) > MOST_WAITING:
+                break
+            self._out += self.slave.command(self._in.popleft())
+
+    def after(self, k: int) -> np.ndarray | None:
+        """Return answers and measurements."""
+        slave = self.slave
+        measured = slave.sample(k)
+        if not self._out and not len(measured):
+            return None
+        self._out += slave.news()
+        answers = [row_of(slave.ident, self._out.popleft()) for _ in range(min(MOST_ANSWERS, len(self._out)))]
+        return np.concatenate([np.array(answers, np.int64).reshape(-1, 2), measured])
+
+
+class Attended:
+    """A node whose frames of service are answered by ``services``; for `run_realtime` it is a node like any other."""
+
+    def __init__(self, node: Node, *services: Service):
+        self.node, self.services = node, services
+        self._by_ident = {ident: s for s in services for ident in s.idents}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.node, name)
+
+    def tick(self, received: np.ndarray, n: int | None = None) -> np.ndarray:
+        """Run the next tick on the first ``n`` rows of ``received``; return the frames to send."""
+        n = len(received) if n is None else n
+        k = self.node.k
+        for head, data in received[:n].tolist():
+            if head & _KIND == 0 and (service := self._by_ident.get(head & IDENT_MASK)) is not None:
+                raw = (data & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "little")
+                service.hear(head & IDENT_MASK, raw[: min(head >> 32 & 0xFF, 8)])
+        for service in self.services:
+            service.before(k)
+        rows, n = self._firmware_s(received, n)
+        for service in self.services:
+            rows, n = service.change(k, rows, n)
+        out = self.node.tick(rows, n)
+        if any(service.silent for service in self.services):
+            out = NOTHING
+        more = [sent for service in self.services if (sent := service.after(k)) is not None]
+        return np.concatenate([out, *more]) if more else out
+
+    def _firmware_s(self, received: np.ndarray, n: int) -> tuple[np.ndarray, int]:
+        """The frames that are not for a service."""
+        idents = received[:n, 0] & IDENT_MASK
+        ours = [i for i, ident in enumerate(idents.tolist()) if ident in self._by_ident]
+        if not ours:
+            return received, n
+        rest = np.delete(received[:n], ours, axis=0)
+        return rest, len(rest)
+
+
+def replay_attended(node: Attended, at: np.ndarray, received: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Run ``node`` for ``ticks`` ticks on recorded frames, commands of its tools included, as `hil.loop.node.replay`
+    does.
+    """
+    first = 0
+    ticks_of, sent = [], []
+    for k in range(ticks):
+        last = int(np.searchsorted(at, k, side="right"))
+        out = node.tick(np.ascontiguousarray(received[first:last]))
+        first = last
+        sent.append(out.copy())
+        ticks_of.append(np.full(len(out), k, np.int64))
+    return np.concatenate(ticks_of or [np.empty(0, np.int64)]), np.concatenate(sent or [np.empty((0, 2), np.int64)])

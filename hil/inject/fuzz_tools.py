@@ -1,0 +1,186 @@
+"""The safety campaign for the tools' protocols: hostile commands of XCP or UDS against a controller in simulated time.
+
+In every tick: current within the calibration's limit and the limit within the reference page's, a mode that exists, the
+monitors as they were while the loop is closed, memory of the services bounded. At the end of each episode the tool is
+gone, and with the calibration of the beginning good frames of the ECU must have RUN back.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller import MODES
+from controller.records import INIT, STANDBY
+from hil.calibrate.memory import CALIBRATION, Memory
+from hil.calibrate.slave import Slave, key_of
+from hil.calibrate.station import MASTER, MOST_WAITING, Attended, XcpService, row_of
+from hil.loop.node import Ecu, Node
+
+__all__ = ["PROTOCOLS", "ToolCampaign", "fuzz_tools"]
+
+PROTOCOLS = ("xcp", "uds")
+EPISODE = 5_000  # frames on one controller
+RECOVERY = 8_000  # ticks within which RUN must be back: the session's end after 5 s, then the firmware's own times
+MOST_HELD = 4 * MOST_WAITING  # commands, answers and frames that services may keep
+
+
+@dataclass
+class ToolCampaign:
+    """What a campaign saw.
+
+    failure  what did not hold, with seed, episode and frame; empty: everything held
+    """
+
+    protocol: str
+    seed: int
+    frames: int = 0
+    episodes: int = 0
+    ticks: int = 0
+    answers: dict[str, int] = field(default_factory=dict)
+    failure: str = ""
+
+
+class _Target:
+    """A controller with one service, its ECU, and what must hold of it."""
+
+    def __init__(self, protocol: str, seed: int, request: int):
+        self.node = Node()
+        self.memory = Memory(self.node)
+        self.reference = self.memory.pages[1].copy()
+        self.guarded = np.array([i for i, e in enumerate(self.memory.elements) if e.guarded])
+        self.limit = self.memory.by_name()["current_limit"]
+        self.protocol = protocol
+        if protocol == "xcp":
+            self.slave = Slave(self.memory, seed=seed, locked=("cal",) if seed % 3 == 0 else ())
+            self.service: Any = XcpService(self.slave)
+        else:
+            from hil.uds.server import Server
+            from hil.uds.station import UdsService
+
+            self.server = Server(self.memory, seed=seed)
+            self.service = UdsService(self.server)
+        self.attended = Attended(self.node, self.service)
+        self.ecu = Ecu(n_dem=70.0)
+        self.ecu.set_demand(70.0, mode_request=request)
+        self.sent = np.zeros((0, 2), np.int64)
+        self.before = self.memory.live()
+
+    def flash(self) -> None:
+        """Put the calibration back that it began with: a tool may set monitors in STANDBY so that none lets RUN be."""
+        self.memory._load(self.reference, np.arange(len(self.reference)))
+        self.before = self.memory.live()
+
+    def tick(self, frames: list[tuple[int, bytes]]) -> list[bytes]:
+        """Run a tick; raise AssertionError in words for what does not hold."""
+        closed = int(self.node.loop.given.mode) not in (INIT, STANDBY)
+        rows = [*self.ecu.tick(self.sent).tolist(), *(row_of(i, d) for i, d in frames)]
+        out = self.attended.tick(np.array(rows, np.int64).reshape(-1, 2))
+        ours = out[:, 0] & 0x7FF < 0x100
+        self.sent = out[ours].copy()
+        loop = self.node.loop
+        limit = float(loop.calibration.scalars.current_limit)
+        if not abs(float(loop.given.i_cmd)) <= limit + 1e-12:
+            raise AssertionError(f"current (={loop.given.i_cmd:g} A) beyond its limit (={limit:g} A)")
+        if not limit <= self.reference[self.limit]:
+            raise AssertionError(f"current_limit (={limit:g} A) above the reference page's")
+        if not 0 <= int(loop.given.mode) < len(MODES):
+            raise AssertionError(f"mode (={loop.given.mode:g}) does not exist")
+        now = self.memory.live()
+        if closed and (now[self.guarded] != self.before[self.guarded]).any():
+            raise AssertionError("a limit or a monitor was changed while the loop was closed")
+        self.before = now
+        held = sum(len(getattr(self.service, name)) for name in ("_in", "_out"))
+        if self.protocol == "uds":
+            held += self.service._transport.tx_queue.qsize()
+        if held > MOST_HELD:
+            raise AssertionError(f"{held} frames are kept")
+        return [(d & (1 << 64) - 1).to_bytes(8, "little")[: h >> 32 & 15] for h, d in out[~ours].tolist()]
+
+
+def _xcp(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
+    raw = bytearray(rng.integers(0, 256, rng.integers(1, 9), dtype=np.uint8).tobytes())
+    kind = rng.integers(0, 10)
+    if kind < 6:
+        raw[0] = int(rng.choice(list(target.slave._commands)))
+    if kind in (1, 2, 3) and len(raw) == 8:  # somewhere in memory
+        base = (CALIBRATION, CALIBRATION, 0x10000000, 0x12000000)[int(rng.integers(0, 4))]
+        raw[0], raw[3] = 0xF6, int(rng.integers(0, 2))
+        raw[4:8] = struct.pack("<I", base + int(rng.integers(0, 4500)) // 4 * 4)
+    elif kind == 4:  # a plausible number
+        at = int(rng.integers(0, len(target.memory.elements)))
+        e = target.memory.elements[at]
+        value = struct.pack("<f", rng.uniform(e.low, e.high))
+        return [(MASTER, struct.pack("<BBBBI", 0xF6, 0, 0, 1, CALIBRATION + 4 * at)), (MASTER, b"\xf0\x04" + value)]
+    elif kind == 5 and last[:2] == b"\xff\x06":
+        return [(MASTER, b"\xf7\x06" + key_of("cal", last[2:]))]
+    if not target.slave.connected:
+        return [(MASTER, b"\xff\x00"), (MASTER, bytes(raw))]
+    return [(MASTER, bytes(raw))]
+
+
+def _uds(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
+    from hil.uds.server import key_of as uds_key
+    from hil.uds.station import FUNCTIONAL, REQUEST
+
+    ident = REQUEST if rng.random() < 0.9 else FUNCTIONAL
+    raw = bytearray(rng.integers(0, 256, rng.integers(1, 8), dtype=np.uint8).tobytes())
+    kind = rng.integers(0, 10)
+    if kind < 5:
+        raw[0] = int(rng.choice(list(target.server._services)))
+        if len(raw) > 1 and kind < 3:
+            raw[1] = int(rng.integers(0, 8))
+        if raw[0] == 0x31 and len(raw) > 3:
+            raw[2:4] = bytes([2, int(rng.integers(0, 5))])
+    elif kind == 5:
+        raw = bytearray([0x10, int(rng.choice([1, 2, 3, 3]))])
+    elif kind == 6 and target.server._seed is not None:  # the whole request, past ISO-TP: it takes two frames
+        target.server.request(target.node.k, b"\x27\x02" + uds_key(target.server._seed))
+        return []
+    elif kind == 7:  # pieces of ISO-TP in any order
+        return [(REQUEST, bytes([int(rng.choice([0x10, 0x20, 0x21, 0x30, 0x31]))]) + bytes(raw))]
+    elif kind == 8:
+        target.server.request(target.node.k, rng.integers(0, 256, rng.integers(8, 300), dtype=np.uint8).tobytes())
+        return []
+    return [(ident, bytes([len(raw)]) + bytes(raw))]
+
+
+def fuzz_tools(protocol: str, frames: int, seed: int, progress: Callable[[float], None] | None = None) -> ToolCampaign:
+    """Send hostile ``frames`` of ``protocol`` ("xcp", "uds"); the same seed gives the same frames."""
+    campaign = ToolCampaign(protocol, seed)
+    make = _xcp if protocol == "xcp" else _uds
+    while campaign.frames < frames and not campaign.failure:
+        rng = np.random.default_rng([seed, campaign.episodes])
+        target = _Target(protocol, campaign.episodes, request=campaign.episodes % 2)
+        campaign.episodes += 1
+        n, end, last = 0, min(EPISODE, frames - campaign.frames), b""
+        try:
+            while n < end:
+                some: list[tuple[int, bytes]] = []
+                for _ in range(int(rng.choice([0, 1, 1, 2, 8]))):
+                    some += make(rng, target, last)
+                n += len(some)
+                for answer in target.tick(some):
+                    last = answer
+                    name = answer[:2].hex() if answer[0] in (0xFE, 0xFD) else "answers"
+                    campaign.answers[name] = campaign.answers.get(name, 0) + 1
+                campaign.ticks += 1
+            target.flash()
+            target.ecu.set_demand(70.0, mode_request=1)
+            for _ in range(RECOVERY):
+                target.tick([])
+                campaign.ticks += 1
+                if target.node.mode == "RUN" and target.node.k % 1000 == 0:
+                    break
+            else:
+                raise AssertionError(f"RUN is not back after {RECOVERY * 1e-3:g} s: {target.node.mode}")
+        except Exception as e:
+            campaign.failure = f"episode {campaign.episodes - 1}, frame {n}: {type(e).__name__}: {e}"
+        campaign.frames += n
+        if progress is not None:
+            progress(min(campaign.frames / frames, 1.0))
+    return campaign

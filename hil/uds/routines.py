@@ -1,0 +1,111 @@
+"""Routines of the service tool: they ask the firmware for strokes as the ECU would, and judge what comes of it.
+
+While a routine runs, the ECU's frames keep coming; the speeds in them, and the request to run, are replaced. So the
+firmware's limits and monitors hold as ever, and whoever ends the routine has the ECU's frames again with the next one.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from controller.records import STANDBY
+from hil.bus.frames import ECU_DEMAND, crc, decode_demand, encode_demand
+from hil.loop.node import Node
+
+__all__ = ["CLEAR_LEARNED", "LVDT", "SWEEP", "Sweep", "clear_learned"]
+
+SWEEP, LVDT, CLEAR_LEARNED = 0x0201, 0x0202, 0x0203
+LOW, HIGH, RATE = 45.0, 104.0, 12.0  # %, %/s: demands of the sweep, over nearly the whole stroke
+HOLD = 1500  # ticks at each end
+RUNNING, DONE, ABORTED = 1, 0, 2
+_LEARNED = ("offset", "width", "proved_offset", "proved_width", "learned_up", "learned_down", "trusted")
+
+
+@dataclass
+class Sweep:
+    """The stroke from one end to the other and back; measured at both ends.
+
+    state  RUNNING, DONE or ABORTED (a fault, or ended by the tool)
+    low, high  m, strokes held at the ends: measured by the LVDT, and by the stem potentiometer of the VIGV
+    worst  m, largest difference between the servo's reference and the stroke
+    """
+
+    node: Node
+    begin: int
+    state: int = RUNNING
+    low: tuple[float, float] = (0.0, 0.0)
+    high: tuple[float, float] = (0.0, 0.0)
+    worst: float = 0.0
+    _held: list[tuple[float, float]] = field(default_factory=list)
+
+    def demand(self, k: int) -> float:
+        """Speed to ask for at tick ``k``, %."""
+        ramp = round((HIGH - LOW) / RATE * 1000)
+        at = k - self.begin
+        if at < HOLD:
+            return LOW
+        if at < HOLD + ramp:
+            return LOW + RATE * (at - HOLD) * 1e-3
+        if at < 2 * HOLD + ramp:
+            return HIGH
+        return max(HIGH - RATE * (at - 2 * HOLD - ramp) * 1e-3, LOW)
+
+    @property
+    def length(self) -> int:
+        """Ticks that it takes."""
+        return 3 * HOLD + 2 * round((HIGH - LOW) / RATE * 1000)
+
+    def replace(self, k: int, rows: np.ndarray) -> None:
+        """Put the routine's demand into the ECU's good frames, in place."""
+        for row in rows:
+            head, data = int(row[0]), int(row[1])
+            if head & 0x7FF == ECU_DEMAND and crc(ECU_DEMAND, data) == data & 0xFF:
+                _, _, request = decode_demand(data)
+                if request <= 1:
+                    speed = self.demand(k)
+                    row[1] = encode_demand(speed, speed, 1, data >> 8 & 0xF)
+
+    def look(self, k: int) -> None:
+        """Take note of tick ``k``, which has been run."""
+        loop = self.node.loop
+        at, ramp = k - self.begin, round((HIGH - LOW) / RATE * 1000)
+        if self.node.faults:
+            self.state = ABORTED
+            return
+        if at > HOLD // 2:
+            self.worst = max(self.worst, abs(float(loop.state.x_servo - loop.state.x_meas)))
+        angle, table = float(loop.angles[0]), loop.calibration.angles
+        if (at % (HOLD + ramp)) > HOLD - 200 and (at % (HOLD + ramp)) <= HOLD:
+            self._held.append((float(loop.fed.x_lvdt), float(np.interp(angle, table[1], table[0]))))
+        elif self._held:
+            mean = tuple(float(v) for v in np.mean(self._held, axis=0))
+            self.low, self.high = (mean, self.high) if at <= HOLD + 1 else (self.low, mean)  # type: ignore[assignment]
+            self._held = []
+        if at >= self.length:
+            self.state = DONE
+
+    def result(self, routine: int) -> bytes:
+        """What the tool is told: the state, then numbers of single precision, big-endian, mm.
+
+        Of the sweep: lowest and highest stroke, largest error of the servo. Of the two-point calibration: the LVDT's
+        gain (-) and offset (mm) against the stem potentiometer through the table of angles.
+        """
+        if routine == SWEEP:
+            return bytes([self.state]) + struct.pack(">3f", self.low[0] * 1e3, self.high[0] * 1e3, self.worst * 1e3)
+        span = self.high[1] - self.low[1]
+        gain = (self.high[0] - self.low[0]) / span if abs(span) > 1e-3 else 0.0
+        return bytes([self.state]) + struct.pack(">2f", gain, (self.low[0] - gain * self.low[1]) * 1e3)
+
+
+def clear_learned(node: Node) -> bool:
+    """Forget what the strategy adaptive has learned; False where the loop is closed, or the controller is foreign."""
+    loop = node.loop
+    if int(loop.given.mode) != STANDBY or loop.foreign:
+        return False
+    for name in _LEARNED:
+        getattr(loop.state, name)[:] = 0.0
+    loop.state.offset_in_use = loop.state.width_in_use = 0.0
+    return True

@@ -1,0 +1,66 @@
+"""Tools' clients on a real vcan0 (`make test-can`): pyxcp and udsoncan against the installed command."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil.calibrate.memory import CALIBRATION, Memory
+from hil.loop.node import Node
+from tests.conftest import ROOT
+from tests.vcan.run import INTERFACE
+
+pytestmark = pytest.mark.socketcan
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Iterator[Path]:
+    """The controller on vcan0 with both services; the folder that it saves into."""
+    command = [sys.executable, "-m", "vaneloop.cli.main", "run", "--bus", INTERFACE, "--xcp", "--uds", "--xcp-save"]
+    with subprocess.Popen([*command, str(tmp_path / "tuned")], stdout=subprocess.PIPE, text=True, cwd=ROOT) as run:
+        try:
+            assert run.stdout is not None
+            assert any("Ctrl-C" in line for line in run.stdout)
+            yield tmp_path / "tuned"
+        finally:
+            run.terminate()
+            run.wait(60)
+
+
+@pytest.mark.any_speed
+def test_both_clients_talk_to_the_controller_on_vcan0(controller: Path) -> None:
+    pytest.importorskip("pyxcp")
+    pytest.importorskip("udsoncan")
+    import isotp
+    from pyxcp.master import Master
+    from udsoncan.connections import PythonIsoTpConnection
+
+    from controller import load_calibration as load
+    from hil.bus.port import open_bus
+    from hil.uds.station import REQUEST, RESPONSE
+    from tests.test_uds import client
+    from tests.test_xcp import application
+
+    app = application(interface="socketcan", channel=INTERFACE)
+    with Master("can", config=app) as x:
+        x.connect()
+        x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
+        raw = struct.pack("<d", 11.0)
+        x.download(raw[:6])
+        x.download(raw[6:])
+        x.setSegmentMode(1, 0)
+        x.setRequest(1, 0)
+        x.disconnect()
+    assert load(controller / "calibration.toml").scalars.kp == 11.0
+    bus = open_bus(INTERFACE, can_filters=[{"can_id": RESPONSE, "can_mask": 0x7FF}])
+    stack = isotp.CanStack(bus, address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=REQUEST, rxid=RESPONSE))
+    with client(PythonIsoTpConnection(stack)) as c:
+        assert c.read_data_by_identifier(0xF18C).service_data.values[0xF18C] == "VANELOOP-0001"
+        c.change_session(3)
+        c.unlock_security_access(1)
+    bus.shutdown()

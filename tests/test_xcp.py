@@ -1,0 +1,462 @@
+"""The XCP slave: against the bytes of docs/xcp.md, and against pyxcp's master in lockstep and on the embedded bus."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controller import INPUTS, MODES, load_calibration
+from controller.records import STATE
+from hil.calibrate import Attended, Memory, Slave
+from hil.calibrate.a2l import a2l_of
+from hil.calibrate.memory import CALIBRATION, Refusal
+from hil.calibrate.slave import key_of
+from hil.calibrate.station import MASTER, SLAVE, XcpService, row_of
+from hil.loop.node import Ecu, Node
+from hil.native import Program
+from hil.native.program import own_scalars
+from tests.conftest import ROOT
+from tests.native_builds import build
+from vaneloop.base.tables import path as table_path
+
+NOTHING = np.zeros((0, 2), np.int64)
+
+
+class Bench:
+    """A node in RUN with a slave, and its ECU, tick by tick."""
+
+    def __init__(self, **options: Any):
+        self.node = Node(seed=3)
+        self.memory = Memory(self.node)
+        options.setdefault("a2l", lambda: a2l_of(self.memory, master=MASTER, slave=SLAVE))
+        self.slave = Slave(self.memory, **options)
+        self.attended = Attended(self.node, XcpService(self.slave))
+        self.ecu = Ecu(n_dem=70.0)
+        self.sent = NOTHING
+
+    def tick(self, *commands: bytes) -> list[bytes]:
+        """Run a tick with these commands; return what the slave sent."""
+        frames = [*self.ecu.tick(self.sent).tolist(), *(row_of(MASTER, c) for c in commands)]
+        out = self.attended.tick(np.array(frames, np.int64).reshape(-1, 2))
+        own = out[:, 0] & 0x7FF == SLAVE
+        self.sent = out[~own].copy()
+        return [(d & (1 << 64) - 1).to_bytes(8, "little")[: h >> 32 & 15] for h, d in out[own].tolist()]
+
+    def ask(self, command: str | bytes) -> bytes:
+        """The one answer to a command."""
+        (answer,) = self.tick(bytes.fromhex(command) if isinstance(command, str) else command)
+        return answer
+
+    def run(self, ticks: int = 500) -> Bench:
+        """Run until the controller is in RUN."""
+        for _ in range(ticks):
+            self.tick()
+        return self
+
+
+def number(bench: Bench, name: str) -> int:
+    """Address of a calibration value."""
+    return CALIBRATION + 8 * bench.memory.by_name()[name]
+
+
+def write(bench: Bench, name: str, value: float) -> list[str]:
+    """Write a double in two commands, as a master on classic CAN does; the answers."""
+    raw = struct.pack("<d", value)
+    answers = [bench.ask(struct.pack("<BxxBI", 0xF6, 0, number(bench, name)))]
+    answers += [bench.ask(bytes([0xF0, len(part)]) + part) for part in (raw[:6], raw[6:])]
+    return [a.hex() for a in answers]
+
+
+def test_the_published_vectors_are_what_the_slave_answers() -> None:
+    text = (ROOT / "docs" / "xcp.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| `([0-9A-F ]+)` \| `([0-9A-F ,]+)` \|", text, re.M)
+    assert len(rows) > 30
+    bench = Bench(save=None).run()
+    for request, answers in rows:
+        found = bench.tick(bytes.fromhex(request))
+        while sum(map(len, found)) < sum(len(bytes.fromhex(a)) for a in answers.split(",")):
+            found += bench.tick()
+        assert [a.hex(" ").upper() for a in found] == [a.strip() for a in answers.split(",")], request
+
+
+def test_nobody_is_answered_before_connect_and_everything_unknown_gets_an_error() -> None:
+    bench = Bench()
+    assert bench.tick(b"\xfd") == [] and bench.tick(b"\xf5\x01") == []
+    bench.ask("FF00")
+    assert (
+        bench.tick(b"\x01") == []
+        and bench.ask("C5") == b"\xfe\x20"
+        and bench.ask("F0") == b"\xfe\x21"
+        and bench.ask("FC") == b"\xfe\x00"
+    )
+    assert bench.ask("FE") == b"\xff" and bench.tick(b"\xfd") == []
+
+
+def test_what_is_read_is_what_the_tick_used() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    for signal in bench.memory.signals[::7]:
+        got = b"".join(bench.memory.read(0, signal.address + i, 4) for i in (0, 4))
+        area, _, name = signal.name.partition("_")
+        if area == "state":
+            assert got == bench.node.loop.z[STATE.index(name) : STATE.index(name) + 1].tobytes(), signal.name
+    before = bench.node.loop.z[STATE.index("x_servo")]
+    answer = bench.ask(struct.pack("<BBBBI", 0xF4, 4, 0, 1, 0x12000000 + 4 * STATE.index("x_servo")))
+    assert answer[1:] == np.float32(before).tobytes()
+
+
+def test_a_value_takes_effect_whole_between_two_ticks() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    was = bench.node.loop.calibration.scalars.kp
+    raw = struct.pack("<d", 12.5)
+    bench.ask(struct.pack("<BxxBI", 0xF6, 0, number(bench, "kp")))
+    bench.ask(b"\xf0\x06" + raw[:6])
+    assert bench.node.loop.calibration.scalars.kp == was, "half a number must not be there"
+    bench.ask(b"\xf0\x02" + raw[6:])
+    assert bench.node.loop.calibration.scalars.kp == 12.5
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code"),
+    [
+        ("kp", 1e9, "fe22"),
+        ("kp", float("nan"), "fe22"),
+        ("current_limit", 0.05, "fe22"),  # more than the valve's, by the tables' bound allowed
+        ("current_limit", 0.03, "fe23"),  # in RUN
+        ("tracking_limit", 0.09, "fe23"),
+        ("strategy", 0.0, "fe23"),
+        ("stages", 2.0, "fe23"),
+        ("stroke_tables_extension_5", 0.0, "fe22"),  # would fall below its neighbour
+    ],
+)
+def test_what_is_refused_changes_nothing(name: str, value: float, code: str) -> None:
+    bench = Bench().run()
+    assert bench.node.mode == "RUN"
+    bench.ask("FF00")
+    before = bench.memory.live()
+    assert write(bench, name, value)[-1] == code
+    assert (bench.memory.live() == before).all()
+
+
+def test_monitors_may_be_set_while_the_loop_is_open() -> None:
+    bench = Bench()
+    bench.ask("FF00")
+    assert bench.node.mode == "INIT"
+    assert write(bench, "tracking_limit", 0.004)[-1] == "ff"
+    assert bench.node.loop.calibration.scalars.tracking_limit == 0.004
+
+
+def test_a_page_is_switched_whole_and_only_if_its_tables_can_be() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    was = bench.node.loop.calibration.table.copy()
+    assert bench.ask("EB 01 00 01") == b"\xff"  # the firmware on the reference page
+    assert write(bench, "stroke_tables_extension_5", 0.0)[-1] == "ff"  # nobody uses it yet
+    assert (bench.node.loop.calibration.table == was).all()
+    assert bench.ask("EB 01 00 00") == b"\xfe\x22"
+    assert write(bench, "stroke_tables_extension_5", float(was[1, 5]) + 1e-5)[-1] == "ff"
+    assert bench.ask("EB 01 00 00") == b"\xff"
+    assert bench.node.loop.calibration.table[1, 5] == was[1, 5] + 1e-5
+    assert bench.ask("E4 00 01 00 00") == b"\xff"  # the reference page over the working page
+    assert (bench.node.loop.calibration.table == was).all()
+    assert bench.ask("E4 00 00 00 01") == b"\xfe\x23"
+
+
+def test_other_nodes_of_the_same_tables_are_left_alone() -> None:
+    tables = load_calibration()
+    node = Node(calibration=tables)
+    kp = float(tables.scalars.kp)
+    memory = Memory(node)
+    memory.change({memory.by_name()["kp"]: 0.5 * kp})
+    assert node.loop.calibration.scalars.kp == 0.5 * kp and tables.scalars.kp == kp
+
+
+def test_a_frozen_page_is_loaded_as_the_same_bits(tmp_path: Path) -> None:
+    bench = Bench(save=tmp_path / "tuned").run()
+    bench.ask("FF00")
+    rng = np.random.default_rng(4)
+    for name in ("kp", "ki", "kff", "trend_hold", "lead"):
+        i = bench.memory.by_name()[name]
+        e = bench.memory.elements[i]
+        bench.memory.change({i: float(rng.uniform(e.low, min(e.high, 0.4)))})
+    assert bench.ask("F9 01 00 00") == b"\xfe\x27"
+    bench.ask("E6 01 00")
+    assert bench.tick(bytes.fromhex("F9010000")) == [b"\xff", b"\xfd\x03"]
+    back = load_calibration(
+        tmp_path / "tuned" / "calibration.toml",
+        tmp_path / "tuned" / "stroke_tables.toml",
+        angles=tmp_path / "tuned" / "vane_angles.toml",
+    )
+    row = np.concatenate([back.k, back.table.reshape(-1), back.angles.reshape(-1)])
+    assert (row == bench.memory.live()).all()
+
+
+def test_without_the_key_nothing_is_changed_and_a_wrong_one_ends_the_session() -> None:
+    bench = Bench(locked=("cal", "daq")).run()
+    bench.ask("FF00")
+    assert bench.ask("FD") == bytes.fromhex("FF0005000000")
+    assert bench.ask("D6") == b"\xfe\x25" and bench.ask("F0 01 00") == b"\xfe\x25"
+    seed = bench.ask("F8 00 01")
+    assert seed[:2] == b"\xff\x06"
+    assert bench.ask(b"\xf7\x06" + key_of("cal", seed[2:])) == b"\xff\x04"
+    assert write(bench, "kp", 12.0)[-1] == "ff"
+    seed = bench.ask("F8 00 04")
+    assert bench.ask(b"\xf7\x06" + bytes(6)) == b"\xfe\x25"
+    assert bench.tick(b"\xfd") == []
+
+
+def test_the_checksum_is_that_of_the_page() -> None:
+    bench = Bench()
+    bench.ask("FF00")
+    bench.ask(struct.pack("<BxxBI", 0xF6, 0, CALIBRATION))
+    image = bench.memory.live().tobytes()
+    assert bench.ask(struct.pack("<BxxxI", 0xF3, len(image))) == struct.pack("<BBHI", 0xFF, 9, 0, zlib.crc32(image))
+
+
+def test_an_attended_node_does_what_one_alone_does() -> None:
+    bench = Bench()
+    alone, ecu, sent = Node(seed=3), Ecu(n_dem=70.0), NOTHING
+    bench.ask("FF00")
+    sent = alone.tick(ecu.tick(sent)).copy()
+    for k in range(1500):
+        bench.tick(b"\xfd", bytes([k & 0xFF]) * 5)
+        sent = alone.tick(ecu.tick(sent)).copy()
+    assert alone.fingerprint() == bench.node.fingerprint()
+
+
+def test_stimulated_speeds_and_angles_reach_the_firmware_and_end_by_themselves() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    names = ["n_dem", "n_r", "vigv"]
+    for command in ("D6", "D5 00 01 00", "D4 00 00 00 03", *(f"D3 00 00 00 {t:02X} 01" for t in range(3))):
+        assert bench.ask(command) == b"\xff", command
+    for table, name in enumerate(names):
+        bench.ask(f"E2 00 00 00 {table:02X} 00")
+        bench.ask(struct.pack("<BBBBI", 0xE1, 0xFF, 4, 1, 0x10000000 + 4 * INPUTS.index(name)))
+    assert bench.ask("E0 02 00 00 01 00 01 00") == b"\xff"
+    assert bench.ask("DE 01 00 00") == b"\xff\x00"
+    for _ in range(50):
+        bench.tick(*(bytes([pid]) + struct.pack("<f", v) for pid, v in enumerate((81.0, 80.5, 0.25))))
+    fed = bench.node.loop.fed
+    assert (fed.n_dem, fed.n_r) == pytest.approx((81.0, 80.5), abs=0.002) and fed.pots[0] == 0.25
+    assert bench.node.mode == "RUN" and bench.node.counts["wrong_crc"] == 0
+    bench.run(130)
+    assert fed.n_dem == pytest.approx(70.0, abs=0.002) and fed.pots[0] != 0.25
+    bench.ask("DE 00 00 00")
+    bench.ask("E2 00 00 00 00 00")
+    bench.ask(struct.pack("<BBBBI", 0xE1, 0xFF, 4, 1, 0x10000000 + 4 * INPUTS.index("x_lvdt")))
+    assert bench.ask("DE 01 00 00") == b"\xfe\x2a"
+
+
+def test_a_flood_is_bounded() -> None:
+    bench = Bench()
+    bench.ask("FF00")
+    frames = np.array([row_of(MASTER, b"\xf5\xff")] * 2000, np.int64)
+    for _ in range(20):
+        bench.attended.tick(frames)
+    (service,) = bench.attended.services
+    assert len(service._in) <= 256 and len(service._out) <= 320 and service.dropped > 30_000  # type: ignore[attr-defined]
+
+
+def test_random_commands_leave_the_limits_alone() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    rng = np.random.default_rng(7)
+    for k in range(3000):
+        command = rng.integers(0, 256, rng.integers(1, 9), dtype=np.uint8)
+        if k % 2:
+            command[0] = rng.choice(list(bench.slave._commands))
+            if len(command) == 8 and k % 4 == 1:
+                command[4:] = np.frombuffer(struct.pack("<I", CALIBRATION + 8 * int(rng.integers(0, 60))), np.uint8)
+        for answer in bench.tick(command.tobytes()):
+            assert answer[0] in (0xFF, 0xFE, 0xFD) or bench.slave.daq.running
+        if not bench.slave.connected:
+            bench.tick(b"\xff\x00")
+        loop = bench.node.loop
+        assert abs(loop.given.i_cmd) <= loop.calibration.scalars.current_limit <= 0.04
+        assert bench.node.mode in MODES
+
+
+def test_two_tools_read_the_a2l_file(tmp_path: Path) -> None:
+    parser = pytest.importorskip("pya2l.parser")
+    pytest.importorskip("pyxcp")
+    bench = Bench()
+    text = a2l_of(bench.memory, master=MASTER, slave=SLAVE)
+    file = tmp_path / "vgv.a2l"
+    file.write_text(text, encoding="utf-8")
+    tool = Path(sys.executable).with_name("a2ltool")
+    if not tool.exists():
+        pytest.skip("a2ltool is not installed")
+    done = subprocess.run([tool, "--strict", "--check", file], check=False, capture_output=True, text=True)
+    assert done.returncode == 0 and "No problems found" in done.stdout + done.stderr, done.stderr
+    with parser.A2lParser() as a2l:
+        tree = a2l.tree_from_a2l(text.encode())
+    module = tree.PROJECT.MODULE[0]
+    assert len(module.MEASUREMENT) == len(bench.memory.signals)
+    for c in module.CHARACTERISTIC:
+        if c.Type == "VALUE":
+            name = str(getattr(c.Name, "Value", c.Name))
+            at = int(str(getattr(c.Address, "Value", c.Address)), 0)
+            assert at == CALIBRATION + 8 * bench.memory.by_name()[name]
+
+
+def test_the_a2l_file_comes_over_xcp_too() -> None:
+    bench = Bench()
+    bench.ask("FF00")
+    n = struct.unpack("<I", bench.ask("FA 04")[4:])[0]
+    got = b""
+    while len(got) < n:
+        want = min(255, n - len(got))
+        part = bench.tick(bytes([0xF5, want]))
+        while sum(len(p) - 1 for p in part) < want:
+            part += bench.tick()
+        got += b"".join(p[1:] for p in part)
+    assert got.decode() == a2l_of(bench.memory, master=MASTER, slave=SLAVE)
+
+
+# ---- pyxcp -----------------------------------------------------------------------------------------------------------
+
+
+def application(**options: Any) -> Any:
+    """pyxcp's settings for our identifiers; they must stand before its parts are made."""
+    pytest.importorskip("pyxcp")
+    from pyxcp.config import create_application_from_config, set_application
+
+    app = create_application_from_config({}, log_level=logging.ERROR)
+    app.transport.layer = "CAN"
+    can = app.transport.can
+    can.can_id_master, can.can_id_slave, can.max_dlc_required = MASTER, SLAVE, False
+    for key, value in options.items():
+        setattr(can, key, value)
+    set_application(app)
+    return app
+
+
+def test_pyxcp_records_a_minute_at_1_ms_bit_for_bit() -> None:
+    pytest.importorskip("pyxcp")
+    app = application()
+    from pyxcp.daq_stim import DaqList, DaqOnlinePolicy
+    from pyxcp.master import Master
+
+    from tests.xcp_bus import Lockstep
+
+    names = ("x_servo", "i_cmd", "x_meas")
+    address = {name: 0x12000000 + 8 * STATE.index(name) for name in names}
+    halves = [(f"{n}_{h}", address[n] + 4 * h, 0, "U32") for n in names for h in (0, 1)]
+    samples: list[tuple[int, tuple[int, ...]]] = []
+
+    class Keep(DaqOnlinePolicy):  # type: ignore[misc]
+        def on_daq_list(self, daq_list: int, timestamp0: int, timestamp1: int, payload: list[int]) -> None:
+            samples.append((timestamp1, tuple(payload)))
+
+    bench = Bench().run(300)
+    bus = Lockstep(bench.attended, bench.ecu)
+    bus.sent = bench.sent
+    daq = Keep([DaqList(name="fast", event_num=0, stim=False, enable_timestamps=True, measurements=halves, priority=0,
+                        prescaler=1)])  # fmt: skip
+    with Master("can", config=app, policy=daq, transport_layer_interface=bus) as x:
+        x.connect()
+        daq.setup()
+        daq.start()
+        first = bus.node.k
+        while bus.node.k < first + 61_000:
+            time.sleep(0.05)  # the listener's thread runs the ticks
+        daq.stop()
+        x.disconnect()
+    assert len(samples) >= 60_000
+    alone, ecu, sent = Node(seed=3), Ecu(n_dem=70.0), NOTHING
+    rows = [STATE.index(n) for n in names]
+    want = []
+    for _ in range(bus.node.k):
+        sent = alone.tick(ecu.tick(sent)).copy()
+        want.append(alone.loop.z[rows].tobytes())
+    order = [h[0] for h in daq.daq_lists[0].headers]
+    columns = [order.index(h[0]) for h in halves]
+    start = next(k for k in range(first - 5, first + 2000) if _same(samples[0][1], columns, want[k]))
+    for i, (at, payload) in enumerate(samples[:60_000]):
+        assert at == i * 1_000_000, "a sample is lost"
+        assert _same(payload, columns, want[start + i]), i
+
+
+def _same(payload: tuple[int, ...], columns: list[int], want: bytes) -> bool:
+    return np.array([payload[c] for c in columns], np.uint32).tobytes() == want
+
+
+def test_pyxcp_calibrates_the_installed_command_on_the_embedded_bus(tmp_path: Path) -> None:
+    pytest.importorskip("pyxcp")
+    app = application(interface="vaneloop", channel=f"xcp{os.getpid()}")
+    from pyxcp.master import Master
+
+    channel = f"xcp{os.getpid()}"
+    run = subprocess.Popen(
+        [sys.executable, "-m", "vaneloop", "run", "--bus", f"local:{channel}", "--xcp", "--xcp-save",
+         str(tmp_path / "tuned"), "--duration", "120"],
+        stdout=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+    try:
+        assert run.stdout is not None
+        assert any("Ctrl-C" in line for line in run.stdout)
+        with Master("can", config=app) as x:
+            x.connect()
+            kp = Memory(Node()).by_name()["kp"]
+            x.setMta(CALIBRATION + 8 * kp)
+            assert struct.unpack("<d", x.upload(8))[0] == 16.0
+            x.setMta(CALIBRATION + 8 * kp)
+            raw = struct.pack("<d", 11.0)
+            x.download(raw[:6])
+            x.download(raw[6:])
+            x.setSegmentMode(1, 0)
+            x.setRequest(1, 0)
+            x.disconnect()
+    finally:
+        run.terminate()
+        run.wait(20)
+    assert load_calibration(tmp_path / "tuned" / "calibration.toml").scalars.kp == 11.0
+
+
+def test_refusals_say_why() -> None:
+    bench = Bench()
+    with pytest.raises(Refusal, match=r"kp .* must be in"):
+        bench.memory.change({bench.memory.by_name()["kp"]: -1.0})
+
+
+def test_no_identifier_of_the_tools_is_in_the_dbc() -> None:
+    cantools = pytest.importorskip("cantools")
+    own = {m.frame_id for m in cantools.database.load_file(str(table_path("vgv.dbc"))).messages}
+    assert not own & {MASTER, SLAVE, 0x7DF, 0x7E0, 0x7E8}
+
+
+def test_scalars_of_a_controller_in_c_are_calibrated_in_its_own_memory(tmp_path: Path) -> None:
+    if (gcc := shutil.which("gcc")) is None:
+        pytest.skip("no gcc")
+    source = ROOT / "examples" / "own_controller" / "follower.c"
+    library = build(gcc, source, tmp_path / "follower.so", "-O2")
+    node = Node(calibration=load_calibration()._replace(program=Program(library)))
+    memory = Memory(node)
+    own = own_scalars(node.loop.foreign)
+    (name, told), *_ = own.items()
+    i = memory.by_name()[f"own_{name}"]
+    wanted = told["low"] + 0.25 * (told["high"] - told["low"])
+    memory.change({i: wanted})
+    assert own_scalars(node.loop.foreign)[name]["value"][0] == wanted == memory.live()[i]
+    assert memory.read(0, CALIBRATION + 8 * i, 8) == struct.pack("<d", wanted)
+    with pytest.raises(Refusal, match="must be in"):
+        memory.change({i: told["high"] * 2.0 + 1.0})
+    memory.save(tmp_path / "tuned")
+    again = Program(library, str(tmp_path / "tuned" / "own_calibration.toml"))
+    other = Node(calibration=load_calibration()._replace(program=again))
+    assert own_scalars(other.loop.foreign)[name]["value"][0] == wanted
+    assert f"own_{name}" in a2l_of(memory, master=MASTER, slave=SLAVE)

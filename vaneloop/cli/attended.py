@@ -1,0 +1,151 @@
+"""Options of ``vaneloop run`` that let tools attend to the controller: XCP for calibration, UDS for service."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import contextlib
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from vaneloop.cli import station
+
+__all__ = ["accepted", "add_service_options", "attend", "check_service_options", "isotp_is_there", "wanted"]
+
+
+def add_service_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    group = parser.add_argument_group("tools on the bus")
+    group.add_argument("--xcp", action="store_true", help="answer calibration tools: XCP on CAN (docs/xcp.md)")
+    group.add_argument(
+        "--xcp-save", metavar="DIR", help="folder into which a tool may save the working page, for --tables"
+    )
+    group.add_argument("--xcp-lock", action="store_true", help="calibration and measurement need seed and key")
+    group.add_argument("--uds", action="store_true", help="answer service tools: UDS on ISO-TP (docs/uds.md)")
+    group.add_argument("--uds-memory", metavar="F.json", help="file that keeps the trouble codes over a restart")
+
+
+def wanted(args: argparse.Namespace) -> bool:
+    """Whether a tool may attend."""
+    return bool(args.xcp or args.uds)
+
+
+def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
+    """Refuse options that do not go together. Raises InputError."""
+    from vaneloop.base.errors import InputError
+
+    for option in ("xcp_save", "xcp_lock"):
+        if getattr(args, option) and not args.xcp:
+            raise InputError(f"--{option.replace('_', '-')} belongs to --xcp")
+    if args.uds_memory and not args.uds:
+        raise InputError("--uds-memory belongs to --uds")
+    if args.uds:
+        isotp_is_there()
+    if lockstep and wanted(args) and not args.inputs:
+        option = "--xcp" if args.xcp else "--uds"
+        raise InputError(
+            f"{option} needs a bus that a tool can join: vcan0, local; --bus lockstep is within one process"
+        )
+    if args.xcp_save and Path(args.xcp_save).exists() and not Path(args.xcp_save).is_dir():
+        raise InputError(f"--xcp-save {args.xcp_save}: is a file; a folder is needed")
+
+
+def accepted(args: argparse.Namespace) -> list[dict[str, int]]:
+    """The acceptance filters: the node's, and those of its tools."""
+    from hil.calibrate.station import MASTER
+
+    idents = [MASTER] if args.xcp else []
+    if args.uds:
+        from hil.uds.station import FUNCTIONAL, REQUEST
+
+        idents += [REQUEST, FUNCTIONAL]
+    return [*station.ACCEPTED, *({"can_id": ident, "can_mask": 0x7FF} for ident in idents)]
+
+
+def isotp_is_there() -> None:
+    """Refuse UDS where its transport is not installed. Raises InputError."""
+    import importlib.util
+
+    from vaneloop.base.errors import InputError
+
+    if importlib.util.find_spec("isotp") is None:
+        raise InputError("--uds needs the package can-isotp: pip install 'vaneloop[diagnostics]'")
+
+
+def attend(args: argparse.Namespace, node: Any) -> Any:
+    """The node with what answers its tools; the node itself where none may come."""
+    if not wanted(args):
+        return node
+    import numpy as np
+
+    from hil.calibrate import Attended, Memory, Slave
+    from hil.calibrate.a2l import a2l_of
+    from hil.calibrate.daq import gather
+    from hil.calibrate.station import MASTER, SLAVE, XcpService
+
+    memory = Memory(node)
+    services: list[Any] = []
+    if args.uds:
+        services.append(_uds(args, memory))
+    if not args.xcp:
+        return Attended(node, *services)
+    gather(memory.raw, np.zeros((0, 4), np.int64), np.zeros((0, 2), np.int64), 0)  # compiles now, not in a tick
+    slave = Slave(
+        memory,
+        ident=SLAVE,
+        a2l=lambda: a2l_of(memory, master=MASTER, slave=SLAVE),
+        save=Path(args.xcp_save) if args.xcp_save else None,
+        locked=("cal", "daq") if args.xcp_lock else (),
+    )
+    return Attended(node, XcpService(slave), *services)
+
+
+def _uds(args: argparse.Namespace, memory: Any) -> Any:
+    """The UDS server, with the trouble codes of ``--uds-memory``."""
+    from hil.uds import Server, TroubleMemory
+    from hil.uds.station import UdsService
+
+    if not args.uds_memory:
+        return UdsService(Server(memory))
+    file = Path(args.uds_memory)
+    trouble = TroubleMemory.load(file)
+    keeper = _Keeper(file)
+    keeper(trouble.dump())
+    return UdsService(Server(memory, trouble, store=keeper))
+
+
+class _Keeper:
+    """Writes the latest text into a file, on a thread of its own: a disk may be slow, a tick may not."""
+
+    def __init__(self, file: Path):
+        self._file, self._text = file, ""
+        self._wake = threading.Event()
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.touch()
+        except OSError as e:
+            from vaneloop.base.errors import InputError
+
+            raise InputError(f"--uds-memory {file}: cannot be written ({e.strerror})") from None
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+        atexit.register(self._now)
+
+    def __call__(self, text: str) -> None:
+        self._text = text
+        self._wake.set()
+
+    def _write(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            self._now()
+            time.sleep(0.1)
+
+    def _now(self) -> None:
+        beside = self._file.with_name(f".{self._file.name}.new")
+        with contextlib.suppress(OSError):
+            beside.write_text(self._text, encoding="utf-8")
+            beside.replace(self._file)
