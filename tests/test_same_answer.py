@@ -131,10 +131,10 @@ def test_terminal_json_page_and_workbench_agree_which_stages_fail(
     page = tmp_path / "locate.html"
     assert main(["locate", str(LOG), "--report", str(page)]) == 1
     text = capsys.readouterr().out
-    terminal = {m[1]: m[2] == "fails" for m in re.finditer(r"^(\w+): (agrees|fails) ", text, re.M)}
+    terminal = {m[1]: m[2] == "fails" for m in re.finditer(r"^(\w+): (fits|fails) ", text, re.M)}
     drawn = page.read_text(encoding="utf-8")
     on_page = {s: f"{s}: fails in" in drawn for s in terminal}
-    assert all(fails or f"{s}: agrees everywhere" in drawn for s, fails in on_page.items())
+    assert all(fails or f"{s}: fits everywhere" in drawn for s, fails in on_page.items())
     in_json = {s["stage"]: s["fails"] for s in said["locate"]["stages"]}
     on_compare = {s: f"{s}: fails in" in said["compare page"] for s in terminal}
     web = {s: x.fails for s, x in said["web"]["located"].items()}

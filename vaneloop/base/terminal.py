@@ -144,9 +144,9 @@ def plain(v: Any) -> Any:
 
 
 @contextmanager
-def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no
-    terminal.
+def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[..., None] | None]:
+    """Give a function that takes the fraction done, and what is being done where that changes; nothing is drawn when
+    quiet or when standard error is no terminal.
     """
     if args.quiet or not sys.stderr.isatty():
         yield None
@@ -157,7 +157,7 @@ def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[floa
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(text, total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
+        yield lambda fraction, now=text: bar.update(task, completed=fraction, description=now)
 
 
 DEFECT = 70  # exit code of sysexits.h for an internal error
