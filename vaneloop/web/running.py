@@ -15,7 +15,7 @@ from controller import FAULTS, MODES
 from hil.inject.scenario import load_scenario
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.style import STAGE_ROLES
-from vaneloop.web.charts import Curves, Panel, Trace
+from vaneloop.web.charts import MODE_ROLES, Curves, Mark, Panel, Trace, bands
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS, COMPILING
 from vaneloop.web.session import LogFile, Session
@@ -53,7 +53,9 @@ class Loop:
     status: dict[str, Any] = field(default_factory=dict)
     late: dict[str, Any] = field(default_factory=dict)
     recorded: LogFile | None = None
-    events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
+    events: deque[str] = field(default_factory=lambda: deque(maxlen=40))
+    injected: list[Mark] = field(default_factory=list)  # scenarios begun, with their times
+    last: tuple[int, int] = (-1, 0)  # latest mode and faults
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
     boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
@@ -71,23 +73,10 @@ class Loop:
         profile = ["--profile", self.profile] if self.profile else []
         tables = [*self.tables_words(), *self.controller_words()]
         if self.bus == "lockstep":
-            own = (
-                "The slider, the pace and the buttons are the page's own. "
-                if profile
-                else "By slider: the page's own. "
-            )
-            words = [
-                "run",
-                "--bus",
-                "lockstep",
-                *(profile or ["--profile", "ramp"]),
-                "--start-speed",
-                f"{self.demand:g}",
-                *seed,
-                *record,
-                *tables,
-            ]
-            return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
+            if not profile:
+                return [("By slider no command does this; choose a profile to see the one that runs it.", [])]
+            words = ["run", "--bus", "lockstep", *profile, "--start-speed", f"{self.demand:g}", *seed, *record, *tables]
+            return [("The profile alone; pace, slider and buttons are the page's own:", words)]
         return [
             ("", ["run", "--bus", self.bus_name, *seed, *record, *tables]),
             ("", ["ecu", "--bus", self.bus_name, *profile, *self.tables_words()]),
@@ -148,6 +137,8 @@ class Loop:
         self.rows = np.empty((KEPT, len(COLUMNS)))
         self.trace.clear()
         self.events.clear()
+        self.injected.clear()
+        self.last = (-1, 0)
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -250,6 +241,7 @@ class Loop:
         """Start a scenario of the library now."""
         if self.bus == "lockstep":
             self.tell(inject=name)
+            self.injected.append(Mark(self.now(), name))
             self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
             self.session.touch("events")
         else:
@@ -257,6 +249,7 @@ class Loop:
 
     async def _inject_outside(self, name: str) -> None:
         bus = self.bus_name
+        self.injected.append(Mark(self.now(), name))
         w = Worker()
         self.session.extra.setdefault("closers", []).append(w.stop)
         try:
@@ -291,6 +284,7 @@ class Loop:
         self.filled += len(rows)
         self.trace.extend(news.pop("trace"))
         self._light(rows)
+        self._note(rows)
         if first and self.filled:
             self.session.touch("loop")
         self.status = news
@@ -305,6 +299,21 @@ class Loop:
         for i, fault in enumerate(FAULTS):
             if bits >> i & 1:
                 self.lit[fault] = self.lit.get(fault, 0) + 1
+
+    def _note(self, rows: np.ndarray) -> None:
+        """Write changes of mode and faults into the list of events."""
+        before = len(self.events), self.events[-1] if self.events else ""
+        columns = [COLUMNS.index(c) for c in ("t", "state", "faults")]
+        for t, state, faults in rows[:, columns].tolist():
+            mode, bits = int(state) if state == state else -1, int(faults) if faults == faults else 0
+            if mode != self.last[0] and 0 <= mode < len(MODES):
+                self.events.append(f"{t:.1f} s  mode {MODES[mode]}")
+            for i, fault in enumerate(FAULTS):
+                if (bits ^ self.last[1]) >> i & 1:
+                    self.events.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
+            self.last = mode, bits
+        if before != (len(self.events), self.events[-1] if self.events else ""):
+            self.session.touch("events")
 
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
@@ -327,4 +336,8 @@ class Loop:
             )
             for title, unit, least, lines in STRIPS
         ]
-        self.session.curves["run"] = Curves(panels, "run")
+        marks = [m for m in self.injected if t[0] <= m.t <= t[-1]]
+        state, faults = rows[:, COLUMNS.index("state")], rows[:, COLUMNS.index("faults")]
+        spans = bands(t, state, {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
+        spans += bands(t, np.where(np.isfinite(faults), faults, 0.0) > 0, {1: ("fault", "noise")})
+        self.session.curves["run"] = Curves(panels, "run", marks, spans)
