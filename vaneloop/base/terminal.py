@@ -207,6 +207,11 @@ def defect(e: BaseException) -> str:
 
     if isinstance(e, MemoryError):
         return "the machine's memory does not suffice for this"
+    if type(e).__name__ == "BrokenProcessPool":
+        return (
+            "a process of the search was ended from outside (killed, or short of memory); nothing is kept of it: start "
+            "it again, --workers 1 needs less memory"
+        )
     lines = "".join(traceback.format_exception(e))
     place = traceback.extract_tb(e.__traceback__)[-1:]
     at = f" ({Path(place[0].filename).name}:{place[0].lineno})" if place else ""

@@ -322,7 +322,13 @@ def waterfall(
             for i, (level, b, d) in enumerate(zip(levels, base, size, strict=True))
         ],
     }
-    _band_and_marks(layout, Panel("", [], marks={} if floor is None else {f"noise floor {number(floor)}": floor}), "y")
+    _band_and_marks(
+        layout,
+        Panel(
+            "", [], marks={} if floor is None else {f"floor {number(floor)}" if steps[-1][1] != floor else "": floor}
+        ),
+        "y",
+    )
     for mark in layout["annotations"][len(levels) :]:
         mark["y"] = math.log10(mark["y"])  # annotations are placed by exponent on such an axis
     bar = {

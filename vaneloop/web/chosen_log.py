@@ -127,7 +127,7 @@ class ChosenLog:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
 
     def _wrong(self) -> bool:
-        return any(self.s.errors.get(x, "stopped") != "stopped" for x in ("log", "compare"))
+        return any(not self.s.errors.get(x, "stopped").startswith("stopped") for x in ("log", "compare"))
 
     def _form_shows(self) -> tuple[Any, ...]:
         s, c = self.s, self.s.choice

@@ -79,18 +79,16 @@ class _Page:
         if c is None:
             return
         ui.label(c["verdict"]).classes(f"verdict {c['tone']}")
-        with ui.element("div").classes("half"):
-            with ui.element("div").classes("stackc"):
-                self._figures(c)
-            with ui.element("div").classes("stackc"):
-                stages = list(c["located"])
-                if stages:
-                    with ui.element("div").classes("rowc"):
-                        ui.label("Failure map of").classes("soft")
-                        self._stage_toggle(stages, "padding='2px 10px'")
-                    self.live.part(
-                        self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s))
-                    )
+        with ui.element("div").classes("stackc"):
+            self._figures(c)
+        stages = list(c["located"])
+        if stages:
+            with ui.element("div").classes("rowc").style("margin-top:12px"):
+                ui.label("Failure map of").classes("soft")
+                self._stage_toggle(stages, "padding='2px 10px'")
+            self.live.part(
+                self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s))
+            )
 
     def _figures(self, c: dict[str, Any]) -> None:
         s = self.s
@@ -140,7 +138,7 @@ class _Page:
         figure = failure_map(mine)
         worst = max((v, t) for r in mine for v, t in zip(r.ratio, r.moments, strict=True) if t == t)[1]
         with ui.element("div").classes("scroll").props('tabindex="0" role="group" aria-label="failure map"'):
-            figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:860px")
+            figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
         with ui.element("div").classes("rowc"):
             ui.label(f"Worst: {mine[0].worst()}. A click on a cell shows its moment.").classes("note")
             ui.button("Show me the worst moment", icon="visibility", on_click=lambda: self._show(worst)).props(
@@ -163,8 +161,10 @@ class _Page:
                 "held-out data is named."
             )
             live.shown(ui.label(words).classes("soft"), lambda: s.compared is None, "compare", "log")
-            start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props(
-                "unelevated size=md"
+            start = (
+                ui.button("Find the missing physics", icon="search", on_click=s.diagnose)
+                .props("unelevated size=md")
+                .classes("find-missing")
             )
             ready = lambda: s.compared is not None and s.diagnosis is None and not s.working["diagnose"]  # noqa: E731
             live.shown(start, ready, "compare", "log", "diagnosis", "diagnose", "jobs")

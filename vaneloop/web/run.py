@@ -201,6 +201,17 @@ class _Page:
                     with ui.element("div").classes("tile"):
                         self.tiles[name] = ui.label("-").classes("v")
                         ui.label(words).classes("l")
+            with ui.element("div").classes("rowc"):
+
+                def arm(e: events.ValueChangeEventArguments[Any]) -> None:
+                    self.loop.trigger, self.loop.held = bool(e.value), None
+
+                ui.checkbox("hold the charts at the next fault", value=self.loop.trigger, on_change=arm)
+
+                def again() -> None:
+                    self.loop.held = None
+
+                ui.button("Go on", icon="play_arrow", on_click=again).props("flat dense padding='2px 10px'")
             Chart("run", live=8.0)
             ui.timer(0.3, self._shown)
 
@@ -258,6 +269,7 @@ class _Page:
                     box.set_visibility((e.value or "").lower() in text)
 
             find.on_value_change(search)
+            self.live.progress("command")
             self.live.part(self._events, "events", "loop", shows=lambda: (*self.loop.events, self.loop.bus))
 
     def _begin(self, name: str) -> None:
@@ -273,7 +285,12 @@ class _Page:
         if self.loop.injected:
             last = self.loop.injected[-1].text
             if self.loop.bus == "lockstep":
-                ui.label("Here it begins in the loop that runs. By itself, and judged:").classes("note")
+                ui.button(f"Judge {last}", icon="rule", on_click=lambda: self.loop.judge(last)).props(
+                    "outline dense padding='2px 12px'"
+                ).classes("judge")
+                ui.label("Here it begins in the loop that runs. By itself, held against what it expects:").classes(
+                    "note"
+                )
             command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
 
     # ---- trace

@@ -23,6 +23,7 @@ from vaneloop.web.session import LogFile, Session
 __all__ = ["Loop"]
 
 KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
+AFTER = 3.0  # s that the charts show after the fault that they stop at
 SHOWN = 30.0  # s in the strip charts
 TRACED = 2000  # frames kept for the trace
 STRIPS: tuple[
@@ -56,6 +57,8 @@ class Loop:
     events: deque[str] = field(default_factory=lambda: deque(maxlen=40))
     injected: list[Mark] = field(default_factory=list)  # scenarios begun, with their times
     last: tuple[int, int] = (-1, 0)  # latest mode and faults
+    trigger: bool = False  # the charts stop at the next fault
+    held: float | None = None  # s: the fault that they stop at
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
     boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
@@ -138,7 +141,7 @@ class Loop:
         self.trace.clear()
         self.events.clear()
         self.injected.clear()
-        self.last = (-1, 0)
+        self.last, self.held = (-1, 0), None
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -247,6 +250,16 @@ class Loop:
         else:
             self.session.do("inject", self._inject_outside(name))
 
+    def judge(self, name: str) -> None:
+        """Run a scenario by itself, and hold what the machine does against what the scenario expects."""
+        self.session.do("inject", self._judge(name))
+
+    async def _judge(self, name: str) -> None:
+        words = ["inject", name, *self.tables_words(), *self.controller_words()]
+        answer = await self.session.bench.call("command", f"judging {name}", words=words)
+        self.events.append(f"{name}, by itself: {'pass' if answer['code'] == 0 else 'FAIL'}")
+        self.session.touch("events")
+
     async def _inject_outside(self, name: str) -> None:
         bus = self.bus_name
         self.injected.append(Mark(self.now(), name))
@@ -256,7 +269,7 @@ class Loop:
             answer = await w.call(
                 "command", f"injecting {name}", words=["inject", name, "--bus", bus, *self.tables_words()]
             )
-            self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
+            self.events.append(f"{self.now():.1f} s  {name}: {'pass' if answer['code'] == 0 else 'FAIL'}")
         finally:
             w.stop()
             self.session.touch("events")
@@ -311,12 +324,16 @@ class Loop:
             for i, fault in enumerate(FAULTS):
                 if (bits ^ self.last[1]) >> i & 1:
                     self.events.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
+                    if self.trigger and self.held is None and bits >> i & 1:
+                        self.held = t
             self.last = mode, bits
         if before != (len(self.events), self.events[-1] if self.events else ""):
             self.session.touch("events")
 
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
+        if self.held is not None:
+            rows = rows[: np.searchsorted(rows[:, 0], self.held + AFTER)]
         if not len(rows):
             self.session.curves["run"] = Curves()
             return
