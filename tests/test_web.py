@@ -1120,6 +1120,29 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
     assert np.isnan(drawn).any() and np.nanmin(drawn) == np.nanmin(y)
 
 
+def test_another_log_is_laid_over_at_the_first_one_s_times() -> None:
+    from vaneloop.web.charts import of_log
+
+    t = np.arange(100) * 0.1
+    here, there = {"x": ("mm", t, t), "y": ("mm", t, t)}, {"x": ("mm", t[::2], 3.0 * t[::2])}
+    panels = of_log(here, "k", there, later=2.0).panels
+    assert [len(p.traces) for p in panels] == [2, 1]
+    over = panels[0].traces[1].y
+    after = panels[0].t >= 2.0
+    assert np.isnan(over[~after]).all()
+    np.testing.assert_allclose(over[after], 3.0 * (panels[0].t[after] - 2.0), atol=1e-9)
+
+
+def test_a_mode_and_a_fault_are_bands_of_time() -> None:
+    from vaneloop.web.charts import bands
+
+    t = np.arange(10.0)
+    state = np.array([2, 2, 4, 4, 4, 2, np.nan, 3, 3, 3])
+    found = bands(t, state, {2: ("RUN", ""), 3: ("DEGRADED", "model"), 4: ("FAIL_SAFE", "bad")})
+    assert [(b.start, b.end, b.text) for b in found] == [(2.0, 5.0, "FAIL_SAFE"), (7.0, 9.0, "DEGRADED")]
+    assert bands(t[:0], state[:0], {}) == []
+
+
 def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path) -> None:
     from vaneloop.web.running import Loop
     from vaneloop.web.schedule import Plan

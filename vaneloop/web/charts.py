@@ -162,14 +162,24 @@ def _whole(y: Array) -> Array:
     return np.where(last >= 0, np.asarray(y, dtype=np.float64)[np.maximum(last, 0)], 0.0)
 
 
-def of_log(channels: Mapping[str, tuple[str, Array, Array]], key: str) -> Curves:
-    """All channels of a log, one below the other, holes open."""
+Channels = Mapping[str, tuple[str, Array, Array]]  # name -> unit, s, values
+
+
+def of_log(channels: Channels, key: str, over: Channels | None = None, later: float = 0.0) -> Curves:
+    """All channels of a log, one below the other, holes open.
+
+    over   those of another log, laid over them, at the first one's samples
+    later  s, added to the times of the other log
+    """
     panels = []
     for name, (unit, t, values) in channels.items():
         x, y = break_at_holes(t, values)
-        panels.append(
-            Panel(f"{name} [{unit}]", unit, np.asarray(x), [Trace(name, np.asarray(y), "measured")], height=74)
-        )
+        lines = [Trace("this log" if over else name, np.asarray(y), "measured")]
+        if over and name in over:
+            _, t2, v2 = over[name]
+            there = np.interp(np.asarray(x), np.asarray(t2) + later, v2, np.nan, np.nan)
+            lines.append(Trace("the other log", there, "model"))
+        panels.append(Panel(f"{name} [{unit}]", unit, np.asarray(x), lines, height=74))
     spans = []
     if "state" in channels:
         _, t, values = channels["state"]

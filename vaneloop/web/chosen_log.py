@@ -66,9 +66,13 @@ class ChosenLog:
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
             self.live.part(self._form, "log", "compare", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
+                self.live.part(
+                    self._other, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
+                )
+                self.live.complaint("over")
                 chart = Chart("log", tree=True)
             all_channels.props("dense")
-            self.live.watch(chart.refetch, "log")
+            self.live.watch(chart.refetch, "log", "over")
 
     def _choose(self) -> None:
         s = self.s
@@ -82,6 +86,22 @@ class ChosenLog:
         ui.select(options, value=at, label="or choose one", on_change=chosen).props(
             "outlined dense options-dense"
         ).classes("w-full choose")
+
+    def _other(self) -> None:
+        """Another log laid over this one."""
+        s = self.s
+        if s.choice.file is None:
+            return
+
+        def lay() -> None:
+            s.lay_over(s.files[other.value] if other.value is not None else None, float(later.value or 0.0))
+
+        with ui.element("div").classes("rowc"):
+            options = {i: f.name for i, f in enumerate(s.files) if f != s.choice.file}
+            other = ui.select(options, label="lay another log over it", on_change=lay, clearable=True)
+            other.props("outlined dense options-dense").style("min-width:240px").classes("other")
+            later = ui.number("later by [s]", value=0.0, on_change=lambda: lay() if other.value is not None else None)
+            later.props("outlined dense debounce=500").style("width:120px")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
         file = await receive(self.s, e, "log")

@@ -12,7 +12,7 @@ import shlex
 import shutil
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +187,19 @@ class Session:
         else:
             wanted = ", ".join(UNITS)
             raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
+
+    def lay_over(self, file: LogFile | None, later: float) -> None:
+        """Draw another log over this one, read in the same way, so many seconds later; None: take it away."""
+        self.do("over", self._lay_over(file, later))
+
+    async def _lay_over(self, file: LogFile | None, later: float) -> None:
+        over = None
+        if file is not None:
+            words = replace(self.choice, file=file).reading(real=True)
+            over = (await self.bench.call("preview", "reading the other log", words=words))["channels"]
+        if self.preview is not None and self.choice.file is not None:
+            self.curves["log"] = of_log(self.preview["channels"], str(self.choice.file.path), over, later)
+        self.touch("over")
 
     async def _compare(self) -> None:
         words = self.choice.words(real=True)
