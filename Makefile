@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can mutants bench lint clean
+.PHONY: help demo test test-all test-can mutants bench pictures lint clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -51,6 +51,10 @@ mutants: $(READY)  ## would the tests notice? changes the code in small ways, a 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)
 	@$(PY) -m benchmarks
+
+pictures: $(READY)  ## take the pictures of the README anew (docs/pictures/web_*.png)
+	@$(need_chromium)
+	@$(PY) -m benchmarks.pictures
 
 lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'ruff'

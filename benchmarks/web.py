@@ -18,6 +18,7 @@ from benchmarks.measure import ROOT, Row
 
 __all__ = ["MEASUREMENTS"]
 
+SERVER: list[int] = []  # process of the server that was started last
 REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
 PATIENCE = 240_000  # ms
 
@@ -40,7 +41,7 @@ STEP = """async ({dx, dy, at}) => {
 
 # A press on another stage: ms until the page shows that stage.
 PRESS = """async (name) => {
-  const button = [...document.querySelectorAll('.half .q-btn-toggle button')].find((b) => b.innerText.trim() === name);
+  const button = [...document.querySelectorAll('.q-btn-toggle button')].find((b) => b.innerText.trim() === name);
   const began = performance.now();
   button.click();
   while (![...document.querySelectorAll('.soft.small')].some((x) => x.innerText.startsWith('The ' + name)) &&
@@ -85,6 +86,7 @@ def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
         str(folder),
     ]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    SERVER.append(server.pid)
     try:
         assert server.stdout is not None
         url = server.stdout.readline().strip()
@@ -145,7 +147,7 @@ def web() -> Iterator[Row]:
             )
 
             page.get_by_role("button", name="Find the missing physics").click()
-            page.get_by_text("searching the library").wait_for()
+            page.get_by_text("stages searched").wait_for()
             answers = []
             stages = ["servo", "engine", "linkage", "actuator", "demand"]
             for k in range(20):
@@ -159,4 +161,90 @@ def web() -> Iterator[Row]:
             yield row("web: zoom, while a diagnosis runs", zooms, 0.2, "until the points of the view are there")
 
 
-MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {"the workbench": web}
+# A press on a switch: ms until the page shows the fit with it, or without.
+SWITCH = """async (name) => {
+  const before = document.querySelector('.after').dataset.ratio, began = performance.now();
+  document.querySelector(`[aria-label="${name}"]`).click();
+  while (document.querySelector('.after').dataset.ratio === before && performance.now() - began < 60000)
+    await new Promise((r) => setTimeout(r, 1));
+  return performance.now() - began;
+}"""
+LIVE = 180.0  # s of the live loop at ten times real time: half an hour of its own time
+GROWTH = 0.1  # of the memory after the first minute that the rest may add
+
+
+def resident(pid: int) -> int:
+    """Memory of a process and all that it started, in kB."""
+    total = 0
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            total = int(line.split()[1])
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        total += sum(resident(int(child)) for child in task.read_text().split())
+    return total
+
+
+def two_minutes() -> Iterator[Row]:
+    """The way of a user with a log of 200 s: where it fails, the first finding, the diagnosis, a switch."""
+    with workbench(ROOT / "examples") as (browser, url):
+        page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE)
+        page.goto(url)
+        page.locator("input[type=file]").first.wait_for(state="attached")
+        dropped, found, whole, switched = [], [], [], []
+        for k in range(4):
+            file = page.locator("input[type=file]").first
+            began = time.perf_counter()
+            file.set_input_files(str(ROOT / "examples" / "hidden_effect.parquet"))
+            if k:
+                page.get_by_text("fails most in the actuator stage").wait_for(state="detached")
+            page.get_by_text("fails most in the actuator stage").wait_for()
+            dropped.append(time.perf_counter() - began)
+            began = time.perf_counter()
+            page.get_by_role("button", name="Find the missing physics").click()
+            page.locator(".sofar").first.wait_for()
+            found.append(time.perf_counter() - began)
+            page.get_by_text("The actuator stage lacks").wait_for()
+            whole.append(time.perf_counter() - began)
+            page.locator(".after").wait_for()
+        time.sleep(20.0)  # the fits ahead
+        for _ in range(8):
+            switched.append(page.evaluate(SWITCH, "aero_load") / 1e3)
+        note = "the first is with modules still to load"
+        yield row("web: a log of 200 s, until where it fails is shown", dropped, 3.0, note)
+        yield row("web: a diagnosis, until the first stage has its answer", found, 2.0, "stages as they finish")
+        yield row("web: a diagnosis, whole", whole, 5.0, "five stages, two processes")
+        yield row("web: a switch whose fit is made ahead", switched, 0.2, "")
+
+
+def half_an_hour() -> Iterator[Row]:
+    """Memory of the server, and of all that it started, while the live loop runs for half an hour of its own time."""
+    with workbench(ROOT / "examples") as (browser, url):
+        page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+        page.set_default_timeout(PATIENCE)
+        page.goto(url.replace("/?", "/run?"))
+        page.locator(".pace").click()
+        page.get_by_role("option", name="10 x", exact=True).click()
+        page.get_by_role("button", name="Start", exact=True).click()
+        page.locator('[data-lamp="RUN"].good').wait_for()
+        time.sleep(LIVE / 3.0)
+        server = SERVER[-1]
+        before = resident(server)
+        time.sleep(LIVE)
+        after, reached = resident(server), page.locator(".tiles .v").first.inner_text()
+        grown = after / before - 1.0
+        note = f"{before / 1024:,.0f} to {after / 1024:,.0f} MB; {reached} s of the loop's own time"
+        yield Row(
+            "web: growth of memory",
+            f"{100 * grown:.1f} %",
+            f"limit {100 * GROWTH:.0f} %",
+            GROWTH / max(grown, 1e-3),
+            ">= 1",
+            grown <= GROWTH,
+            note,
+        )
+
+
+MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "the workbench": web, "two minutes with the workbench": two_minutes, "half an hour of the live loop": half_an_hour,
+}  # fmt: skip

@@ -513,7 +513,7 @@ def test_locating_and_diagnosing_start_from_the_same_error() -> None:
 
 def test_a_stage_fails_where_one_condition_does_or_the_whole_is_more_than_noise() -> None:
     clean = locate(Judge(integrator(1), FLOOR))
-    assert not clean.fails and clean.verdict() == "agrees everywhere" and clean.json()["fails"] is False
+    assert not clean.fails and clean.verdict() == "fits everywhere" and clean.json()["fails"] is False
     louder = locate(Judge(integrator(1), FLOOR / 1.2))
     assert louder.fails and louder.worst.ratio == pytest.approx(1.2, rel=0.03)
     assert replace(louder, regimes=()).verdict().startswith("fails in no single condition more than in others: ")

@@ -6,6 +6,7 @@ import importlib
 import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,22 @@ def test_the_traceback_is_printed_where_asked_for(
 def test_a_traceback_that_cannot_be_kept_is_no_second_error(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda *a, **k: (_ for _ in ()).throw(OSError("full")))
     assert "VANELOOP_DEBUG=1 prints the traceback" in terminal.defect(KeyError("x"))
+
+
+def killed(*_: object, **__: object) -> None:
+    """Work in a process that somebody kills."""
+    with ProcessPoolExecutor(1) as pool:
+        pool.submit(os.kill, os.getpid(), 0).result()  # it works
+        pool.submit(os._exit, 9).result()
+
+
+def test_a_killed_search_says_what_to_do_next(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vaneloop.cli.diagnose.command", killed)
+    assert main(["diagnose", LOG]) == 70
+    line = complaint(capsys.readouterr().err)
+    assert "was ended from outside" in line and "start it again" in line and "BrokenProcessPool" not in line
 
 
 def test_bad_input_is_no_defect(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,11 +20,13 @@ from hypothesis import strategies as st
 from hil.figures import error_figures
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
+from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
 from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.replay import replay_page
 from vaneloop.pages.series import MAX_POINTS, decimate
+from vaneloop.pages.story import falling, worths
 from vaneloop.pages.style import THEMES, number
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'\u2028"
@@ -296,7 +298,28 @@ def test_a_histogram_shares_out_all_samples():
 
 def test_a_waterfall_hangs_each_fall_from_the_level_before():
     bar = waterfall([("base", 1.0), ("friction", 0.4), ("offset", 0.1), ("left", 0.1)], "rms")["data"][0]
-    assert bar["base"] == [0, 0.4, 0.1, 0] and bar["y"] == pytest.approx([1.0, 0.6, 0.3, 0.1])
+    bottom = bar["base"][0]
+    assert 0.0 < bottom < 0.1  # the axis is logarithmic
+    assert bar["base"] == [bottom, 0.4, 0.1, bottom]
+    assert bar["y"] == pytest.approx([1.0 - bottom, 0.6, 0.3, 0.1 - bottom])
+
+
+def test_steps_are_named_by_what_they_add_and_what_they_drop():
+    said = StageDiagnosis.__new__(StageDiagnosis)
+    said.steps = [("nominal", 9.0), ("a + b", 3.0), ("a + b + c", 2.0), ("a + c", 1.0)]
+    assert falling(said) == [
+        ("nominal", 9.0), ("+ a + b", 3.0), ("+ c", 2.0), ("− b", 1.0), ("noise floor", 1.0),
+    ]  # fmt: skip
+    said.steps = [("nominal", 9.0), ("+ a", 3.0), ("+ b", 1.2), ("without numerical error", 1.1)]
+    assert [n for n, _ in falling(said)] == ["nominal", "+ a", "+ b", "without numerical error", "noise floor"]
+
+
+def test_an_effect_s_share_is_its_part_of_the_way_in_decades():
+    said = StageDiagnosis.__new__(StageDiagnosis)
+    said.steps, said.excess = [("nominal", 100.0)], 1.0
+    said.effects = [Found("small", 1.0, {}, [], 0.0, fall=10.0), Found("great", 1.0, {}, [], 0.0, fall=100.0)]
+    assert [(w.effect, w.without) for w in worths(said)] == [("great", 100.0), ("small", 10.0)]
+    assert [w.share for w in worths(said)] == pytest.approx([1.0, 0.5])
 
 
 # ---------------------------------------------------------------- replay and engine test

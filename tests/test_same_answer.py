@@ -131,10 +131,10 @@ def test_terminal_json_page_and_workbench_agree_which_stages_fail(
     page = tmp_path / "locate.html"
     assert main(["locate", str(LOG), "--report", str(page)]) == 1
     text = capsys.readouterr().out
-    terminal = {m[1]: m[2] == "fails" for m in re.finditer(r"^(\w+): (agrees|fails) ", text, re.M)}
+    terminal = {m[1]: m[2] == "fails" for m in re.finditer(r"^(\w+): (fits|fails) ", text, re.M)}
     drawn = page.read_text(encoding="utf-8")
     on_page = {s: f"{s}: fails in" in drawn for s in terminal}
-    assert all(fails or f"{s}: agrees everywhere" in drawn for s, fails in on_page.items())
+    assert all(fails or f"{s}: fits everywhere" in drawn for s, fails in on_page.items())
     in_json = {s["stage"]: s["fails"] for s in said["locate"]["stages"]}
     on_compare = {s: f"{s}: fails in" in said["compare page"] for s in terminal}
     web = {s: x.fails for s, x in said["web"]["located"].items()}
@@ -143,6 +143,42 @@ def test_terminal_json_page_and_workbench_agree_which_stages_fail(
     sentence = "The model fails most in the actuator stage: x_lvdt is off by"
     assert all(sentence in x for x in (drawn, said["compare page"], said["web"]["verdict"]))
     assert said["compare"]["verdict"] == "fails"
+
+
+def test_every_verb_s_page_has_a_title_of_its_own_and_the_extended_model_is_told_as_such(said: dict[str, Any]) -> None:
+    titles = {v: re.search("<h1>(.*?)</h1>", said[f"{v} page"])[1] for v in ("compare", "locate", "diagnose", "extend")}  # type: ignore[index]
+    assert len(set(titles.values())) == 4 and titles["extend"] == f"Extended model: {LOG.name}"
+    page = said["extend page"]
+    verdict = re.search('<p class="verdict (.*?)">(.*?)</p>', page)
+    assert verdict and verdict[1] == "good" and "lacks" not in verdict[2] and verdict[2].endswith("explained.")
+    assert re.search(r'class="tile good">.*?actuator: x_lvdt.*?class="value">13\d → (0\.9\d|1\.0\d)<', page)
+    assert "tile bad" not in page
+
+
+def test_an_effect_found_is_never_without_its_bar(said: dict[str, Any]) -> None:
+    """aero_load helps only beside the dead band: alone it gains nothing, and yet it is worth much."""
+    for verb in ("diagnose", "extend"):
+        figures = json.loads(re.search(r'id="figures">(.*?)</script>', said[f"{verb} page"])[1])  # type: ignore[index]
+        worth = next(
+            f for f in figures if "without it" in f["layout"].get("xaxis", {}).get("title", {}).get("text", "")
+        )
+        without = dict(zip(worth["data"][0]["y"], worth["data"][0]["x"], strict=True))
+        assert set(without) == {"valve_dead_band", "aero_load"}
+        assert without["aero_load"] > 5.0 and without["valve_dead_band"] > 60.0
+        assert worth["layout"]["xaxis"]["type"] == "log"
+
+
+def test_a_cell_of_a_failure_map_has_its_values_and_its_moment(said: dict[str, Any]) -> None:
+    figures = json.loads(re.search(r'id="figures">(.*?)</script>', said["locate page"])[1])  # type: ignore[index]
+    found = next(f for f in figures if f["data"][0]["type"] == "heatmap")
+    stage = next(s for s in said["locate"]["stages"] if s["stage"] == "actuator")
+    times = next(r for r in stage["regimes"] if r["condition"] == "time")
+    row = found["data"][0]["y"].index("time [s]")
+    assert found["data"][0]["customdata"][row][: len(times["moments_s"])] == times["moments_s"]
+    for low, high, t in zip(times["edges"][:-1], times["edges"][1:], times["moments_s"], strict=True):
+        assert low <= t <= high
+    shown = figures[found["layout"]["meta"]["shows"]]
+    assert "x_lvdt" in shown["layout"]["yaxis"]["title"]["text"]
 
 
 def test_agrees_is_one_number() -> None:

@@ -143,9 +143,26 @@ def shot(page: Any, name: str) -> None:
     page.screenshot(path=str(SHOTS / f"{name}.png"), full_page=True)
 
 
+def violations(page: Any) -> dict[str, str]:
+    """What axe-core finds wrong for somebody who uses a keyboard or a screen reader: rule -> the first place."""
+    axe = pytest.importorskip("axe_playwright_python", reason="no axe-core: pip install -e '.[test]'")
+    page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run(document).then((r) => r.violations.map((v) => [v.id, v.nodes[0].html]))")
+    return dict(found)
+
+
+def tab_to(page: Any, selector: str) -> None:
+    """Press Tab until the element that matches has the focus."""
+    for _ in range(200):
+        page.keyboard.press("Tab")
+        if page.evaluate("(s) => !!document.activeElement && document.activeElement.matches(s)", selector):
+            return
+    raise AssertionError(f"{selector} cannot be reached by keyboard")
+
+
 def looks(page: Any, name: str) -> None:
-    """Pictures, narrow and light, wide and dark; nothing may stick out of the page."""
-    for width, dark in ((1280, False), (1920, True)):
+    """Pictures: a laptop in light, a wide screen and a phone in dark. Nothing sticks out, axe-core is content."""
+    for width, dark in ((1280, False), (1920, True), (360, True)):
         page.set_viewport_size({"width": width, "height": 900})
         if dark != ("body--dark" in (page.locator("body").get_attribute("class") or "")):
             page.get_by_label("light or dark").click()
@@ -155,6 +172,7 @@ def looks(page: Any, name: str) -> None:
             f"{name} at {width}"
         )
         shot(page, f"{name}_{width}_{'dark' if dark else 'light'}")
+        assert not violations(page), f"{name} at {width}"
     page.get_by_label("light or dark").click()
     page.set_viewport_size({"width": 1280, "height": 800})
 
@@ -181,13 +199,29 @@ def wait_ratio(page: Any, condition: str) -> None:
 @needs_browser
 def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page: Any) -> None:
     page.goto(server.url)
-    choose(page, "hidden_effect.parquet")
+    # all of the way by keyboard: the log, the search, a switch
+    page.get_by_text("Drop a log here").first.wait_for()
+    tab_to(page, ".choose input")
+    page.keyboard.press("Enter")
+    option = page.get_by_role("option", name="hidden_effect.parquet")
+    option.wait_for()
+    chosen = "[...document.querySelectorAll('[role=option]')].findIndex((o) => o.innerText.includes('hidden_effect'))"
+    for _ in range(1 + page.evaluate(chosen)):
+        page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
     page.get_by_text("fails most in the actuator stage").wait_for()
+    tab_to(page, ".show-worst")
+    page.keyboard.press("Enter")  # the curves go to the worst moment of the map
+    page.wait_for_function(
+        "[...document.querySelectorAll('.curves')].some((c) => c.dataset.view && "
+        "Math.abs(c.dataset.view.split(' ')[1] - c.dataset.view.split(' ')[0] - 4) < 0.01)"
+    )
     search = page.get_by_role("button", name="Find the missing physics")
 
     # a cancelled search leaves nothing behind
-    search.click()
-    page.get_by_text("searching the library").wait_for()
+    tab_to(page, ".find-missing")
+    page.keyboard.press("Enter")
+    page.get_by_text("stages searched").wait_for()
     during = server.workers()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_text("stopped").wait_for()
@@ -201,8 +235,9 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
 
     # a reload in the middle of a search keeps it
     search.click()
-    page.get_by_text("searching the library").wait_for()
+    page.get_by_text("stages searched").wait_for()
     page.reload()
+    page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
     page.get_by_text("The actuator stage lacks valve_dead_band and aero_load").wait_for()
     wait_ratio(page, "< 1.1")
     found = page.locator('[data-effect="valve_dead_band"] .about').inner_text()
@@ -211,7 +246,8 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     shot(page, "missing_1280_light")
 
     # the error follows the switches
-    page.get_by_role("switch", name="aero_load").click()
+    tab_to(page, "[aria-label=aero_load]")
+    page.keyboard.press(" ")
     wait_ratio(page, "> 5")
     page.get_by_role("switch", name="aero_load").click()
     wait_ratio(page, "< 1.1")
@@ -291,6 +327,17 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     page.locator(".cmd code", has_text="--design-rpm 38000").first.wait_for()
     page.get_by_text("fails most in the").wait_for()
     assert page.get_by_label("name of n_r in the log").input_value() == "N1"
+    # typed and confirmed with Enter, a name stays; all of it is saved as the file that --mapping takes
+    page.get_by_label("name of x_dem in the log").click()
+    page.keyboard.type("x_dem")
+    page.keyboard.press("Enter")
+    page.locator(".cmd code", has_text="--map x_dem=x_dem").first.wait_for()
+    page.get_by_text("fails most in the").wait_for()
+    page.get_by_role("button", name="Save as mapping file").click()
+    with page.expect_download() as download:
+        page.get_by_text("download mapping.toml").click()
+    bench = tomllib.loads(Path(download.value.path()).read_text())
+    assert bench["names"]["n_r"] == "N1" and bench["units"]["x_lvdt"] == "m"
     preview = page.locator(".vtable").first.inner_text()
     assert "ACT_POS" in preview and "N1_DEM" in preview
     command = page.locator(".cmd code").first.inner_text()
@@ -309,6 +356,44 @@ def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
         "a.csv", "--map", "N1=n_dem", "--unit", "n_dem=rpm", "--design-rpm", "38000", "--mapping", "bench.toml",
         "--no-guess",
     ]  # fmt: skip
+
+
+@needs_browser
+def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path: Path) -> None:
+    import vaneloop
+    from vaneloop.pages.diagnosis import diagnosis_page, experiment_page
+
+    log = ROOT / "examples" / "hidden_effect.parquet"
+    extended = vaneloop.extend(log, ["valve_dead_band", "aero_load"])
+    parts = extended.diagnosis, extended.bound, "vaneloop", str(log)
+    t = np.arange(100.0)
+    experiment = {"text": "Ramp it.", "t": t, "n_dem": t}
+    reports = {
+        "locate": vaneloop.locate(log).page(),
+        "replay": vaneloop.replay(vaneloop.read_log(log)).page(),
+        "extend": extended.page(),
+        "diagnose": diagnosis_page(*parts),
+        "experiment": experiment_page(*parts, "Ramp it.", experiment),
+    }
+    for name, made in reports.items():
+        file = made.write(tmp_path / f"{name}.html")
+        for width, scheme in ((1280, "light"), (360, "dark")):
+            context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+            page = context.new_page()
+            page.goto(file.as_uri())
+            page.wait_for_function("document.querySelectorAll('.main-svg').length > 0", timeout=LONG)
+            shot(page, f"report_{name}_{width}_{scheme}")
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{name}: {wide} px of {width}"
+            assert not violations(page), f"{name} at {width}"
+            if name == "extend" and width == 1280:  # the way from a cell to its moment, by keyboard
+                tab_to(page, ".show")
+                page.keyboard.press("Enter")
+                page.wait_for_function(
+                    "[...document.querySelectorAll('.plot')].some((p) => p.layout.xaxis.range && "
+                    "Math.abs(p.layout.xaxis.range[1] - p.layout.xaxis.range[0] - 4) < 1e-6)"
+                )
+            context.close()
 
 
 # ---- page 2: schedule ------------------------------------------------------------------------------------------------
@@ -465,6 +550,9 @@ def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> Non
     for loop.bus in ("lockstep", "local", "vcan0"):
         for loop.profile, loop.seed, loop.record in ((None, None, True), ("staircase", 7, False)):
             for without, words in loop.commands():
+                if not words:  # by slider: no command does that
+                    assert loop.bus == "lockstep" and loop.profile is None and without
+                    continue
                 args = parsed(words[0], words[1:])
                 assert args.bus == loop.bus_name and shlex.split(shlex.join(words)) == words
                 assert bool(without) == (loop.bus == "lockstep")
@@ -1032,6 +1120,29 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
     assert np.isnan(drawn).any() and np.nanmin(drawn) == np.nanmin(y)
 
 
+def test_another_log_is_laid_over_at_the_first_one_s_times() -> None:
+    from vaneloop.web.charts import of_log
+
+    t = np.arange(100) * 0.1
+    here, there = {"x": ("mm", t, t), "y": ("mm", t, t)}, {"x": ("mm", t[::2], 3.0 * t[::2])}
+    panels = of_log(here, "k", there, later=2.0).panels
+    assert [len(p.traces) for p in panels] == [2, 1]
+    over = panels[0].traces[1].y
+    after = panels[0].t >= 2.0
+    assert np.isnan(over[~after]).all()
+    np.testing.assert_allclose(over[after], 3.0 * (panels[0].t[after] - 2.0), atol=1e-9)
+
+
+def test_a_mode_and_a_fault_are_bands_of_time() -> None:
+    from vaneloop.web.charts import bands
+
+    t = np.arange(10.0)
+    state = np.array([2, 2, 4, 4, 4, 2, np.nan, 3, 3, 3])
+    found = bands(t, state, {2: ("RUN", ""), 3: ("DEGRADED", "model"), 4: ("FAIL_SAFE", "bad")})
+    assert [(b.start, b.end, b.text) for b in found] == [(2.0, 5.0, "FAIL_SAFE"), (7.0, 9.0, "DEGRADED")]
+    assert bands(t[:0], state[:0], {}) == []
+
+
 def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path) -> None:
     from vaneloop.web.running import Loop
     from vaneloop.web.schedule import Plan
@@ -1042,7 +1153,7 @@ def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path
     s.choice.file = LogFile(tmp_path / "run.csv", "run.csv", "run.csv")
     for real in (False, True):
         assert s.choice.words(real)[-2:] == ["--tables", folder]
-    assert all(words[-2:] == ["--tables", folder] for _, words in Loop(s).commands())
+    assert all(words[-2:] == ["--tables", folder] for _, words in Loop(s, profile="ramp").commands())
     plan = Plan.of(s)
     assert plan.geometry.vanes == plan.schedules.vanes == ("vigv", "vgv1", "vgv2", "vgv3")
 

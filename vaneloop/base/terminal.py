@@ -144,9 +144,9 @@ def plain(v: Any) -> Any:
 
 
 @contextmanager
-def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that takes the fraction done; nothing is drawn when quiet or when standard error is no
-    terminal.
+def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[..., None] | None]:
+    """Give a function that takes the fraction done, and what is being done where that changes; nothing is drawn when
+    quiet or when standard error is no terminal.
     """
     if args.quiet or not sys.stderr.isatty():
         yield None
@@ -157,7 +157,7 @@ def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[[floa
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(text, total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
+        yield lambda fraction, now=text: bar.update(task, completed=fraction, description=now)
 
 
 DEFECT = 70  # exit code of sysexits.h for an internal error
@@ -207,6 +207,11 @@ def defect(e: BaseException) -> str:
 
     if isinstance(e, MemoryError):
         return "the machine's memory does not suffice for this"
+    if type(e).__name__ == "BrokenProcessPool":
+        return (
+            "a process of the search was ended from outside (killed, or short of memory); nothing is kept of it: start "
+            "it again, --workers 1 needs less memory"
+        )
     lines = "".join(traceback.format_exception(e))
     place = traceback.extract_tb(e.__traceback__)[-1:]
     at = f" ({Path(place[0].filename).name}:{place[0].lineno})" if place else ""

@@ -37,6 +37,7 @@ def command(args: argparse.Namespace) -> int:
         return _own(args)
     from hil.logs import LogError
     from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.pages import story
     from vaneloop.verbs.search import Stages
 
     extra: dict[str, object] = {}
@@ -57,12 +58,12 @@ def command(args: argparse.Namespace) -> int:
         stages = [f.json() for f in figures]
         floors = {f.signal: f.noise_floor for f in figures}
         rows = [
-            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), f"{f.ratio:.2f}",
+            [f.stage, f.signal, *(f"{v:.4g}" for v in (f.rms, f.noise_floor)), story.floors(f.ratio),
             f"{f.rms_as_given:.4g}", f.unit,
              f"{f.samples:,}"] for f in figures
         ]  # fmt: skip
         rows += [
-            [name, "not observed: " + why, "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()
+            [name, f"{story.CANNOT}: {why}", "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()
         ]
         columns = ["stage", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
         terminal.print_table(

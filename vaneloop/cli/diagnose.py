@@ -50,7 +50,8 @@ def command(args: argparse.Namespace) -> int:
     else:
         chain = chain_of(args)
         with terminal.progress_bar(args, "searching the library of effects") as progress:
-            answer = diagnosed(chain, args.log, args.workers, progress)
+            tell = progress and (lambda n: progress(n.fraction, n.text))
+            answer = diagnosed(chain, args.log, args.workers, news=tell)
     show(args, answer)
     terminal.write_json(args, answer.to_dict())
     if args.report:
@@ -61,14 +62,16 @@ def command(args: argparse.Namespace) -> int:
 
 def show(args: argparse.Namespace, answer: Any) -> None:
     """Print the verdict, the stages and the effects."""
+    from vaneloop.pages.story import CANNOT, doubt, word
+
     d = answer.diagnosis
     rows = []
     for s in d.stages:
         for k in range(len(s.floor)):
             figures = [f"{v:.4g}" for v in (s.error_before[k], s.error_after[k], s.floor[k])]
-            rows.append([s.stage, s.verdict, s.outputs[k], *figures, s.units[k]])
+            rows.append([s.stage, word(s), s.outputs[k], *figures, s.units[k]])
     for name, why in d.not_observed.items():
-        rows.append([name, "not observed", why, "-", "-", "-", ""])
+        rows.append([name, CANNOT, why, "-", "-", "-", ""])
     columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
@@ -82,11 +85,8 @@ def show(args: argparse.Namespace, answer: Any) -> None:
             values = ", ".join(
                 f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
             )
-            rivals = f"; as good: {', '.join(f.rivals)}" if f.rivals else ""
-            cause = f"; this log cannot tell its cause from {' or '.join(f.inseparable)}" if f.inseparable else ""
-            terminal.say(
-                args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{rivals}{cause}"
-            )
+            unsure = f"; {doubt(f)}" if doubt(f) else ""
+            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{unsure}")
         for x in d.shapes.get(s.stage, []):
             terminal.say(args, f"{'unknown' if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
         if s.verdict == "unknown" and (s.nearest or s.refused):

@@ -38,7 +38,8 @@ def command(args: argparse.Namespace) -> int:
 
     chain = chain_of(args)
     with terminal.progress_bar(args, "searching the library of effects") as progress:
-        found = diagnosed(chain, args.log, progress=progress)
+        tell = progress and (lambda n: progress(n.fraction, n.text))
+        found = diagnosed(chain, args.log, news=tell)
     with terminal.progress_bar(args, "trying profiles") as progress:
         answer = recommend(None, found, progress=progress)
     e = answer.recommended

@@ -43,6 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import Model
+    from vaneloop.pages.story import floors, word
     from vaneloop.verbs.search import extended, known
 
     wanted = list(dict.fromkeys(e for group in args.effect for e in group))
@@ -73,8 +74,10 @@ def command(args: argparse.Namespace) -> int:
     for r in results:
         for k in range(len(r.floor)):
             figures = [f"{v:.4g}" for v in (r.error_before[k], r.error_after[k], r.floor[k])]
-            rows.append([r.stage, r.outputs[k], *figures, f"{r.error_after[k] / r.floor[k]:.2f}", r.units[k]])
-    columns = ["stage", "signal", "error before", "error after", "noise floor", "after / floor", "unit"]
+            rows.append(
+                [r.stage, word(r, True), r.outputs[k], *figures, floors(r.error_after[k] / r.floor[k]), r.units[k]]
+            )
+    columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "after / floor", "unit"]
     terminal.print_table(args, "errors are RMS on held-out data", columns, rows)
     options.say_tested(args, answer.tested)
     for r in results:
@@ -86,9 +89,10 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(
             args,
             f"{r.stage}, in noise floors: "
-            + " -> ".join(f"{name} {level:.2f}" for name, level in r.steps)
+            + " -> ".join(f"{name} {floors(level)}" for name, level in r.steps)
             + " -> noise floor 1.00",
         )
+    terminal.say(args, answer.sentence())
     terminal.say(args, f"model: {args.out}")
     terminal.write_json(args, answer.to_dict())
     if args.report:

@@ -19,7 +19,7 @@ examples:
   vaneloop locate examples/hidden_effect.parquet --report locate.html
   vaneloop locate examples/hidden_effect.parquet --model with_dead_band.toml --json -
 
-exit codes: 0 every stage agrees everywhere, 1 at least one fails, 2 bad input"""
+exit codes: 0 every stage fits everywhere, 1 at least one fails, 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def command(args: argparse.Namespace) -> int:
         own_model.show(args, answer.by_log)
     else:
         chain = chain_of(args)
-        answer = Stages(chain, locate_stages(chain.stages), args.log)
+        answer = Stages(chain, locate_stages(chain.stages), args.log, verb="locate")
     options.say_tested(args, answer.tested)
     for x in answer.located:
         say_located(args, x)

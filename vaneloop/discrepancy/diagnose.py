@@ -188,7 +188,7 @@ def _search(search: Search) -> Said:
     candidates = []
     for name, fit in singles.items():
         why = "" if criterion.shows(search.reach[name]) else stage.effect(name).excites or "this log does not excite it"
-        candidates.append(Candidate(name, *criterion.gain(base, fit), why))
+        candidates.append(Candidate(name, *criterion.gain(base, fit), why, rms_of(judge, fit)))
     candidates.sort(key=lambda c: -c.nats)
 
     current, steps = base, [("nominal", rms_of(judge, base))]
@@ -274,4 +274,5 @@ def extend_stage(
         numerical = float(np.sqrt(np.sum(d * d) / max(judge.n, 1)))
         steps.append(("without numerical error", float(np.sqrt(max(rms_of(judge, fit) ** 2 - numerical**2, 0.0)))))
     verdict = "missing" if effects else "none"
-    return answer_of(judge, verdict, search.base, fit, found_of(judge, fit, effects), steps)
+    without = {e: search.joined(tuple(m for m in effects if m != e)) for e in effects}
+    return answer_of(judge, verdict, search.base, fit, found_of(judge, fit, effects, without), steps)

@@ -6,7 +6,6 @@ own models draw it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,19 +15,7 @@ from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.stage import KNOWN_TO, Array, without_jumps
 from vaneloop.discrepancy.stage_answer import rms_per_output
 
-__all__ = [
-    "AGREES",
-    "Located",
-    "Regime",
-    "Shape",
-    "StageFigures",
-    "agrees",
-    "bins_of",
-    "locate",
-    "onset",
-    "regimes",
-    "shape",
-]
+__all__ = ["AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape"]
 
 # noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
 AGREES = 1.1
@@ -83,6 +70,7 @@ class Regime:
     samples  per bin
     significant  bins whose error exceeds the noise floor, corrected for the number of bins and regimes looked at
     contrast how unevenly the squared error is spread over the bins: 0 even, 1 all in one bin
+    moments  s, when the error of each bin is greatest; NaN where a bin has no sample
     """
 
     output: str
@@ -95,17 +83,20 @@ class Regime:
     samples: Array
     significant: Array
     contrast: float
+    moments: Array
+
+    def place(self, b: int) -> str:
+        """A bin in words."""
+        low, high = self.edges[b], self.edges[b + 1]
+        if self.condition == "direction":
+            where = {-1.0: "negative", 0.0: "at rest", 1.0: "positive"}
+            return f"direction {where[float(round(0.5 * (low + high)))]}"
+        return f"{self.condition} {low:.4g} to {high:.4g} {self.condition_unit}".rstrip()
 
     def worst(self) -> str:
         """The bin with the greatest error, in words."""
         b = int(np.nanargmax(np.where(self.samples > 0, self.rms, np.nan)))
-        low, high = self.edges[b], self.edges[b + 1]
-        where = {-1.0: "negative", 0.0: "at rest", 1.0: "positive"}
-        if self.condition == "direction":
-            place = f"direction {where[float(round(0.5 * (low + high)))]}"
-        else:
-            place = f"{self.condition} {low:.4g} to {high:.4g} {self.condition_unit}".rstrip()
-        return f"{self.output}: {self.rms[b]:.3g} {self.unit} ({self.ratio[b]:.1f} noise floors) at {place}"
+        return f"{self.output}: {self.rms[b]:.3g} {self.unit} ({self.ratio[b]:.3g} noise floors) at {self.place(b)}"
 
     def json(self) -> dict[str, Any]:
         """The condition as the commands' JSON."""
@@ -114,6 +105,7 @@ class Regime:
             "condition_unit": self.condition_unit,
             "edges": self.edges, "rms": self.rms, "noise_floors": self.ratio, "samples": self.samples,
             "significant": [bool(b) for b in self.significant], "contrast": self.contrast,
+            "moments_s": self.moments,
         }  # fmt: skip
 
 
@@ -154,13 +146,13 @@ class Located:
     def verdict(self) -> str:
         """Whether it agrees or fails, in words."""
         if not self.fails:
-            return "agrees everywhere"
+            return "fits everywhere"
         where = (
             f"{len(self.hot)} of {len(self.regimes)} conditions"
             if self.hot
             else "no single condition more than in others"
         )
-        return f"fails in {where}: {self.worst.signal} at {self.worst.ratio:.2f} noise floors"
+        return f"fails in {where}: {self.worst.signal} at {self.worst.ratio:.3g} noise floors"
 
     def json(self) -> dict[str, Any]:
         """The stage as the JSON of ``vaneloop locate``."""
@@ -202,22 +194,6 @@ def _edges(values: Array) -> Array:
     return edges
 
 
-def bins_of(
-    found: Sequence[Regime], figure: Callable[[Regime], Array]
-) -> tuple[list[list[float | None]], list[str], list[str]]:
-    """Lay out a failure map: ``figure`` of each condition's bins, None where 20 samples or fewer say it; names of bins;
-    of conditions.
-    """
-    width = max(len(figure(r)) for r in found)
-    values = [
-        [float(v) if n > 20 else None for v, n in zip(figure(r), r.samples, strict=True)]
-        + [None] * (width - len(figure(r)))
-        for r in found
-    ]
-    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in found]
-    return values, [f"bin {i + 1}" for i in range(width)], names
-
-
 def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
     """Error of every output against every condition of the stage, most telling first.
 
@@ -248,12 +224,21 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
             worst = (np.arange(many), np.argmax(square - floor, axis=1))
             looks += many
             others = [x.sum(axis=1) - x[worst] for x in (n, square, floor)]
+            moments = _greatest(bin_of, np.abs(e[k, use]), stage.t[use], many)
             raw.append(
-                (k, output, name, edges, *_mean(n.sum(axis=1), square.sum(axis=1), floor.sum(axis=1)), *_mean(*others))
+                (
+                    k,
+                    output,
+                    name,
+                    edges,
+                    *_mean(n.sum(axis=1), square.sum(axis=1), floor.sum(axis=1)),
+                    *_mean(*others),
+                    moments,
+                )
             )
     out = []
     z_limit = norm.isf(LEVEL / max(looks, 1))
-    for k, output, name, edges, n, ms, other, rest in raw:
+    for k, output, name, edges, n, ms, other, rest, moments in raw:
         z, confirmed = (
             (x / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, x in ((n, ms), (other, rest))
         )
@@ -266,6 +251,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
             Regime(
                 output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * floor, ratio, n,
                 (z > z_limit) & (confirmed > norm.isf(LEVEL)) & (n > 20) & (ratio > 1.05), contrast,
+                moments,
             )
         )  # fmt: skip
     out.sort(key=lambda r: (-float(r.significant.any()), -r.contrast))
@@ -275,6 +261,14 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
 def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:
     """How many samples; mean square of their error over that of the noise to be expected of them."""
     return n.astype(int), squares / np.maximum(np.maximum(floor, n), 1.0)
+
+
+def _greatest(bin_of: Array, size: Array, t: Array, bins: int) -> Array:
+    """Time of the greatest ``size`` in each bin."""
+    out = np.full(bins, np.nan)
+    order = np.argsort(size, kind="stable")
+    out[bin_of[order]] = t[order]  # the last of a bin to be written is its greatest
+    return out
 
 
 def onset(judge: Judge, fit: Fit) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,12 +24,14 @@ class Candidate:
     nats, spreads  as the criterion counts a gain: nats and noise-floor spreads, or per cent of the error and the share
                    of the change that is improvement
     reason         why it cannot be seen in this log, if it cannot
+    left           held-out error with it alone, in noise floors
     """
 
     effect: str
     nats: float
     spreads: float
     reason: str = ""
+    left: float = float("nan")
 
 
 @dataclass
@@ -134,9 +137,16 @@ def parameters_of(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, obje
     return out
 
 
-def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...]) -> list[Found]:
-    """Effects of a fit that was asked for: no rivals looked for, probability 1 by decree."""
-    return [Found(name, 1.0, parameters_of(judge.stage, fit, name), [], 0.0) for name in effects]
+def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...], without: Mapping[str, Fit]) -> list[Found]:
+    """Effects of a fit that was asked for: no rivals looked for, probability 1 by decree.
+
+    without  effect -> fit of all the others
+    """
+    left = max(rms_of(judge, fit), 1e-300)
+    return [
+        Found(m, 1.0, parameters_of(judge.stage, fit, m), [], 0.0, fall=rms_of(judge, without[m]) / left)
+        for m in effects
+    ]
 
 
 def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:

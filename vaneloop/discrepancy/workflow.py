@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +20,7 @@ from vaneloop.discrepancy.stage import Stage, StageError
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
 
 __all__ = [
-    "Diagnosis", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
+    "Diagnosis", "News", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
     "extend_stage", "floor_of", "locate_stages", "no_better",
 ]  # fmt: skip
 
@@ -55,12 +54,36 @@ def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
     return [figures for located in locate_stages(stages) for figures in located.signals]
 
 
+@dataclass(frozen=True)
+class News:
+    """How far a search is.
+
+    fraction  done, as far as that can be known: a search ends when nothing more earns its place
+    text      what is being tried
+    found     what a stage says, as soon as it is searched; the other stages may still correct it (`diagnose`)
+    """
+
+    fraction: float
+    text: str
+    found: StageDiagnosis | None = None
+
+
+OFTEN = 0.1  # s between two looks at searches in other processes
+USUAL = 60.0  # fits after which half of a stage's search is usually done
+
 _WORK: list[Stage] = []
+_FITS: list[Any] = []  # of the work: a number that all processes see, fits made by each stage
 _JUDGED: list[Judged] = [NoiseFloor]  # of the work
 
 
-def _one(i: int, tick: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
+def _one(i: int, tell: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
     stage = _WORK[i]
+
+    def tick() -> None:
+        _FITS[i].value += 1  # one process writes each
+        if tell:
+            tell()
+
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0]))
     if d.verdict == "none" and d.criterion == "noise_floor":
         d = _under_every_condition(stage, d)
@@ -100,35 +123,44 @@ def diagnose(
     progress: Callable[[float], None] | None = None,
     workers: int = 2,
     judged: Judged = NoiseFloor,
+    news: Callable[[News], None] | None = None,
 ) -> Diagnosis:
     """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can
     fork.
 
-    judged  what an effect must do to be named
+    judged    what an effect must do to be named
+    progress  takes the fraction done
+    news      takes that too, with what is being tried and what each stage says as soon as it is searched
     """
     started = time.perf_counter()
     _WORK[:], _JUDGED[:] = list(stages), [judged]
+    _FITS[:] = [multiprocessing.RawValue("l", 0) for _ in _WORK]
     # the longest first
     order = sorted(range(len(_WORK)), key=lambda i: -len(_WORK[i].effects) * len(_WORK[i].outputs))
     done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
+
+    def tell(found: StageDiagnosis | None = None) -> None:
+        told = News(*_how_far(set(done)), found)
+        if progress:
+            progress(told.fraction)
+        if news:
+            news(told)
+
     if workers > 1 and len(_WORK) > 1 and hasattr(os, "fork"):
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
-            jobs = {i: pool.submit(_one, i) for i in order}
-            for n, i in enumerate(order):
-                done[i] = jobs[i].result()
-                if progress:
-                    progress((n + 1) / len(order))
+            open_jobs = {pool.submit(_one, i): i for i in order}
+            while open_jobs:
+                ended, _ = wait(open_jobs, OFTEN if news or progress else None, FIRST_COMPLETED)
+                for job in ended:
+                    i = open_jobs.pop(job)
+                    done[i] = job.result()
+                    tell(done[i][0])
+                if not ended:
+                    tell()
     else:
-        fits = itertools.count(1)
-        for n, i in enumerate(order):
-
-            def tick(n: int = n) -> None:  # nobody knows how many fits there will be
-                if progress:
-                    progress((n + 1.0 - 1.0 / (1.0 + next(fits) / 60.0)) / len(order))
-
-            done[i] = _one(i, tick)
-            if progress:
-                progress((n + 1) / len(order))
+        for i in order:
+            done[i] = _one(i, tell)
+            tell(done[i][0])
     results = [done[i][0] for i in range(len(_WORK))]
     _agree({s.name: s for s in stages}, results)
     for d in results:
@@ -137,6 +169,20 @@ def diagnose(
     verdicts = {d.verdict for d in results}
     verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
     return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def _how_far(done: set[int]) -> tuple[float, str]:
+    """Fraction of the search that is done, and what is being tried: nobody knows how many fits there will be."""
+    size = [max(1, len(s.effects)) * len(s.outputs) for s in _WORK]
+    fits = [n.value for n in _FITS]
+    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL) for i in range(len(_WORK))]
+    at_work = [
+        f"{_WORK[i].name} ({len(_WORK[i].effects)} effects, {fits[i]} fits)"
+        for i in range(len(_WORK))
+        if i not in done and fits[i]
+    ]
+    text = f"{len(done)} of {len(_WORK)} stages searched" + (f"; trying {', '.join(at_work)}" if at_work else "")
+    return sum(a * b for a, b in zip(share, size, strict=True)) / sum(size), text
 
 
 def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:

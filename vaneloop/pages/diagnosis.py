@@ -4,22 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import Located, bins_of, locate
+from vaneloop.discrepancy.locate import Located, Regime, locate
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.stage import Bound, Stage
 from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
-from vaneloop.pages.figures import Line, Panel, heat, loop, overlay, ranking, waterfall
+from vaneloop.pages.figures import Figure, Line, Panel, heat, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
-from vaneloop.pages.style import TONE_OF, number
+from vaneloop.pages.story import (
+    CANNOT,
+    doubt,
+    extended_sentence,
+    fall,
+    falling,
+    floors,
+    reached,
+    stage_tone,
+    word,
+    word_of_located,
+    worths,
+)
+from vaneloop.pages.style import TONE_OF, Tone, number
 
-__all__ = ["compare_page", "diagnosis_page", "located_sentence", "located_tone", "verdict_sentence"]
+__all__ = [
+    "compare_page", "diagnosis_page", "experiment_page", "extended_page", "failure_map", "located_sentence",
+    "located_tone", "verdict_sentence",
+]  # fmt: skip
+
+Columns = list[tuple[str, np.ndarray, str]]
+MOST_CONDITIONS = 9  # rows of a failure map
 
 
 def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
@@ -38,7 +57,7 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
             what = f": {first[0].text}" if first else ""
             parts.append(f"the {s.stage} stage lacks something that the library does not have{what}")
     if not parts:
-        return "Nothing is missing: every observed stage explains its measurements down to the noise floor."
+        return "Nothing is missing: every observed stage fits its measurements down to the noise floor."
     text = "; ".join([*parts, by_log.sentence()] if by_log is not None else parts)
     return text[0].upper() + text[1:] + "."
 
@@ -47,16 +66,16 @@ def located_sentence(located: Sequence[Located]) -> str:
     """What all stages say together, in one sentence."""
     failing = [x for x in located if x.fails]
     if not failing:
-        return "Every stage agrees with its measurements to within the noise."
+        return "Every stage fits its measurements to within the noise."
     worst = max(failing, key=lambda x: x.worst.ratio)
     s = worst.worst
     others = [x.stage for x in failing if x is not worst]
     also = f" {' and '.join(others)} {'fail' if len(others) > 1 else 'fails'} too." if others else ""
-    off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {number(s.ratio)} times its noise floor"
+    off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {floors(s.ratio)} times its noise floor"
     return f"The model fails most in the {worst.stage} stage: {off}.{also}"
 
 
-def located_tone(located: Sequence[Located]) -> Literal["good", "neutral", "bad"]:
+def located_tone(located: Sequence[Located]) -> Tone:
     """Whether that is good news."""
     failing = [x.worst.ratio for x in located if x.fails]
     return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
@@ -73,11 +92,22 @@ def compare_page(
     log: str,
     by_log: ByLog | None = None,
     tested: Sequence[Any] = (),
+    title: str = "Model and log",
 ) -> Page:
     """The page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
     page = Page(
-        f"Stages of {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
+        f"{title}: {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
     )
+    for x in located:
+        w = x.worst
+        note = f"{number(w.rms)} {w.unit}; noise floor {number(w.noise_floor)}"
+        page.tile(
+            f"{x.stage}: {w.signal}",
+            floors(w.ratio),
+            "noise floors",
+            f"{word_of_located(x)}; {note}",
+            located_tone([x]),
+        )
     page.section(
         "Stage by stage",
         "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does "
@@ -85,20 +115,20 @@ def compare_page(
         "parameters as given.",
     )
     rows: list[list[object]] = [
-        [x.stage, "fails" if x.fails else "agrees", f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit,
+        [x.stage, word_of_located(x), f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit,
         f.samples]
         for x in located for f in x.signals
     ]  # fmt: skip
     rows += [
-        [name, "not observed: " + why, "", None, None, None, None, "", None] for name, why in bound.not_observed.items()
+        [name, f"{CANNOT}: {why}", "", None, None, None, None, "", None] for name, why in bound.not_observed.items()
     ]
     page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
     _tested(page, tested)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
         judge = Judge(_stage(bound, x.stage), x.floor)
-        _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
-        _failure_map(page, x)
+        drawn = _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
+        _failure_map(page, x, drawn)
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
@@ -124,6 +154,30 @@ def _notes(page: Page, notes: Sequence[str]) -> None:
             page.text(n[0].upper() + n[1:] + ".")
 
 
+def extended_page(
+    d: Diagnosis,
+    bound: Bound,
+    command: str,
+    log: str,
+    refused: str = "",
+    by_log: ByLog | None = None,
+    tested: Sequence[Any] = (),
+) -> Page:
+    """The page of ``vaneloop extend``: the model with its effects, and the error that is left."""
+    good = not refused and all(reached(s) for s in d.stages)
+    sentence = " ".join([extended_sentence(d, refused), *([_capital(by_log.sentence()) + "."] if by_log else [])])
+    page = Page(f"Extended model: {Path(log).name}", sentence, tone="good" if good else "bad", command=command, log=log)
+    return _told(page, d, bound, None, by_log, tested, True)
+
+
+def experiment_page(
+    d: Diagnosis, bound: Bound, command: str, log: str, sentence: str, experiment: dict[str, Any] | None
+) -> Page:
+    """The page of ``vaneloop experiment``: what to measure next, and the diagnosis that asks for it."""
+    page = Page(f"Next experiment: {Path(log).name}", sentence, command=command, log=log)
+    return _told(page, d, bound, experiment, None, ())
+
+
 def diagnosis_page(
     d: Diagnosis,
     bound: Bound,
@@ -133,15 +187,32 @@ def diagnosis_page(
     by_log: ByLog | None = None,
     tested: Sequence[Any] = (),
 ) -> Page:
-    """The page of ``vaneloop diagnose`` or ``extend``."""
-    title = f"Diagnosis of {Path(log).name}"
+    """The page of ``vaneloop diagnose``."""
+    title = f"What is missing: {Path(log).name}"
     page = Page(title, verdict_sentence(d, by_log), tone=TONE_OF[d.verdict], command=command, log=log)
+    return _told(page, d, bound, experiment, by_log, tested)
+
+
+def _told(
+    page: Page,
+    d: Diagnosis,
+    bound: Bound,
+    experiment: dict[str, Any] | None,
+    by_log: ByLog | None,
+    tested: Sequence[Any],
+    extended: bool = False,
+) -> Page:
+    """Fill the page of a diagnosis, of an extended model or of the next experiment."""
     for s in d.stages:
-        k = int(np.argmax(s.error_before / s.floor))
-        page.tile(
-            f"{s.stage}: {s.outputs[k]}", f"{number(s.error_before[k])} to {number(s.error_after[k])}", s.units[k],
-            f"noise floor {number(s.floor[k])}; {s.verdict}", "good" if s.verdict == "none" else "bad",
-        )  # fmt: skip
+        k, before, after = fall(s)
+        note = f"{number(s.error_before[k])} to {number(s.error_after[k])} {s.units[k]}; floor {number(s.floor[k])}"
+        value = before if s.verdict == "none" else f"{before} → {after}"
+        said = word(s, extended)
+        if said in ("missing", "explained") and s.effects:
+            said = f"{said}: {', '.join(f.effect for f in s.effects)}"
+        page.tile(f"{s.stage}: {s.outputs[k]}", value, "noise floors", f"{said}; {note}", stage_tone(s, extended))
+    if experiment:
+        _next(page, experiment)
     page.section(
         "What each stage says",
         "A stage is judged on its own logged inputs. Errors are RMS on data that the parameters were not fitted to; a "
@@ -150,40 +221,38 @@ def diagnosis_page(
     rows: list[list[object]] = []
     for s in d.stages:
         for k in range(len(s.floor)):
-            rows.append([s.stage, s.verdict, s.outputs[k], s.error_before[k], s.error_after[k], s.floor[k], s.units[k]])
-    rows += [[name, "not observed: " + why, "", None, None, None, ""] for name, why in d.not_observed.items()]
+            rows.append(
+                [s.stage, word(s, extended), s.outputs[k], s.error_before[k], s.error_after[k], s.floor[k], s.units[k]]
+            )
+    rows += [[name, f"{CANNOT}: {why}", "", None, None, None, ""] for name, why in d.not_observed.items()]
     page.table(["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"], rows)
+    _floors_anew(page, d, bound)
     _tested(page, tested)
     found = [(s, f) for s in d.stages for f in s.effects]
     if found:
         page.section(
-            "Effects found",
-            "Parameters with their 90 % intervals. Rivals explain this log as well: another experiment must decide.",
+            "Effects added" if extended else "Effects found",
+            "Parameters with their 90 % intervals."
+            + ("" if extended else " Rivals explain this log as well: another experiment must decide."),
         )
         rows = []
         for s, f in found:
             for name, p in f.parameters.items():
-                rows.append(
-                    [
-                        f.effect,
-                        s.stage,
-                        f"{100 * f.probability:.0f} %",
-                        name,
-                        p["value"],
-                        p["low"],
-                        p["high"],
-                        p["unit"],
-                        ", ".join(f.rivals) or "none",
-                    ]
-                )
-        page.table(["effect", "stage", "probability", "parameter", "value", "low", "high", "unit", "rivals"], rows)
+                row = [name, p["value"], p["low"], p["high"], p["unit"]]
+                sure = [] if extended else [f"{100 * f.probability:.0f} %"]
+                rows.append([f.effect, s.stage, *sure, *row, *([] if extended else [doubt(f) or "none"])])
+        columns = ["parameter", "value", "low", "high", "unit"]
+        page.table(
+            ["effect", "stage", *([] if extended else ["probability"]), *columns, *([] if extended else ["rivals"])],
+            rows,
+        )
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
     for s in d.stages:
         if s.verdict == "none":
             continue
-        _stage_story(page, s, bound)
+        _stage_story(page, s, bound, extended)
         for x in d.shapes.get(s.stage, []):
             page.text(x.text[0].upper() + x.text[1:] + ".")
             page.plot(
@@ -200,11 +269,6 @@ def diagnosis_page(
             ["parameter", "value", "low", "high", "unit"],
             [[r["parameter"], r["value"], r["low"], r["high"], r["unit"]] for r in recal],
         )
-    if experiment:
-        page.section("Next experiment", str(experiment["text"]))
-        page.plot(
-            overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
-        )
     unseen = [[c.effect, s.stage, c.reason] for s in d.stages for c in s.candidates if c.reason]
     if unseen:
         page.section(
@@ -216,32 +280,70 @@ def diagnosis_page(
     return page
 
 
-def _stage_story(page: Page, s: StageDiagnosis, bound: Bound) -> None:
+def _next(page: Page, experiment: dict[str, Any]) -> None:
+    page.section("The next experiment", str(experiment["text"]))
+    page.plot(
+        overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
+    )
+
+
+def _floors_anew(page: Page, d: Diagnosis, bound: Bound) -> None:
+    """Say where the noise floor is another than that of compare."""
+    for s in d.stages:
+        before = _stage(bound, s.stage).floor
+        for k, output in enumerate(s.outputs):
+            if before is not None and abs(s.floor[k] / before[k] - 1.0) > 0.02:
+                page.text(
+                    f"The noise floor of {output} is {number(s.floor[k])} {s.units[k]} here, and "
+                    f"{number(before[k])} {s.units[k]} where nothing is added: it was measured again on the errors of "
+                    f"the best model."
+                )
+
+
+def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) -> None:
     stage = _stage(bound, s.stage)
     judge = Judge(stage, s.floor)
     page.section(
         f"The {s.stage} stage",
-        f"Verdict: {s.verdict}. Noise is correlated by a factor of {s.correlation:.1f} in variance.",
+        f"Verdict: {word(s, extended)}. Noise is correlated by a factor of {s.correlation:.1f} in variance.",
     )
+    page.plot(
+        waterfall(falling(s), "held-out error [noise floors]", floor=1.0),
+        "How the error falls as effects are added, down to the noise floor. All outputs of the stage together.",
+    )
+    if s.effects and (worth := worths(s)):
+        page.plot(
+            ranking(
+                [w.effect for w in worth], [w.without for w in worth], "error without it [noise floors]",
+                highlight=[w.effect for w in worth],
+                log=True, marks={"with all": s.excess, "nominal": s.steps[0][1]},
+            ),
+            "What each effect is worth in the final model: the error that comes back without it, the others fitted "
+            "anew.",
+        )  # fmt: skip
     curves = [("nominal model", s.base.theta, "error")]
     if s.final.effects:
         curves.append(("with " + " + ".join(s.final.effects), s.final.theta, "model"))
-    _curves(page, judge, curves, f"{s.stage}: error before and after")
-    _failure_map(page, locate(judge, s.base))
-    top = [c for c in s.candidates if c.nats > 0][:12]
+    drawn = _curves(page, judge, curves, f"{s.stage}: error before and after")
+    _failure_map(page, locate(judge, s.base), drawn, "before" if s.final.effects else "")
+    known = [c for c in s.candidates if np.isfinite(c.left)]
+    chosen = [f.effect for f in s.effects]
+    best = sorted((c for c in known if c.nats > 0), key=lambda c: c.left)[:12]
+    top = [*best, *(c for c in known if c.effect in chosen and c not in best)]
     if top:
-        chosen = [f.effect for f in s.effects]
+        nominal = s.steps[0][1]
         page.plot(
-            ranking([c.effect for c in top], [c.nats for c in top], s.gain, highlight=chosen),
-            "Effects tried alone, by what they gain on data that they were not fitted to.",
-        )
-    page.plot(
-        waterfall([*s.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0),
-        "How the error falls as effects are added, down to the noise floor.",
-    )
+            ranking(
+                [c.effect for c in top], [c.left for c in top], "error with it alone [noise floors]", highlight=chosen,
+                log=True, marks={"nominal": nominal},
+            ),
+            f"Each effect alone, added to the nominal model ({floors(nominal)} noise floors): the error that is left. "
+            f"Short bars help. Effects found are orange; one that helps only beside another has a long bar.",
+        )  # fmt: skip
 
 
-def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]], caption: str) -> None:
+def _curves(page: Page, judge: Judge, models: Columns, caption: str) -> int:
+    """Draw measured curves and errors; return the number of the plot."""
     stage = judge.stage
     e = judge.errors(np.array([m[1] for m in models])) * judge.floor[None, :, None]
     panels = []
@@ -254,14 +356,47 @@ def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]],
         ]
         panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=1.0))
     page.plot(overlay(panels), caption + ". The grey band is three noise floors to each side.")
+    return len(page.figures) - 1
 
 
-def _failure_map(page: Page, located: Located) -> None:
+def failure_map(regimes: Sequence[Regime]) -> Figure:
+    """Error in noise floors under each condition: every cell has its range of values, and the moment it is worst at."""
+    width = max(len(r.ratio) for r in regimes)
+    cells: list[list[float | None]] = []
+    places, moments = [], []
+    for r in regimes:
+        empty = width - len(r.ratio)
+        cells.append([float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty)
+        places.append([_range(r, b) for b in range(len(r.ratio))] + [""] * empty)
+        moments.append([*(float(v) for v in r.moments), *[None] * empty])
+    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in regimes]
+    columns = [f"eighth {i + 1}" for i in range(width)]
+    return heat(cells, columns, names, "noise floors", "an eighth of the samples each, lowest values to highest", "",
+                places=places, moments=moments)  # fmt: skip
+
+
+def _range(r: Regime, b: int) -> str:
+    """The values of a bin, short enough for a cell."""
+    if r.condition == "direction":
+        return r.place(b).partition(" ")[2]
+    return f"{r.edges[b]:.3g} … {r.edges[b + 1]:.3g}"
+
+
+def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> None:
+    """Draw where a stage fails; ``drawn``: the plot of its curves, which a click on a cell moves to the moment."""
     if located.onset is not None:
         page.text(f"The error of the {located.stage} stage begins at t = {located.onset:.0f} s.")
     for output in dict.fromkeys(r.output for r in located.hot):
-        mine = [r for r in located.hot if r.output == output]
+        mine = [r for r in located.hot if r.output == output][:MOST_CONDITIONS]
+        figure = failure_map(mine)
+        figure["layout"]["meta"] |= {"shows": drawn}
+        said = f" {when} anything was added" if when else ""
         page.plot(
-            heat(*bins_of(mine, lambda r: r.ratio), "noise floors", "from the lowest values to the highest", ""),
-            f"Where the {located.stage} stage fails: error of {output} in noise floors. Worst: {mine[0].worst()}.",
+            figure,
+            f"Where the {located.stage} stage fails{said}: error of {output} in noise floors. "
+            f"Worst: {mine[0].worst()}. A click on a cell shows its moment in the curves above.",
         )
+
+
+def _capital(text: str) -> str:
+    return text[0].upper() + text[1:]

@@ -273,25 +273,27 @@ def bars(
 def waterfall(
     steps: Sequence[tuple[str, float]], y_title: str, floor: float | None = None, height: int = 400
 ) -> Figure:
-    """How an error falls step by step: the level after each step, the fall hanging from the level before.
+    """How an error falls step by step, on a logarithmic axis, so that a small step is seen beside a great one.
 
-    steps  (name, level reached); the first is where it starts, the last where it ends
+    The level after each step stands above it; the fall hangs from the level before.
+
+    steps  (name, level reached, above 0); the first is where it starts, the last where it ends
     floor  level that cannot be undercut, drawn as a line
     """
     names = [_label(s[0]) for s in steps]
     levels = [float(s[1]) for s in steps]
-    base, size, colours, text = [], [], [], []
+    shown = [v for v in [*levels, floor or 0.0] if v > 0.0] or [1.0]
+    bottom, top = 0.5 * min(shown), 2.0 * max(shown)
+    base, size, colours = [], [], []
     for i, level in enumerate(levels):
-        if i in (0, len(levels) - 1):
-            base.append(0.0)
-            size.append(level)
+        ends = i in (0, len(levels) - 1)
+        low, high = (bottom, level) if ends else sorted((level, levels[i - 1]))
+        base.append(max(low, bottom))
+        size.append(max(high - max(low, bottom), 0.0))
+        if ends:
             colours.append("@error" if i == 0 else "@measured")
-            text.append(number(level))
         else:
-            base.append(min(level, levels[i - 1]))
-            size.append(abs(level - levels[i - 1]))
             colours.append("@good" if level <= levels[i - 1] else "@bad")
-            text.append(f"{level - levels[i - 1]:+.3g}".replace("-", "−"))
     thin = {"color": "@muted", "width": 1, "dash": "dot"}
     connectors = [
         {"type": "line", "xref": "x", "yref": "y", "x0": i, "x1": i + 1, "y0": levels[i], "y1": levels[i], "line": thin}
@@ -302,21 +304,41 @@ def waterfall(
         "showlegend": False,
         "bargap": 0.35,
         "xaxis": {"type": "category", "showgrid": False},
-        "yaxis": {"title": {"text": _label(y_title)}, "rangemode": "tozero"},
+        "yaxis": {
+            "title": {"text": _label(y_title)},
+            "type": "log",
+            "dtick": 1,
+            "range": [math.log10(bottom), math.log10(top)],
+        },
         "shapes": connectors,
-        "annotations": [],
+        "annotations": [
+            {
+                "x": i,
+                "y": math.log10(max(b + d, bottom)),
+                "text": number(level),
+                "showarrow": False,
+                "yanchor": "bottom",
+            }
+            for i, (level, b, d) in enumerate(zip(levels, base, size, strict=True))
+        ],
     }
-    _band_and_marks(layout, Panel("", [], marks={} if floor is None else {f"noise floor {number(floor)}": floor}), "y")
+    _band_and_marks(
+        layout,
+        Panel(
+            "", [], marks={} if floor is None else {f"floor {number(floor)}" if steps[-1][1] != floor else "": floor}
+        ),
+        "y",
+    )
+    for mark in layout["annotations"][len(levels) :]:
+        mark["y"] = math.log10(mark["y"])  # annotations are placed by exponent on such an axis
     bar = {
         "type": "bar",
         "x": names,
         "y": size,
         "base": base,
-        "text": text,
-        "textposition": "outside",
-        "cliponaxis": False,
+        "customdata": levels,
         "marker": {"color": colours},
-        "hovertemplate": "%{x}: %{text}",
+        "hovertemplate": "%{x}: %{customdata:.3g}<extra></extra>",
     }
     return {"data": [bar], "layout": layout}
 
@@ -329,8 +351,14 @@ def ranking(
     highlight: Sequence[str] = (),
     low: Sequence[float] | None = None,
     high: Sequence[float] | None = None,
+    log: bool = False,
+    marks: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Horizontal bars, greatest on top, for example candidate effects by probability; ``highlight`` ones stand out."""
+    """Horizontal bars, greatest on top, for example candidate effects by probability; ``highlight`` ones stand out.
+
+    log    a logarithmic axis
+    marks  levels with their names, dashed lines
+    """
     order = sorted(range(len(names)), key=lambda i: values[i])
     bar: Figure = {
         "type": "bar",
@@ -352,13 +380,31 @@ def ranking(
             "color": "@soft",
         }
     top = max([*values, *(high or [])], default=1.0) or 1.0
-    layout = {
-        "height": 90 + 26 * max(3, len(names)),
+    layout: Figure = {
+        "height": 110 + 26 * max(3, len(names)),
         "bargap": 0.3,
         "showlegend": False,
         "xaxis": {"title": {"text": _label(x_title)}, "range": [0, 1.25 * top]},
         "yaxis": {"type": "category", "showgrid": False, "automargin": True},
+        "shapes": [],
+        "annotations": [],
     }
+    levels = dict(marks or {})
+    if log:
+        shown = [v for v in [*values, *levels.values()] if v > 0.0] or [1.0]
+        reach = [math.log10(0.6 * min(shown)), math.log10(max(shown))]
+        layout["xaxis"] |= {"type": "log", "dtick": 1, "range": [reach[0], reach[1] + 0.3 * (reach[1] - reach[0])]}
+    for name, level in levels.items():
+        line = {"color": "@soft", "width": 1, "dash": "dot"}
+        layout["shapes"].append(
+            {"type": "line", "xref": "x", "yref": "paper", "x0": level, "x1": level, "y0": 0, "y1": 1, "line": line}
+        )
+        layout["annotations"].append(
+            {
+                "x": math.log10(level) if log else level, "xref": "x", "y": 1, "yref": "paper", "yanchor": "bottom",
+                "text": _label(name), "showarrow": False, "font": {"size": 11, "color": "@soft"},
+            }
+        )  # fmt: skip
     return {"data": [bar], "layout": layout}
 
 
@@ -370,15 +416,24 @@ def heat(
     x_title: str = "",
     y_title: str = "",
     signed: bool = False,
+    places: Sequence[Sequence[str]] | None = None,
+    moments: Sequence[Sequence[float | None]] | None = None,
 ) -> Figure:
     """Map of a figure over two conditions (rows, columns); an empty cell was never visited.
 
     signed: colours diverge about zero (bias); otherwise they grow from zero (size of an error).
+    places   the range of values of each cell, where every row has its own: it stands in the cell
+    moments  s, what a click on a cell shows in the curves
     """
     z = np.array(
         [[math.nan if v is None else float(v) for v in row] for row in np.asarray(values, dtype=object)], dtype=float
     )
     text = [["" if not math.isfinite(v) else number(v, 2) for v in row] for row in z]
+    if places is not None:
+        text = [
+            [f"{t}<br>{_label(p)}" if t else "" for t, p in zip(*row, strict=True)]
+            for row in zip(text, places, strict=True)
+        ]
     reach = float(np.nanmax(np.abs(z))) if np.isfinite(z).any() else 1.0
     scale = (
         [[0, "@cold"], [0.5, "@heat0"], [1, "@heat2"]] if signed else [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]]
@@ -399,10 +454,19 @@ def heat(
         "colorbar": {"title": {"text": _label(unit)}, "thickness": 12, "outlinewidth": 0},
         "hovertemplate": f"%{{y}}, %{{x}}: %{{z:.3g}} {_label(unit)}<extra></extra>",
     }
+    if places is not None:
+        trace["textfont"] = {"size": 11}
+        trace["hovertext"] = [[_label(p) for p in row] for row in places]
+        trace["hovertemplate"] = f"%{{y}} %{{hovertext}}: %{{z:.3g}} {_label(unit)}<extra></extra>"
+    if moments is not None:
+        trace["customdata"] = [
+            [None if v is None or not math.isfinite(v) else float(v) for v in row] for row in moments
+        ]
     return {
         "data": [trace],
         "layout": {
-            "height": 120 + 38 * max(3, len(rows)),
+            "meta": {"wide": places is not None},
+            "height": 120 + (46 if places is not None else 38) * max(3, len(rows)),
             "xaxis": {"type": "category", "title": {"text": _label(x_title)}, "showgrid": False},
             "yaxis": {
                 "type": "category",

@@ -31,18 +31,75 @@
     hoverlabel: {bgcolor: c.panel, bordercolor: c.muted, font: {color: c.text}},
     modebar: {orientation: "v", bgcolor: "rgba(0,0,0,0)", color: c.muted, activecolor: c.text},
     colorway: [c.measured, c.model, c.target, c.error, c.other]}});
+  const save = (name, type, text) => {
+    const a = document.createElement("a");
+    a.href = URL.createObjectURL(new Blob([text], {type}));
+    a.download = name;
+    a.click();
+    setTimeout(() => URL.revokeObjectURL(a.href), 1000);
+  };
+  const quoted = v => /[",\n]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v;
+  // every line, bar or cell as a row: name, x, y and what a map's cell holds
+  const csv = plot => {
+    const rows = [["name", "x", "y", "value"]];
+    for (const d of plot._fullData) {
+      if (d.visible !== true) continue;
+      if (d.type === "heatmap") {
+        d.z.forEach((row, i) => Array.from(row).forEach((z, j) => rows.push([d.name || "", d.x[j], d.y[i], z ?? ""])));
+      } else Array.from(d.x).forEach((x, i) => rows.push([d.name || "", x, d.y[i] ?? "", ""]));
+    }
+    return rows.map(r => r.map(v => quoted(String(v))).join(",")).join("\n") + "\n";
+  };
+  const name = plot => (document.title + " " + plot.id).replace(/[^A-Za-z0-9]+/g, "_");
+  const button = (title, icon, click) => ({name: title, title, icon, click});
   // the buttons are named one by one: Plotly's own list has one that sends the plot to a server
   const config = {responsive: true, displaylogo: false, displayModeBar: "hover", plotlyServerURL: "",
-    modeBarButtons: [["zoom2d", "pan2d", "resetScale2d"], ["toImage"]]};
+    modeBarButtons: [["zoom2d", "pan2d", "resetScale2d"], [
+      button("save as PNG", Plotly.Icons.camera, p => Plotly.downloadImage(p, {format: "png", scale: 2, filename: name(p)})),
+      button("save as SVG", Plotly.Icons.pencil, p => Plotly.downloadImage(p, {format: "svg", filename: name(p)})),
+      button("save the numbers as CSV", Plotly.Icons.disk, p => save(name(p) + ".csv", "text/csv", csv(p)))]]};
+  // a moment of the log: two seconds to each side in the curves that a map belongs to
+  const show = (map, t) => {
+    const plot = document.getElementById("p" + map.layout.meta.shows);
+    if (!plot || typeof t !== "number") return;
+    Plotly.relayout(plot, {"xaxis.range": [t - 2, t + 2], "xaxis.autorange": false});
+    plot.scrollIntoView({behavior: "smooth", block: "center"});
+  };
+  const worst = map => {
+    let best = [0, null];
+    map.data[0].z.forEach((row, i) => row.forEach((z, j) => {
+      if (z > best[0]) best = [z, map.data[0].customdata[i][j]];
+    }));
+    return best[1];
+  };
+  const connect = (map, caption) => {
+    if (!map.layout.meta || map.layout.meta.shows === undefined) return;
+    map.on("plotly_click", e => show(map, e.points[0].customdata));
+    const b = document.createElement("button");
+    b.type = "button";
+    b.className = "show";
+    b.textContent = "Show me the worst moment";
+    b.onclick = () => show(map, worst(map));
+    caption.append(b);
+  };
   const draw = (name, width) => figures.forEach((figure, i) => {
     const c = themes[name], painted = paint(figure, c), element = document.getElementById("p" + i);
+    const narrow = !width && element.clientWidth < 560;
     painted.layout.template = template(c);
+    if (narrow) {  // a phone: the curves get the width, and the buttons do not cover the names
+      painted.layout.template.layout.margin = {l: 44, r: 8, t: 60, b: 46};
+      painted.layout.template.layout.font.size = 11;
+      painted.layout.template.layout.dragmode = false;
+    }
+    if (narrow && painted.layout.meta && painted.layout.meta.wide) element.style.width = "1040px";
     painted.layout.uirevision = "keep";
     painted.layout.legend = Object.assign({orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container"},
       painted.layout.legend);
     if (width) painted.layout.width = element.closest(".pair") ? width / 2 - 24 : width - 24;
     else painted.layout.autosize = true;
-    Plotly.react(element, painted.data, painted.layout, config);
+    const begun = element.classList.contains("js-plotly-plot");
+    Plotly.react(element, painted.data, painted.layout, {...config, displayModeBar: narrow ? false : "hover"});
+    if (!begun) connect(element, element.closest("figure").querySelector("figcaption"));
   });
   const screen = () => draw(dark.matches ? "dark" : "light");
   screen();

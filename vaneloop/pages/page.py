@@ -38,6 +38,9 @@ _POLICY = (  # no network at all, whatever a page may hold
 )
 
 
+_REGION = ' tabindex="0" role="group" aria-label="{}"'  # what is wider than the screen is moved by keyboard, too
+
+
 class Page:
     """A report under construction: verdict, key figures, sections, footer."""
 
@@ -96,7 +99,8 @@ class Page:
         height = int(figure.get("layout", {}).get("height") or 400)
         note = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
         self._body.append(
-            f'<figure><div class="plot" id="p{len(self.figures)}" style="height:{height}px"></div>{note}</figure>'
+            f'<figure><div class="box"{_REGION.format("plot")}><div class="plot" id="p{len(self.figures)}" '
+            f'style="height:{height}px"></div></div>{note}</figure>'
         )
         self.figures.append(figure)
 
@@ -111,7 +115,8 @@ class Page:
         body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self._body.append(
-            f'<div class="scroll"><table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+            f'<div class="scroll"{_REGION.format("table")}>'
+            f"<table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
         )
 
     def html(self) -> str:

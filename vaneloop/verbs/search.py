@@ -7,15 +7,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import Record, StageError, System
-from vaneloop.discrepancy.locate import Located, agrees
-from vaneloop.discrepancy.workflow import Diagnosis, as_compared, diagnosis_json, extend_stage, locate_stages, no_better
+from vaneloop.discrepancy.locate import Located
+from vaneloop.discrepancy.workflow import (
+    Diagnosis,
+    News,
+    as_compared,
+    diagnosis_json,
+    extend_stage,
+    locate_stages,
+    no_better,
+)
 from vaneloop.discrepancy.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
@@ -45,12 +53,14 @@ class Stages(Answer):
 
     bound   the model held against the log
     by_log  of a `System`, what that means log by log
+    verb    what was asked: compare, locate
     """
 
     bound: Bound
     located: list[Located]
     log: str = ""
     by_log: ByLog | None = None
+    verb: str = "compare"
 
     @cached_property
     def tested(self) -> list[Tested]:
@@ -81,7 +91,8 @@ class Stages(Answer):
         """The answer as a page."""
         from vaneloop.pages.diagnosis import compare_page
 
-        return compare_page(self.located, self.bound, command, self.log, self.by_log, self.tested)
+        title = "Where the model fails" if self.verb == "locate" else "Model and log"
+        return compare_page(self.located, self.bound, command, self.log, self.by_log, self.tested, title)
 
 
 @dataclass(frozen=True)
@@ -146,15 +157,21 @@ class Extended(Diagnosed):
     @property
     def reached(self) -> bool:
         """Whether each stage extended stands at its noise floor."""
-        stages = self.diagnosis.stages
-        return all(agrees(e, f) for r in stages for e, f in zip(r.error_after, r.floor, strict=True))
+        from vaneloop.pages.story import reached
+
+        return all(map(reached, self.diagnosis.stages))
 
     def sentence(self) -> str:
         """The answer in one sentence."""
-        if self.refused:
-            return f"The model is no better with it: {self.refused}."
-        falls = (f"{r.stage} from {r.steps[0][1]:.3g} to {r.excess:.3g}" for r in self.diagnosis.stages)
-        return f"Error in noise floors, held out: {', '.join(falls)}."
+        from vaneloop.pages.story import extended_sentence
+
+        return extended_sentence(self.diagnosis, self.refused)
+
+    def page(self, command: str = "") -> Page:
+        """The answer as a page."""
+        from vaneloop.pages.diagnosis import extended_page
+
+        return extended_page(self.diagnosis, self.bound, command, self.log, self.refused, self.by_log, self.tested)
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop extend``."""
@@ -192,9 +209,10 @@ class Experiment(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.diagnosis import diagnosis_page
+        from vaneloop.pages.diagnosis import experiment_page
 
-        return diagnosis_page(self.diagnosed.diagnosis, self.diagnosed.bound, command, self.log, self.recommended)
+        d = self.diagnosed
+        return experiment_page(d.diagnosis, d.bound, command, self.log, self.sentence(), self.recommended)
 
 
 # ---- the verbs -------------------------------------------------------------------------------------------------------
@@ -258,7 +276,17 @@ def compare(
     return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
 
 
-locate = compare  # which stage fails, under which conditions, since when? The same answer, asked for its details
+def locate(
+    log: Any,
+    model: Machine | System | None = None,
+    *,
+    fit: Any = (),
+    test: Any = (),
+    added: Model | None = None,
+    progress: Progress | None = None,
+) -> Stages:
+    """Which stage fails, under which conditions, since when? `compare`, asked for its details."""
+    return replace(compare(log, model, fit=fit, test=test, added=added, progress=progress), verb="locate")
 
 
 def diagnose(
@@ -284,9 +312,15 @@ def diagnose(
     return diagnosed(chain, name, workers, progress)
 
 
-def diagnosed(chain: Chain, log: str, workers: int = 2, progress: Progress | None = None) -> Diagnosed:
-    """`diagnose` of a log that has been put into stages."""
-    d = search(chain.stages, chain.not_observed, progress, workers)
+def diagnosed(
+    chain: Chain,
+    log: str,
+    workers: int = 2,
+    progress: Progress | None = None,
+    news: Callable[[News], None] | None = None,
+) -> Diagnosed:
+    """`diagnose` of a log that has been put into stages; ``news`` takes what is being tried and found meanwhile."""
+    d = search(chain.stages, chain.not_observed, progress, workers, news=news)
     d.notes = [*chain.notes, *_at_limit(d.stages)]
     return Diagnosed(chain, d, log)
 

@@ -5,9 +5,17 @@ import uPlot from "uplot";
 const PAD = 0.34;
 
 export default {
-  template: `<div class="curves"><div ref="legend" class="curves-legend"></div><div ref="stack"></div>
-    <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; double-click: everything</div></div>`,
-  props: { src: String, version: Number, live: Number, unit: String },
+  template: `<div class="curves"><div v-if="tools" class="curves-tools">
+      <input v-if="tree" v-model="word" @input="build" class="curves-find" type="search" placeholder="find a channel" aria-label="find a channel">
+      <button v-for="(act, name) in { PNG: png, SVG: svg, CSV: csv }" :key="name" type="button" class="curves-tool" @click="act" :aria-label="'save these curves as ' + name">{{ name }}</button>
+      <button type="button" class="curves-tool" @click="keep" aria-label="keep this layout: view, channels, names hidden">Keep layout</button>
+      <button type="button" class="curves-tool" @click="recall" aria-label="show the layout that was kept">Show kept</button></div>
+    <div ref="legend" class="curves-legend"></div>
+    <div ref="stack" class="curves-stack" tabindex="0" role="group" :aria-label="'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference'" @keydown="key_"></div>
+    <div ref="said" class="away" role="status"></div>
+    <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; click: reference for differences &middot; double-click: everything</div></div>`,
+  props: { src: String, version: Number, live: Number, unit: String, tree: Boolean },
+  data() { return { tools: false, word: "" }; },
   mounted() {
     this.plots = [];
     this.view = null; // [from, to] in s; null: everything
@@ -15,6 +23,7 @@ export default {
     this.busy = false;
     this.again = false;
     this.hidden = {};
+    this.at = null; // s: reference cursor
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(this.$el);
     this.themes = new MutationObserver(() => this.rebuild());
@@ -68,14 +77,15 @@ export default {
       const data = head.panels.map((p) => [next(p.n), ...p.lines.map(() => Array.from(next(p.n), (v) => (v === v ? v : null)))]);
       this.head = head;
       this.data = data;
+      this.tools = !this.live && head.panels.length > 0;
       const shape = JSON.stringify([head.panels.map((p) => [p.title, p.unit, p.lines, p.height]), head.key]);
       if (shape !== this.shape) {
-        if (head.key !== this.key) this.view = null;
+        if (head.key !== this.key) { this.view = null; this.at = null; }
         this.key = head.key;
         this.shape = shape;
         this.build();
       } else {
-        this.plots.forEach((p, i) => p.setData(data[i], false));
+        this.plots.forEach((p) => p.setData(data[p.panel], false));
         this.scale();
       }
       this.$el.dataset.points = data.reduce((n, d) => n + d[0].length, 0);
@@ -116,14 +126,17 @@ export default {
       const legend = new Map();
       const first = this.head.panels.map((p) => p.lines.map((l) => l.name).join());
       const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own
-      this.plots = this.head.panels.map((panel, i) => {
+      const word = this.word.trim().toLowerCase();
+      const shown = this.head.panels.map((p, i) => i).filter((i) => !word || this.head.panels[i].title.toLowerCase().includes(word));
+      this.plots = shown.map((i) => {
+        const panel = this.head.panels[i];
         if (!own) panel.lines.forEach((l) => legend.set(l.name, l.role));
-        const last = i === this.head.panels.length - 1;
+        const last = i === shown[shown.length - 1];
         const axis = { stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, font: "12px system-ui, sans-serif" };
         const plot = new uPlot({
           width: this.width(), height: panel.height + (last ? 34 : 12), padding: [8, 14, 0, 0],
           legend: { show: false },
-          cursor: { sync: { key: this.src }, drag: { x: true, y: false, setScale: false }, focus: { prox: 24 }, points: { size: 6 } },
+          cursor: { sync: { key: "vaneloop", scales: ["x", null] }, drag: { x: true, y: false, setScale: false }, focus: { prox: 24 }, points: { size: 6 } },
           scales: { x: { time: false }, y: { range: (u, low, high) => this.range(low, high, panel) } },
           axes: [
             { ...axis, show: last, size: last ? 34 : 0, values: (u, v) => v.map((x) => +x.toPrecision(9) + (x === v[v.length - 1] ? " s" : "")) },
@@ -131,7 +144,8 @@ export default {
           ],
           series: [{}, ...panel.lines.map((l) => ({ label: l.name, stroke: colour(l.role), width: l.width || 1.25, dash: l.dash, points: { show: false }, show: !this.hidden[l.name] }))],
           hooks: {
-            drawClear: [(u) => this.band(u, panel, colour)],
+            drawClear: [(u) => this.band(u, panel, colour), (u) => this.spans(u, colour)],
+            draw: [(u) => this.marks(u, colour, i === shown[0])],
             setSelect: [(u) => {
               if (u.select.width > 4) {
                 const a = u.posToVal(u.select.left, "x"), b = u.posToVal(u.select.left + u.select.width, "x");
@@ -146,6 +160,7 @@ export default {
         readout.className = "curves-readout";
         plot.root.appendChild(readout);
         plot.readout = readout;
+        plot.panel = i;
         this.handle(plot);
         if (own && panel.lines.length > 1) {
           const names = document.createElement("div");
@@ -192,12 +207,131 @@ export default {
       c.fillRect(left, a, width, b - a);
       c.restore();
     },
+    spans(u, colour) {
+      const { left, top, width, height } = u.bbox, c = u.ctx;
+      (this.head.bands || []).forEach(([a, b, text, role]) => {
+        const x = Math.max(left, u.valToPos(a, "x", true)), y = Math.min(left + width, u.valToPos(b, "x", true));
+        if (y <= left || x >= left + width) return;
+        c.save();
+        c.globalAlpha = 0.16;
+        c.fillStyle = colour(role);
+        c.fillRect(x, top, Math.max(1, y - x), height);
+        c.restore();
+      });
+    },
+    marks(u, colour, named) {
+      const { left, top, width, height } = u.bbox, c = u.ctx, dots = devicePixelRatio || 1;
+      const line = (t, role, text) => {
+        const x = u.valToPos(t, "x", true);
+        if (x < left || x > left + width) return;
+        c.save();
+        c.strokeStyle = c.fillStyle = colour(role);
+        c.setLineDash([4 * dots, 3 * dots]);
+        c.lineWidth = dots;
+        c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
+        if (text) { c.font = 11 * dots + "px system-ui, sans-serif"; c.textAlign = x > left + 0.8 * width ? "right" : "left"; c.fillText(" " + text + " ", x, top + 11 * dots); }
+        c.restore();
+      };
+      (this.head.marks || []).forEach(([t, text]) => line(t, "bad", named ? text : ""));
+      if (named) (this.head.bands || []).forEach(([a, , text, role]) => { const x = u.valToPos(a, "x", true); if (x >= left && x < left + width) { c.save(); c.fillStyle = colour("text"); c.font = 11 * dots + "px system-ui, sans-serif"; c.fillText(text, x + 3 * dots, top + height - 4 * dots); c.restore(); } });
+      if (this.at !== null) line(this.at, "text", "");
+    },
+    moment(t) {
+      // show a moment of the log: two seconds to each side, with the cursor's reference on it
+      this.at = t;
+      this.look(t - 2, t + 2);
+      this.plots.forEach((p) => p.redraw(false));
+      this.$el.scrollIntoView({ behavior: "smooth", block: "center" });
+    },
+    key_(e) {
+      if (!this.head || !this.head.panels.length || !this.plots.length) return;
+      const [a, b] = this.view || this.head.span, w = b - a, u = this.plots[0];
+      const at = u.cursor.left >= 0 && u.cursor.left !== undefined && u.cursor.left !== null ? u.posToVal(u.cursor.left, "x") : (a + b) / 2;
+      const step = (e.shiftKey ? 0.1 : 0.01) * w;
+      const cursor = (t) => { u.setCursor({ left: u.valToPos(Math.min(b, Math.max(a, t)), "x"), top: 10 }); this.$refs.said.textContent = this.plots.map((p) => this.head.panels[p.panel].title + " " + p.readout.textContent).join("; "); };
+      const acts = { ArrowLeft: () => cursor(at - step), ArrowRight: () => cursor(at + step), "+": () => this.look(at - w / 4, at + w / 4), "-": () => this.look(at - w, at + w),
+        PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => { this.view = null; this.scale(); this.fetch(); }, Enter: () => this.refer(at) };
+      if (!acts[e.key] || this.live) return;
+      e.preventDefault();
+      acts[e.key]();
+    },
+    refer(t) {
+      this.at = this.at !== null && Math.abs(this.at - t) < 1e-9 ? null : t;
+      this.plots.forEach((p) => p.redraw(false));
+    },
+    near(u, t) {
+      // index of the sample next to a time
+      const x = u.data[0];
+      let a = 0, b = x.length - 1;
+      while (b - a > 1) { const m = (a + b) >> 1; if (x[m] <= t) a = m; else b = m; }
+      return t - x[a] < x[b] - t ? a : b;
+    },
+    save(name, href) { const a = document.createElement("a"); a.href = href; a.download = name; a.click(); },
+    name(suffix) { return this.src.split("/").pop() + "." + suffix; },
+    csv() {
+      const [a, b] = this.view || this.head.span, rows = ["channel,line,t,value"];
+      const q = (v) => (/[",]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v);
+      this.plots.forEach((p) => this.head.panels[p.panel].lines.forEach((l, j) => p.data[0].forEach((t, k) => {
+        const v = p.data[j + 1][k];
+        if (t >= a && t <= b && v !== null && v !== undefined) rows.push([q(this.head.panels[p.panel].title), q(l.name), t, v].join(","));
+      })));
+      this.save(this.name("csv"), URL.createObjectURL(new Blob([rows.join("\n") + "\n"], { type: "text/csv" })));
+    },
+    png() {
+      const all = this.plots.map((p) => p.ctx.canvas), out = document.createElement("canvas");
+      out.width = Math.max(...all.map((c) => c.width));
+      out.height = all.reduce((n, c) => n + c.height, 0);
+      const c = out.getContext("2d");
+      c.fillStyle = this.colours()("panel");
+      c.fillRect(0, 0, out.width, out.height);
+      let y = 0;
+      all.forEach((part) => { c.drawImage(part, 0, y); y += part.height; });
+      this.save(this.name("png"), out.toDataURL("image/png"));
+    },
+    svg() {
+      const colour = this.colours(), w = this.width(), e = (t) => String(t).replace(/[&<>]/g, (x) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[x]);
+      let y = 0;
+      const parts = this.plots.map((p) => {
+        const panel = this.head.panels[p.panel], h = p.height, dots = devicePixelRatio || 1, box = p.bbox, top = y;
+        y += h;
+        const X = (t) => (p.valToPos(t, "x", true) / dots).toFixed(1), Y = (v) => (p.valToPos(v, "y", true) / dots + top).toFixed(1);
+        const lines = panel.lines.map((l, j) => {
+          let path = "", pen = "M";
+          p.data[0].forEach((t, k) => { const v = p.data[j + 1][k]; if (v === null || v === undefined) { pen = "M"; return; } path += pen + X(t) + " " + Y(v); pen = "L"; });
+          return `<path d="${path}" fill="none" stroke="${colour(l.role)}" stroke-width="${l.width || 1.25}"/>`;
+        }).join("");
+        const [L, T, W, H] = [box.left, box.top, box.width, box.height].map((v) => v / dots);
+        const { min, max } = p.scales.y;
+        const words = [[L - 6, top + T + 10, "end", max.toPrecision(4)], [L - 6, top + T + H, "end", min.toPrecision(4)], [L + 4, top + T + 12, "start", panel.title]]
+          .map(([x, at, anchor, text]) => `<text x="${x}" y="${at}" text-anchor="${anchor}">${e(text)}</text>`).join("");
+        return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${lines}</g>${words}`;
+      }).join("");
+      const [a, b] = this.view || this.head.span;
+      const foot = `<text x="66" y="${y + 14}">${a.toPrecision(6)} s</text><text x="${w - 14}" y="${y + 14}" text-anchor="end">${b.toPrecision(6)} s</text>`;
+      const text = `<svg xmlns="http://www.w3.org/2000/svg" width="${w}" height="${y + 20}" font-family="sans-serif" font-size="11" fill="${colour("text")}"><rect width="100%" height="100%" fill="${colour("panel")}"/>${parts}${foot}</svg>`;
+      this.save(this.name("svg"), URL.createObjectURL(new Blob([text], { type: "image/svg+xml" })));
+    },
+    keep() { localStorage.setItem("layout " + this.src, JSON.stringify({ view: this.view, word: this.word, hidden: this.hidden })); },
+    recall() {
+      const kept = JSON.parse(localStorage.getItem("layout " + this.src) || "null");
+      if (!kept) return;
+      this.word = kept.word || "";
+      this.hidden = kept.hidden || {};
+      this.view = kept.view;
+      this.build();
+      this.fetch();
+    },
     read(u, i) {
       const k = u.cursor.idx, panel = this.head.panels[i];
       if (!u.readout) return;
       if (k === null || k === undefined || u.cursor.left < 0) { u.readout.textContent = ""; return; }
       const text = panel.lines.map((l, j) => { const v = u.data[j + 1][k]; return v === null || v === undefined ? "" : (panel.lines.length > 1 ? l.name + " " : "") + Number(v).toPrecision(5); });
-      u.readout.textContent = Number(u.data[0][k]).toFixed(3) + " s  " + text.filter((x) => x).join("   ") + " " + panel.unit;
+      let apart = "";
+      if (this.at !== null && u.data[0].length) {
+        const r = this.near(u, this.at), d = panel.lines.map((l, j) => { const v = u.data[j + 1][k], w = u.data[j + 1][r]; return v === null || w === null || v === undefined || w === undefined ? "" : (v - w).toPrecision(4); });
+        apart = "  | to the reference: " + (u.data[0][k] - this.at).toFixed(3) + " s, " + d.filter((x) => x).join(", ") + " " + panel.unit;
+      }
+      u.readout.textContent = Number(u.data[0][k]).toFixed(3) + " s  " + text.filter((x) => x).join("   ") + " " + panel.unit + apart;
     },
     handle(plot) {
       const over = plot.over;
@@ -219,6 +353,9 @@ export default {
         document.addEventListener("mousemove", move);
         document.addEventListener("mouseup", up);
       }, true);
+      let down = 0;
+      over.addEventListener("pointerdown", (e) => { down = e.clientX; });
+      over.addEventListener("click", (e) => { if (!this.live && Math.abs(e.clientX - down) < 4 && e.detail === 1) this.refer(plot.posToVal(e.offsetX, "x")); });
       over.addEventListener("dblclick", () => { this.view = null; this.scale(); this.fetch(); });
     },
     resize() {

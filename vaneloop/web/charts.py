@@ -18,12 +18,28 @@ from nicegui.element import Element
 from nicegui.elements import plotly as bundled
 from tsdownsample import MinMaxDownsampler
 
+from controller import MODES
 from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import THEMES
 
-__all__ = ["Chart", "Curves", "Figure", "Panel", "Trace", "figure", "of_log", "painted", "view"]
+__all__ = [
+    "MODE_ROLES",
+    "Band",
+    "Chart",
+    "Curves",
+    "Figure",
+    "Mark",
+    "Panel",
+    "Trace",
+    "bands",
+    "figure",
+    "of_log",
+    "painted",
+    "view",
+]
 
 Array = np.ndarray
+MOST_BANDS = 400
 MOST_POINTS = 4000  # a line and view, whatever the browser asks for
 
 
@@ -52,12 +68,46 @@ class Panel:
     least: float = 0.0
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A moment with a name: a fault that was injected."""
+
+    t: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Band:
+    """A stretch of time with a name: a mode, a fault; its colour by role."""
+
+    start: float
+    end: float
+    text: str
+    role: str
+
+
 @dataclass
 class Curves:
     """What a chart shows. ``key`` changes where the old view makes no sense any more."""
 
     panels: Sequence[Panel] = field(default_factory=list)
     key: str = ""
+    marks: Sequence[Mark] = field(default_factory=list)
+    bands: Sequence[Band] = field(default_factory=list)
+
+
+def bands(t: Array, values: Array, names: Mapping[int, tuple[str, str]]) -> list[Band]:
+    """Stretches in which a signal has one of these values: value -> name, role ("": not drawn)."""
+    if not len(t):
+        return []
+    v = np.where(np.isfinite(values), values, -1.0).astype(np.int64)
+    at = np.flatnonzero(np.diff(v, prepend=v[0] - 1))
+    ends = [*at[1:], len(v) - 1]
+    return [
+        Band(float(t[i]), float(t[j]), *names[int(v[i])])
+        for i, j in zip(at, ends, strict=True)
+        if names.get(int(v[i]), ("", ""))[1]
+    ][:MOST_BANDS]
 
 
 def view(curves: Curves, start: float | None, end: float | None, pixels: int) -> bytes:
@@ -86,7 +136,9 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
         )
         body += [np.ascontiguousarray(a, dtype="<f8").tobytes() for a in (x, *lines)]
     span = [low, high if high > low else low + 1.0] if np.isfinite(low) else [0.0, 1.0]
-    head = json.dumps({"panels": heads, "span": span, "key": curves.key}).encode()
+    more = {"marks": [[m.t, m.text] for m in curves.marks]}
+    more |= {"bands": [[b.start, b.end, b.text, b.role] for b in curves.bands]}
+    head = json.dumps({"panels": heads, "span": span, "key": curves.key, **more}).encode()
     return struct.pack("<I", len(head)) + head + bytes(-(4 + len(head)) % 8) + b"".join(body)
 
 
@@ -110,26 +162,46 @@ def _whole(y: Array) -> Array:
     return np.where(last >= 0, np.asarray(y, dtype=np.float64)[np.maximum(last, 0)], 0.0)
 
 
-def of_log(channels: Mapping[str, tuple[str, Array, Array]], key: str) -> Curves:
-    """All channels of a log, one below the other, holes open."""
+Channels = Mapping[str, tuple[str, Array, Array]]  # name -> unit, s, values
+
+
+def of_log(channels: Channels, key: str, over: Channels | None = None, later: float = 0.0) -> Curves:
+    """All channels of a log, one below the other, holes open.
+
+    over   those of another log, laid over them, at the first one's samples
+    later  s, added to the times of the other log
+    """
     panels = []
     for name, (unit, t, values) in channels.items():
         x, y = break_at_holes(t, values)
-        panels.append(
-            Panel(f"{name} [{unit}]", unit, np.asarray(x), [Trace(name, np.asarray(y), "measured")], height=74)
-        )
-    return Curves(panels, key)
+        lines = [Trace("this log" if over else name, np.asarray(y), "measured")]
+        if over and name in over:
+            _, t2, v2 = over[name]
+            there = np.interp(np.asarray(x), np.asarray(t2) + later, v2, np.nan, np.nan)
+            lines.append(Trace("the other log", there, "model"))
+        panels.append(Panel(f"{name} [{unit}]", unit, np.asarray(x), lines, height=74))
+    spans = []
+    if "state" in channels:
+        _, t, values = channels["state"]
+        spans = bands(np.asarray(t), np.asarray(values), {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
+    return Curves(panels, key, bands=spans)
+
+
+MODE_ROLES = {"DEGRADED": "model", "FAIL_SAFE": "bad"}  # modes that are drawn as bands
 
 
 class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):
     """Time curves in the browser; ``source`` names the curves at the server (`/curves/SOURCE`)."""
 
-    def __init__(self, source: str, live: float = 0.0):
-        """``live``: questions a second of a chart whose curves move on by themselves."""
+    def __init__(self, source: str, live: float = 0.0, tree: bool = False):
+        """``live``: questions a second of a chart whose curves move on by themselves; ``tree``: channels are found by
+        name.
+        """
         super().__init__()
         self._props["src"] = f"/curves/{source}"
         self._props["version"] = 0
         self._props["live"] = live
+        self._props["tree"] = tree
 
     def refetch(self) -> None:
         """Tell the browser that the curves have changed."""

@@ -8,7 +8,7 @@ from nicegui import events, ui
 
 from vaneloop.base.signals import UNITS
 from vaneloop.web.charts import Chart
-from vaneloop.web.frame import Live, card, opened, table
+from vaneloop.web.frame import Live, card, drop, opened, table
 from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
@@ -54,12 +54,7 @@ class ChosenLog:
         with card("1  The log", "A measured run: any CAN log, MDF4, CSV or Parquet. It stays on this machine."):
             with ui.element("div").classes("two"):
                 with ui.element("div").classes("stackc"):
-                    self.upload = ui.upload(
-                        label="drop a log here, or press +", auto_upload=True, max_file_size=self.most,
-                        on_upload=self._uploaded,
-                        on_rejected=self._rejected,
-                    )  # fmt: skip
-                    self.upload.props(f'accept="{suffixes()}" flat')
+                    self.upload = drop("Drop a log here", self.most, suffixes(), self._uploaded, self._rejected)
                     s = self.s
                     self.live.part(
                         self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
@@ -71,9 +66,13 @@ class ChosenLog:
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
             self.live.part(self._form, "log", "compare", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
-                chart = Chart("log")
+                self.live.part(
+                    self._other, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
+                )
+                self.live.complaint("over")
+                chart = Chart("log", tree=True)
             all_channels.props("dense")
-            self.live.watch(chart.refetch, "log")
+            self.live.watch(chart.refetch, "log", "over")
 
     def _choose(self) -> None:
         s = self.s
@@ -87,6 +86,22 @@ class ChosenLog:
         ui.select(options, value=at, label="or choose one", on_change=chosen).props(
             "outlined dense options-dense"
         ).classes("w-full choose")
+
+    def _other(self) -> None:
+        """Another log laid over this one."""
+        s = self.s
+        if s.choice.file is None:
+            return
+
+        def lay() -> None:
+            s.lay_over(s.files[other.value] if other.value is not None else None, float(later.value or 0.0))
+
+        with ui.element("div").classes("rowc"):
+            options = {i: f.name for i, f in enumerate(s.files) if f != s.choice.file}
+            other = ui.select(options, label="lay another log over it", on_change=lay, clearable=True)
+            other.props("outlined dense options-dense").style("min-width:240px").classes("other")
+            later = ui.number("later by [s]", value=0.0, on_change=lambda: lay() if other.value is not None else None)
+            later.props("outlined dense debounce=500").style("width:120px")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
         file = await receive(self.s, e, "log")
@@ -132,7 +147,7 @@ class ChosenLog:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
 
     def _wrong(self) -> bool:
-        return any(self.s.errors.get(x, "stopped") != "stopped" for x in ("log", "compare"))
+        return any(not self.s.errors.get(x, "stopped").startswith("stopped") for x in ("log", "compare"))
 
     def _form_shows(self) -> tuple[Any, ...]:
         s, c = self.s, self.s.choice
@@ -185,7 +200,8 @@ class ChosenLog:
                 for name in s.offered[:500]:
                     ui.element("option").props["value"] = name
             with ui.element("div").style(
-                "display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:8px 18px;margin:8px 0"
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));"
+                "gap:8px 18px;margin:8px 0"
             ):
                 for signal in ("t", *UNITS):
                     name, unit, how, sure, why, curve = seen["signals"].get(signal, ("", "", "", 0.0, "", []))
@@ -205,7 +221,7 @@ class ChosenLog:
                             about = ui.label(said or seen["open"][signal]).classes("soft small guess")
                             about.style("grid-column:span 2")
                             if why:
-                                about.tooltip(why)
+                                about.props["title"] = why
             with ui.element("div").classes("rowc"):
                 hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
                 rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")
@@ -228,8 +244,19 @@ class ChosenLog:
                     apply()
 
                 ui.checkbox("guess what is not stated", value=choice.guess, on_change=guessing)
+                ui.button("Save as mapping file", icon="save", on_click=s.save_mapping).props(
+                    "outline dense padding='4px 14px'"
+                ).classes("save-mapping")
                 ui.button("Read again", icon="refresh", on_click=apply).props("unelevated dense padding='4px 14px'")
                 ui.button("Forget all of it", on_click=plain).props("flat dense padding='4px 14px'")
+                self.live.complaint("mapping")
+                self.live.part(lambda: _mapping_link(s), "mapping", shows=lambda: ("mapping" in s.saved,))
+
+
+def _mapping_link(s: Session) -> None:
+    """The mapping file, where it has been written."""
+    if "mapping" in s.saved:
+        ui.link("download mapping.toml", "/saved/mapping").props('download="mapping.toml"').classes("saved-mapping")
 
 
 def _curve(values: list[float]) -> str:

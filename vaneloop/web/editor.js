@@ -6,7 +6,7 @@ export default {
     <g v-for="t in ticks.x" :key="'x' + t"><line :x1="px(t)" :x2="px(t)" :y1="10" :y2="H - B" class="editor-grid"/><text :x="px(t)" :y="H - B + 16" text-anchor="middle">{{ t }}</text></g>
     <text :x="W - 10" :y="H - 4" text-anchor="end">{{ xtitle }}</text><text :x="L + 6" y="20">{{ ytitle }}</text>
     <polyline :points="x.map((v, i) => px(v) + ',' + py(now[i])).join(' ')" class="editor-line"/>
-    <circle v-for="(v, i) in x" :key="i" :cx="px(v)" :cy="py(now[i])" r="6" class="editor-point" tabindex="0" :aria-label="'point at ' + v"
+    <circle v-for="(v, i) in x" :key="i" :cx="px(v)" :cy="py(now[i])" r="6" class="editor-point" tabindex="0" role="slider" :aria-label="'point at ' + v" :aria-valuenow="now[i]" :aria-valuemin="range[0]" :aria-valuemax="range[1]"
       @pointerdown.prevent="grab(i, $event)" @keydown.up.prevent="nudge(i, 0.1)" @keydown.down.prevent="nudge(i, -0.1)"/>
     <text v-if="held !== null" :x="px(x[held])" :y="py(now[held]) - 12" text-anchor="middle" class="editor-value">{{ now[held].toFixed(2) }}</text>
   </svg>`,

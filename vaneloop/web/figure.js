@@ -6,6 +6,7 @@ export default {
   props: { options: Object },
   mounted() {
     Plotly.newPlot(this.$el, this.options.data, this.options.layout, this.options.config);
+    this.$el.on("plotly_click", (e) => { const t = e.points[0].customdata; if (typeof t === "number") this.$emit("cell", t); });
     this.sizes = new ResizeObserver(() => {
       const w = this.$el.clientWidth;
       if (w > 0 && w !== this.wide && this.$el.isConnected) { this.wide = w; Plotly.relayout(this.$el, { width: w }); }

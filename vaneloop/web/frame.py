@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,9 +17,10 @@ from nicegui.element import Element
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
+from vaneloop.web.jobs import Job
 from vaneloop.web.session import Session
 
-__all__ = ["PAGES", "Live", "card", "command_line", "figure_of", "frame", "opened", "table", "tone"]
+__all__ = ["PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "opened", "table", "tone"]
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
 PRIMARY = "#1f6fc4"
@@ -51,8 +53,8 @@ def frame(session: Session, here: str) -> Iterator[None]:
             session.touch("theme")
 
         ui.button(icon="contrast", on_click=flip).props(
-            'flat round dense color=grey aria-label="light or dark"'
-        ).tooltip("light or dark")
+            'flat round dense color=grey aria-label="light or dark" title="light or dark"'
+        )
 
     async def ask() -> None:
         try:
@@ -64,7 +66,8 @@ def frame(session: Session, here: str) -> Iterator[None]:
             session.touch("theme")
 
     ui.timer(0.01, ask, once=True)
-    with ui.element("main").classes("main"):
+    with ui.element("div").classes("main"):  # NiceGUI's own page is the landmark "main"
+        ui.html(f"<h1>{html.escape(dict(PAGES)[here])}</h1>", sanitize=False).classes("away")
         yield
 
 
@@ -140,7 +143,7 @@ class Live:
         def draw() -> None:
             for text in shows():
                 if text:
-                    ui.label(text if text == "stopped" else f"vaneloop: {text}").classes("complaint").props(
+                    ui.label(text if text.startswith("stopped") else f"vaneloop: {text}").classes("complaint").props(
                         'role="alert"'
                     )
 
@@ -153,8 +156,10 @@ class Live:
         """A bar with what is being done in jobs of these names, and a button that stops it."""
         with ui.element("div").classes("rowc").style("width:100%;flex-wrap:nowrap") as row:
             with ui.element("div").classes("stackc").style("gap:3px"):
-                text = ui.label().classes("small soft")
-                bar = ui.linear_progress(0.0, show_value=False).props("rounded instant-feedback")
+                text = ui.label().classes("small soft work").props('role="status"')
+                bar = ui.linear_progress(0.0, show_value=False).props(
+                    f'rounded instant-feedback aria-label="progress: {names[0]}"'
+                )
             ui.button("Cancel", icon="close", on_click=lambda: self.session.stop(*names)).props(
                 "outline dense padding='2px 10px'"
             ).classes("cancel")
@@ -164,7 +169,7 @@ class Live:
             row.set_visibility(job is not None and bool(job.text))
             if job is not None:
                 share = f", {100 * job.fraction:.0f} %" if job.fraction is not None else ""
-                text.set_text(f"{job.text}{share} ({job.seconds:.0f} s)")
+                text.set_text(f"{job.text}{share} ({job.seconds:.0f} s{_left(job)})")
                 if (job.fraction is None) != ("indeterminate" in bar.props):
                     bar.props(add="indeterminate") if job.fraction is None else bar.props(remove="indeterminate")
                 bar.set_value(round(job.fraction or 0.0, 3))
@@ -188,6 +193,14 @@ class Live:
             for draw, sections, of in list(self.parts):
                 if changed.intersection(sections) and (of is None or not of.is_deleted):
                     draw()
+
+
+def _left(job: Job) -> str:
+    """How long a job may still take, as it went so far; "" before that can be said."""
+    f = job.fraction or 0.0
+    if f < 0.05 or f >= 1.0 or job.seconds < 2.0:
+        return ""
+    return f", about {math.ceil(job.seconds * (1.0 - f) / f)} s left"
 
 
 def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
@@ -215,7 +228,8 @@ def command_line(text: str, label: str = "the same as a command") -> None:
         ui.clipboard.write(text)
         ui.notify("copied")
 
-    with ui.element("div").classes("cmd").tooltip(label):
+    with ui.element("div").classes("cmd") as line:
+        line.props["title"] = label
         ui.html(f"<code>{html.escape(text)}</code>", sanitize=False).style("flex:1;min-width:0")
         ui.button(icon="content_copy", on_click=copy).props('flat dense round size=sm aria-label="copy the command"')
 
@@ -234,9 +248,25 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequen
         for r in rows
     )
     ui.html(
-        f'<div class="scroll"><table class="vtable"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>',
+        '<div class="scroll" tabindex="0" role="group" aria-label="table">'
+        f'<table class="vtable"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>',
         sanitize=False,
     )
+
+
+def drop(label: str, most: int, accept: str, on_upload: Any, on_rejected: Any) -> ui.upload:
+    """A field to drop a file on, with a button that opens one: by mouse, keyboard and screen reader."""
+    box = ui.upload(auto_upload=True, max_file_size=most, on_upload=on_upload, on_rejected=on_rejected)
+    box.props(f'accept="{accept}" flat')
+    words = html.escape(label, quote=True)
+    box.add_slot(
+        "header",
+        f"""<div class="drop"><span>{words}</span>
+        <q-btn dense unelevated no-caps color="primary" padding="4px 14px" label="Choose a file"
+        @click="props.pickFiles" />
+        <label class="away">{words}<q-uploader-add-trigger /></label></div>""",
+    )
+    return box
 
 
 def opened(session: Session, title: str, now: bool = False) -> ui.expansion:

@@ -87,7 +87,7 @@ class Worker:
         try:
             await asyncio.get_running_loop().run_in_executor(None, self._connection.send, (job.number, name, arguments))
         except OSError:
-            self._end(job.number, WorkError("the worker process has ended"))
+            self._end(job.number, WorkError("the process that does this has ended; start it again"))
         return await job.future
 
     def tell(self, **content: Any) -> None:
@@ -155,5 +155,8 @@ class Worker:
         for number in list(self.jobs):
             self._end(
                 number,
-                WorkError(f"the process that did this has ended ({how}); the log may need more memory than there is"),
+                WorkError(
+                    f"the process that did this was ended from outside ({how}), perhaps for want of memory; nothing is "
+                    f"kept of it, start it again"
+                ),
             )

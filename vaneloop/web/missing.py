@@ -9,9 +9,11 @@ from nicegui import events, ui
 
 from plant.effects import EFFECTS
 from vaneloop.discrepancy.locate import AGREES, Located
+from vaneloop.pages.diagnosis import MOST_CONDITIONS, failure_map
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
-from vaneloop.pages.figures import heat, overlay, waterfall
+from vaneloop.pages.figures import overlay, waterfall
+from vaneloop.pages.story import CANNOT, doubt, fall, falling, floors, reached, worths
 from vaneloop.pages.style import number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
@@ -37,7 +39,7 @@ class _Page:
         self.s, self.live = session, live
         self.readout: ui.label | None = None
         self.sliders: dict[tuple[str, str], tuple[ui.slider, ui.label]] = {}
-        self.switches: dict[str, tuple[ui.switch, ui.element]] = {}
+        self.switches: dict[str, tuple[ui.switch, ui.element, ui.element, ui.element]] = {}
 
     def _stage_toggle(self, stages: list[str], props: str) -> None:
         """Choose the stage shown; follows where it is chosen elsewhere."""
@@ -77,18 +79,16 @@ class _Page:
         if c is None:
             return
         ui.label(c["verdict"]).classes(f"verdict {c['tone']}")
-        with ui.element("div").classes("half"):
-            with ui.element("div").classes("stackc"):
-                self._figures(c)
-            with ui.element("div").classes("stackc"):
-                stages = list(c["located"])
-                if stages:
-                    with ui.element("div").classes("rowc"):
-                        ui.label("Failure map of").classes("soft")
-                        self._stage_toggle(stages, "padding='2px 10px'")
-                    self.live.part(
-                        self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s))
-                    )
+        with ui.element("div").classes("stackc"):
+            self._figures(c)
+        stages = list(c["located"])
+        if stages:
+            with ui.element("div").classes("rowc").style("margin-top:12px"):
+                ui.label("Failure map of").classes("soft")
+                self._stage_toggle(stages, "padding='2px 10px'")
+            self.live.part(
+                self._map, "compare", "diagnosis", "fit", "theme", shows=lambda: (s.compared, s.stage, dark(s))
+            )
 
     def _figures(self, c: dict[str, Any]) -> None:
         s = self.s
@@ -97,13 +97,13 @@ class _Page:
             width = 100 * min(1.0, math.log10(max(f.ratio, 1.0)) / 2.2) + 2
             bar = f'<span class="bar {tone(f.ratio)}" style="width:{width:.0f}px"></span>'
             rows.append(
-                [f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, f"{f.ratio:.2f}", ("html", bar)]
+                [f.stage, f.signal, f"{f.rms:.4g}", f"{f.noise_floor:.4g}", f.unit, floors(f.ratio), ("html", bar)]
             )
         for name, why in c["not_observed"].items():
-            rows.append([name, f"not observed: {why}", "", "", "", "", ""])
-        table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", ""], rows, numbers=(2, 3, 5))
+            rows.append([name, f"{CANNOT}: {why}", "", "", "", "", ""])
+        table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", "size"], rows, numbers=(2, 3, 5))
         given = [
-            f"{f.signal} {number(f.rms_as_given / f.noise_floor)}"
+            f"{f.signal} {floors(f.rms_as_given / f.noise_floor)}"
             for f in c["figures"]
             if f.rms_as_given > AGREES * f.noise_floor
         ]
@@ -134,24 +134,21 @@ class _Page:
         if located.onset is not None:
             ui.label(f"The error begins at t = {located.onset:.0f} s.")
         output = hot[0].output
-        mine = [r for r in hot if r.output == output][:9]
-        width = max(len(r.ratio) for r in mine)
-        cells = [
-            [float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)]
-            + [None] * (width - len(r.ratio))
-            for r in mine
-        ]
-        names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in mine]
-        f = heat(
-            cells,
-            [str(i + 1) for i in range(width)],
-            names,
-            "noise floors",
-            "an eighth of the samples each, lowest to highest",
-            "",
-        )
-        figure_of(f, dark(self.s), height=90 + 27 * max(3, len(names)))
-        ui.label(f"Worst: {mine[0].worst()}.").classes("note")
+        mine = [r for r in hot if r.output == output][:MOST_CONDITIONS]
+        figure = failure_map(mine)
+        worst = max((v, t) for r in mine for v, t in zip(r.ratio, r.moments, strict=True) if t == t)[1]
+        with ui.element("div").classes("scroll").props('tabindex="0" role="group" aria-label="failure map"'):
+            figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
+        with ui.element("div").classes("rowc"):
+            ui.label(f"Worst: {mine[0].worst()}. A click on a cell shows its moment.").classes("note")
+            ui.button("Show me the worst moment", icon="visibility", on_click=lambda: self._show(worst)).props(
+                "outline dense padding='2px 12px'"
+            ).classes("show-worst")
+
+    def _show(self, t: Any) -> None:
+        """Move the curves of the stage to a moment of the log."""
+        if isinstance(t, int | float):
+            self.chart.run_method("moment", float(t))
 
     # ---- 3: what
 
@@ -164,12 +161,15 @@ class _Page:
                 "held-out data is named."
             )
             live.shown(ui.label(words).classes("soft"), lambda: s.compared is None, "compare", "log")
-            start = ui.button("Find the missing physics", icon="search", on_click=s.diagnose).props(
-                "unelevated size=md"
+            start = (
+                ui.button("Find the missing physics", icon="search", on_click=s.diagnose)
+                .props("unelevated size=md")
+                .classes("find-missing")
             )
             ready = lambda: s.compared is not None and s.diagnosis is None and not s.working["diagnose"]  # noqa: E731
             live.shown(start, ready, "compare", "log", "diagnosis", "diagnose", "jobs")
             live.progress("diagnose")
+            live.part(self._sofar, "sofar", "diagnose", "diagnosis", shows=lambda: (len(s.sofar), s.diagnosis))
             live.complaint("diagnose")
             live.part(self._verdict, "diagnosis", "compare", "log", shows=lambda: (s.compared, s.diagnosis))
             with ui.element("div").classes("two"):
@@ -196,7 +196,7 @@ class _Page:
                     live.watch(stale, "fit", "diagnosis", "compare")
                     live.part(self._sliders, "fit", "diagnosis", "compare", shows=lambda: (s.diagnosis, s.fitted()))
                     self.chart_title = ui.label().classes("soft small")
-                    chart = Chart("stage")
+                    self.chart = chart = Chart("stage")
             self._title()
             live.watch(self._by_hand, "hand", "fit")
             live.watch(self._title, "fit", "diagnosis", "compare", "hand")
@@ -211,6 +211,12 @@ class _Page:
             else ""
         )
         self.chart_title.set_text(text)
+
+    def _sofar(self) -> None:
+        """What the stages said that are searched already."""
+        if self.s.diagnosis is None:
+            for text in self.s.sofar:
+                ui.label(f"so far: {text}").classes("small sofar")
 
     def _verdict(self) -> None:
         s = self.s
@@ -234,10 +240,11 @@ class _Page:
     def _switched(self) -> None:
         """Switches and their marks as the session has them."""
         on = self.s.chosen.get(self.s.stage, ())
-        for name, (switch, row) in self.switches.items():
+        for name, (switch, row, _, _) in self.switches.items():
             if not switch.is_deleted:
                 switch.set_value(name in on)
                 row.classes(**{"add" if name in on else "remove": "on"})
+        self._shares()
 
     def _effects(self) -> None:
         s = self.s
@@ -247,10 +254,12 @@ class _Page:
             return
         found = {f.effect: f for f in d.effects}
         named = {r: f.effect for f in d.effects for r in f.rivals}
-        gain = {c.effect: c for c in d.candidates}
-        top = max((c.nats for c in d.candidates), default=1.0)
+        alone = {c.effect: c for c in d.candidates}
         on = s.chosen.get(s.stage, ())
-        with ui.element("div").classes("effects"):
+        ui.label(
+            "Bar: what the model would lose without the effect, of the way from noise to the nominal error."
+        ).classes("note")
+        with ui.element("div").classes("effects").props('tabindex="0" role="group" aria-label="effects"'):
             for name in s.effects():
                 with (
                     ui.element("div")
@@ -261,21 +270,27 @@ class _Page:
                         value=name in on, on_change=lambda e, name=name: self._switch(name, bool(e.value))
                     )
                     switch.props(f'dense aria-label="{name}"')
-                    self.switches[name] = switch, row
                     ui.label(name).classes("name")
-                    c = gain.get(name)
-                    share = (
-                        0.0
-                        if c is None or c.nats <= 0 or top <= 0
-                        else max(0.03, math.log10(1 + c.nats) / math.log10(1 + top))
-                    )
-                    with (
-                        ui.element("div")
-                        .classes("gain")
-                        .tooltip(f"gain alone: {c.nats:,.0f} nats on held-out data" if c else "not tried alone")
-                    ):
-                        ui.element("i").style(f"width:{100 * share:.0f}%")
-                    ui.label(self._about_effect(name, found, named, c)).classes("about")
+                    with ui.element("div").classes("gain") as gain:
+                        bar = ui.element("i")
+                    self.switches[name] = switch, row, gain, bar
+                    ui.label(self._about_effect(name, found, named, alone.get(name))).classes("about")
+        self._shares()
+
+    def _shares(self) -> None:
+        """The bars: each effect's share in the model as it is fitted now."""
+        f, d = self.s.shown_fit(), self.s.stage_diagnosis()
+        if d is None:
+            return
+        worth = {w.effect: w for w in (worths(f.result) if f is not None else worths(d))}
+        for name, (_, _, gain, bar) in self.switches.items():
+            if bar.is_deleted:
+                continue
+            w = worth.get(name)
+            said = f"without it {floors(w.without)} noise floors" if w else "not in the model"
+            gain.props["title"] = said
+            bar.style(f"width:{max(3.0, 100 * w.share) if w else 0:.0f}%")
+            gain.update()
 
     def _switch(self, name: str, on: bool) -> None:
         if on != (name in self.s.chosen.get(self.s.stage, ())):
@@ -291,13 +306,16 @@ class _Page:
             ]
             text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
             return (
-                text + (f". As good: {', '.join(f.rivals)}" if f.rivals else "") + (f". {summary}" if summary else "")
+                text
+                + (f". {doubt(f)[0].upper()}{doubt(f)[1:]}" if doubt(f) else "")
+                + (f". {summary}" if summary else "")
             )
         if name in named:
             return f"Rival of {named[name]}: this log cannot tell them apart. {summary}"
         if c is not None and c.reason:
-            return f"Not observable in this log; needs: {c.reason}"
-        return summary
+            return f"{CANNOT[0].upper()}{CANNOT[1:]}; needs: {c.reason}"
+        left = f"Alone it leaves {floors(c.left)} noise floors. " if c is not None and c.left == c.left else ""
+        return left + summary
 
     def _fall(self) -> None:
         s = self.s
@@ -305,24 +323,19 @@ class _Page:
         if s.diagnosis is None or f is None:
             return
         r = f.result
-        k = int((r.error_before / r.floor).argmax())
-        with ui.element("div").classes("tiles error-tiles"):
-            for label, v in (
-                ("nominal", r.error_before[k]),
-                ("with the effects that are on", r.error_after[k]),
-                ("noise floor", r.floor[k]),
-            ):
-                with ui.element("div").classes("tile"):
-                    ui.label(f"{number(v)} {r.units[k]}").classes("v")
-                    ui.label(f"{label}: {r.outputs[k]}").classes("l")
-            with ui.element("div").classes("tile"):
-                ui.label(f"{number(r.error_after[k] / r.floor[k])}").classes("v after").props(
-                    f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
-                )
-                ui.label("noise floors, held out").classes("l")
-        figure_of(
-            waterfall([*r.steps, ("noise floor", 1.0)], "held-out error [noise floors]", floor=1.0), dark(s), height=250
-        )
+        k, before, after = fall(r)
+        good = reached(r)
+        names = " and ".join(x.effect for x in r.effects) or "nothing added"
+        end = "An error remains." if not good else "Explained." if r.effects else "It fits."
+        with ui.element("div").classes(f"verdict fell {'good' if good else 'bad'}"):
+            ui.label(f"{before} → {after} noise floors").classes("v after").props(
+                f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
+            )
+            ui.label(
+                f"{r.outputs[k]} with {names}: {number(r.error_before[k])} → {number(r.error_after[k])} {r.units[k]}, "
+                f"noise floor {number(r.floor[k])}, held out. {end}"
+            ).classes("l")
+        figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0), dark(s), height=250)
 
     def _sliders(self) -> None:
         s = self.s
@@ -336,7 +349,8 @@ class _Page:
                 ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
             now = s.values()
             with ui.element("div").style(
-                "display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:4px 28px;width:100%"
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(300px,100%),1fr));"
+                "gap:4px 28px;width:100%"
             ):
                 for e in f.result.effects:
                     for name, p in e.parameters.items():

@@ -94,8 +94,8 @@ class _Page:
                     self.loop.tell(mode_request=int(e.value == "run"))
 
                 ui.toggle({"run": "run", "standby": "standby"}, value="run", on_change=ask).props(
-                    "dense unelevated no-caps padding='2px 10px'"
-                ).tooltip("mode that the ECU asks for")
+                    "dense unelevated no-caps padding='2px 10px' title='mode that the ECU asks for'"
+                )
             self.live.part(self._waiting, "loop", "loop-jobs", "run", shows=lambda: (" ".join(self._waits()),))
             self.live.part(self._commands, "loop", "run", shows=lambda: tuple(" ".join(w) for _, w in lp.commands()))
 
@@ -173,7 +173,8 @@ class _Page:
         for without, words in self.loop.commands():
             if without:
                 ui.label(without).classes("note")
-            command_line(shlex.join(["vaneloop", *words]))
+            if words:
+                command_line(shlex.join(["vaneloop", *words]))
 
     # ---- charts and lamps
 
@@ -200,6 +201,17 @@ class _Page:
                     with ui.element("div").classes("tile"):
                         self.tiles[name] = ui.label("-").classes("v")
                         ui.label(words).classes("l")
+            with ui.element("div").classes("rowc"):
+
+                def arm(e: events.ValueChangeEventArguments[Any]) -> None:
+                    self.loop.trigger, self.loop.held = bool(e.value), None
+
+                ui.checkbox("hold the charts at the next fault", value=self.loop.trigger, on_change=arm)
+
+                def again() -> None:
+                    self.loop.held = None
+
+                ui.button("Go on", icon="play_arrow", on_click=again).props("flat dense padding='2px 10px'")
             Chart("run", live=8.0)
             ui.timer(0.3, self._shown)
 
@@ -217,7 +229,9 @@ class _Page:
                 self.seen[name] = lp.lit[name], now  # from now on, however late this page comes to show it
             fresh = now - self.seen.get(name, (0, now - LIT))[1] < LIT or name == mode
             tone = (TONES.get(name, "mid") if name in MODES else "bad") if fresh else ""
-            wanted = f"lamp {tone}".strip()
+            # the controller is in one mode: another that has just passed is drawn as past
+            past = " was" if fresh and name in MODES and mode and name != mode else ""
+            wanted = f"lamp {tone}{past}".strip()
             if getattr(lamp, "shown", None) != wanted:
                 lamp.classes(replace=wanted)
                 lamp.shown = wanted  # type: ignore[attr-defined]
@@ -246,7 +260,7 @@ class _Page:
                     with ui.element("div").style("padding:3px 0;border-bottom:1px solid var(--grid)") as box:
                         ui.button(name, on_click=lambda name=name: self._begin(name)).props(
                             "flat dense no-caps align=left padding='1px 6px'"
-                        ).tooltip(title)
+                        )
                         ui.label(title).classes("note").style("padding-left:6px;line-height:1.3")
                     boxes.append((box, f"{name} {title}".lower()))
 
@@ -255,6 +269,7 @@ class _Page:
                     box.set_visibility((e.value or "").lower() in text)
 
             find.on_value_change(search)
+            self.live.progress("command")
             self.live.part(self._events, "events", "loop", shows=lambda: (*self.loop.events, self.loop.bus))
 
     def _begin(self, name: str) -> None:
@@ -264,12 +279,18 @@ class _Page:
             ui.notify("start the loop first")
 
     def _events(self) -> None:
-        for text in self.loop.events:
-            ui.label(text).classes("small mono")
-        if self.loop.events:
-            last = self.loop.events[-1].split("  ", 1)[1].split(":")[0]
+        with ui.element("div").classes("events").props('role="log" tabindex="0" aria-label="events"'):
+            for text in reversed(self.loop.events):
+                ui.label(text).classes("small mono")
+        if self.loop.injected:
+            last = self.loop.injected[-1].text
             if self.loop.bus == "lockstep":
-                ui.label("Here it begins in the loop that runs. By itself, and judged:").classes("note")
+                ui.button(f"Judge {last}", icon="rule", on_click=lambda: self.loop.judge(last)).props(
+                    "outline dense padding='2px 12px'"
+                ).classes("judge")
+                ui.label("Here it begins in the loop that runs. By itself, held against what it expects:").classes(
+                    "note"
+                )
             command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
 
     # ---- trace

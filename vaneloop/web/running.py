@@ -15,7 +15,7 @@ from controller import FAULTS, MODES
 from hil.inject.scenario import load_scenario
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.style import STAGE_ROLES
-from vaneloop.web.charts import Curves, Panel, Trace
+from vaneloop.web.charts import MODE_ROLES, Curves, Mark, Panel, Trace, bands
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS, COMPILING
 from vaneloop.web.session import LogFile, Session
@@ -23,6 +23,7 @@ from vaneloop.web.session import LogFile, Session
 __all__ = ["Loop"]
 
 KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
+AFTER = 3.0  # s that the charts show after the fault that they stop at
 SHOWN = 30.0  # s in the strip charts
 TRACED = 2000  # frames kept for the trace
 STRIPS: tuple[
@@ -53,7 +54,11 @@ class Loop:
     status: dict[str, Any] = field(default_factory=dict)
     late: dict[str, Any] = field(default_factory=dict)
     recorded: LogFile | None = None
-    events: deque[str] = field(default_factory=lambda: deque(maxlen=12))
+    events: deque[str] = field(default_factory=lambda: deque(maxlen=40))
+    injected: list[Mark] = field(default_factory=list)  # scenarios begun, with their times
+    last: tuple[int, int] = (-1, 0)  # latest mode and faults
+    trigger: bool = False  # the charts stop at the next fault
+    held: float | None = None  # s: the fault that they stop at
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
     boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
@@ -71,23 +76,10 @@ class Loop:
         profile = ["--profile", self.profile] if self.profile else []
         tables = [*self.tables_words(), *self.controller_words()]
         if self.bus == "lockstep":
-            own = (
-                "The slider, the pace and the buttons are the page's own. "
-                if profile
-                else "By slider: the page's own. "
-            )
-            words = [
-                "run",
-                "--bus",
-                "lockstep",
-                *(profile or ["--profile", "ramp"]),
-                "--start-speed",
-                f"{self.demand:g}",
-                *seed,
-                *record,
-                *tables,
-            ]
-            return [(own + ("The profile alone:" if profile else "With a profile instead:"), words)]
+            if not profile:
+                return [("By slider no command does this; choose a profile to see the one that runs it.", [])]
+            words = ["run", "--bus", "lockstep", *profile, "--start-speed", f"{self.demand:g}", *seed, *record, *tables]
+            return [("The profile alone; pace, slider and buttons are the page's own:", words)]
         return [
             ("", ["run", "--bus", self.bus_name, *seed, *record, *tables]),
             ("", ["ecu", "--bus", self.bus_name, *profile, *self.tables_words()]),
@@ -148,6 +140,8 @@ class Loop:
         self.rows = np.empty((KEPT, len(COLUMNS)))
         self.trace.clear()
         self.events.clear()
+        self.injected.clear()
+        self.last, self.held = (-1, 0), None
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -250,20 +244,32 @@ class Loop:
         """Start a scenario of the library now."""
         if self.bus == "lockstep":
             self.tell(inject=name)
+            self.injected.append(Mark(self.now(), name))
             self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
             self.session.touch("events")
         else:
             self.session.do("inject", self._inject_outside(name))
 
+    def judge(self, name: str) -> None:
+        """Run a scenario by itself, and hold what the machine does against what the scenario expects."""
+        self.session.do("inject", self._judge(name))
+
+    async def _judge(self, name: str) -> None:
+        words = ["inject", name, *self.tables_words(), *self.controller_words()]
+        answer = await self.session.bench.call("command", f"judging {name}", words=words)
+        self.events.append(f"{name}, by itself: {'pass' if answer['code'] == 0 else 'FAIL'}")
+        self.session.touch("events")
+
     async def _inject_outside(self, name: str) -> None:
         bus = self.bus_name
+        self.injected.append(Mark(self.now(), name))
         w = Worker()
         self.session.extra.setdefault("closers", []).append(w.stop)
         try:
             answer = await w.call(
                 "command", f"injecting {name}", words=["inject", name, "--bus", bus, *self.tables_words()]
             )
-            self.events.append(f"{self.now():.1f} s  {name}: {'held' if answer['code'] == 0 else 'NOT held'}")
+            self.events.append(f"{self.now():.1f} s  {name}: {'pass' if answer['code'] == 0 else 'FAIL'}")
         finally:
             w.stop()
             self.session.touch("events")
@@ -291,6 +297,7 @@ class Loop:
         self.filled += len(rows)
         self.trace.extend(news.pop("trace"))
         self._light(rows)
+        self._note(rows)
         if first and self.filled:
             self.session.touch("loop")
         self.status = news
@@ -306,8 +313,27 @@ class Loop:
             if bits >> i & 1:
                 self.lit[fault] = self.lit.get(fault, 0) + 1
 
+    def _note(self, rows: np.ndarray) -> None:
+        """Write changes of mode and faults into the list of events."""
+        before = len(self.events), self.events[-1] if self.events else ""
+        columns = [COLUMNS.index(c) for c in ("t", "state", "faults")]
+        for t, state, faults in rows[:, columns].tolist():
+            mode, bits = int(state) if state == state else -1, int(faults) if faults == faults else 0
+            if mode != self.last[0] and 0 <= mode < len(MODES):
+                self.events.append(f"{t:.1f} s  mode {MODES[mode]}")
+            for i, fault in enumerate(FAULTS):
+                if (bits ^ self.last[1]) >> i & 1:
+                    self.events.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
+                    if self.trigger and self.held is None and bits >> i & 1:
+                        self.held = t
+            self.last = mode, bits
+        if before != (len(self.events), self.events[-1] if self.events else ""):
+            self.session.touch("events")
+
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
+        if self.held is not None:
+            rows = rows[: np.searchsorted(rows[:, 0], self.held + AFTER)]
         if not len(rows):
             self.session.curves["run"] = Curves()
             return
@@ -327,4 +353,8 @@ class Loop:
             )
             for title, unit, least, lines in STRIPS
         ]
-        self.session.curves["run"] = Curves(panels, "run")
+        marks = [m for m in self.injected if t[0] <= m.t <= t[-1]]
+        state, faults = rows[:, COLUMNS.index("state")], rows[:, COLUMNS.index("faults")]
+        spans = bands(t, state, {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
+        spans += bands(t, np.where(np.isfinite(faults), faults, 0.0) > 0, {1: ("fault", "noise")})
+        self.session.curves["run"] = Curves(panels, "run", marks, spans)

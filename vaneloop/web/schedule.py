@@ -23,7 +23,7 @@ from vaneloop.pages.schedule import NAMES
 from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.chosen_log import receive, suffixes
-from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table
+from vaneloop.web.frame import Live, card, command_line, dark, drop, figure_of, frame, opened, table
 from vaneloop.web.session import LogFile, Session
 from vaneloop.web.worker import STEPS
 
@@ -175,12 +175,9 @@ class _Page:
                         if key not in ("lb", "lc", "hysteresis"):
                             self._number(section, key, key)
                         del q
-        self.upload = ui.upload(
-            label="geometry.toml, schedules.toml or a log", auto_upload=True, max_file_size=self.most,
-            on_upload=self._uploaded,
-            on_rejected=self._rejected,
-        )  # fmt: skip
-        self.upload.props(f'accept="{suffixes()}" flat')
+        self.upload = drop(
+            "Drop geometry.toml, schedules.toml or a log", self.most, suffixes(), self._uploaded, self._rejected
+        )
         options = {-1: "no log: the play entered above", **{i: f.name for i, f in enumerate(s.files)}}
         at = next((i for i, f in enumerate(s.files) if f == plan.log), -1)
 

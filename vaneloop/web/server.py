@@ -182,7 +182,7 @@ def _serve(
     pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
     pages.on_shutdown(sessions.close)
     ui.run_with(
-        api, title="VaneLoop", dark=None, tailwind=False, storage_secret=secrets.token_hex(32),
+        api, title="VaneLoop", dark=None, language="en-US", tailwind=False, storage_secret=secrets.token_hex(32),
         show_welcome_message=False,
         reconnect_timeout=RECONNECT,
         session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},

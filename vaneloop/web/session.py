@@ -12,71 +12,18 @@ import shlex
 import shutil
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base.signals import UNITS
 from vaneloop.web.charts import Curves, Panel, Trace, of_log
+from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, safe_name
 from vaneloop.web.jobs import Cancelled, Job, Worker, WorkError
 
-__all__ = ["LOG_SUFFIXES", "LogFile", "Session", "safe_name"]
+__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "Session", "safe_name"]
 
-LOG_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
-OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
 LEADERS = 4  # candidate effects whose fits are made ahead
-
-
-@dataclass(frozen=True)
-class LogFile:
-    """A file that may be chosen: where it is, what the user calls it, and how a command would name it."""
-
-    path: Path
-    name: str
-    word: str
-
-
-@dataclass
-class Choice:
-    """How the log is read: what the form says."""
-
-    file: LogFile | None = None
-    dbc: LogFile | None = None
-    model: LogFile | None = None
-    bench: LogFile | None = None  # mapping file
-    mapping: dict[str, str] = field(default_factory=dict)  # signal -> name in the log
-    units: dict[str, str] = field(default_factory=dict)  # signal -> unit in the log
-    design_rpm: str = ""
-    guess: bool = True
-    tables: str | None = None
-
-    def words(self, real: bool) -> list[str]:
-        """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type
-        them.
-        """
-
-        def place(f: LogFile) -> str:
-            return str(f.path) if real else f.word
-
-        assert self.file is not None
-        out = [place(self.file)]
-        if self.dbc is not None:
-            out += ["--dbc", place(self.dbc)]
-        for signal, name in self.mapping.items():
-            out += ["--map", f"{name}={signal}"]
-        for signal, unit in self.units.items():
-            out += ["--unit", f"{signal}={unit}"]
-        if self.design_rpm.strip():
-            out += ["--design-rpm", self.design_rpm.strip()]
-        if self.bench is not None:
-            out += ["--mapping", place(self.bench)]
-        if not self.guess:
-            out += ["--no-guess"]
-        if self.model is not None:
-            out += ["--model", place(self.model)]
-        if self.tables is not None:
-            out += ["--tables", self.tables]
-        return out
 
 
 @dataclass(eq=False)
@@ -104,6 +51,7 @@ class Session:
         self.versions: dict[str, int] = {}
         self.lookers: list[Callable[[], None]] = []  # pages that want to know
         self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
+        self.search.news = self._news
         self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
         self.tasks: set[asyncio.Task[None]] = set()
         self.working: Counter[str] = Counter()  # sections whose work has not ended
@@ -135,6 +83,7 @@ class Session:
         self.experiment: dict[str, Any] | None = None
         self.experiment_done = False
         self._hand_wanted = False
+        self.sofar: list[str] = []  # what the stages said that are searched already
         self.saved = {k: v for k, v in self.saved.items() if k.startswith(("schedule-", "entered-", "run-"))}
 
     # ---- housekeeping
@@ -156,7 +105,7 @@ class Session:
             except WorkError as e:
                 self.errors[section] = self.clean(str(e))
             except Cancelled:
-                self.errors[section] = "stopped"
+                self.errors[section] = "stopped; nothing is kept of it, start it again when you like"
 
         def ended(task: asyncio.Task[None]) -> None:
             self.tasks.discard(task)
@@ -239,6 +188,19 @@ class Session:
             wanted = ", ".join(UNITS)
             raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
 
+    def lay_over(self, file: LogFile | None, later: float) -> None:
+        """Draw another log over this one, read in the same way, so many seconds later; None: take it away."""
+        self.do("over", self._lay_over(file, later))
+
+    async def _lay_over(self, file: LogFile | None, later: float) -> None:
+        over = None
+        if file is not None:
+            words = replace(self.choice, file=file).reading(real=True)
+            over = (await self.bench.call("preview", "reading the other log", words=words))["channels"]
+        if self.preview is not None and self.choice.file is not None:
+            self.curves["log"] = of_log(self.preview["channels"], str(self.choice.file.path), over, later)
+        self.touch("over")
+
     async def _compare(self) -> None:
         words = self.choice.words(real=True)
         self.compared = await self.search.call("compare", "comparing", words=words)
@@ -259,8 +221,14 @@ class Session:
         if self.compared is not None and not self.working["diagnose"]:
             self.do("diagnose", self._diagnose())
 
+    def _news(self, news: dict[str, str]) -> None:
+        self.sofar.append(news["found"])
+        self.touch("sofar")
+
     async def _diagnose(self) -> None:
         words = self.choice.words(real=True)
+        self.sofar = []
+        self.touch("sofar")
         self.touch("diagnosis")
         self.diagnosis = await self.search.call("diagnose", "searching the library of effects", words=words)
         self.experiment, self.experiment_done = None, False
@@ -483,6 +451,19 @@ class Session:
         }  # nothing is written that is no better
         self.touch("save")
 
+    def save_mapping(self) -> None:
+        """Run ``vaneloop map`` for the file that ``--mapping`` takes."""
+        if self.choice.file is not None:
+            self.do("mapping", self._save_mapping())
+
+    async def _save_mapping(self) -> None:
+        path = self.folder / "mapping.toml"
+        words = ["map", *self.choice.reading(real=True), "--out", str(path)]
+        await self.bench.call("command", "writing the mapping file", words=words)
+        if path.exists():
+            self.saved["mapping"] = path
+        self.touch("mapping")
+
     def stop(self, *names: str) -> None:
         """End jobs of these names (or of any) and whatever else their processes do."""
         for w in (self.search, self.bench):
@@ -490,10 +471,3 @@ class Session:
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")
-
-
-def safe_name(name: str) -> str:
-    """A file name that is one: its last part, letters, digits and -_. only, not hidden."""
-    kept = re.sub(r"[^A-Za-z0-9._ -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")
-    stem, dot, suffix = kept.rpartition(".")
-    return (stem[:80].strip(" .") or "file") + dot + suffix[:10] if dot else kept[:80] or "file"

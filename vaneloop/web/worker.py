@@ -165,15 +165,22 @@ def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
 
 def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Search every stage for missing effects, as ``vaneloop diagnose`` does."""
-    from vaneloop.discrepancy.workflow import diagnose as search
-    from vaneloop.discrepancy.workflow import diagnosis_json
-    from vaneloop.pages.diagnosis import verdict_sentence
+    from vaneloop.pages.story import fall, word
+    from vaneloop.verbs.search import diagnosed
 
     chain = chain_for(words, progress)
     progress(0.0, "searching the library of effects")
-    d = search(chain.stages, chain.not_observed, lambda f: progress(f, "searching the library of effects"), 2)
-    d.notes = list(chain.notes)
-    return {"diagnosis": d, "json": diagnosis_json(d, words[0]), "verdict": verdict_sentence(d)}
+
+    def news(n: Any) -> None:
+        if n.found is not None:
+            k, before, after = fall(n.found)
+            names = " and ".join(f.effect for f in n.found.effects)
+            said = f"{n.found.stage} {word(n.found)}" + (f" {names}, {before} → {after} noise floors" if names else "")
+            progress(None, {"found": said})
+        progress(n.fraction, n.text)
+
+    answer = diagnosed(chain, words[0], 2, news=news)
+    return {"diagnosis": answer.diagnosis, "json": answer.to_dict(), "verdict": answer.sentence()}
 
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:

@@ -1,0 +1,124 @@
+"""The words and figures in which an answer is told: terminal, pages and workbench take them from here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vaneloop.discrepancy.locate import Located, agrees
+from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
+from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.pages.style import Tone
+
+__all__ = [
+    "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
+    "falling", "floors",
+    "reached", "stage_tone", "word", "word_of_located", "worths",
+]  # fmt: skip
+
+FITS = "fits"  # no error beyond the noise
+EXPLAINED = "explained"  # effects were added, and no error beyond the noise is left
+MISSING = "missing"  # an effect of the library would explain the error
+UNKNOWN = "unknown"  # the error is there, and nothing in the library explains it
+CANNOT = "cannot tell from this log"
+
+
+def floors(ratio: float) -> str:
+    """An error in noise floors, for a reader."""
+    return f"{ratio:.2f}" if ratio < 9.995 else f"{ratio:.3g}" if ratio < 1e5 else f"{ratio:.1e}"
+
+
+def reached(s: StageDiagnosis) -> bool:
+    """Whether every output of a stage stands at its noise floor with the best model."""
+    return all(agrees(e, f) for e, f in zip(s.error_after, s.floor, strict=True))
+
+
+def word(s: StageDiagnosis, extended: bool = False) -> str:
+    """What a stage says, in one word; ``extended``: the effects have been added."""
+    if s.verdict == "none":
+        return FITS
+    if extended and s.effects:
+        return EXPLAINED if reached(s) else MISSING
+    return MISSING if s.verdict == "missing" else UNKNOWN
+
+
+def word_of_located(located: Located) -> str:
+    """Whether a stage with nothing added fits or fails."""
+    return "fails" if located.fails else FITS
+
+
+def stage_tone(s: StageDiagnosis, extended: bool = False) -> Tone:
+    """Whether that is good news."""
+    return {FITS: "good", EXPLAINED: "good", MISSING: "bad" if extended else "neutral"}.get(word(s, extended), "bad")
+
+
+def fall(s: StageDiagnosis) -> tuple[int, str, str]:
+    """The output that fails most, and its error in noise floors before and after."""
+    k = int(np.argmax(s.error_before / s.floor))
+    return k, floors(float(s.error_before[k] / s.floor[k])), floors(float(s.error_after[k] / s.floor[k]))
+
+
+def doubt(f: Found) -> str:
+    """What this log cannot tell about an effect; "": nothing."""
+    out = []
+    if f.rivals:
+        out.append(f"this log cannot tell it from {' or '.join(f.rivals)}")
+    if f.inseparable:
+        out.append(f"this log cannot tell its cause from {' or '.join(f.inseparable)}")
+    return "; ".join(out)
+
+
+def extended_sentence(d: Diagnosis, refused: str = "") -> str:
+    """What an extended model says, in one sentence."""
+    if refused:
+        return f"The model is no better with it: {refused}."
+    parts = []
+    for s in d.stages:
+        k, before, after = fall(s)
+        names = " and ".join(f.effect for f in s.effects) or "the nominal model"
+        end = EXPLAINED if reached(s) else "an error remains"
+        parts.append(f"with {names} the error of {s.outputs[k]} falls from {before} to {after} noise floors: {end}")
+    text = "; ".join(parts) or "nothing was extended"
+    return text[0].upper() + text[1:] + "."
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What an effect is worth in the final model.
+
+    without  error of the stage without it, all others fitted anew, in noise floors
+    share    of the way, in decades, from the final error to the nominal one: 0 to 1
+    """
+
+    effect: str
+    without: float
+    share: float
+
+
+def worths(s: StageDiagnosis, effects: Sequence[Found] | None = None) -> list[Worth]:
+    """Worth of every effect of the final model, the greatest first."""
+    nominal = s.steps[0][1] if s.steps else 1.0
+    way = math.log(max(nominal / max(s.excess, 1e-300), 1.0 + 1e-9))
+    out = [
+        Worth(f.effect, f.fall * s.excess, min(1.0, max(0.0, math.log(max(f.fall, 1e-300))) / way))
+        for f in (s.effects if effects is None else effects)
+    ]
+    return sorted(out, key=lambda w: -w.without)
+
+
+def falling(s: StageDiagnosis) -> list[tuple[str, float]]:
+    """Steps in which the error falls, each named by what it adds to the one before, down to the noise floor."""
+    out: list[tuple[str, float]] = []
+    before: set[str] = set()
+    for name, level in s.steps:
+        if name in ("nominal", "model", "without numerical error"):
+            out.append((name, level))
+            continue
+        now = [e for e in name.split(" + ") if e] if not name.startswith("+ ") else [*before, name[2:]]
+        new, gone = [e for e in now if e not in before], sorted(before - set(now))
+        out.append((" ".join([*(f"+ {e}" for e in new), *(f"− {e}" for e in gone)]) or name, level))
+        before = set(now)
+    return [*out, ("noise floor", 1.0)]

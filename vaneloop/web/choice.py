@@ -1,0 +1,77 @@
+"""What a user has chosen: the log, what lies beside it, and how it is read, as the words of a command."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "safe_name"]
+
+LOG_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
+OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A file that may be chosen: where it is, what the user calls it, and how a command would name it."""
+
+    path: Path
+    name: str
+    word: str
+
+
+@dataclass
+class Choice:
+    """How the log is read: what the form says."""
+
+    file: LogFile | None = None
+    dbc: LogFile | None = None
+    model: LogFile | None = None
+    bench: LogFile | None = None  # mapping file
+    mapping: dict[str, str] = field(default_factory=dict)  # signal -> name in the log
+    units: dict[str, str] = field(default_factory=dict)  # signal -> unit in the log
+    design_rpm: str = ""
+    guess: bool = True
+    tables: str | None = None
+
+    def words(self, real: bool) -> list[str]:
+        """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type
+        them.
+        """
+
+        out = self.reading(real)
+        if self.model is not None:
+            out += ["--model", str(self.model.path) if real else self.model.word]
+        if self.tables is not None:
+            out += ["--tables", self.tables]
+        return out
+
+    def reading(self, real: bool) -> list[str]:
+        """Those of them that say how the log is read."""
+
+        def place(f: LogFile) -> str:
+            return str(f.path) if real else f.word
+
+        assert self.file is not None
+        out = [place(self.file)]
+        if self.dbc is not None:
+            out += ["--dbc", place(self.dbc)]
+        for signal, name in self.mapping.items():
+            out += ["--map", f"{name}={signal}"]
+        for signal, unit in self.units.items():
+            out += ["--unit", f"{signal}={unit}"]
+        if self.design_rpm.strip():
+            out += ["--design-rpm", self.design_rpm.strip()]
+        if self.bench is not None:
+            out += ["--mapping", place(self.bench)]
+        if not self.guess:
+            out += ["--no-guess"]
+        return out
+
+
+def safe_name(name: str) -> str:
+    """A file name that is one: its last part, letters, digits and -_. only, not hidden."""
+    kept = re.sub(r"[^A-Za-z0-9._ -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")
+    stem, dot, suffix = kept.rpartition(".")
+    return (stem[:80].strip(" .") or "file") + dot + suffix[:10] if dot else kept[:80] or "file"
