@@ -200,7 +200,8 @@ class ChosenLog:
                 for name in s.offered[:500]:
                     ui.element("option").props["value"] = name
             with ui.element("div").style(
-                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));gap:8px 18px;margin:8px 0"
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));"
+                "gap:8px 18px;margin:8px 0"
             ):
                 for signal in ("t", *UNITS):
                     name, unit, how, sure, why, curve = seen["signals"].get(signal, ("", "", "", 0.0, "", []))

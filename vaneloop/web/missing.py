@@ -349,7 +349,8 @@ class _Page:
                 ui.button("Back to the fit", icon="undo", on_click=s.release).props("flat dense padding='2px 10px'")
             now = s.values()
             with ui.element("div").style(
-                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(300px,100%),1fr));gap:4px 28px;width:100%"
+                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(300px,100%),1fr));"
+                "gap:4px 28px;width:100%"
             ):
                 for e in f.result.effects:
                     for name, p in e.parameters.items():
