@@ -108,10 +108,10 @@ class Page:
         """Add a table; numbers are rounded to three digits and set flush right."""
         self._end_grid()
         e = html.escape
-        head = "".join(
-            f"<th{_right(all(_is_number(r[i]) for r in rows) and bool(rows))}>{e(str(c))}</th>"
-            for i, c in enumerate(columns)
-        )
+        head = ""
+        for i, c in enumerate(columns):
+            tag = "th" if c else "td"  # a heading without words is none
+            head += f"<{tag}{_right(bool(rows) and all(_is_number(r[i]) for r in rows))}>{e(str(c))}</{tag}>"
         body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self._body.append(
