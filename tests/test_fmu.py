@@ -282,7 +282,7 @@ def test_it_runs_without_python_and_so_does_what_its_source_gives(
     reference = {v.name: str(v.valueReference) for v in described.modelVariables}
     sources = tmp_path / "it" / "sources"
     build = fmpy.model_description.read_build_description(str(fmus["loop3"]))
-    files = build.buildConfigurations[0].sourceFileSets[0]
+    files = build[0].sourceFileSets[0]
     again = [
         gcc,
         *files.compilerOptions.split(),
