@@ -1177,7 +1177,14 @@ def test_the_live_loop_runs_another_machine(tmp_path: Path) -> None:
     assert known == set(VANES[:4])
 
 
-def test_a_controller_of_one_s_own_that_crashes_is_told_and_the_page_goes_on(tmp_path: Path, gcc: str) -> None:
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [("*(volatile int *)0 = 1;", "ended its process"), ("for (;;) {}", "did not come back within 1 s")],
+    ids=["crashes", "hangs"],
+)
+def test_a_controller_of_one_s_own_that_fails_is_told_and_the_page_goes_on(
+    tmp_path: Path, gcc: str, monkeypatch: pytest.MonkeyPatch, fault: str, told: str
+) -> None:
     import asyncio
     from concurrent.futures import ThreadPoolExecutor
 
@@ -1187,7 +1194,8 @@ def test_a_controller_of_one_s_own_that_crashes_is_told_and_the_page_goes_on(tmp
     from vaneloop.web.run import Loop
     from vaneloop.web.session import Session
 
-    path = wrong(gcc, tmp_path, "*(volatile int *)0 = 1;")
+    path = wrong(gcc, tmp_path, fault)
+    monkeypatch.setattr("hil.native.isolation.PATIENCE", 1.0)
 
     async def run(controller: str | None) -> Loop:
         lp = Loop(Session("x", tmp_path / f"{bool(controller)}0123456789", [], None, controller))
@@ -1200,7 +1208,7 @@ def test_a_controller_of_one_s_own_that_crashes_is_told_and_the_page_goes_on(tmp
                 w.stop()
         return lp
 
-    told = r"ended its process, in tick 500, 0\.500 s after power-on; last inputs: n_dem"
+    told += r", in tick 500, 0\.500 s after power-on; last inputs: n_dem"
     # the browser's event loop is this thread's
     with ThreadPoolExecutor(1) as thread, pytest.raises(WorkError, match=told):
         thread.submit(asyncio.run, run(path)).result()

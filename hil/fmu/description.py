@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from hil.fmu.variables import FIXED, INPUT, OUTPUT, REAL, Variable
+from hil.fmu.variables import FIXED, INPUT, OUTPUT, REAL, WHOLE, Variable
 
 __all__ = ["OPTIONS", "SOURCES", "base_unit", "build_description", "model_description"]
 
@@ -86,6 +86,7 @@ def _of_type(v: Variable) -> dict[str, str]:
     if v.kind == REAL:
         out |= {"unit": v.unit} if v.unit else {}
         out |= {"displayUnit": v.shown} if v.shown else {}
+    if v.kind in (REAL, WHOLE):
         out |= {key: _number(x) for key, x in (("min", v.low), ("max", v.high)) if math.isfinite(x)}
     if v.role != OUTPUT:
         out["start"] = ("true" if v.start else "false") if v.kind == 2 else _number(v.start)

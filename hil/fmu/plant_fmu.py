@@ -10,8 +10,10 @@ import platform
 import shutil
 import tempfile
 import weakref
+import zipfile
 from collections.abc import Mapping
 from typing import Any, NamedTuple
+from xml.etree import ElementTree as ET
 
 from controller import Calibration
 from hil.fmu.description import base_unit
@@ -159,16 +161,20 @@ def _fmpy(path: str) -> Any:
 def _described(fmpy: Any, path: str) -> Any:
     """Its model description; what cannot be run here is refused."""
     try:
+        with zipfile.ZipFile(path) as archive:
+            root = ET.fromstring(archive.read("modelDescription.xml"))
+        version = root.get("fmiVersion", "")
+        if not version.startswith(("2.", "3.")):
+            raise InputError(f"--plant {path}: FMI version (={version}) must be 2.0 or 3.0")
+        if root.find("CoSimulation") is None:
+            raise InputError(f"--plant {path}: is for model exchange only; co-simulation is needed")
         described = fmpy.read_model_description(path, validate=False)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"--plant {path}: is not there") from None
     except Exception as e:
         raise InputError(f"--plant {path}: is no FMU that can be read ({_line(e)})") from None
-    version = described.fmiVersion
-    if not version.startswith(("2.", "3.")):
-        raise InputError(f"--plant {path}: FMI version (={version}) must be 2.0 or 3.0")
-    if described.coSimulation is None:
-        raise InputError(f"--plant {path}: is for model exchange only; co-simulation is needed")
     here = {fmpy.platform, fmpy.platform_tuple}
     offered = fmpy.supported_platforms(path)
     if not here & set(offered):

@@ -16,7 +16,7 @@ the functions that run here, and gives the same bits. The archive holds the sour
 
 examples:
   vaneloop export-fmu --part loop --out loop.fmu
-  vaneloop export-fmu --part plant --model extended.toml --out plant.fmu
+  vaneloop export-fmu --part plant --model M.toml --out plant.fmu
   vaneloop export-fmu --part controller --strategy adaptive --fmi 2.0 --out controller.fmu
 
 exit codes: 0 written, 2 bad input"""

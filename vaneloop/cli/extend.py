@@ -32,6 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     options.add_machine_options(parser)
+    options.add_controller_options(parser)
     parser.add_argument(
         "--effect", metavar="NAME", action="append", nargs="+", default=[], help="effect to add (docs/effects.md)"
     )
@@ -40,6 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     terminal.add_output_options(parser, report=True)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import Model

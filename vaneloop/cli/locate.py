@@ -26,10 +26,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     add_machine_options(parser)
+    options.add_controller_options(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.discrepancy.workflow import locate_stages
