@@ -20,7 +20,7 @@ examples:
   vaneloop run --bus local --duration 60 --record run.mf4 --limit-late-us 2000
   vaneloop run --bus lockstep --profile slam --record slam.log
   vaneloop run --bus lockstep --inputs run.mf4  the recorded run again: must send the same frames, bit for bit
-  vaneloop run --bus vcan0 --xcp --uds          calibration and service tools connect: docs/xcp.md, docs/uds.md
+  vaneloop run --bus vcan0 --xcp --uds          for INCA, CANape, pyxcp (docs/xcp.md) and service tools (docs/uds.md)
 
 exit codes: 0 good (also after Ctrl-C), 1 a limit is exceeded, the repeated run differs or the record is incomplete, 2
 bad input
