@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 
 from tests.nominal_systems import NOMINAL, nominal
-from tests.rig_systems import FAMILIES, Case, Family, draw_case, left_over
+from tests.rig_systems import FAMILIES, LEARNED, Case, Family, draw_case, left_over
 from tests.rig_systems.cases import RATES, hide
 from tests.rig_systems.laws import on_signal
 from tests.rig_systems.simulate import course, simulate
@@ -273,6 +273,35 @@ def test_the_table_counts_singles_pairs_intervals_and_variants() -> None:
     assert count("same answer: time x 20") == (1, 1) and count("same answer: reordered") == (0, 1)
     low, high = s["a single name given is right"]["low"], s["a single name given is right"]["high"]
     assert 0.0 < low < 0.5 < high < 1.0
+
+
+def test_what_is_learned_is_counted_where_it_was_asked() -> None:
+    def asked(kind: str, curves: list[str], names: list[str], error: float | None = None, left: float = 5.0) -> Any:
+        laws = [{"names": names, "formulas": []}] if names else []
+        said = {"verdict": "learned" if names else "unknown", "laws": laws, "error": error, "nearest": []}
+        truth = ["clogging"] if kind == "outside" else []
+        of = row(kind, truth, [left] * len(truth), {})
+        return {**of, "learned": json.dumps(said), "curves": json.dumps(curves)}
+
+    rows = [
+        asked("outside", ["a.gain_of_time"], ["a.gain_of_time"], 1.1),
+        asked("outside", ["a.gain_of_time"], ["b.curve_of_u", "a.gain_of_time"], 1.7),  # among its rivals
+        asked("outside", ["a.gain_of_time"], ["b.curve_of_u"], 1.0),
+        asked("outside", [], [], None),  # no curve of one quantity is it, and none was given: not found either
+        asked("outside", ["a.gain_of_time"], [], None, 0.1),  # nobody could see it
+        asked("clean", [], []),
+        asked("clean", [], ["b.curve_of_u"]),
+    ]
+    s = hidden_law.summary(rows)
+    assert s["learned: outside the library, right place and quantity"]["hits"] == 2
+    assert s["learned: outside the library, right place and quantity"]["of"] == 4
+    assert s["learned: of these, error on the test log within 1.5 noise floors"]["hits"] == 1
+    assert s["learned: nothing hidden, nothing learned"]["hits"] == 1
+    assert not any(k.startswith("learned") for k in hidden_law.summary([row("clean", [], [], {})]))
+
+
+def test_every_law_outside_the_library_has_its_curves_or_is_said_to_have_none() -> None:
+    assert set(LEARNED) == {(name, law) for name, f in FAMILIES.items() for law in f.outside}
 
 
 def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,7 @@ from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import FORMS, begin, text_of
+from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import candidates, with_curves
 from vaneloop.discrepancy.models.learning import held_out
 from vaneloop.discrepancy.models.quantities import column_of
@@ -207,22 +208,16 @@ def test_a_law_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         load_model(tmp_path / "law.toml")
 
 
-def test_a_model_with_a_law_says_what_the_curve_says(bound) -> None:
-    values = {f"c{k + 1}": v for k, v in enumerate(LAW.values)}
-    own = TANK.bind(
-        [run_of_a_tank()], values={"inflow": 0.2, "outflow": 0.05}, present={NAME: values}, curves={NAME: LAW}
-    )
+def test_a_law_from_a_file_does_what_the_curve_does(bound) -> None:
     c = next(c for c in candidates(bound, bound.stage.neutral()[:2]) if c.name == NAME)
-    w = with_curves(bound, (), [(c.placed(np.eye(len(LAW.values))), own.effects[0])])
-    w.runner.steps = own.runner.steps
-    theta = np.concatenate([[0.2, 0.05], bound.stage.neutral()[2:], LAW.values])
-    assert np.allclose(own.run(own.stage.neutral()[None]), w.run(theta[None]), rtol=1e-9)
-    form = Learned(how="state adds", at="level", of="level", low=0.0, high=50.0, form="power", values=[0.1, 0.5])
-    n = {"a": 0.1, "b": 0.5}
-    own = TANK.bind(
-        [run_of_a_tank()], values={"inflow": 0.2, "outflow": 0.05}, present={"p.q": n}, curves={"p.q": form}
-    )
-    assert own.run(own.stage.neutral()[None])[0, 0, -1] < w.run(theta[None])[0, 0, -1]
+    placed, effect = from_file(NAME, LAW, bound.data)
+    theirs = with_curves(bound, (), [(c.placed(np.eye(len(LAW.values))), effect)])
+    theta = np.concatenate([[0.2, 0.05], LAW.values])
+    ours = with_curves(bound, (), [(placed, effect)]).run(theta[None])[0, 0]
+    assert np.allclose(ours, theirs.run(theta[None])[0, 0], rtol=1e-9)
+    form = Learned(how="state adds", at="level", of="level", low=0.0, high=50.0, form="root", values=[0.1])
+    more = with_curves(bound, (), [from_file("p.q", form, bound.data)]).run(np.array([[0.2, 0.05, 0.1]]))[0, 0]
+    assert np.all(more[5:] < with_curves(bound, (), ()).run(np.array([[0.2, 0.05]]))[0, 0, 5:])  # an outflow more
 
 
 @pytest.mark.parametrize(
@@ -236,9 +231,9 @@ def test_a_model_with_a_law_says_what_the_curve_says(bound) -> None:
         ({"form": "cosine"}, "form .='cosine'.*must be one of constant"),
     ],
 )
-def test_a_wrong_law_gets_one_line(change: dict[str, object], said: str) -> None:
+def test_a_wrong_law_gets_one_line(bound, change: dict[str, object], said: str) -> None:
     with pytest.raises(StageError, match=said) as e:
-        TANK.bind([run_of_a_tank()], curves={NAME: LAW.model_copy(update=change)})
+        from_file(NAME, LAW.model_copy(update=change), bound.data)
     assert "\n" not in str(e.value)
 
 
@@ -295,11 +290,12 @@ def test_the_command_learns_the_law_and_another_log_confirms_it(tmp_path: Path) 
     assert "outflow.gain_of_oil" in (tmp_path / "a.html").read_text()
     done = vaneloop(tmp_path, "extend", "warm.csv", *own, "--effect", "law.toml", "--out", "m.toml", "--json", "b.json")
     assert done.returncode in (0, 1), done.stderr
-    stage = json.loads((tmp_path / "b.json").read_text())["stages"][0]
-    assert stage["signals"][0]["error_after"] < 0.02 * stage["signals"][0]["error_before"]
+    before, after = json.loads((tmp_path / "b.json").read_text())["waterfall"]["tank"]
+    assert before["noise_floors"] > 50.0
+    assert after["noise_floors"] < 2.0
     done = vaneloop(tmp_path, "compare", "warm.csv", *own, "--model", "law.toml", "--json", "c.json")
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "c.json").read_text())["stages"][0]["signals"][0]["rms"] < 0.075  # its noise is 0.05
+    assert json.loads((tmp_path / "c.json").read_text())["signals"][0]["rms"] < 0.075  # its noise is 0.05
 
 
 OWN = ("--system", "tank.py")
