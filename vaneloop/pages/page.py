@@ -22,7 +22,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,12 +30,19 @@ from vaneloop.base.errors import InputError
 from vaneloop.pages.figures import Figure
 from vaneloop.pages.style import THEMES, Tone, number
 
-__all__ = ["Page", "write_atomically"]
+__all__ = ["Link", "Page", "write_atomically"]
 
 _POLICY = (  # no network at all, whatever a page may hold
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
     "form-action 'none'"
 )
+
+
+class Link(NamedTuple):
+    """A cell of a table that leads to another page: its text, and where that page is from here."""
+
+    text: str
+    href: str
 
 
 class Page:
@@ -108,7 +115,7 @@ class Page:
             f"<th{_right(all(_is_number(r[i]) for r in rows) and bool(rows))}>{e(str(c))}</th>"
             for i, c in enumerate(columns)
         )
-        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
+        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{_cell(v)}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self._body.append(
             f'<div class="scroll"><table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
@@ -141,7 +148,7 @@ class Page:
             "</main>",
             f'<script type="application/json" id="figures">{_json(self.figures)}</script>',
             f'<script type="application/json" id="themes">{_json(THEMES)}</script>',
-            f"<script>{get_plotlyjs()}</script>",
+            f"<script>{get_plotlyjs()}</script>" if self.figures else "",
             f"<script>\n{_beside('page.js')}</script>",
             "</body></html>",
         ]
@@ -195,6 +202,13 @@ def _version() -> str:
 
 def _is_number(value: object) -> bool:
     return value is None or (isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool))
+
+
+def _cell(value: object) -> str:
+    """Inside of a table cell."""
+    if isinstance(value, Link):
+        return f'<a href="{html.escape(value.href)}">{html.escape(value.text)}</a>'
+    return html.escape(number(value))
 
 
 def _kind(value: object) -> str:
