@@ -381,3 +381,72 @@ def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
         f.write('{"what": "en')
     assert [(x["what"], x["key"], x["worker"]) for x in lines(tmp_path)] == [("begin", "a", "w")]
     journal.close()
+
+
+# ---- rented workers --------------------------------------------------------------------------------------------------
+
+RENT = (
+    "import sys; from vaneloop.fleet.folder import Folder; from vaneloop.fleet.rent import rent\n"
+    "if __name__ == '__main__': print(rent(Folder(sys.argv[1]), sys.argv[2], 2, {}, 0.2, lambda n, of: None))"
+)
+
+
+def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    (tmp_path / "rent.py").write_text(RENT)
+    folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
+    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
+    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: len(folder.finished()) >= 3, p)
+    rented = psutil.Process(p.pid).children(recursive=True)
+    p.kill()
+    p.wait()
+    psutil.wait_procs(rented)  # scheduler, workers and readers end by themselves, though one log hangs
+    (tmp_path / "logs" / "e1" / "slow.csv").unlink()
+    state.tidy(folder)
+    work(folder.path)
+    seen = [tuple(r.values()) for r in rows(folder) if r["status"] == "done"]
+    assert seen == undisturbed
+    assert [r["status"] for r in rows(folder) if r["status"] != "done"] == ["unreadable"]
+
+
+def test_a_killed_rented_worker_is_replaced_and_the_run_ends(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    (tmp_path / "rent.py").write_text(RENT)
+    folder = fleet(tmp_path, many(40), in_chunk=2)
+    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
+    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)
+    worker = int(next(line["worker"] for line in lines(folder.path)).split("-")[-2])
+    psutil.Process(worker).kill()
+    out, err = p.communicate()
+    assert p.returncode == 0, err
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed and out.startswith("{")
+
+
+@pytest.mark.parametrize(("on", "says"), [("slrum", "did you mean slurm"), ("tcp://127.0.0.1:1", "no Dask scheduler")])
+def test_a_place_that_is_not_there_is_one_line(tmp_path: Path, on: str, says: str) -> None:
+    from vaneloop.fleet import rent
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    with pytest.raises(InputError, match=says):
+        rent.rent(fleet(tmp_path, many(2)), on, 1, {}, 0.2, lambda n, of: None)
+
+
+def test_without_the_extra_one_line_says_what_to_install() -> None:
+    script = (
+        "import sys; sys.modules['psutil'] = None\n"
+        "import importlib.util; find = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda n, *a: None if n == 'psutil' else find(n, *a)\n"
+        "from vaneloop.cli.main import main; sys.exit(main(['fleet', 'status', 'x']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], env=ENV, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "pip install 'vaneloop[fleet]'" in done.stderr and done.stderr.count("\n") == 1
