@@ -374,6 +374,20 @@ def test_a_silent_worker_of_another_host_loses_its_lease_by_the_observer_s_clock
     near.leave()
 
 
+def test_a_worker_that_stands_still_while_it_writes_its_heartbeat_loses_its_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = Me(tmp_path, every=3600.0)
+    clock = [100.0]
+    monkeypatch.setattr("vaneloop.fleet.leases.time.monotonic", lambda: clock[0])
+    (tmp_path / "workers" / f"{still.name}.beat").write_text("")
+    leases = Leases(tmp_path, patience=60.0)
+    assert not leases.dead(still.name)
+    clock[0] = 161.0
+    assert leases.dead(still.name)
+    still.leave()
+
+
 def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
     journal = Journal(tmp_path, "w")
     journal.note("begin", key="a")
@@ -414,7 +428,7 @@ def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
     assert [r["status"] for r in rows(folder) if r["status"] != "done"] == ["unreadable"]
 
 
-def test_a_killed_rented_worker_is_replaced_and_the_run_ends(
+def test_a_killed_rented_worker_has_a_successor_and_the_run_ends(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]
 ) -> None:
     import psutil

@@ -135,8 +135,8 @@ class Leases:
         except (OSError, InputError):
             return True  # it has left
         now = time.monotonic()
-        last, since = self._seen.get(worker, ("", now))
-        if last != beat:
+        last, since = self._seen.get(worker, (None, now))
+        if last != beat:  # also an empty one: a worker may stand still while it writes
             self._seen[worker] = (beat, now)
             return False
         return now - since > self.patience
