@@ -276,3 +276,39 @@ def test_a_folder_of_a_hundred_thousand_logs(tmp_path: Path) -> None:
     memory = int(done.stdout.rsplit("MiB", 1)[1].split()[0])
     print(f"listed in {listed:.1f} s, reported with {done.stdout.splitlines()[-1]}; {psutil.cpu_count()} cores")
     assert memory <= 2048
+
+
+# ---- a simulated fleet -----------------------------------------------------------------------------------------------
+
+
+def test_the_fates_of_a_simulated_fleet_are_known() -> None:
+    from collections import Counter
+
+    from vaneloop.cli.fleet_demo import YEARS, fate, size_at
+
+    fates = [fate(1, e, 40) for e in range(40)]
+    count = Counter(f["fate"] for f in fates)
+    assert count["badly rigged"] == count["sensor exchanged"] == 1
+    assert 8 <= count["wear"] <= 11 and 6 <= count["null drift"] <= 9 and count["healthy"] >= 18
+    for f in fates:
+        if f.get("comes") == "growth":
+            assert size_at(f, 0.99 * f["onset_years"]) == 0.0 and size_at(f, YEARS) == pytest.approx(f["size"])
+            half = 0.5 * (f["onset_years"] + YEARS)
+            assert size_at(f, half) == pytest.approx(0.5 * f["size"])
+    assert fates == [fate(1, e, 40) for e in range(40)] != [fate(2, e, 40) for e in range(40)]
+
+
+@pytest.mark.slow
+def test_a_small_simulated_fleet_runs_from_logs_to_page(tmp_path: Path) -> None:
+    """Eight real logs: simulated, diagnosed by two workers, reported; the badly rigged engine lacks something."""
+    logs, run = str(tmp_path / "logs"), str(tmp_path / "run")
+    done = command("demo", "--engines", "4", "--logs", "8", "--duration", "60", "--out", logs)
+    assert done.returncode == 0, done.stderr
+    done = command("run", logs, "--out", run)
+    assert done.returncode == 0 and "8 of 8" in done.stdout, done.stderr
+    done = command("report", run, "--report", str(tmp_path / "fleet.html"))
+    assert done.returncode in (0, 1), done.stderr
+    view = view_of(roll_up(Folder(run)), {})
+    assert set(view.engines) == {f"engine_{k:03d}" for k in range(4)}
+    assert {s.quantity for s in view.series} >= {"linkage.vigv_play", "actuator.flow_gain", "engine.lag"}
+    assert {v for by in view.verdicts.values() for v in by} <= {"none", "missing", "unknown"}

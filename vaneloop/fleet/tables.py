@@ -1,7 +1,7 @@
 """All results of a run as tables: rolled up from its parts by DuckDB, in bounded memory.
 
     logs      path, engine, time, key, status, reason, verdict, duration_s      a row a log
-    effects   ... effect, stage, parameter, unit, value, low, high, neutral, probability, t_min ...
+    effects   ... effect, stage, parameter, unit, value, low, high, neutral, probability
     nominal   ... stage, parameter, unit, value, low, high, table, tolerance
     coverage  ... effect, stage, needs                                          what a log could not show
 
@@ -10,6 +10,8 @@ Rows are in the order of path, so that two runs over the same logs give the same
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["TABLES", "answers", "roll_up", "write_tables"]
 
 TABLES = ("logs", "effects", "nominal", "coverage")
-MEMORY = "1GB"
+MEMORY = "700MB"
 _OF = "l.path, l.engine, l.time, l.key"
 _SIZES = """[{"effect": "VARCHAR", "stage": "VARCHAR", "probability": "DOUBLE", "parameter": "VARCHAR",
 "unit": "VARCHAR", "value": "DOUBLE", "low": "DOUBLE", "high": "DOUBLE", "neutral": "DOUBLE"}]"""
@@ -35,12 +37,9 @@ _UNSEEN = """[{"stage": "VARCHAR", "verdict": "VARCHAR", "reason": "VARCHAR"}]""
 
 def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
     """The tables of a run, in a database in memory. Raises InputError where nothing is finished yet."""
-    import duckdb
-
     if not folder.finished():
         raise InputError(f"{folder.path}: no part of the run is finished yet; vaneloop fleet status says how far it is")
-    db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2"})
-    db.execute("SET enable_progress_bar = false")
+    db = _database()
     entries, parts = str(folder.path / "logs" / "*.parquet"), str(folder.path / "parts" / "*.parquet")
     db.execute(  # of a path and of a content the latest counts
         "CREATE TEMP TABLE entries AS SELECT path, key, engine, time, reason FROM read_parquet($1, filename = true) "
@@ -61,11 +60,11 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
         "CAST(r.answer ->> '$.duration_s' AS DOUBLE) AS duration_s "
         "FROM entries e LEFT JOIN results r USING (key) ORDER BY e.path"
     )
-    shapes = (("effects", "sizes", _SIZES), ("nominal", "nominal", _NOMINAL))
-    for table, field, shape in shapes:
+    shapes = (("effects", "sizes", _SIZES, "x.effect, "), ("nominal", "nominal", _NOMINAL, ""))
+    for table, field, shape, first in shapes:
         db.execute(
             f"CREATE TABLE {table} AS SELECT {_OF}, x.* FROM (SELECT key, unnest(from_json(answer -> '$.{field}', "
-            f"'{shape}')) AS x FROM results) r JOIN logs l USING (key) ORDER BY l.path, x.stage, x.parameter"
+            f"'{shape}')) AS x FROM results) r JOIN logs l USING (key) ORDER BY l.path, {first}x.stage, x.parameter"
         )
     db.execute(
         f"CREATE TABLE coverage AS SELECT {_OF}, x.* FROM (SELECT key, unnest(from_json(answer -> '$.not_observable', "
@@ -76,14 +75,23 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
     return db
 
 
+def _database() -> duckdb.DuckDBPyConnection:
+    """A database in memory; what does not fit goes to the system's folder for temporary files, not to where the user
+    stands.
+    """
+    import duckdb
+
+    place = str(Path(tempfile.gettempdir()) / f"vaneloop-fleet-{os.getpid()}")
+    db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2", "temp_directory": place})
+    db.execute("SET enable_progress_bar = false")
+    return db
+
+
 def answers(folder: Folder, keys: list[str]) -> dict[str, dict[str, Any]]:
     """The answers to some logs by their keys, as ``vaneloop diagnose --json`` gives them."""
     import json
 
-    import duckdb
-
-    db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2"})
-    rows = db.execute(
+    rows = _database().execute(
         "SELECT key, answer FROM read_parquet($1, filename = true) WHERE list_contains($2, key) AND answer IS NOT NULL "
         "ORDER BY filename", [str(folder.path / "parts" / "*.parquet"), keys],
     ).fetchall()  # fmt: skip
