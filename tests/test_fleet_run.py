@@ -464,3 +464,48 @@ def test_without_the_extra_one_line_says_what_to_install() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], env=ENV, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "pip install 'vaneloop[fleet]'" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
+    file = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "distributed.cli"]
+    runs = ["dask_scheduler", "dask_worker"]
+    options = [["--port", "0", "--no-dashboard"], ["--nthreads", "1", "--nworkers", "2", "--no-dashboard"]]
+    cluster = [
+        subprocess.Popen(
+            [*dask[:2], f"distributed.cli.{name}", "--scheduler-file", str(file), *more], env=ENV,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        ) for name, more in zip(runs, options, strict=True)
+    ]  # fmt: skip
+    started = None
+    try:
+        until(file.exists, None)
+        until(lambda: bool(file.read_text()), None)
+        address = json.loads(file.read_text())["address"]
+        (tmp_path / "rent.py").write_text(
+            RENT.replace(
+                "print(rent(", "from vaneloop.base import terminal; sys.exit(terminal.run(lambda: rent("
+            ).replace("None))", "None) and 0))")
+        )
+        words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), address]
+        started = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        until(lambda: len(folder.finished()) >= 3, started)
+        cluster[0].kill()
+        _, err = started.communicate()
+        assert started.returncode == 2 and "the Dask scheduler has gone" in err, err
+    finally:
+        for p in [*cluster, *([started] if started else [])]:
+            for child in psutil.Process(p.pid).children(recursive=True) if p.poll() is None else []:
+                child.kill()
+            p.kill()
+            p.wait()
+    (tmp_path / "logs" / "e1" / "slow.csv").unlink()
+    state.tidy(folder)
+    work(folder.path)
+    assert [tuple(r.values()) for r in rows(folder) if r["status"] == "done"] == undisturbed

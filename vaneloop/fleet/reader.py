@@ -12,6 +12,7 @@ import importlib
 import json
 import os
 import select
+import socket
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.base.compiled import sources_digest
+from vaneloop.base.compiled import cache_folder, sources_digest
 from vaneloop.base.errors import InputError
 
 __all__ = ["Died", "Reader", "Stopped", "TimedOut", "serve"]
@@ -77,7 +78,7 @@ class Reader:
         words = [sys.executable, "-c", "from vaneloop.fleet.reader import serve; serve()", self.function, self.folder]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (as long as the process)
         self.process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, env={**os.environ, **ONE_THREAD}
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, env=_environment()
         )
         self._answer({"options": options}, WARM_UP)
 
@@ -115,6 +116,12 @@ class Reader:
         said = self._errors.read().decode("utf-8", "replace").strip().splitlines()
         fatal = [line for line in said if line.startswith("Fatal")] or said[-1:]
         return f" ({fatal[0][:120]})" if fatal else ""
+
+
+def _environment() -> dict[str, str]:
+    """Environment of the process: one thread, and a cache of compiled code that no other host or version shares."""
+    own = {"NUMBA_CACHE_DIR": f"{cache_folder()}-{socket.gethostname()}"}
+    return {**own, **os.environ, **ONE_THREAD}
 
 
 def serve() -> None:
