@@ -312,3 +312,13 @@ def test_a_small_simulated_fleet_runs_from_logs_to_page(tmp_path: Path) -> None:
     assert set(view.engines) == {f"engine_{k:03d}" for k in range(4)}
     assert {s.quantity for s in view.series} >= {"linkage.vigv_play", "actuator.flow_gain", "engine.lag"}
     assert {v for by in view.verdicts.values() for v in by} <= {"none", "missing", "unknown"}
+
+
+def test_healthy_engines_are_hardly_said_to_change() -> None:
+    """Of 100 engines with 20 quantities each, 50 logs: at most 2 % are meant, 6 or more would be a chance of 2 %."""
+    rng = np.random.default_rng(4)
+    accused = 0
+    for _ in range(100):
+        t, s = np.sort(rng.uniform(0.0, 2.0, 50)), np.full(50, 0.3)
+        accused += any(trend(t, rng.normal(0.0, 1.0, 50), s, 0.01 / 20).kind != "none" for _ in range(20))
+    assert accused <= 5

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from vaneloop.base.errors import InputError
-from vaneloop.fleet.trends import ODD, Trend, limit_of, odd, trend
+from vaneloop.fleet.trends import ODD, SURE, Trend, limit_of, odd, trend
 from vaneloop.pages.fleet import FleetView, Series
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ def view_of(db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str =
     if wrong:
         raise InputError(f"--limits: quantity (={wrong[0]!r}) is in no log of the run; a quantity is "
                          "effect.parameter, or a nominal parameter such as linkage.vigv_play")  # fmt: skip
-    found = [_judged(s, limits) for s in found]
+    nominal = len({s.quantity for s in found if s.kind == "nominal"})  # of each engine so many are looked at
+    found = [_judged(s, limits, ODD / nominal if s.kind == "nominal" else SURE) for s in found]
     outliers = _outliers(found)
     view = FleetView(
         name=name, engines=engines, statuses=statuses, verdicts=_verdicts(db), lacks=lacks, series=found,
@@ -159,13 +160,13 @@ def _series(
     )  # fmt: skip
 
 
-def _judged(s: Series, limits: dict[str, float]) -> Series:
+def _judged(s: Series, limits: dict[str, float], sure: float) -> Series:
     """The series with its trend, and when it will be at its limit: times in s since 1970."""
     if not len(s.t):
         return replace(s, trend={"kind": "too few", "logs": 0})
     zero = float(s.t[0])
     years = (s.t - zero) / YEAR
-    found = trend(years, s.y, s.s)
+    found = trend(years, s.y, s.s, sure)
     said: dict[str, Any] = {k: v for k, v in asdict(found).items() if k != "lines"}
     for k in ("onset", "onset_low", "onset_high"):
         said[k] = zero + said[k] * YEAR
