@@ -18,13 +18,14 @@ from typing import Any, Protocol, TypeVar, cast
 import numba
 from numba import njit
 
-__all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached"]
+__all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached", "sources_digest"]
 
 KEPT = 6
 _PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
 
 
-def _digest() -> str:
+def sources_digest() -> str:
+    """Digest of all sources that are compiled, and of numba's version."""
     root = Path(__file__).parents[2]
     h = hashlib.sha256(numba.__version__.encode())
     for package in _PACKAGES:
@@ -46,7 +47,7 @@ def cache_folder() -> Path:
         except OSError:
             continue
         if os.access(place, os.W_OK):
-            return place / f"compiled-{_digest()}"
+            return place / f"compiled-{sources_digest()}"
     return places[-1]
 
 

@@ -42,6 +42,7 @@ COMMANDS = {
         "vaneloop.cli.hidden_law",
         "blind benchmark for users' own models: laws hidden in systems of many families (needs a checkout)",
     ),
+    "fleet": ("vaneloop.cli.fleet", "many engines, many logs: who lacks what, since when, how fast it grows"),
     "schedule": (
         "vaneloop.cli.schedule",
         "links and stroke tables from geometry, schedules and a measured stroke-angle loop",

@@ -22,7 +22,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.pages.figures import Figure
 from vaneloop.pages.style import THEMES, Tone, number
 
-__all__ = ["Page", "write_atomically"]
+__all__ = ["Link", "Page", "write_atomically"]
 
 _POLICY = (  # no network at all, whatever a page may hold
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
@@ -39,6 +39,13 @@ _POLICY = (  # no network at all, whatever a page may hold
 
 
 _REGION = ' tabindex="0" role="group" aria-label="{}"'  # what is wider than the screen is moved by keyboard, too
+
+
+class Link(NamedTuple):
+    """A cell of a table that leads to another page: its text, and where that page is from here."""
+
+    text: str
+    href: str
 
 
 class Page:
@@ -112,7 +119,7 @@ class Page:
         for i, c in enumerate(columns):
             tag = "th" if c else "td"  # a heading without words is none
             head += f"<{tag}{_right(bool(rows) and all(_is_number(r[i]) for r in rows))}>{e(str(c))}</{tag}>"
-        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{e(number(v))}</td>" for v in row) + "</tr>\n" for row in rows)
+        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{_cell(v)}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self._body.append(
             f'<div class="scroll"{_REGION.format("table")}>'
@@ -146,7 +153,7 @@ class Page:
             "</main>",
             f'<script type="application/json" id="figures">{_json(self.figures)}</script>',
             f'<script type="application/json" id="themes">{_json(THEMES)}</script>',
-            f"<script>{get_plotlyjs()}</script>",
+            f"<script>{get_plotlyjs()}</script>" if self.figures else "",
             f"<script>\n{_beside('page.js')}</script>",
             "</body></html>",
         ]
@@ -200,6 +207,13 @@ def _version() -> str:
 
 def _is_number(value: object) -> bool:
     return value is None or (isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool))
+
+
+def _cell(value: object) -> str:
+    """Inside of a table cell."""
+    if isinstance(value, Link):
+        return f'<a href="{html.escape(value.href)}">{html.escape(value.text)}</a>'
+    return html.escape(number(value))
 
 
 def _kind(value: object) -> str:

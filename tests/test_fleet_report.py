@@ -1,0 +1,324 @@
+"""What a fleet's logs say together, on results whose truth is known: onsets, growth, limits, outliers, coverage."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
+pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
+
+from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
+from vaneloop.fleet import state
+from vaneloop.fleet.folder import Folder, _schema
+from vaneloop.fleet.report import YEAR, limits_of, view_of, write_pages
+from vaneloop.fleet.sources import moment
+from vaneloop.fleet.tables import TABLES, answers, roll_up, write_tables
+from vaneloop.fleet.trends import Trend, limit_of, odd, trend
+from vaneloop.pages.fleet import fleet_page
+
+BEGIN = moment("2026-01-01") or 0.0
+NOMINAL = [f"linkage.vgv{k}_{what}" for k in range(5) for what in ("play", "lc", "l", "bias")]
+
+
+def answer(rng: np.random.Generator, engine: int, years: float, tail: list[float]) -> dict[str, Any]:
+    """What a log of an engine says: engine 0 wears from 0.8 years on, in engine 1 a sensor is exchanged at 1.2 years,
+    engine 2 is badly rigged, engine 3 lacks an effect that grows from 0.6 years on. ``tail``: an engine's own values.
+    """
+    nominal = []
+    for k, name in enumerate(NOMINAL):
+        value = 1.0 + tail[k] + rng.normal(0.0, 0.01)
+        value += 0.2 * max(years - 0.8, 0.0) if (engine, k) == (0, 0) else 0.0
+        value += 0.15 * (years >= 1.2) if (engine, k) == (1, 3) else 0.0
+        value += 0.5 if (engine, k) == (2, 1) else 0.0
+        row = {"stage": "linkage", "parameter": name, "unit": "deg", "value": value, "low": value - 0.01}
+        nominal.append(row | {"high": value + 0.01, "table": 1.0, "tolerance": 0.3})
+    sizes = []
+    size = 0.5 * max(years - 0.6, 0.0) + rng.normal(0.0, 0.02)
+    if engine == 3 and size > 0.08 or rng.random() < 0.01:
+        size = max(size, 0.08)
+        row = {"effect": "supply_dip", "stage": "actuator", "probability": 0.9, "parameter": "depth", "unit": "MPa"}
+        sizes.append(row | {"value": size, "low": size - 0.03, "high": size + 0.03, "neutral": 0.0})
+    blind = {"effect": "coil_heating", "stage": "actuator", "needs": "an oil temperature that changes by 20 K"}
+    return {
+        "log": f"e{engine}", "verdict": "missing" if sizes else "none", "nominal": nominal, "sizes": sizes,
+        "not_observable": [blind] if years < 1.0 else [], "stages": [], "duration_s": 300.0, "notes": [],
+        "effects": [{**s, "rivals": [], "parameters": {"depth": s}} for s in sizes],
+    }  # fmt: skip
+
+
+def synthetic(tmp: Path, engines: int, each: int, seed: int = 1) -> Folder:
+    """A finished run over two years, as the workers would leave it."""
+    rng = np.random.default_rng(seed)
+    folder = Folder.begin(tmp / "run", "tests.fleet_jobs:read", {}, {})
+    rows: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
+    for e in range(engines):
+        own = rng.normal(0.0, 0.03, len(NOMINAL)).tolist()
+        for k, years in enumerate(np.sort(rng.uniform(0.0, 2.0, each))):
+            key, at = f"{e:05d}{k:059d}.csv", BEGIN + years * YEAR
+            chunk = f"000000-{len(rows) // 64:06d}"
+            rows.append({"path": f"/logs/e{e:03d}/{k:05d}.csv", "key": key, "size": 1, "mtime_ns": 1, "chunk": chunk,
+                         "engine": f"e{e:03d}", "time": at, "reason": ""})  # fmt: skip
+            said = answer(rng, e, float(years), own)
+            row = {"key": key, "status": "done", "reason": "", "verdict": said["verdict"], "answer": json.dumps(said)}
+            results.append(row)
+    for where in ("logs", "parts"):
+        (folder.path / where).mkdir()
+    pq.write_table(pa.Table.from_pylist(rows, schema=_schema()), folder.path / "logs" / "000000.parquet")
+    for k in range(0, len(rows), 64):
+        pq.write_table(pa.Table.from_pylist(results[k : k + 64]), folder.path / f"parts/000000-{k // 64:06d}.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
+    return synthetic(tmp_path_factory.mktemp("fleet"), 30, 50)
+
+
+def series(rng: np.random.Generator, n: int, size: float, kind: str) -> tuple[Any, Any, Any, float, float]:
+    """A quantity over two years with its scatter of 1: times, values, deviations, onset, growth a year."""
+    t, s = np.sort(rng.uniform(0.0, 2.0, n)), rng.uniform(0.2, 0.5, n)
+    onset = float(rng.uniform(0.2, 1.4))
+    rate = size / (2.0 - onset)
+    y = 5.0 + rng.normal(0.0, 1.0, n) + rng.normal(0.0, s)
+    late = {"growth": rate * np.maximum(t - onset, 0.0), "step": size * (t >= onset), "none": 0.0 * t}[kind]
+    return t, y + late, s, onset, rate
+
+
+def shares(kind: str, n: int, size: float, many: int, seed: int) -> list[tuple[Trend, Any]]:
+    rng = np.random.default_rng(seed)
+    drawn = [series(rng, n, size, kind) for _ in range(many)]
+    return [(trend(*x[:3]), x) for x in drawn]
+
+
+# ---- statistics ------------------------------------------------------------------------------------------------------
+
+
+def test_quantities_that_do_not_change_are_left_alone() -> None:
+    kinds = [f.kind for n in (20, 50, 200) for f, _ in shares("none", n, 0.0, 200, n)]
+    assert sum(k != "none" for k in kinds) <= 4, "one in a thousand is allowed; four in 600 are a chance of 0.3 %"
+
+
+def test_onsets_and_growth_are_found_and_their_intervals_hold() -> None:
+    """Growths of 6 to 12 scatters within the log, 50 logs an engine, as in a fleet of 40 engines and 2,000 logs."""
+    found = [x for size in (6.0, 8.0, 12.0) for x in shares("growth", 50, size, 150, int(size))]
+    named = [(f, x) for f, x in found if f.kind == "growth"]
+    assert len(named) >= 0.95 * len(found)
+    assert np.mean([abs(f.onset - x[3]) <= 0.2 for f, x in named]) >= 0.9
+    assert 0.85 <= np.mean([f.rate_low <= x[4] <= f.rate_high for f, x in named]) <= 0.95
+    assert 0.82 <= np.mean([f.onset_low <= x[3] <= f.onset_high for f, x in named]) <= 0.97
+
+
+def test_the_time_to_a_limit_is_within_its_interval() -> None:
+    inside = []
+    for f, (t, _, _, onset, rate) in shares("growth", 50, 8.0, 150, 5):
+        when = limit_of(f, float(t[-1]), 5.0 + 16.0)
+        if f.kind == "growth":
+            assert when.low is not None and when.high is not None and when.time is not None
+            inside.append(when.low <= onset + 16.0 / rate <= when.high)
+    assert 0.82 <= np.mean(inside) <= 0.97
+
+
+def test_a_noise_free_growth_is_found_exactly() -> None:
+    t = np.linspace(0.0, 2.0, 41)
+    f = trend(t, 1.0 + 3.0 * np.maximum(t - 0.8, 0.0), np.full(41, 1e-3))
+    assert f.kind == "growth" and f.onset == pytest.approx(0.8, abs=0.02) and f.rate == pytest.approx(3.0, rel=0.02)
+    assert limit_of(f, 2.0, 7.6).time == pytest.approx(3.0, abs=0.05)
+
+
+def test_an_exchange_is_a_step_and_not_growth() -> None:
+    found = shares("step", 50, 6.0, 60, 3)
+    assert np.mean([f.kind == "step" for f, _ in found]) >= 0.95
+    assert np.mean([abs(f.onset - x[3]) <= 0.2 for f, x in found]) >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("found", "limit", "says"),
+    [
+        (Trend("none", 20, now=1.0), 2.0, "does not grow"),
+        (Trend("step", 20, now=1.0), 2.0, "in one step"),
+        (Trend("too few", 5), 2.0, "are too few"),
+        (Trend("growth", 20, start=0.0, now=1.0, rate=1.0), -2.0, "away from its limit"),
+        (Trend("growth", 20, start=0.0, now=3.0, rate=1.0), 2.0, "beyond its limit"),
+    ],
+)
+def test_where_a_limit_cannot_be_told_words_say_why(found: Trend, limit: float, says: str) -> None:
+    assert says in limit_of(found, 2.0, limit).why
+
+
+@pytest.mark.parametrize("n", [6, 20, 40, 200])
+def test_healthy_engines_are_hardly_accused(n: int) -> None:
+    rng = np.random.default_rng(n)
+    accused = [(odd(rng.normal(0.0, 1.0, n), tests=20) < 0.01).mean() for _ in range(40)]
+    assert np.mean(accused) <= 0.02
+
+
+def test_an_odd_engine_is_seen_also_beside_other_odd_ones() -> None:
+    rng = np.random.default_rng(2)
+    hits = [(odd(np.r_[rng.normal(0.0, 1.0, 37), 9.0, 10.0, -9.0], tests=20)[-3:] < 0.01).all() for _ in range(40)]
+    assert np.mean(hits) >= 0.9
+
+
+# ---- tables and page -------------------------------------------------------------------------------------------------
+
+
+def test_the_report_finds_what_is_in_the_fleet(folder: Folder) -> None:
+    view = view_of(roll_up(folder), {"supply_dip.depth": 2.0})
+    assert [(r["engine"], r["effect"]) for r in view.lacking] == [("e003", "supply_dip")]
+    by = {(s.engine, s.quantity): s.trend for s in view.changed}
+    wear = by.pop(("e000", "linkage.vgv0_play"))
+    assert wear["kind"] == "growth" and abs(wear["onset"] - BEGIN - 0.8 * YEAR) < 0.2 * YEAR
+    assert wear["rate_low"] <= 0.2 <= wear["rate_high"] and wear["limit"] == pytest.approx(1.3)
+    swap = by.pop(("e001", "linkage.vgv0_bias"))
+    assert swap["kind"] == "step" and abs(swap["onset"] - BEGIN - 1.2 * YEAR) < 0.2 * YEAR
+    dip = by.pop(("e003", "supply_dip.depth"))
+    assert dip["kind"] == "growth" and abs(dip["onset"] - BEGIN - 0.6 * YEAR) < 0.2 * YEAR
+    assert dip["limit_low"] <= BEGIN + 4.6 * YEAR <= dip["limit_high"]
+    assert len(by) <= 1, f"of 600 quantities that do not change: {list(by)}"
+    assert ("e002", "linkage.vgv0_lc") in {(r["engine"], r["quantity"]) for r in view.outliers}
+    assert len({r["engine"] for r in view.outliers} - {"e000", "e001", "e002"}) <= 1
+    (blind,) = {(r["effect"], r["needs"]) for r in view.coverage}
+    assert blind == ("coil_heating", "an oil temperature that changes by 20 K")
+
+
+def test_the_page_leads_to_the_logs_own_pages(folder: Folder, tmp_path: Path) -> None:
+    view = view_of(roll_up(folder), {})
+    said = answers(folder, view.keys())
+    write_pages(tmp_path / "fleet_logs", said)
+    page = fleet_page(view, "vaneloop fleet report", "fleet_logs").write(tmp_path / "fleet.html").read_text()
+    links = set(re.findall(r'href="(fleet_logs/[^"]+)"', page))
+    assert links and all((tmp_path / x).is_file() for x in links)
+    assert "supply_dip" in page and "no limit is given" in page and view.sentence() in page
+
+
+def test_tables_of_two_reports_are_the_same_bytes(folder: Folder, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_tables(roll_up(folder), tmp_path / name)
+    for table in TABLES:
+        assert (tmp_path / "a" / f"{table}.csv").read_bytes() == (tmp_path / "b" / f"{table}.csv").read_bytes()
+        assert pq.read_table(tmp_path / "a" / f"{table}.parquet").num_rows > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("a,b\n1,2\n", "needs the columns"), ("quantity,limit\nx,soon\n", "number")]
+)
+def test_a_wrong_file_of_limits_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "l.csv").write_text(text)
+    with pytest.raises(InputError, match=says):
+        limits_of(str(tmp_path / "l.csv"))
+
+
+def test_a_limit_of_something_else_is_refused(folder: Folder) -> None:
+    with pytest.raises(InputError, match="'linkage.plya'"):
+        view_of(roll_up(folder), {"linkage.plya": 1.0})
+
+
+def command(*words: str) -> subprocess.CompletedProcess[str]:
+    run = [sys.executable, "-m", "vaneloop", "fleet", *words]
+    return subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_the_command_reports_and_says_how_far_a_run_is(folder: Folder, tmp_path: Path) -> None:
+    done = command("status", str(folder.path), "--json", str(tmp_path / "s.json"))
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "s.json").read_text())["came_to"] == {"done": 1500}
+    page = tmp_path / "fleet.html"
+    done = command("report", str(folder.path), "--report", str(page), "--tables-out", str(tmp_path / "t"))
+    assert done.returncode == 1, done.stderr
+    assert "supply_dip" in done.stdout and page.stat().st_size > 100_000
+    assert pq.read_table(tmp_path / "t" / "lacks.parquet").num_rows > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("status", "nowhere"), "is no fleet run"),
+        (("run", "nowhere", "--out", "x"), "neither a log nor a folder"),
+        (("run", "examples", "--out", "x", "--workers", "0"), "must be in"),
+        (("work", "x", "--patience", "0"), "must be in"),
+    ],
+)
+def test_bad_input_is_one_line(words: tuple[str, ...], says: str) -> None:
+    done = command(*words)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr, done.stderr
+
+
+@pytest.mark.slow
+def test_a_folder_of_a_hundred_thousand_logs(tmp_path: Path) -> None:
+    """It is listed and reported in bounded memory; the times are for reading."""
+    import psutil
+
+    folder = synthetic(tmp_path, 200, 500)
+    began = time.process_time()
+    assert state.state_of(folder).came == {"done": 100_000}
+    listed = time.process_time() - began
+    script = (
+        "import sys, resource, time; from vaneloop.cli.main import main\n"
+        "began = time.time(); code = main(['fleet', 'report', sys.argv[1], '--report', sys.argv[2]])\n"
+        "print('MiB', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, 's', time.time() - began,"
+        " time.process_time()); sys.exit(code)"
+    )
+    words = [sys.executable, "-c", script, str(folder.path), str(tmp_path / "fleet.html")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr
+    memory = int(done.stdout.rsplit("MiB", 1)[1].split()[0])
+    print(f"listed in {listed:.1f} s, reported with {done.stdout.splitlines()[-1]}; {psutil.cpu_count()} cores")
+    assert memory <= 2048
+
+
+# ---- a simulated fleet -----------------------------------------------------------------------------------------------
+
+
+def test_the_fates_of_a_simulated_fleet_are_known() -> None:
+    from collections import Counter
+
+    from vaneloop.cli.fleet_demo import YEARS, fate, size_at
+
+    fates = [fate(1, e, 40) for e in range(40)]
+    count = Counter(f["fate"] for f in fates)
+    assert count["badly rigged"] == count["sensor exchanged"] == 1
+    assert 8 <= count["wear"] <= 11 and 6 <= count["null drift"] <= 9 and count["healthy"] >= 18
+    for f in fates:
+        if f.get("comes") == "growth":
+            assert size_at(f, 0.99 * f["onset_years"]) == 0.0 and size_at(f, YEARS) == pytest.approx(f["size"])
+            half = 0.5 * (f["onset_years"] + YEARS)
+            assert size_at(f, half) == pytest.approx(0.5 * f["size"])
+    assert fates == [fate(1, e, 40) for e in range(40)] != [fate(2, e, 40) for e in range(40)]
+
+
+@pytest.mark.slow
+def test_a_small_simulated_fleet_runs_from_logs_to_page(tmp_path: Path) -> None:
+    """Eight real logs: simulated, diagnosed by two workers, reported; the badly rigged engine lacks something."""
+    logs, run = str(tmp_path / "logs"), str(tmp_path / "run")
+    done = command("demo", "--engines", "4", "--logs", "8", "--duration", "60", "--out", logs)
+    assert done.returncode == 0, done.stderr
+    done = command("run", logs, "--out", run)
+    assert done.returncode == 0 and "8 of 8" in done.stdout, done.stderr
+    done = command("report", run, "--report", str(tmp_path / "fleet.html"))
+    assert done.returncode in (0, 1), done.stderr
+    view = view_of(roll_up(Folder(run)), {})
+    assert set(view.engines) == {f"engine_{k:03d}" for k in range(4)}
+    assert {s.quantity for s in view.series} >= {"linkage.vigv_play", "actuator.flow_gain", "engine.lag"}
+    assert {v for by in view.verdicts.values() for v in by} <= {"none", "missing", "unknown"}
+
+
+def test_healthy_engines_are_hardly_said_to_change() -> None:
+    """Of 100 engines with 20 quantities each, 50 logs: at most 2 % are meant, 6 or more would be a chance of 2 %."""
+    rng = np.random.default_rng(4)
+    accused = 0
+    for _ in range(100):
+        t, s = np.sort(rng.uniform(0.0, 2.0, 50)), np.full(50, 0.3)
+        accused += any(trend(t, rng.normal(0.0, 1.0, 50), s, 0.01 / 20).kind != "none" for _ in range(20))
+    assert accused <= 5

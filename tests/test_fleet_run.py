@@ -1,0 +1,511 @@
+"""A fleet run loses no log and does none twice, whoever is killed, and whatever a log does to its reader.
+
+The logs are a stand-in's (tests/fleet_jobs.py), so that a run takes a second; the last tests run real logs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
+
+from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
+from vaneloop.fleet import sources, state
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.journal import Journal, lines
+from vaneloop.fleet.leases import Leases, Me
+from vaneloop.fleet.worker import DEATHS, work
+
+JOB = "tests.fleet_jobs:read"
+ENV = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+WORK = (
+    "import sys; from vaneloop.fleet.worker import work\n"
+    "from vaneloop.base import terminal\n"
+    "sys.exit(terminal.run(lambda: bool(work(sys.argv[1], every=0.2, patience=float(sys.argv[2]))) * 0))"
+)
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The readers find the stand-in."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    yield
+
+
+def fleet(tmp: Path, texts: dict[str, str], in_chunk: int | None = None, limit: float = 600.0) -> Folder:
+    """A run of logs with these texts, nothing done yet."""
+    for name, text in texts.items():
+        (tmp / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp / "logs" / name).write_text(text, encoding="utf-8")
+    folder = Folder.begin(tmp / "run", JOB, {"limit": limit}, {})
+    folder.add(sources.find([str(tmp / "logs")]), in_chunk)
+    return folder
+
+
+def many(n: int, text: str = "log {i}") -> dict[str, str]:
+    return {f"e{i % 3}/2026-01-{1 + i % 28:02d}_{i}.csv": text.format(i=i) for i in range(n)}
+
+
+def rows(folder: Folder) -> list[dict[str, str]]:
+    """All rows of all parts, in the order of their keys; every content must be there once."""
+    out = [r for f in (folder.path / "parts").glob("*.parquet") for r in pq.read_table(f).to_pylist()]
+    assert len({r["key"] for r in out}) == len(out)
+    return sorted(out, key=lambda r: r["key"])
+
+
+def of(folder: Folder, name: str) -> dict[str, str]:
+    """The row of the log with this name."""
+    (key,) = (e.key for e in folder.entries() if Path(e.path).name == name)
+    (row,) = (r for r in rows(folder) if r["key"] == key)
+    return row
+
+
+def process(folder: Folder, patience: float = 600.0, **env: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", WORK, str(folder.path), str(patience)], env={**ENV, **env}, cwd=ROOT,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def until(happens: Callable[[], bool], p: subprocess.Popen[str] | None = None) -> None:
+    """Wait for an event, however long it takes; fail where the process ends instead."""
+    while not happens():
+        assert p is None or p.poll() is None or happens(), p.stderr and p.stderr.read()
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, ...]]:
+    """Rows of 40 logs that nobody disturbed."""
+    folder = fleet(tmp_path_factory.mktemp("calm"), many(40))
+    work(folder.path)
+    return [tuple(r.values()) for r in rows(folder)]
+
+
+# ---- what is taken up ------------------------------------------------------------------------------------------------
+
+
+def test_a_run_does_every_content_once(tmp_path: Path) -> None:
+    folder = fleet(tmp_path, {**many(6), "e9/copy_2026-02-01.csv": "log 3"})
+    assert work(folder.path) == {"done": 6}
+    assert len(folder.entries()) == 7 and len(rows(folder)) == 6
+    assert state.state_of(folder).came == {"done": 6}
+    assert json.loads(of(folder, "copy_2026-02-01.csv")["answer"])["letters"] == 5
+    assert work(folder.path) == {}, "a second worker finds nothing to do"
+
+
+def test_engine_and_time_come_from_list_metadata_and_path(tmp_path: Path) -> None:
+    import pyarrow as pa
+
+    for name in ("a7/start_20260314T1230.csv", "a7/b.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    said = pa.table({"t": [0.0]}).replace_schema_metadata({"engine": "b8", "time": "2026-03-15"})
+    pq.write_table(said, tmp_path / "a7" / "c_2020-01-01.parquet")
+    (tmp_path / "list.csv").write_text("path,engine,time\na7/b.csv,c9,2026-03-16 08:00\n")
+    folder = Folder.begin(tmp_path / "run", JOB, {}, {})
+    folder.add(sources.find([str(tmp_path / "a7")], str(tmp_path / "list.csv")))
+    found = {Path(e.path).name: (e.engine, e.time) for e in folder.entries()}
+    assert found == {
+        "start_20260314T1230.csv": ("a7", sources.moment("2026-03-14T12:30")),
+        "b.csv": ("c9", sources.moment("2026-03-16 08:00")),
+        "c_2020-01-01.parquet": ("b8", sources.moment("2026-03-15")),
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("run_19700102", 86400.0),
+        ("1970-01-01T01:00:05Z", 3605.0),
+        ("2026-02-30", None),
+        ("n7", None),
+        ("1234567890", None),
+    ],
+)
+def test_a_moment_is_read_from_words(text: str, seconds: float | None) -> None:
+    assert sources.moment(text) == seconds
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [("a,b\n1,2\n", "needed: path and engine"), ("path,time\nx,soon\n", "must be a date"), (None, "cannot be read")],
+)
+def test_a_wrong_list_of_engines_is_one_line(tmp_path: Path, table: str | None, says: str) -> None:
+    (tmp_path / "a.csv").write_text("x")
+    if table is not None:
+        (tmp_path / "list.csv").write_text(table)
+    with pytest.raises(InputError, match=says):
+        sources.find([str(tmp_path / "a.csv")], str(tmp_path / "list.csv"))
+
+
+def test_new_and_changed_logs_are_taken_up_and_others_are_left(tmp_path: Path) -> None:
+    folder = fleet(tmp_path, many(4))
+    work(folder.path)
+    logs = sorted((tmp_path / "logs").rglob("*.csv"))
+    logs[0].write_text("now it is another")
+    (tmp_path / "logs" / "new_2026-05-05.csv").write_text("log 99")
+    assert folder.add(sources.find([str(tmp_path / "logs")])) == 2
+    assert work(folder.path) == {"done": 2}
+    assert len(folder.entries()) == 5 and folder.add(sources.find([str(tmp_path / "logs")])) == 0
+    assert json.loads(of(folder, logs[0].name)["answer"])["first"] == "now it is an"
+
+
+def test_a_run_of_another_machine_or_version_is_not_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text("a = 1\n")
+    folder = Folder.begin(tmp_path / "run", JOB, {}, {"model": str(tmp_path / "m.toml")})
+    assert (tmp_path / "run" / folder.job["files"]["model"]).read_text() == "a = 1\n"
+    (tmp_path / "m.toml").write_text("a = 2\n")
+    with pytest.raises(InputError, match="was begun with machine"):
+        Folder.begin(tmp_path / "run", JOB, {}, {"model": str(tmp_path / "m.toml")})
+    job = json.loads((tmp_path / "run" / "run.json").read_text())
+    (tmp_path / "run" / "run.json").write_text(json.dumps({**job, "version": "0.0+old"}))
+    with pytest.raises(InputError, match=r"was begun by vaneloop 0\.0\+old"):
+        work(folder.path)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(InputError, match="holds other files"):
+        Folder.begin(tmp_path, JOB, {}, {})
+    with pytest.raises(InputError, match="is no fleet run"):
+        Folder(tmp_path)
+
+
+# ---- logs that do harm -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "says"),
+    [
+        ("kill the reader", "died", f"signal 11 .*Segmentation fault.*, {DEATHS} times"),
+        ("hang", "timeout", "no answer in 5 s"),
+        ("refuse", "refused", r"must be in \[0, 120\]"),
+        ("defect", "defect", "internal error: KeyError"),
+        ("alter", "changed", "has changed since"),
+    ],
+)
+def test_a_bad_log_is_a_row_with_its_reason(tmp_path: Path, text: str, status: str, says: str) -> None:
+    folder = fleet(
+        tmp_path, {**many(3), "e1/bad_2026-01-01.csv": text}, in_chunk=4, limit=5.0 if text == "hang" else 600.0
+    )
+    came = work(folder.path)
+    assert came == {"done": 3, status: 1}
+    bad = next(r for r in rows(folder) if r["status"] != "done")
+    assert bad["status"] == status and re.search(says, bad["reason"]), bad["reason"]
+    assert "\n" not in bad["reason"]
+
+
+def test_a_log_that_changed_is_done_the_next_time(tmp_path: Path) -> None:
+    folder = fleet(tmp_path, {"e1/a.csv": "alter"})
+    work(folder.path)
+    assert folder.add(sources.find([str(tmp_path / "logs")])) == 1
+    assert work(folder.path) == {"done": 1}
+    assert of(folder, "a.csv")["status"] == "done"
+
+
+def test_a_log_that_vanishes_is_a_row_and_comes_back(tmp_path: Path) -> None:
+    folder = fleet(tmp_path, {"e1/a.csv": "log 1"})
+    (tmp_path / "logs/e1/a.csv").rename(tmp_path / "away")
+    assert work(folder.path) == {"unreadable": 1}
+    (tmp_path / "away").rename(tmp_path / "logs/e1/a.csv")
+    bad = frozenset(k for k, s in state.came_to(folder).items() if s == "unreadable")
+    assert folder.add(sources.find([str(tmp_path / "logs")]), again=bad) == 1
+    assert work(folder.path) == {"done": 1} and set(state.came_to(folder).values()) == {"done"}
+
+
+def test_a_pipe_or_a_dangling_link_among_the_logs_is_a_row(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "logs" / "a.csv").symlink_to(tmp_path / "pipe")
+    (tmp_path / "logs" / "b.csv").symlink_to(tmp_path / "nowhere")
+    folder = fleet(tmp_path, {"c.csv": "log 1"})
+    assert work(folder.path) == {"done": 1}
+    assert {Path(e.path).name: bool(e.reason) for e in folder.entries()} == {
+        "a.csv": True,
+        "b.csv": True,
+        "c.csv": False,
+    }
+    assert state.state_of(folder).came == {"done": 1, "unreadable": 2}
+
+
+# ---- processes that end ----------------------------------------------------------------------------------------------
+
+POINTS = ("take", "leased", "begin", "written:1", "written:5", "result", "result:7", "part", "part:2")
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_a_kill_at_any_point_loses_nothing(tmp_path: Path, point: str, undisturbed: list[tuple[str, ...]]) -> None:
+    folder = fleet(tmp_path, many(40), in_chunk=5)
+    killed = process(folder, VANELOOP_FLEET_KILL=point)
+    assert killed.wait() == -signal.SIGKILL, killed.stderr and killed.stderr.read()
+    state.tidy(folder)
+    work(folder.path)
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed
+    assert not [f for f in folder.path.rglob("*.part") if "parts" in f.parts]
+    assert not list((folder.path / "results").iterdir()) and not list((folder.path / "leases").iterdir())
+
+
+def test_fifty_kills_leave_the_same_table(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
+    """Workers are killed at 50 points drawn by chance, two at a time side by side, each followed by others."""
+    folder = fleet(tmp_path, many(40), in_chunk=3)
+    draw, kills = random.Random(7), 0
+    while kills < 50:
+        pair = [
+            process(folder, VANELOOP_FLEET_KILL=f"{draw.choice(('take', 'leased', 'begin', 'written'))}:1")
+            for _ in range(2)
+        ]
+        kills += sum(p.wait() == -signal.SIGKILL for p in pair)
+        if len(folder.finished()) == len(folder.chunks()):
+            break
+    assert kills == 50 or len(rows(folder)) == 40
+    work(folder.path)
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed
+
+
+def test_a_reader_ends_with_its_worker(tmp_path: Path) -> None:
+    import psutil
+
+    folder = fleet(tmp_path, {"e1/a.csv": "hang"})
+    p = process(folder)
+    until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)
+    until(lambda: bool(psutil.Process(p.pid).children()), p)
+    (reader,) = psutil.Process(p.pid).children()
+    p.kill()
+    p.wait()
+    reader.wait()  # fails by the test's own limit, not by a time
+
+
+def test_sigterm_ends_a_worker_in_order(tmp_path: Path) -> None:
+    folder = fleet(tmp_path, {"e1/a.csv": "hang"})
+    p = process(folder)
+    until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)
+    p.terminate()
+    assert (
+        p.wait() == 0 and not list((folder.path / "leases").iterdir()) and not list((folder.path / "workers").iterdir())
+    )
+
+
+def test_a_worker_that_stands_still_is_replaced_and_does_no_harm(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    folder = fleet(tmp_path, many(40), in_chunk=40)
+    p = process(folder)
+    until(lambda: any(n >= 2 for _, n in folder.begun()), p)
+    p.send_signal(signal.SIGSTOP)
+    work(folder.path, every=0.1, patience=0.5)
+    p.send_signal(signal.SIGCONT)
+    assert p.wait() == 0
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
+    folder = fleet(tmp_path, many(40), in_chunk=5)
+    p = process(folder, VANELOOP_FLEET_FULL="9")
+    _, err = p.communicate()
+    assert p.returncode == 2 and err.count("\n") == 1 and "No space left on device" in err, err
+    assert not list((folder.path / "leases").iterdir()), "it gives back what it had"
+    work(folder.path)
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed
+
+
+def test_two_starters_make_one_run(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
+    for name, text in many(40).items():
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).write_text(text)
+    script = (
+        "import sys; from vaneloop.fleet import sources; from vaneloop.fleet.folder import Folder\n"
+        "from vaneloop.fleet.worker import work\n"
+        f"folder = Folder.begin(sys.argv[2], {JOB!r}, {{}}, {{'model': sys.argv[3]}})\n"
+        "folder.add(sources.find([sys.argv[1]])); work(folder.path, every=0.2)"
+    )
+    (tmp_path / "m.toml").write_text("a = 1\n")
+    words = [sys.executable, "-c", script, str(tmp_path / "logs"), str(tmp_path / "run"), str(tmp_path / "m.toml")]
+    pair = [subprocess.Popen(words, env=ENV, cwd=ROOT, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    for p in pair:
+        _, err = p.communicate()
+        assert p.returncode == 0, err
+    folder = Folder(tmp_path / "run")
+    assert len(folder.entries()) == 40 and [tuple(r.values()) for r in rows(folder)] == undisturbed
+
+
+# ---- leases and journals ---------------------------------------------------------------------------------------------
+
+
+def test_a_lease_has_one_holder_and_only_a_dead_one_loses_it(tmp_path: Path) -> None:
+    a, b = Me(tmp_path, every=3600.0), Me(tmp_path, every=3600.0)
+    leases = Leases(tmp_path, patience=3600.0)
+    assert leases.take(["c"], a.name) == ("c", 0)
+    assert leases.take(["c"], b.name) is None and leases.mine("c", 0)
+    a.leave()
+    assert leases.take(["c"], b.name) == ("c", 1)
+    assert not leases.mine("c", 0) and leases.mine("c", 1)
+    b.leave()
+
+
+def test_a_silent_worker_of_another_host_loses_its_lease_by_the_observer_s_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far, near = Me(tmp_path, every=3600.0), Me(tmp_path, every=3600.0)
+    file = tmp_path / "workers" / f"{far.name}.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "host": "far away", "pid": 1}))
+    clock = [100.0]
+    monkeypatch.setattr("vaneloop.fleet.leases.time.monotonic", lambda: clock[0])
+    leases = Leases(tmp_path, patience=60.0)
+    assert leases.take(["c"], far.name) == ("c", 0)
+    for now, beat, taken in ((100.0, "1", None), (150.0, "2", None), (205.0, "2", None), (215.0, "2", ("c", 1))):
+        clock[0] = now
+        (tmp_path / "workers" / f"{far.name}.beat").write_text(beat)
+        assert leases.take(["c"], near.name) == taken, now
+    far.leave()
+    near.leave()
+
+
+def test_a_worker_that_stands_still_while_it_writes_its_heartbeat_loses_its_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = Me(tmp_path, every=3600.0)
+    clock = [100.0]
+    monkeypatch.setattr("vaneloop.fleet.leases.time.monotonic", lambda: clock[0])
+    (tmp_path / "workers" / f"{still.name}.beat").write_text("")
+    leases = Leases(tmp_path, patience=60.0)
+    assert not leases.dead(still.name)
+    clock[0] = 161.0
+    assert leases.dead(still.name)
+    still.leave()
+
+
+def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "w")
+    journal.note("begin", key="a")
+    with open(tmp_path / "journal" / "w.jsonl", "a") as f:
+        f.write('{"what": "en')
+    assert [(x["what"], x["key"], x["worker"]) for x in lines(tmp_path)] == [("begin", "a", "w")]
+    journal.close()
+
+
+# ---- rented workers --------------------------------------------------------------------------------------------------
+
+RENT = (
+    "import sys; from vaneloop.fleet.folder import Folder; from vaneloop.fleet.rent import rent\n"
+    "if __name__ == '__main__': print(rent(Folder(sys.argv[1]), sys.argv[2], 2, {}, 0.2, lambda n, of: None))"
+)
+
+
+def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    (tmp_path / "rent.py").write_text(RENT)
+    folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
+    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
+    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: len(folder.finished()) >= 3, p)
+    rented = psutil.Process(p.pid).children(recursive=True)
+    p.kill()
+    p.wait()
+    psutil.wait_procs(rented)  # scheduler, workers and readers end by themselves, though one log hangs
+    (tmp_path / "logs" / "e1" / "slow.csv").unlink()
+    state.tidy(folder)
+    work(folder.path)
+    seen = [tuple(r.values()) for r in rows(folder) if r["status"] == "done"]
+    assert seen == undisturbed
+    assert [r["status"] for r in rows(folder) if r["status"] != "done"] == ["unreadable"]
+
+
+def test_a_killed_rented_worker_has_a_successor_and_the_run_ends(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    (tmp_path / "rent.py").write_text(RENT)
+    folder = fleet(tmp_path, many(40), in_chunk=2)
+    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
+    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)
+    worker = int(next(line["worker"] for line in lines(folder.path)).split("-")[-2])
+    psutil.Process(worker).kill()
+    out, err = p.communicate()
+    assert p.returncode == 0, err
+    assert [tuple(r.values()) for r in rows(folder)] == undisturbed and out.startswith("{")
+
+
+@pytest.mark.parametrize(("on", "says"), [("slrum", "did you mean slurm"), ("tcp://127.0.0.1:1", "no Dask scheduler")])
+def test_a_place_that_is_not_there_is_one_line(tmp_path: Path, on: str, says: str) -> None:
+    from vaneloop.fleet import rent
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    with pytest.raises(InputError, match=says):
+        rent.rent(fleet(tmp_path, many(2)), on, 1, {}, 0.2, lambda n, of: None)
+
+
+def test_without_the_extra_one_line_says_what_to_install() -> None:
+    script = (
+        "import sys; sys.modules['psutil'] = None\n"
+        "import importlib.util; find = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda n, *a: None if n == 'psutil' else find(n, *a)\n"
+        "from vaneloop.cli.main import main; sys.exit(main(['fleet', 'status', 'x']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], env=ENV, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "pip install 'vaneloop[fleet]'" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
+    tmp_path: Path, undisturbed: list[tuple[str, ...]]
+) -> None:
+    import psutil
+
+    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
+    folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
+    file = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "distributed.cli"]
+    runs = ["dask_scheduler", "dask_worker"]
+    options = [["--port", "0", "--no-dashboard"], ["--nthreads", "1", "--nworkers", "2", "--no-dashboard"]]
+    cluster = [
+        subprocess.Popen(
+            [*dask[:2], f"distributed.cli.{name}", "--scheduler-file", str(file), *more], env=ENV,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        ) for name, more in zip(runs, options, strict=True)
+    ]  # fmt: skip
+    started = None
+    try:
+        until(file.exists, None)
+        until(lambda: bool(file.read_text()), None)
+        address = json.loads(file.read_text())["address"]
+        (tmp_path / "rent.py").write_text(
+            RENT.replace(
+                "print(rent(", "from vaneloop.base import terminal; sys.exit(terminal.run(lambda: rent("
+            ).replace("None))", "None) and 0))")
+        )
+        words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), address]
+        started = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        until(lambda: len(folder.finished()) >= 3, started)
+        cluster[0].kill()
+        _, err = started.communicate()
+        assert started.returncode == 2 and "the Dask scheduler has gone" in err, err
+    finally:
+        for p in [*cluster, *([started] if started else [])]:
+            for child in psutil.Process(p.pid).children(recursive=True) if p.poll() is None else []:
+                child.kill()
+            p.kill()
+            p.wait()
+    (tmp_path / "logs" / "e1" / "slow.csv").unlink()
+    state.tidy(folder)
+    work(folder.path)
+    assert [tuple(r.values()) for r in rows(folder) if r["status"] == "done"] == undisturbed

@@ -1,0 +1,216 @@
+"""``vaneloop fleet``: many engines, many logs: which engine lacks what, since when, how fast it grows."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.cli import options
+
+__all__ = ["DESCRIPTION", "add_options", "command"]
+
+DESCRIPTION = """Diagnose the logs of a fleet, and say which engine lacks what, since when, how fast it grows, and which
+engine is unlike its sisters.
+
+A run is a folder. It can be killed at any moment: the same command goes on where it was, and takes up logs that are new
+or have changed. A log that cannot be read is a row with its reason. Any number of machines that see the folder can work
+on it at once. Needs the extra `fleet`: pip install 'vaneloop[fleet]'. See docs/fleet.md.
+
+  run     take up the logs and diagnose them
+  work    join a run from this or another machine
+  status  how far a run is
+  report  tables and a page of what the logs say together
+  demo    logs of a simulated fleet whose truth is known (needs a checkout)
+
+examples:
+  vaneloop fleet run examples/ --out out/fleet
+  vaneloop fleet run LOGS --out out/fleet --engines ENGINES.csv --workers 8
+  vaneloop fleet run LOGS --out out/fleet --on slurm --workers 200 --queue queue=batch
+  vaneloop fleet work out/fleet
+  vaneloop fleet status out/fleet --json -
+  vaneloop fleet report out/fleet --report fleet.html --tables-out TABLES
+  vaneloop fleet demo --engines 4 --logs 20 --duration 60 --out out/fleet_logs
+
+exit codes: 0 done (report: nothing found), 1 report: an engine lacks something or is unlike its sisters, 2 bad input"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the parts of the command and their options."""
+    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, parser_class=terminal.Parser)
+    run = parts.add_parser("run", help="take up the logs and diagnose them")
+    run.add_argument("logs", nargs="+", metavar="LOGS", help="logs, and folders that hold logs at any depth")
+    run.add_argument("--out", required=True, metavar="RUN", help="folder of the run; one that is there is gone on with")
+    run.add_argument(
+        "--engines", metavar="F.csv", help="columns path, engine, time: whose a log is and when it began (default: its "
+        "Parquet metadata engine and time, else its folder's name and a date in its own name)",
+    )  # fmt: skip
+    run.add_argument("--on", default="local", metavar="WHERE", help="local (default), slurm, tcp://HOST:PORT of Dask")
+    run.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
+    run.add_argument("--queue", action="append", default=[], metavar="NAME=value", help="option of the Slurm queue")
+    run.add_argument("--limit", type=float, default=3600.0, metavar="S", help="s for one log, then it is given up")
+    run.add_argument("--retry", action="store_true", help="once more what died, took too long or met a defect")
+    run.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
+                     "worker takes over (default 60)")  # fmt: skip
+    options.add_reading_options(run.add_argument_group("reading the logs (docs/logs.md)"))
+    options.add_machine_options(run)
+    run.add_argument("--controller", metavar="PATH.so", help="your own controller in place of the firmware")
+    work = parts.add_parser("work", help="join a run from this or another machine")
+    status = parts.add_parser("status", help="how far a run is")
+    report = parts.add_parser("report", help="tables and a page of what the logs say together")
+    demo = parts.add_parser("demo", help="logs of a simulated fleet whose truth is known (needs a checkout)")
+    demo.add_argument("--out", required=True, metavar="DIR", help="folder of the logs; what is there stays")
+    demo.add_argument("--engines", type=int, default=40, metavar="N", help="number of engines (default 40)")
+    demo.add_argument("--logs", type=int, default=2000, metavar="N", help="logs of all together (default 2000)")
+    demo.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of a log (default 300 s)")
+    demo.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")
+    demo.add_argument("--workers", type=int, default=2, metavar="N", help="logs simulated side by side (default 2)")
+    for part in (work, status, report):
+        part.add_argument("run", metavar="RUN", help="folder of the run")
+    work.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
+                      "worker takes over (default 60)")  # fmt: skip
+    report.add_argument("--limits", metavar="F.csv", help="columns quantity, limit: where an effect's parameter or a "
+                        "nominal one ends its life; of a nominal one without, the end of its tolerance")  # fmt: skip
+    report.add_argument("--tables-out", metavar="DIR", help="write every table as Parquet and CSV")
+    for part in (run, work, status, demo):
+        terminal.add_output_options(part)
+    terminal.add_output_options(report, report=True)
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    from vaneloop.fleet.rent import needs
+
+    needs("psutil", "duckdb")
+    parts = {"run": _run, "work": _work, "status": _status, "report": _report, "demo": _demo}
+    return parts[args.part](args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from vaneloop.fleet import sources, state
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.rent import rent
+
+    if not 1 <= args.workers <= 10_000:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 10000]")
+    if not 0.0 < args.limit <= 1e6:
+        raise InputError(f"--limit (={args.limit:g} s) must be in (0, 1e6]")
+    logs = sources.find(args.logs, args.engines)
+    folder = Folder.begin(args.out, "vaneloop.fleet.diagnosis:diagnose_log", *_job(args))
+    state.tidy(folder)
+    again = {"changed", "unreadable", *(("died", "timeout", "defect") if args.retry else ())}
+    statuses = state.came_to(folder)
+    new = folder.add(logs, again=frozenset(k for k, s in statuses.items() if s in again))
+    left = len(set(folder.chunks()) - folder.finished())
+    terminal.say(args, f"{len(logs)} logs, {new} of them new or changed; {left} chunks to do")
+    if left:
+        with terminal.progress_bar(args, "diagnosing the fleet") as progress:
+            queue = terminal.pairs(args.queue, "queue")
+            rent(folder, args.on, args.workers, queue, _patience(args) / 12.0,
+                 lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
+    return _show(args, folder)
+
+
+def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
+    """Options of the job, and the files that it needs."""
+    options.machine_of(args)  # refuses what cannot be read, before anything is begun
+    files = {"tables": args.tables, "model": args.model, "plant": args.plant, "controller": args.controller,
+             "dbc": args.dbc, "mapping": args.mapping}  # fmt: skip
+    given = {name: str(f) for name, f in files.items() if f is not None}
+    if args.plant and not Path(args.plant).is_file():
+        from vaneloop.base import tables
+
+        given["plant"] = str(tables.path(args.plant))
+    reading = options.log_options(args, source="LOGS")
+    for in_files in ("dbc", "mapping_file"):
+        reading.pop(in_files)
+    inside = {name: f"machine/{name}{Path(f).suffix}" for name, f in given.items()}
+    return {"files": inside, "reading": reading, "limit": args.limit}, given
+
+
+def _work(args: argparse.Namespace) -> int:
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.worker import work
+
+    patience = _patience(args)
+    came = work(args.run, every=patience / 12.0, patience=patience)
+    terminal.say(args, "this worker: " + (", ".join(f"{n} {s}" for s, n in sorted(came.items())) or "nothing to do"))
+    return _show(args, Folder(args.run))
+
+
+def _status(args: argparse.Namespace) -> int:
+    from vaneloop.fleet.folder import Folder
+
+    return _show(args, Folder(args.run))
+
+
+def _report(args: argparse.Namespace) -> int:
+    from vaneloop.fleet import report, tables
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.pages.fleet import day, fleet_page
+
+    folder = Folder(args.run)
+    limits = report.limits_of(args.limits)
+    db = tables.roll_up(folder)
+    view = report.view_of(db, limits, str(args.run))
+    if args.tables_out:
+        tables.write_tables(db, args.tables_out, (*tables.TABLES, "lacks", "trends", "outliers"))
+    rows = [[r["engine"], r["effect"], f"{r['named']} of {r['able']}", day(r["first"])] for r in view.lacking]
+    terminal.print_table(args, "engines that lack an effect", ["engine", "effect", "named in logs", "first"], rows)
+    changes = [
+        [s.engine, s.quantity, s.trend["kind"], day(s.trend["onset"]), f"{s.trend['rate']:.3g}", s.unit,
+         day(s.trend["limit_time"])] for s in view.changed
+    ]  # fmt: skip
+    columns = ["engine", "quantity", "change", "since", "a year, or step", "unit", "limit"]
+    terminal.print_table(args, "what changes", columns, changes[:40])
+    odd = [[r["engine"], r["quantity"], f"{r['value']:.4g}", f"{r['sisters']:.4g}", r["unit"]] for r in view.outliers]
+    terminal.print_table(args, "unlike their sisters", ["engine", "quantity", "value", "sisters", "unit"], odd[:40])
+    terminal.say(args, view.sentence())
+    terminal.write_json(args, view.json())
+    if args.report:
+        pages = Path(args.report).with_suffix("")
+        pages = pages.with_name(f"{pages.name}_logs")
+        said = tables.answers(folder, view.keys())
+        words = " ".join(["vaneloop fleet", *sys.argv[2:]])
+        page = fleet_page(view, words, pages.name if said else "").write(args.report)
+        if said:
+            report.write_pages(pages, said)
+        terminal.say(args, f"page: {page}")
+    return int(view.found)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from vaneloop.cli.fleet_demo import make
+
+    if not 4 <= args.engines <= args.logs <= 100_000 or not 1 <= args.workers <= 64:
+        raise InputError("--engines must be in [4, logs], --logs in [engines, 100000], --workers in [1, 64]")
+    if not 30.0 <= args.duration <= 1e5:
+        raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
+    with terminal.progress_bar(args, "simulating the fleet") as progress:
+        truth = make(Path(args.out), args.engines, args.logs, args.duration, args.seed, args.workers,
+                     progress or (lambda fraction: None))  # fmt: skip
+    terminal.say(args, f"truth: {truth}; next: vaneloop fleet run {args.out} --out RUN")
+    terminal.write_json(args, {"schema": 1, "truth": str(truth)})
+    return 0
+
+
+def _patience(args: argparse.Namespace) -> float:
+    if not 0.5 <= args.patience <= 1e5:
+        raise InputError(f"--patience (={args.patience:g} s) must be in [0.5, 1e5]")
+    return float(args.patience)
+
+
+def _show(args: argparse.Namespace, folder: Any) -> int:
+    """Print how far the run is."""
+    from vaneloop.fleet.state import state_of
+
+    s = state_of(folder)
+    rows = [[status, f"{n:,}"] for status, n in s.came.items()]
+    terminal.print_table(args, f"{s.done:,} of {s.contents:,} contents done ({s.logs:,} logs)", ["came to", "n"], rows)
+    for name, kind in s.workers.items():
+        terminal.say(args, f"at work: {kind} {name}")
+    terminal.write_json(args, {"schema": 1, "run": str(folder.path), **s.json()})
+    return 0

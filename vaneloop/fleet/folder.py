@@ -1,0 +1,306 @@
+"""The folder of a fleet run. All its state is in files, so that any process can end at any moment.
+
+    run.json               what is done with each log, VaneLoop's version and sources, SHA-256 of the machine
+    machine/               tables, model file and mapping: copies, so that all workers use the same
+    logs/000000.parquet    a batch of logs: path, SHA-256, engine, time, chunk; later batches add, or replace a path
+    leases/CHUNK.N         who works on a chunk; the greatest N counts
+    workers/W.json, W.beat who a worker is, and that it lives
+    journal/W.jsonl        what a worker did, a line each, never changed
+    results/CHUNK/KEY.json what came of one log of a chunk in work
+    parts/CHUNK.parquet    what came of all logs of a finished chunk
+
+A result belongs to the content of a log (KEY: SHA-256 and suffix), not to its name: a copy is not diagnosed again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+from collections.abc import Iterator, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base.compiled import sources_digest
+from vaneloop.base.errors import InputError
+from vaneloop.fleet.files import create, digest_of, passed, read_json, whole
+from vaneloop.fleet.sources import Source
+
+__all__ = ["DONE", "Entry", "Folder", "sources_version"]
+
+DONE = ("done", "refused", "defect", "died", "timeout", "changed", "unreadable")  # what may come of a log
+_COLUMNS = ("key", "status", "reason", "verdict", "answer")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One log of the run: where it is, what is in it, whose it is.
+
+    key     its content: SHA-256 and suffix; "": it cannot be read, ``reason`` says why
+    chunk   the chunk that does it; "": another entry of the same content has one
+    engine  "" where it is not known
+    time    s since 1970, of the log's start; None: not known
+    """
+
+    path: str
+    key: str
+    size: int
+    mtime_ns: int
+    chunk: str
+    engine: str
+    time: float | None
+    reason: str = ""
+
+
+def sources_version() -> str:
+    """VaneLoop's version and a digest of its sources: results of other code do not belong beside these."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        number = version("vaneloop")
+    except PackageNotFoundError:
+        number = "0"
+    return f"{number}+{sources_digest()}"
+
+
+class Folder:
+    """A run folder, by its path."""
+
+    def __init__(self, path: str | Path):
+        """Open a run that is there. Raises InputError where ``path`` is none."""
+        self.path = Path(path)
+        if not (self.path / "run.json").is_file():
+            raise InputError(
+                f"{self.path}: is no fleet run (it has no run.json); vaneloop fleet run LOGS --out makes one"
+            )
+        self.job: dict[str, Any] = read_json(self.path / "run.json")
+        if self.job.get("schema") != 1:
+            raise InputError(f"{self.path}: run.json has schema {self.job.get('schema')!r}; allowed: 1")
+
+    @classmethod
+    def begin(cls, path: str | Path, function: str, options: dict[str, Any], files: dict[str, str]) -> Folder:
+        """Make the run, or open it where it was begun before with the same job, machine and sources.
+
+        function  module:name of what is done with each log (`vaneloop.fleet.reader`)
+        options   its plain options
+        files     name -> file or folder that it needs, copied
+        """
+        root = Path(path)
+        if root.exists() and not root.is_dir():
+            raise InputError(f"--out {root}: is a file; a folder is needed")
+        if root.is_dir() and not (root / "run.json").is_file() and any(
+            p.name not in ("machine",) and not p.name.startswith(".") for p in root.iterdir()
+        ):  # fmt: skip
+            raise InputError(f"--out {root}: holds other files and is no fleet run; give an empty or a new folder")
+        digest = _digest_of_all(files)
+        job = {
+            "schema": 1, "function": function, "options": options, "version": sources_version(), "machine": digest,
+            "files": {name: f"machine/{name}{Path(f).suffix}" for name, f in files.items()},
+        }  # fmt: skip
+        if not (root / "run.json").is_file():
+            try:
+                _copy(files, root / "machine")
+                create(root / "run.json", lambda f: f.write_text(json.dumps(job, indent=2, sort_keys=True) + "\n"))
+            except OSError as e:
+                raise InputError(f"--out {root}: cannot be written ({e.strerror})") from None
+        folder = cls(root)
+        for what in ("function", "options", "machine", "version"):
+            if folder.job[what] != job[what]:
+                raise InputError(
+                    f"--out {root}: was begun with {what} {_short(folder.job[what])}, not {_short(job[what])}; "
+                    f"give another --out"
+                )
+        return folder
+
+    # ---- the logs ----------------------------------------------------------------------------------------------------
+
+    def entries(self) -> list[Entry]:
+        """Every log, each path once: as the latest batch has it, in the order of the batches."""
+        import pyarrow.parquet as pq
+
+        found: dict[str, Entry] = {}
+        for batch in self._batches():
+            for row in pq.read_table(batch).to_pylist():
+                found.pop(row["path"], None)
+                found[row["path"]] = Entry(**row)
+        return list(found.values())
+
+    def chunks(self) -> dict[str, list[Entry]]:
+        """The chunks of all batches and their logs; a chunk never changes."""
+        import pyarrow.parquet as pq
+
+        out: dict[str, list[Entry]] = {}
+        for batch in self._batches():
+            for row in pq.read_table(batch).to_pylist():
+                if row["chunk"]:
+                    out.setdefault(row["chunk"], []).append(Entry(**row))
+        return out
+
+    def finished(self) -> set[str]:
+        """Names of the chunks that are done."""
+        try:
+            return {f.name.removesuffix(".parquet") for f in os.scandir(self.path / "parts") if f.name[0] != "."}
+        except FileNotFoundError:
+            return set()
+
+    def add(self, logs: Sequence[Source], in_chunk: int | None = None, again: Set[str] = frozenset()) -> int:
+        """Take up logs that are new or have changed since they were taken up; return how many.
+
+        in_chunk  logs in a chunk (default: few logs, small chunks)
+        again     keys that are to be done once more
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        while True:
+            known = {e.path: e for e in self.entries()}
+            keys = {e.key for c in self.chunks().values() for e in c} - again
+            with ThreadPoolExecutor(8) as pool:
+                looked = pool.map(lambda s, known=known: _look(s, known.get(s.path), again), logs)
+                new = [e for e in looked if e is not None]
+            if not new:
+                return 0
+            batch = len(self._batches())
+            size = in_chunk or min(max(len(new) // 200, 1), 64)
+            n, rows = 0, []
+            for e in new:
+                fresh = e.key not in keys and e.key != ""
+                keys.add(e.key)
+                rows.append({**asdict(e), "chunk": f"{batch:06d}-{n // size:06d}" if fresh else ""})
+                n += fresh
+            table = pa.Table.from_pylist(rows, schema=_schema())
+            if create(self.path / "logs" / f"{batch:06d}.parquet", partial(pq.write_table, table)):
+                return len(new)
+            # another starter was quicker: what it took up is known now
+
+    def _batches(self) -> list[Path]:
+        return sorted((self.path / "logs").glob("[0-9]*.parquet"))
+
+    # ---- results -----------------------------------------------------------------------------------------------------
+
+    def results(self, chunk: str) -> Path:
+        """Folder of the results of a chunk in work."""
+        return self.path / "results" / chunk
+
+    def close(self, chunk: str, entries: Sequence[Entry]) -> bool:
+        """Put the results of a chunk into its part, and clear its files away; False: a result is missing."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if chunk in self.finished():
+            return True
+        rows = []
+        for e in entries:
+            try:
+                rows.append(read_json(self.results(chunk) / f"{e.key}.json"))
+            except FileNotFoundError:
+                return chunk in self.finished()
+        table = pa.Table.from_pylist(
+            [{**{c: r.get(c) for c in _COLUMNS}, "answer": _json(r.get("answer"))} for r in rows],
+            schema=pa.schema([(c, pa.string()) for c in _COLUMNS]),
+        )
+        whole(self.path / "parts" / f"{chunk}.parquet", lambda f: pq.write_table(table, f, compression="zstd"))
+        passed("part")
+        self.clear(chunk)
+        return True
+
+    def clear(self, chunk: str) -> None:
+        """Remove what a finished chunk does not need any more."""
+        shutil.rmtree(self.results(chunk), ignore_errors=True)
+        for lease in (self.path / "leases").glob(f"{chunk}.*"):
+            lease.unlink(missing_ok=True)
+
+    def tidy(self) -> None:
+        """Clear up after processes that were killed between a part and its clearing."""
+        done = self.finished()
+        for folder in (self.path / "results").glob("*") if (self.path / "results").is_dir() else ():
+            if folder.name in done:
+                self.clear(folder.name)
+
+    def begun(self) -> Iterator[tuple[str, int]]:
+        """Chunks in work, and how many results each has by now."""
+        done = self.finished()
+        for folder in sorted((self.path / "results").glob("*")):
+            if folder.name not in done:
+                yield folder.name, sum(1 for f in folder.glob("*.json") if f.name[0] != ".")
+
+
+def _schema() -> Any:
+    import pyarrow as pa
+
+    text, number = pa.string(), pa.int64()
+    return pa.schema([
+        ("path", text), ("key", text), ("size", number), ("mtime_ns", number), ("chunk", text), ("engine", text),
+        ("time", pa.float64()), ("reason", text),
+    ])  # fmt: skip
+
+
+def _look(s: Source, known: Entry | None, again: Set[str]) -> Entry | None:
+    """The log as an entry; None where nothing has changed since it was ``known``."""
+    try:
+        there = os.stat(s.path)
+        if not stat.S_ISREG(there.st_mode):
+            raise OSError(0, "it is no plain file")
+        same = known is not None and (known.size, known.mtime_ns) == (there.st_size, there.st_mtime_ns)
+        if same and known is not None and s.engine in ("", known.engine) and s.time in (None, known.time):
+            return replace(known, chunk="") if known.key in again else None
+        s = s.described()
+        key = known.key if same and known is not None else f"{digest_of(s.path)}{Path(s.path).suffix.lower()}"
+        return Entry(s.path, key, there.st_size, there.st_mtime_ns, "", s.engine, s.time)
+    except OSError as e:
+        reason = f"cannot be read ({e.strerror})"
+        if known is not None and known.reason == reason:
+            return None
+        return Entry(s.path, "", 0, 0, "", s.engine or Path(s.path).parent.name, s.time, reason)
+
+
+def _digest_of_all(files: dict[str, str]) -> str:
+    """SHA-256 of what files and folders hold, by name."""
+    import hashlib
+
+    h = hashlib.sha256()
+    for name, f in sorted(files.items()):
+        path = Path(f)
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file():
+                try:
+                    inside = file.relative_to(path).as_posix() if path.is_dir() else ""
+                    h.update(f"{name}/{inside}:{digest_of(file)}\n".encode())
+                except OSError as e:
+                    raise InputError(f"{file}: cannot be read ({e.strerror})") from None
+    return h.hexdigest()
+
+
+def _copy(files: dict[str, str], to: Path) -> None:
+    """Copy files and folders, all at once: of two starters one is the first."""
+    import tempfile
+
+    to.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(prefix=".machine-", dir=to.parent))
+    try:
+        for name, f in files.items():
+            path = Path(f)
+            if path.is_dir():
+                shutil.copytree(path, made / name)
+            else:
+                shutil.copyfile(path, made / f"{name}{path.suffix}")
+        made.chmod(0o755)
+        os.rename(made, to)
+    except OSError:
+        if not to.is_dir():
+            raise
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _json(answer: Any) -> str | None:
+    return None if answer is None else json.dumps(answer, sort_keys=True)
+
+
+def _short(value: object) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,113 @@
+"""Workers are rented: of this machine's cores, of a Dask cluster, of a Slurm queue. The run's state is not theirs."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from vaneloop.base.errors import InputError, meant
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.leases import Me
+
+__all__ = ["PLACES", "needs", "rent"]
+
+PLACES = "local, slurm, tcp://HOST:PORT (a Dask scheduler)"
+_NEEDED = {"distributed": "dask", "duckdb": "duckdb", "psutil": "psutil"}
+
+
+def needs(*modules: str) -> None:
+    """Raise InputError, one line, where the extra ``fleet`` is not installed."""
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            name = _NEEDED.get(module, module)
+            raise InputError(f"vaneloop fleet needs {name}, which is not installed: pip install 'vaneloop[fleet]'")
+
+
+def rent(
+    folder: Folder, on: str, workers: int, queue: dict[str, str], every: float, told: Callable[[int, int], None]
+) -> dict[str, int]:
+    """Have ``workers`` processes work on the run until it is done; return how many logs came to what.
+
+    on     one of `PLACES`
+    queue  options of the Slurm queue (dask-jobqueue's SLURMCluster): queue, account, walltime, memory ...
+    every  s between heartbeats
+    told   function that takes chunks done and all, called every second
+    Raises InputError where the place cannot be reached, or a worker cannot go on (a full disk).
+    """
+    needs("distributed")
+    import dask
+    from dask.distributed import Client
+
+    # the run's own leases see to lost work: a worker that dies is no reason to give its task up
+    dask.config.set({"distributed.scheduler.allowed-failures": 1_000_000, "distributed.worker.daemon": False})
+    starter = Me(folder.path, every, kind="starter")
+    cluster, client = None, None
+    try:
+        cluster = _cluster(on, workers, queue)
+        try:
+            client = Client(cluster if cluster is not None else on, timeout=30)
+        except (OSError, ValueError) as e:
+            raise InputError(f"--on {on}: no Dask scheduler answers ({type(e).__name__})") from None
+        run = str(folder.path.resolve())
+        tasks = [
+            client.submit(_work, run, starter.name, every, key=f"fleet-{starter.name}-{i}", pure=False)
+            for i in range(workers)
+        ]
+        all_chunks, pause = len(folder.chunks()), threading.Event()
+        while not all(t.done() for t in tasks):
+            told(len(folder.finished()), all_chunks)
+            pause.wait(1.0)
+        counts: dict[str, int] = {}
+        for task in tasks:
+            for status, n in _result(task).items():
+                counts[status] = counts.get(status, 0) + n
+        return counts
+    finally:
+        starter.leave()
+        for rented in (client, cluster):
+            if rented is not None:
+                rented.close()
+
+
+def _result(task: Any) -> dict[str, int]:
+    """What a task gave back. An InputError of the worker passes; another error is ours to mend."""
+    from concurrent.futures import CancelledError
+
+    try:
+        return dict(task.result())
+    except CancelledError:
+        raise InputError("the Dask scheduler has gone; what is done is kept, run the same command again") from None
+
+
+def _cluster(on: str, workers: int, queue: dict[str, str]) -> Any:
+    """A cluster of our own; None: ``on`` names one that is there."""
+    if on.startswith(("tcp://", "tls://", "ws://")):
+        return None
+    if on == "local":
+        from dask.distributed import LocalCluster
+
+        # each worker's logs are read in a process of its own, whose memory is not Dask's to count
+        return LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        )  # fmt: skip
+    if on == "slurm":
+        needs("dask_jobqueue")
+        options = {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "08:00:00", **queue}
+        cluster = importlib.import_module("dask_jobqueue").SLURMCluster(**options)
+        cluster.scale(jobs=workers)
+        return cluster
+    raise InputError(f"--on {on!r} is not known{meant(on, ['local', 'slurm'])}; allowed: {PLACES}")
+
+
+def _work(run: str, starter: str, every: float) -> dict[str, int]:
+    """Work on the run, in a process of the cluster."""
+    from vaneloop.fleet.worker import work
+
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    return work(run, starter=starter, every=every, patience=12.0 * every)

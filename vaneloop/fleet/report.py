@@ -1,0 +1,260 @@
+"""What the logs of a fleet say together: which engine lacks what, since when, how fast it grows, which is unlike its
+sisters, and what the logs could not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import stats
+
+from vaneloop.base.errors import InputError
+from vaneloop.fleet.trends import ODD, SURE, Trend, limit_of, odd, trend
+from vaneloop.pages.fleet import FleetView, Series
+
+if TYPE_CHECKING:
+    import duckdb
+
+__all__ = ["FALSE", "YEAR", "limits_of", "view_of", "write_pages"]
+
+YEAR = 365.25 * 86400.0  # s
+FALSE = (
+    0.05  # of the logs of an engine that lacks nothing, in which some one effect is named: docs/diagnosis.md has less
+)
+CHANCE = 1e-3  # that an engine with no more than that is said to lack the effect
+MINIMUM = 2  # logs that name an effect, before an engine is said to lack it
+SPREAD = 2.0 * 1.6449  # a 90 % interval over a standard deviation
+
+
+def limits_of(file: str | None) -> dict[str, float]:
+    """Limit of each quantity from a CSV file with the columns quantity, limit. Raises InputError."""
+    if file is None:
+        return {}
+    import polars as pl
+
+    try:
+        table = pl.read_csv(file, infer_schema=False)
+        return {str(q).strip(): float(x) for q, x in zip(table["quantity"], table["limit"], strict=True)}
+    except (OSError, pl.exceptions.PolarsError) as e:
+        raise InputError(f"--limits {file}: needs the columns quantity, limit ({str(e).splitlines()[0]})") from None
+    except (TypeError, ValueError) as e:
+        raise InputError(f"--limits {file}: {str(e).splitlines()[0]}; a limit must be a number") from None
+
+
+def view_of(db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str = "") -> FleetView:
+    """Work out what the page shows and the tables ``engines``, ``lacks``, ``trends``, ``outliers`` of the database."""
+    engines = [str(r[0]) for r in db.execute("SELECT DISTINCT engine FROM logs ORDER BY engine").fetchall()]
+    statuses = dict(db.execute("SELECT status, count(*) FROM logs GROUP BY status ORDER BY status").fetchall())
+    lacks = _lacks(db)
+    found: list[Series] = [*_effects(db, lacks), *_nominal(db)]
+    wrong = sorted(set(limits) - {s.quantity for s in found} - _known(db))
+    if wrong:
+        raise InputError(f"--limits: quantity (={wrong[0]!r}) is in no log of the run; a quantity is "
+                         "effect.parameter, or a nominal parameter such as linkage.vigv_play")  # fmt: skip
+    nominal = len({s.quantity for s in found if s.kind == "nominal"})  # of each engine so many are looked at
+    found = [_judged(s, limits, ODD / nominal if s.kind == "nominal" else SURE) for s in found]
+    outliers = _outliers(found)
+    view = FleetView(
+        name=name, engines=engines, statuses=statuses, verdicts=_verdicts(db), lacks=lacks, series=found,
+        outliers=outliers, coverage=_coverage(db), refused=_refused(db),
+        span=db.execute("SELECT min(time), max(time) FROM logs").fetchall()[0],
+    )  # fmt: skip
+    _store(db, "lacks", lacks)
+    _store(db, "trends", [s.json() for s in found])
+    _store(db, "outliers", outliers)
+    return view
+
+
+def _verdicts(db: duckdb.DuckDBPyConnection) -> dict[str, dict[str, int]]:
+    out: dict[str, dict[str, int]] = {}
+    query = "SELECT engine, verdict, count(*) FROM logs WHERE status = 'done' GROUP BY ALL ORDER BY ALL"
+    for engine, verdict, n in db.execute(query).fetchall():
+        out.setdefault(engine, {})[verdict] = n
+    return out
+
+
+def _lacks(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
+    """Each engine and effect that was named in its logs: in how many of those that could show it, and whether that is
+    more than false names explain.
+    """
+    rows = db.execute(
+        "SELECT e.engine, e.effect, e.stage, count(DISTINCT e.path) AS named, avg(e.probability) AS probability, "
+        "min(e.time) AS first, max(e.time) AS last, max_by(e.key, coalesce(e.time, 0)), any_value(n.logs) AS logs, "
+        "any_value(coalesce(c.missed, 0)) AS missed FROM effects e "
+        "JOIN (SELECT engine, count(*) AS logs FROM logs WHERE status = 'done' GROUP BY engine) n USING (engine) "
+        "LEFT JOIN (SELECT engine, effect, count(DISTINCT path) AS missed FROM coverage GROUP BY ALL) c "
+        "ON c.engine = e.engine AND c.effect = e.effect GROUP BY e.engine, e.effect, e.stage ORDER BY ALL"
+    ).fetchall()
+    out = []
+    for engine, effect, stage, named, probability, first, last, key, logs, missed in rows:
+        able = max(logs - missed, named)
+        chance = float(stats.binom.sf(named - 1, able, FALSE))
+        out.append({
+            "engine": engine, "effect": effect, "stage": stage, "named": named, "able": able, "share": named / able,
+            "probability": probability, "first": first, "last": last, "chance": chance, "key": key,
+            "lacks": bool(chance < CHANCE and named >= MINIMUM),
+        })  # fmt: skip
+    return out
+
+
+def _effects(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> list[Series]:
+    """Sizes over time of every effect that an engine lacks; logs that could show it and did not say it is small."""
+    rows = db.execute(
+        "SELECT engine, effect, stage, parameter, unit, neutral, list(time ORDER BY path), list(value ORDER BY path), "
+        "list(high - low ORDER BY path), list(key ORDER BY path) FROM effects WHERE time IS NOT NULL GROUP BY ALL "
+        "ORDER BY ALL"
+    ).fetchall()
+    smallest: dict[tuple[str, str], float] = {}
+    for _, effect, _, parameter, _, neutral, _, values, _, _ in rows:
+        sizes = [abs(v - neutral) for v in values if v is not None and v != neutral]
+        smallest[effect, parameter] = min([smallest.get((effect, parameter), np.inf), *sizes])
+    real = {(r["engine"], r["effect"]) for r in lacks if r["lacks"]}
+    out = []
+    for engine, effect, _, parameter, unit, neutral, times, values, widths, keys in rows:
+        if (engine, effect) not in real:
+            continue
+        silent = db.execute(
+            "SELECT l.time, l.key FROM logs l WHERE l.engine = $1 AND l.status = 'done' AND l.time IS NOT NULL AND NOT "
+            "EXISTS (SELECT 1 FROM effects e WHERE e.path = l.path AND e.effect = $2) AND NOT EXISTS (SELECT 1 FROM "
+            "coverage c WHERE c.path = l.path AND c.effect = $2) ORDER BY l.path", [engine, effect],
+        ).fetchall()  # fmt: skip
+        least = smallest[effect, parameter]
+        out.append(_series(
+            engine, f"{effect}.{parameter}", unit, [*times, *(s[0] for s in silent)],
+            [*values, *[neutral] * len(silent)], [*widths, *[least * SPREAD] * len(silent)],
+            [*keys, *(s[1] for s in silent)], neutral, None, "effect",
+        ))  # fmt: skip
+    return out
+
+
+def _nominal(db: duckdb.DuckDBPyConnection) -> list[Series]:
+    """Every nominal parameter of every engine over time, as recalibrated."""
+    rows = db.execute(
+        'SELECT engine, parameter, unit, any_value("table"), any_value(tolerance), list(time ORDER BY path), '
+        "list(value ORDER BY path), list(high - low ORDER BY path), list(key ORDER BY path) FROM nominal "
+        "WHERE time IS NOT NULL GROUP BY engine, parameter, unit ORDER BY ALL"
+    ).fetchall()
+    return [
+        _series(engine, parameter, unit, times, values, widths, keys, table, tolerance, "nominal")
+        for engine, parameter, unit, table, tolerance, times, values, widths, keys in rows
+    ]
+
+
+def _series(
+    engine: str, quantity: str, unit: str, times: Sequence[float], values: Sequence[float],
+    widths: Sequence[float | None], keys: Sequence[str], neutral: float, tolerance: float | None, kind: str,
+) -> Series:  # fmt: skip
+    t, y = np.array(times, dtype=float), np.array(values, dtype=float)
+    s = np.array([np.nan if v is None else v for v in widths], dtype=float) / SPREAD
+    good = np.isfinite(t) & np.isfinite(y)
+    s = np.where(np.isfinite(s), s, np.nanmax(s) if np.isfinite(s).any() else 0.0)
+    order = np.argsort(t[good], kind="stable")
+    names = np.array(keys, dtype=object)[good][order]
+    return Series(
+        engine, quantity, unit, t[good][order], y[good][order], s[good][order], [str(k) for k in names], neutral,
+        tolerance, kind,
+    )  # fmt: skip
+
+
+def _judged(s: Series, limits: dict[str, float], sure: float) -> Series:
+    """The series with its trend, and when it will be at its limit: times in s since 1970."""
+    if not len(s.t):
+        return replace(s, trend={"kind": "too few", "logs": 0})
+    zero = float(s.t[0])
+    years = (s.t - zero) / YEAR
+    found = trend(years, s.y, s.s, sure)
+    said: dict[str, Any] = {k: v for k, v in asdict(found).items() if k != "lines"}
+    for k in ("onset", "onset_low", "onset_high"):
+        said[k] = zero + said[k] * YEAR
+    limit = limits.get(s.quantity)
+    if limit is None and s.tolerance and found.kind == "growth":
+        limit = s.neutral + float(np.copysign(s.tolerance, found.rate))
+    said |= {"limit": limit, "limit_time": None, "limit_low": None, "limit_high": None, "limit_why": ""}
+    if limit is not None:
+        when = limit_of(found, float(years[-1]), limit)
+        for k, v in (("limit_time", when.time), ("limit_low", when.low), ("limit_high", when.high)):
+            said[k] = None if v is None or not np.isfinite(v) else zero + v * YEAR
+        said["limit_why"] = when.why
+    elif found.kind == "growth":
+        said["limit_why"] = "no limit is given (--limits)"
+    return replace(s, trend=said, curve=_curve(found, s.t))
+
+
+def _curve(found: Trend, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The trend as a line: times and values."""
+    zero, last = float(t[0]), float(t[-1])
+    if found.kind == "growth":
+        return np.array([zero, zero + found.onset * YEAR, last]), np.array([found.start, found.start, found.now])
+    if found.kind == "step":
+        at = zero + found.onset * YEAR
+        return np.array([zero, at, at, last]), np.array([found.start, found.start, found.now, found.now])
+    return np.array([zero, last]), np.array([found.now, found.now])
+
+
+def _outliers(found: Sequence[Series]) -> list[dict[str, Any]]:
+    """Engines whose present level of a nominal parameter is unlike that of their sisters."""
+    by: dict[str, list[Series]] = {}
+    for s in found:
+        if s.kind == "nominal" and s.trend.get("now") is not None:
+            by.setdefault(s.quantity, []).append(s)
+    out = []
+    for quantity, group in sorted(by.items()):
+        level = [float(s.trend.get("now", np.nan)) for s in group]
+        own = [
+            float(s.trend["now_high"] - s.trend["now_low"]) / SPREAD if "now_high" in s.trend else 0.0 for s in group
+        ]
+        for s, v, p in zip(group, level, odd(level, own, len(by)), strict=True):
+            if p < ODD:
+                sisters = float(np.nanmedian([x for x, g in zip(level, group, strict=True) if g is not s]))
+                row = {"engine": s.engine, "quantity": quantity, "unit": s.unit}
+                out.append(row | {"value": v, "sisters": sisters, "p": float(p)})
+    return sorted(out, key=lambda r: (r["p"], r["engine"], r["quantity"]))
+
+
+def _coverage(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
+    """Effects and stages that logs could not show: of each engine in how many, and what they lacked."""
+    rows = db.execute(
+        "SELECT c.engine, c.stage, c.effect, count(DISTINCT c.path) AS n, any_value(l.n) AS of, mode(c.needs) FROM "
+        "coverage c JOIN (SELECT engine, count(*) AS n FROM logs WHERE status = 'done' GROUP BY engine) l "
+        "USING (engine) GROUP BY c.engine, c.stage, c.effect ORDER BY ALL"
+    ).fetchall()
+    return [dict(zip(("engine", "stage", "effect", "logs", "of", "needs"), r, strict=True)) for r in rows]
+
+
+def _refused(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
+    rows = db.execute(
+        "SELECT engine, path, status, reason FROM logs WHERE status NOT IN ('done', 'pending') ORDER BY path"
+    ).fetchall()
+    return [dict(zip(("engine", "path", "status", "reason"), r, strict=True)) for r in rows]
+
+
+def _known(db: duckdb.DuckDBPyConnection) -> set[str]:
+    query = "SELECT DISTINCT effect || '.' || parameter FROM effects UNION SELECT DISTINCT parameter FROM nominal"
+    return {str(r[0]) for r in db.execute(query).fetchall()}
+
+
+def _store(db: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]) -> None:
+    """Keep rows as a table of the database, to be written with the others."""
+    import polars as pl
+
+    frame = (
+        pl.DataFrame(rows, infer_schema_length=None)
+        if rows
+        else pl.DataFrame({"engine": []}, schema={"engine": pl.String})
+    )
+    db.register("_rows", frame.to_arrow())
+    db.execute(f"CREATE OR REPLACE TABLE {table} AS SELECT * FROM _rows")
+    db.unregister("_rows")
+
+
+def write_pages(folder: Path, said: dict[str, dict[str, Any]]) -> None:
+    """Write the page of each log that the fleet's page leads to."""
+    from vaneloop.pages.fleet import log_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for key, answer in said.items():
+        log_page(key, answer).write(folder / f"{key}.html")

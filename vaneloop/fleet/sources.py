@@ -1,0 +1,131 @@
+"""Which logs there are, whose they are, and when each began: from a list, the file's metadata, or its path."""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from vaneloop.base.errors import InputError
+
+__all__ = ["Source", "find", "moment"]
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
+# 2026-03-14, 20260314, each with or without T12:30:05, T1230, _12-30-05
+_DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)-?(0[1-9]|1[0-2])-?(0[1-9]|[12]\d|3[01])"
+    r"(?:[T_ -]?([01]\d|2[0-3])[:-]?([0-5]\d)(?:[:-]?([0-5]\d))?)?(?!\d)"
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A log: path, engine ("": not known), time of its start in s since 1970 (None: not known)."""
+
+    path: str
+    engine: str = ""
+    time: float | None = None
+
+    def described(self) -> Source:
+        """The same with what the list leaves open, from the file's metadata or else its path."""
+        if self.engine and self.time is not None:
+            return self
+        own, path = _metadata(self.path), Path(self.path)
+        when = next((t for text in (own.get("time", ""), path.name) if (t := moment(text)) is not None), None)
+        return Source(
+            self.path,
+            self.engine or own.get("engine", "") or path.parent.name,
+            when if self.time is None else self.time,
+        )
+
+
+def moment(text: str) -> float | None:
+    """Seconds since 1970 of the first date (with or without a time, taken as UTC) in ``text``; None: there is none."""
+    m = _DATE.search(text)
+    if m is None:
+        return None
+    try:
+        year, month, date, hour, minute, second = (int(x or 0) for x in m.groups())
+        return datetime(year, month, date, hour, minute, second, tzinfo=UTC).timestamp()
+    except ValueError:  # 30 February
+        return None
+
+
+def find(places: Sequence[str], engines: str | None = None) -> list[Source]:
+    """Every log under ``places`` (files and folders), each once, by path.
+
+    engines  CSV file with the columns path, engine, time (or some of them): it comes before what a file says of itself
+             (`Source.described`): its Parquet metadata ``engine`` and ``time``, and these before its path, the folder's
+             name and a date in the file's name
+    Raises InputError for a place that is not there, or a table that cannot be read.
+    """
+    listed = _table(engines) if engines else {}
+    out = []
+    for path in sorted(set(_files(places))):
+        said = listed.get(path) or listed.get(Path(path).name) or {}
+        out.append(Source(path, said.get("engine", ""), moment(said.get("time", ""))))
+    if not out:
+        raise InputError(f"{', '.join(places)}: holds no log; allowed: {', '.join(SUFFIXES)}")
+    return out
+
+
+def _files(places: Sequence[str]) -> Iterator[str]:
+    for place in places:
+        p = Path(place)
+        if p.is_dir():
+            for f in p.rglob("*"):
+                if f.suffix.lower() in SUFFIXES and f.name[0] != "." and (f.is_symlink() or _is_file(f)):
+                    yield str(f.absolute())
+        elif _is_file(p):
+            yield str(p.absolute())
+        else:
+            raise InputError(f"{place}: is neither a log nor a folder of logs")
+
+
+def _is_file(path: Path) -> bool:
+    """Whether it is a plain file: to read a pipe would wait for ever."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError:
+        return False
+
+
+def _metadata(path: str) -> dict[str, str]:
+    """What a Parquet file says of itself; nothing of others, and of a damaged one (it becomes a row with a reason)."""
+    if not path.lower().endswith(".parquet") or not _is_file(Path(path)):
+        return {}
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        said = pq.read_metadata(path).metadata or {}
+    except (OSError, pa.ArrowException):
+        return {}
+    names = (b"engine", b"time")
+    return {n.decode(): said[n].decode("utf-8", "replace") for n in names if n in said}
+
+
+def _table(file: str) -> dict[str, dict[str, str]]:
+    """Engine and time by path (as written, and from the table's folder) and by a file's name."""
+    import polars as pl
+
+    try:
+        table = pl.read_csv(file, infer_schema=False)
+    except (OSError, pl.exceptions.PolarsError) as e:
+        raise InputError(f"--engines {file}: cannot be read as CSV ({str(e).splitlines()[0]})") from None
+    if "path" not in table.columns or not {"engine", "time"} & set(table.columns):
+        have = ", ".join(table.columns)
+        raise InputError(f"--engines {file}: has the columns {have}; needed: path and engine, time or both")
+    out: dict[str, dict[str, str]] = {}
+    for number, row in enumerate(table.to_dicts(), 2):
+        said = {k: (row.get(k) or "").strip() for k in ("engine", "time")}
+        if said["time"] and moment(said["time"]) is None:
+            raise InputError(
+                f"--engines {file}:{number}: time (={said['time']!r}) must be a date such as 2026-03-14T12:30"
+            )
+        path = (row["path"] or "").strip()
+        out[path] = out[str((Path(file).parent / path).absolute())] = said
+    return out

@@ -1,0 +1,77 @@
+"""How far a run is, from its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vaneloop.fleet.files import read_json
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.leases import Leases, gone
+
+__all__ = ["State", "came_to", "state_of", "tidy"]
+
+
+@dataclass(frozen=True)
+class State:
+    """Logs of a run by what came of them, and who works on it.
+
+    logs      paths taken up, each once
+    contents  different contents among them, which is what has to be done
+    done      of these, in finished chunks and in chunks in work
+    came      status -> contents, of the finished chunks
+    workers   processes that are not known to be gone: name, kind
+    """
+
+    logs: int
+    contents: int
+    done: int
+    came: dict[str, int] = field(default_factory=dict)
+    workers: dict[str, str] = field(default_factory=dict)
+
+    def json(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {
+            "logs": self.logs, "contents": self.contents, "done": self.done, "came_to": self.came,
+            "workers": self.workers,
+        }  # fmt: skip
+
+
+def came_to(folder: Folder) -> dict[str, str]:
+    """Status of every content in a finished chunk; of one that was done again, the later."""
+    import pyarrow.parquet as pq
+
+    out: dict[str, str] = {}
+    for chunk in sorted(folder.finished()):
+        table = pq.read_table(folder.path / "parts" / f"{chunk}.parquet", columns=["key", "status"])
+        out.update(zip(table["key"].to_pylist(), table["status"].to_pylist(), strict=True))
+    return out
+
+
+def state_of(folder: Folder) -> State:
+    """Look how far a run is."""
+    entries, statuses = folder.entries(), came_to(folder)
+    came: dict[str, int] = {}
+    for status in statuses.values():
+        came[status] = came.get(status, 0) + 1
+    unreadable = sum(e.key == "" for e in entries)
+    if unreadable:
+        came["unreadable"] = came.get("unreadable", 0) + unreadable
+    contents = len({e.key for e in entries if e.key} | statuses.keys()) + unreadable
+    done = len(statuses) + unreadable + sum(n for _, n in folder.begun())
+    workers = {}
+    for file in sorted((folder.path / "workers").glob("*.json")):
+        who = read_json(file)
+        if not Leases(folder.path).dead(file.stem):
+            workers[file.stem] = str(who["kind"])
+    return State(len(entries), contents, min(done, contents), dict(sorted(came.items())), workers)
+
+
+def tidy(folder: Folder) -> None:
+    """Clear up after processes that were killed: files of finished chunks, names of workers that are gone."""
+    folder.tidy()
+    for file in (folder.path / "workers").glob("*.json"):
+        if gone(read_json(file)):
+            for f in (file, Path(str(file).removesuffix("json") + "beat")):
+                f.unlink(missing_ok=True)

@@ -1,0 +1,200 @@
+"""One worker: takes a chunk, has its logs read, writes what came of them, and takes the next, until all are done."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from vaneloop.base.errors import InputError
+from vaneloop.fleet.files import digest_of, passed, whole_json
+from vaneloop.fleet.folder import Entry, Folder, sources_version
+from vaneloop.fleet.journal import Journal
+from vaneloop.fleet.leases import Leases, Me
+from vaneloop.fleet.reader import Died, Reader, Stopped, TimedOut
+
+__all__ = ["LIMIT", "work"]
+
+LIMIT = 3600.0  # s for one log, if the run says nothing else
+DEATHS = 3  # of its reader, after which a log is given up
+TRIES = 12  # begun and never ended, also by the death of the whole worker
+
+
+def work(
+    run: str | Path, *, starter: str = "", every: float = 5.0, patience: float = 60.0, wait: bool = True
+) -> dict[str, int]:
+    """Work on a run until nothing is left to do; return how many logs came to what.
+
+    starter   name of the process that rents this one: when it is gone, this one stops too
+    every     s between heartbeats
+    patience  s without a heartbeat, after which another worker's chunk is taken over
+    wait      stay until others have done theirs, and take over what they leave
+    Raises InputError where this VaneLoop is not the run's, or the disk is full: what is done is done.
+    """
+    folder = Folder(run)
+    if folder.job["version"] != sources_version():
+        raise InputError(
+            f"{folder.path}: was begun by vaneloop {folder.job['version']}; this is {sources_version()}, whose results "
+            f"do not belong beside those"
+        )
+    me: Me | None = None
+    try:
+        me = Me(folder.path, every, starter)
+        with _terminable(me):
+            return _Worker(folder, me, Leases(folder.path, patience)).run(wait)
+    except OSError as e:
+        raise InputError(f"{folder.path}: {_short(e)}; what is done is kept, run the same command again") from None
+    finally:
+        if me is not None:
+            me.leave()
+
+
+class _Worker:
+    def __init__(self, folder: Folder, me: Me, leases: Leases):
+        self.folder, self.me, self.leases = folder, me, leases
+        self.reader = Reader(folder.job["function"], str(folder.path), me.orphan)
+        self.limit = float(folder.job["options"].get("limit", LIMIT))
+        self.counts: dict[str, int] = {}
+        self.journal = Journal(folder.path, me.name)
+
+    def run(self, wait: bool) -> dict[str, int]:
+        chunks = self.folder.chunks()
+        order = sorted(chunks)
+        # each begins elsewhere, so that a thousand workers do not all ask for the first chunk
+        at = random.Random(self.me.name).randrange(max(len(order), 1))
+        order = order[at:] + order[:at]
+        try:
+            while not self.me.orphan.is_set():
+                done = self.folder.finished()
+                order = [c for c in order if c not in done]
+                if not order:
+                    break
+                passed("take")
+                taken = self.leases.take(order, self.me.name)
+                if taken is not None:
+                    self._chunk(*taken, chunks[taken[0]])
+                elif not wait or self.me.orphan.wait(min(self.me.every, 1.0)):
+                    break
+        finally:
+            self.reader.stop()
+            self.journal.close()
+        return self.counts
+
+    def _chunk(self, chunk: str, number: int, entries: Sequence[Entry]) -> None:
+        passed("leased")
+        if chunk in self.folder.finished():  # between the look and the lease
+            self.folder.clear(chunk)
+            return
+        self.journal.note("took", chunk=chunk, lease=number)
+        try:
+            for e in entries:
+                if self.me.orphan.is_set() or not self.leases.mine(chunk, number):
+                    return
+                if not (self.folder.results(chunk) / f"{e.key}.json").exists():
+                    self._log(chunk, e)
+            self.folder.close(chunk, entries)
+        finally:
+            self.leases.give_back(chunk, number)
+        self.journal.note("closed", chunk=chunk)
+
+    def _log(self, chunk: str, e: Entry) -> None:
+        tried = self.folder.results(chunk) / f"{e.key}.tried"
+        row: dict[str, Any] | None = None
+        while row is None:
+            before = _lines(tried)
+            row = _given_up(before)
+            if row is None:
+                _append(tried, "begin")
+                self.journal.note("begin", key=e.key, path=e.path)
+                passed("begin")
+                row = self._read(e, tried, before)
+            if self.me.orphan.is_set():
+                return
+        whole_json(self.folder.results(chunk) / f"{e.key}.json", {"key": e.key, **row})
+        passed("result")
+        tried.unlink(missing_ok=True)
+        self.counts[row["status"]] = self.counts.get(row["status"], 0) + 1
+        self.journal.note("end", key=e.key, status=row["status"])
+
+    def _read(self, e: Entry, tried: Path, before: Sequence[str]) -> dict[str, Any] | None:
+        """What comes of a log now; None: to be tried again."""
+        if (bad := _unlike(e)) is not None:
+            return bad
+        try:
+            row = self.reader.ask(e.path, self.folder.job["options"], self.limit)
+        except Stopped:
+            return None
+        except Died as why:
+            self.journal.note("died", key=e.key, reason=str(why))
+            _append(tried, f"died {why}")
+            return None
+        except TimedOut as why:
+            return {"status": "timeout", "reason": str(why)}
+        if (bad := _unlike(e)) is not None:
+            return bad
+        if row["status"] == "defect" and not any(x.startswith("defect") for x in before):
+            # once more, in a process that begins anew: compiled code read while another process wrote it, say
+            _append(tried, f"defect {row['reason']}")
+            self.reader.stop()
+            return None
+        return row
+
+
+def _given_up(before: Sequence[str]) -> dict[str, Any] | None:
+    """The row of a log that was tried often enough; None: it is tried (again)."""
+    died = [x.removeprefix("died ") for x in before if x.startswith("died ")]
+    if len(died) >= DEATHS:
+        return {"status": "died", "reason": f"{died[-1]}, {len(died)} times"}
+    begun = sum(x == "begin" for x in before)
+    if begun >= TRIES:
+        return {"status": "died", "reason": f"was begun {begun} times, and its worker ended each time"}
+    return None
+
+
+def _unlike(e: Entry) -> dict[str, Any] | None:
+    """The row of a log that is not what the run took up; None: it is."""
+    try:
+        if f"{digest_of(e.path)}{Path(e.path).suffix.lower()}" == e.key:
+            return None
+    except OSError as why:
+        return {"status": "unreadable", "reason": f"cannot be read ({why.strerror})"}
+    reason = "its content has changed since the run took it up; vaneloop fleet run takes it up anew"
+    return {"status": "changed", "reason": reason}
+
+
+def _lines(file: Path) -> list[str]:
+    try:
+        return file.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+
+
+def _append(file: Path, line: str) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with open(file, "a", encoding="utf-8") as f:
+        f.write(" ".join(line.split()) + "\n")
+        f.flush()
+        os.fsync(f.fileno())
+
+
+@contextlib.contextmanager
+def _terminable(me: Me) -> Iterator[None]:
+    """SIGTERM (a queue that wants its node back) ends the work in order; only a main thread can hear it."""
+    stop: Callable[..., None] = lambda *_: me.orphan.set()  # noqa: E731
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _short(e: OSError) -> str:
+    return f"{e.filename}: {e.strerror}" if e.filename else str(e.strerror or e)
