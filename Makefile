@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can mutants bench lint clean
+.PHONY: help demo test test-all test-can mutants bench docs lint clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -51,6 +51,10 @@ mutants: $(READY)  ## would the tests notice? changes the code in small ways, a 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)
 	@$(PY) -m benchmarks
+
+docs: $(READY)  ## the documentation site, in out/site/index.html; every link and anchor is checked
+	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+	@$(SAY) 'open out/site/index.html'
 
 lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'ruff'
