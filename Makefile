@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can mutants bench pictures lint clean
+.PHONY: help demo test test-all test-can mutants bench pictures docs lint clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -55,6 +55,10 @@ bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 pictures: $(READY)  ## take the pictures of the README anew (docs/pictures/web_*.png)
 	@$(need_chromium)
 	@$(PY) -m benchmarks.pictures
+
+docs: $(READY)  ## the documentation site, in out/site/index.html; every link and anchor is checked
+	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+	@$(SAY) 'open out/site/index.html'
 
 lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'ruff'

@@ -25,8 +25,8 @@ diagnose` looks for them in a log. A parameter `vigv`, `vgv1`, ... is one of eac
 This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
 (docs/architecture.md); inside the code everything is SI.
 
-| effect | site | actuator | shows in | what | parameters |
-|---|---|---|---|---|---|
+| effect | site | actuator | shows in | what |
+|---|---|---|---|---|
 """
 
 
@@ -34,10 +34,7 @@ def page() -> str:
     """Return the page, Markdown."""
     effects = [e for site in SITES for e in EFFECTS.values() if e.site == site]
     rows = [
-        f"| [`{e.name}`](#{e.name}) | {e.site} | {_kinds(e)} | {', '.join(e.stages)} | {e.summary} | "
-        + ", ".join(f"{_name(p)} {p.unit}" for p in _told(e))
-        + " |\n"
-        for e in effects
+        f"| [`{e.name}`](#{e.name}) | {e.site} | {_kinds(e)} | {', '.join(e.stages)} | {e.summary} |\n" for e in effects
     ]
     return HEAD + "".join(rows) + "".join(_section(e) for e in effects)
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from hil.logs import Channel, read_log, write_log
 from tests.conftest import ROOT
 from vaneloop.base import terminal
-from vaneloop.cli.main import COMMANDS
+from vaneloop.cli.main import COMMANDS, main
 
 _FILE = re.compile(r"[\w./-]+\.(?:log|asc|blf|trc|mf4|csv|parquet|toml|dbc|html|py|json)|[\w./-]+/")
 _MAKES = {"--out", "--record", "--report", "--json"}
@@ -72,3 +73,89 @@ def test_a_missing_file_and_a_wrong_option_in_an_example_would_be_seen() -> None
     with pytest.raises(SystemExit):
         parser_of("replay").parse_args(["examples/engine_run.blf", "--tolerence", "vigv=1"])
     assert not (ROOT / "examples/engine_run.log").exists() and _FILE.fullmatch("examples/engine_run.log")
+
+
+# ---- the examples, run -----------------------------------------------------------------------------------------------
+
+LIVE = "runs in real time, on a bus or in a browser, until Ctrl-C: tests/test_realtime.py, test_record.py, test_web.py"
+# the beginning of an example that is not run here -> why
+NOT_RUN = {
+    "run --bus vcan0": LIVE,
+    "run --bus local": LIVE,
+    "run --bus lockstep --inputs run.mf4": LIVE,
+    "ecu": LIVE,
+    "record": LIVE,
+    "web": LIVE,
+    "inject flood_low_priority --bus vcan0": LIVE,
+    "inject --all --controller FW.so": "a library of the reader's own: tests/test_native.py",
+    "inject MY_DAY.toml": "a scenario of the reader's own: tests/test_inject.py",
+    "replay YOURS.log": "a log and a DBC of the reader's own: tests/test_logs.py",
+    "schedule --log LOOP.mf4": "another format of the loop that the example before it takes",
+    "fuzz --replay": "needs a failure to repeat: tests/test_fuzz.py makes one",
+    "hidden-effect --logs 200": "the same as the example before it, on more logs",
+    "hidden-law --systems": "minutes a system: tests/test_hidden_law.py",
+}
+SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60"}
+# commands whose examples take long
+LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
+LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables"}
+
+
+def runs(long: bool) -> list[tuple[str, str]]:
+    """Command and example, as it is run: the quick ones, or the long ones."""
+    out = []
+    for name in COMMANDS:
+        for words in examples(name):
+            line = shlex.join(words)
+            if any(line == k or line.startswith(f"{k} ") for k in NOT_RUN) or "(" in line or "|" in words:
+                continue
+            slow = words[0] in LONG or any(line.startswith(k) for k in LONG_EXAMPLES)
+            if slow == long:
+                out.append((name, line))
+    return list(dict.fromkeys(out))
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a reader of the help has it: the checkout's files, own logs, and what other examples wrote."""
+    folder = tmp_path_factory.mktemp("reader")
+    for name in ("examples", "tables"):
+        (folder / name).symlink_to(ROOT / name)
+    channels = read_log(ROOT / "examples" / "hidden_effect.parquet").channels
+    loop = {k: Channel(channels[k].t[::10], channels[k].values[::10]) for k in ("n_dem", "x_lvdt", "vigv")}
+    write_log(folder / "LOOP.csv", loop)
+    write_log(folder / "BENCH.csv", {k: Channel(c.t[:3000], c.values[:3000]) for k, c in channels.items()})
+    with pytest.MonkeyPatch.context() as m:
+        m.chdir(folder)
+        for line in (
+            "extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml --quiet",
+            "map BENCH.csv --design-rpm 38000 --out bench.toml --quiet",
+            "schedule --log LOOP.csv --out engine7/ --quiet",
+        ):
+            assert main(line.split()) in (0, 1), line
+        (folder / "engine7" / "geometry.toml").write_bytes((ROOT / "tables" / "geometry.toml").read_bytes())
+    return folder
+
+
+def run(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    for words, instead in SMALLER.items():
+        line = line.replace(words, instead)
+    assert main(shlex.split(line)) in (0, 1), f"vaneloop {line}"
+
+
+@pytest.mark.parametrize(("name", "line"), runs(long=False), ids=lambda x: x)
+def test_an_example_of_the_help_runs(name: str, line: str, reader: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(line, reader, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "line"), runs(long=True), ids=lambda x: x)
+def test_a_long_example_of_the_help_runs(name: str, line: str, reader: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(line, reader, monkeypatch)
+
+
+def test_every_exception_is_an_example_of_some_help() -> None:
+    lines = [shlex.join(words) for name in COMMANDS for words in examples(name)]
+    assert [k for k in [*NOT_RUN, *LONG, *LONG_EXAMPLES] if not any(x.startswith(k) for x in lines)] == []
+    assert [k for k in SMALLER if not any(k in x for x in lines)] == []

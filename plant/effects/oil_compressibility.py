@@ -5,10 +5,10 @@ Equation::
     give = -(C0 + compliance) F - compliance drag v,   x = s + give
 
 Symbols: s way that the oil has pushed (m), F load against extension (N), v speed (m/s), drag of seals and oil
-(N/(m/s)), C0 = (stroke + 2 d) / (4 B A) = 6.9e-9 m/N: two columns of oil, B = 1.6 GPa, A = 1.2e-3 m2, 48 mm, d = 2.4 mm
-of dead volume at either end. Friction acts through the same compliance (piston_friction).
+(N/(m/s)). C0 = (stroke + 2 d) / (4 B A) = 6.9e-9 m/N is that of two columns of oil: B = 1.6 GPa, A = 1.2e-3 m2, 48 mm,
+d = 2.4 mm of dead volume at either end. Friction acts through the same compliance (piston_friction).
 Limits: quasi-static: the load changes slowly, so that the valve keeps both chambers' mean pressure and the compliance
-is that of mid-stroke anywhere (piston_friction); the resonance with the moving mass (200 Hz for 5 kg at 0.1 mm/kN) lies
+is that of mid-stroke anywhere (piston_friction). The resonance with the moving mass (200 Hz for 5 kg at 0.1 mm/kN) lies
 above the servo's band.
 In a log: the stroke shifts as the load changes with n_r; reversals with friction lose more motion; while moving it
 trails by compliance * drag * v. Without load, friction or fast motion nothing shows.

@@ -8,9 +8,9 @@ Symbols: level greatest friction force (N), force Coulomb's (N), excess above it
 (m/s), speed Stribeck speed (m/s). The first factor of S is within 0.035 of the usual exp(-r) and needs no
 transcendental function. The second falls from 1 to 1/2 about a tenth of the Stribeck speed: there the piston sticks
 and slips on its oil column, and the mean of that sawtooth is half the excess.
-Limits: the sawtooth itself, some hundred hertz and up to C excess high, is not in it (C see oil_compressibility); it
-stays as scatter: of a sawtooth as high as twice what the second factor takes off, A = excess (1 + r / 8)^-8 100 r /
-(1 + 100 r), the RMS is A / sqrt(12) (`scatter`).
+Limits: the sawtooth itself, some hundred hertz and up to C excess high, is not in it (C see oil_compressibility). It
+stays as scatter. Of a sawtooth as high as twice what the second factor takes off, A = excess (1 + r / 8)^-8 100 r / (1
++ 100 r), the RMS is A / sqrt(12) (`scatter`).
 In a log: lost motion at reversals as with piston_friction, 2 C (force + excess), but hardly slower at speed; after
 slow reversals a small catching up when it lets go; scatter of some micrometres in slow motion.
 Source: Stribeck curve and stick-slip, Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), sections 2

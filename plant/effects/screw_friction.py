@@ -6,8 +6,8 @@ Equation::
 
 Symbols: f Coulomb friction seen at the rod (N), force (N).
 Limits: the same both ways and at every stroke; sticking holds no more than sliding.
-In a log: at each reversal the stroke stops until the speed loop's integral has turned the current round, some 0.1 s:
-what it loses (2 r force / (K_t k_p / T_i) r, 60 um for 500 N) does not depend on the speed. Steady motion does not
+In a log: at each reversal the stroke stops until the speed loop's integral has turned the current round, some 0.1 s.
+What it loses (2 r force / (K_t k_p / T_i) r, 60 um for 500 N) does not depend on the speed. Steady motion does not
 change. Play (gear_backlash) loses its width in a time that does depend on the speed.
 Source: Coulomb friction; Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
 """

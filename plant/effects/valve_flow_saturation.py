@@ -4,9 +4,9 @@ Equation::
 
     v <- (1 - roundness) clip(v, -limit, limit) + roundness v / sqrt(1 + (v / limit)^2)
 
-Symbols: v speed of the piston (m/s), limit (m/s); the neutral 1,000 mm/s is beyond any spool position and switches
-the effect off; roundness (-): 0 a sharp corner, as of a spool whose ports are fully open, 1 an orifice in series with
-the spool's, whose pressure drops add up.
+Symbols: v speed of the piston (m/s), limit (m/s), roundness (-). The neutral limit, 1,000 mm/s, is beyond any spool
+position and switches the effect off. Roundness 0 is a sharp corner, as of a spool whose ports are fully open. Roundness
+1 is an orifice in series with the spool's, whose pressure drops add up.
 Limits: the same both ways, independent of the supply pressure.
 In a log: the stroke's speed stops rising with i_cmd. A sharp corner leaves everything below the limit untouched, so
 that only fast manoeuvres show it; a series orifice bends gradually, some 6 % at a third of the limit.
