@@ -14,6 +14,7 @@ from vaneloop.verbs.search import Diagnosed, diagnose
 
 if TYPE_CHECKING:
     from plant import Model
+    from vaneloop.discrepancy.fit import Fit, Judge
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.learned import LearnedLaw
     from vaneloop.discrepancy.models.learning import Outcome
@@ -157,12 +158,23 @@ def _learned(diagnosed: Diagnosed, added: Model | None, progress: Callable[[floa
     theta[: len(stage.parameters)] = learner.base.theta
     base = judge.fit((), theta, 1)
     steps = [("nominal", rms_of(judge, base)), (" + ".join(names), rms_of(judge, last.fit))]
-    d = answer_of(judge, "missing", base, last.fit, found_of(judge, last.fit, names), steps)
+    without = {n: _without(judge, last.fit, names, n) or base for n in names}
+    d = answer_of(judge, "missing", base, last.fit, found_of(judge, last.fit, names, without), steps)
     d.criterion = "error_share"
     by_log = ByLog.of(on_logs(logs, last.curves), d, added)
     model = _as_model(by_log.model, outcome, laws)
     progress(1.0)
     return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log)
+
+
+def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit | None:
+    """The fit with all curves but one; None where there is no other."""
+    others = tuple(n for n in names if n != leave)
+    if not others:
+        return None
+    theta, at = fit.theta.copy(), judge.stage.index()[leave]
+    theta[at] = judge.stage.neutral()[at]
+    return judge.fit(others, theta)
 
 
 def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw]) -> Model:
