@@ -207,7 +207,7 @@ def controls(r, y, p, u):
 
 
 @jit
-def bend(u, slope, t, k, part):
+def between(u, slope, t, k, part):
     h, rise = t[k + 1] - t[k], u[k + 1] - u[k]
     return part * (1.0 - part) * ((1.0 - part) * (h * slope[k] - rise) - part * (h * slope[k + 1] - rise))
 
@@ -279,13 +279,13 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * q / steps
                     if len(slopes) > 0:
-                        u[j] += bend(inputs[j], slopes[j], t, k, q / steps)
+                        u[j] += between(inputs[j], slopes[j], t, k, q / steps)
             rhs x k1
             if line and not loop:
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 0.5) / steps
                     if len(slopes) > 0:
-                        u[j] += bend(inputs[j], slopes[j], t, k, (q + 0.5) / steps)
+                        u[j] += between(inputs[j], slopes[j], t, k, (q + 0.5) / steps)
             now = t[k] + (q + 0.5) * h
             for w in range(m):
                 z[w] = x[w] + 0.5 * h * k1[w]
@@ -297,7 +297,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                 for j in range(len(inputs)):
                     u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 1.0) / steps
                     if len(slopes) > 0:
-                        u[j] += bend(inputs[j], slopes[j], t, k, (q + 1.0) / steps)
+                        u[j] += between(inputs[j], slopes[j], t, k, (q + 1.0) / steps)
             now = t[k] + (q + 1.0) * h
             for w in range(m):
                 z[w] = x[w] + h * k3[w]
