@@ -259,6 +259,7 @@ def test_a_kill_at_any_point_loses_nothing(tmp_path: Path, point: str, undisturb
     assert not list((folder.path / "results").iterdir()) and not list((folder.path / "leases").iterdir())
 
 
+@pytest.mark.slow
 def test_fifty_kills_leave_the_same_table(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
     """Workers are killed at 50 points drawn by chance, two at a time side by side, each followed by others."""
     folder = fleet(tmp_path, many(40), in_chunk=3)
