@@ -94,6 +94,13 @@ NOT_RUN = {
     "fuzz --replay": "needs a failure to repeat: tests/test_fuzz.py makes one",
     "hidden-effect --logs 200": "the same as the example before it, on more logs",
     "hidden-law --systems": "minutes a system: tests/test_hidden_law.py",
+    "learn LOG": "logs and a model of the reader's own: tests/test_learn.py",
+    "extend NEW": "goes on from the example before it: tests/test_learn.py",
+    "compare NEW": "goes on from the example before it: tests/test_learn.py",
+    "fleet": "logs of many engines, workers of a cluster: tests/test_fleet_run.py",
+    "a2l --out mine.a2l --controller": "a library of the reader's own: tests/test_xcp.py",
+    "export-fmu --part plant --model M.toml": "a model of the reader's own: tests/test_fmu.py",
+    "fuzz --tool": "a minute each: tests/test_fuzz.py",
 }
 SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60"}
 # commands whose examples take long

@@ -45,7 +45,13 @@ def test_at_least_25_scenarios_ship_and_use_every_action() -> None:
 
 def test_the_page_names_every_action_with_its_keys() -> None:
     page = (ROOT / "docs" / "injection.md").read_text(encoding="utf-8")
-    rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
+    rows: dict[str, str] = {}
+    name = ""
+    for line in page.splitlines():  # a row may go on in the next, which then has no name
+        if line.startswith("| `"):
+            name = line.split("`")[1]
+        if line.startswith(("| `", "| |")):
+            rows[name] = rows.get(name, "") + line
     for name, action in inject.ACTIONS.items():
         common = {"action", "start", "duration", "every", "probability", "count"} | (
             {"frame"} if issubclass(action, OnFrame) else set()

@@ -348,8 +348,8 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
     squares = np.ones(8 * n)
     squares[:n] = 1.0 + float(norm.isf(chance / 8)) * np.sqrt(2.0 * correlation / n)
     stage = SimpleNamespace(
-        name="s", outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)}, regime_units={},
-        neutral=lambda: np.zeros(1), lost=None,
+        name="s", t=np.arange(8.0 * n), outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)},
+        regime_units={}, neutral=lambda: np.zeros(1), lost=None,
     )  # fmt: skip
     return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],

@@ -1200,7 +1200,7 @@ def test_a_controller_of_one_s_own_that_fails_is_told_and_the_page_goes_on(
     async def run(controller: str | None) -> Loop:
         lp = Loop(Session("x", tmp_path / f"{bool(controller)}0123456789", [], None, controller))
         lp.speed, lp.demand, lp.running, lp.rows = 0.0, 80.0, True, np.empty((36_000, len(COLUMNS)))
-        assert ("--controller" in lp.commands()[0][1]) == (controller is not None)
+        assert ("--controller" in lp.controller_words()) == (controller is not None)
         try:
             await lp._in_lockstep()
         finally:

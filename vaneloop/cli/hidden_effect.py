@@ -30,7 +30,7 @@ the controller is for some seconds in another mode.
 examples:
   vaneloop hidden-effect --logs 40 --out out/blind.parquet
   vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
-  vaneloop hidden-effect --plant plant_electromechanical.toml --out out/motor.parquet
+  vaneloop hidden-effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
 

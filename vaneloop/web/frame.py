@@ -240,7 +240,11 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequen
     def cell(v: Any) -> str:
         return str(v[1]) if isinstance(v, tuple) else html.escape(str(v))
 
-    head = "".join(f'<th class="{"num" if i in numbers else ""}">{html.escape(c)}</th>' for i, c in enumerate(columns))
+    tags = ["th" if c else "td" for c in columns]  # a heading without words is none
+    head = "".join(
+        f'<{tag} class="{"num" if i in numbers else ""}">{html.escape(c)}</{tag}>'
+        for i, (tag, c) in enumerate(zip(tags, columns, strict=True))
+    )
     body = "".join(
         "<tr>"
         + "".join(f'<td class="{"num" if i in numbers else ""}">{cell(v)}</td>' for i, v in enumerate(r))

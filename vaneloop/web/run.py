@@ -304,7 +304,9 @@ class _Page:
                 )
                 self.hold = ui.checkbox("hold")
                 self.counts = ui.label().classes("soft small")
-            self.trace_box = ui.html("", sanitize=False).classes("trace w-full").props('role="log"')
+            self.trace_box = (
+                ui.html("", sanitize=False).classes("trace w-full").props('role="log" tabindex="0" aria-label="frames"')
+            )
 
     def _trace(self) -> None:
         lp, text = self.loop, (self.words.value or "").lower()
