@@ -181,6 +181,8 @@ def _serve(
 
     pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
     pages.on_shutdown(sessions.close)
+    # Quasar would show a bar without a name at every request of a chart; what takes long has a bar of its own.
+    pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run_with(
         api, title="VaneLoop", dark=None, language="en-US", tailwind=False, storage_secret=secrets.token_hex(32),
         show_welcome_message=False,
