@@ -313,6 +313,29 @@ def test_a_worker_that_stands_still_is_replaced_and_does_no_harm(
     assert [tuple(r.values()) for r in rows(folder)] == undisturbed
 
 
+@pytest.mark.parametrize("moment", range(1, 13))
+def test_a_worker_may_stand_still_at_any_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    """Another takes its chunk over, finishes it and clears up; then the first one goes on where it stood."""
+    from vaneloop.fleet import files, folder, worker
+
+    run = fleet(tmp_path, many(2), in_chunk=2)
+    count = 0
+
+    def stand_still(point: str) -> None:
+        nonlocal count
+        count += 1
+        if count == moment:
+            work(run.path, every=0.05, patience=0.0)
+
+    for module in (files, folder, worker):
+        monkeypatch.setattr(module, "passed", stand_still)
+    work(run.path, every=3600.0)
+    assert count >= moment, "the first worker comes to this moment"
+    assert [r["status"] for r in rows(run)] == ["done", "done"]
+    run.tidy()
+    assert not list((run.path / "leases").iterdir()) and not list((run.path / "results").iterdir())
+
+
 def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
     folder = fleet(tmp_path, many(40), in_chunk=5)
     p = process(folder, VANELOOP_FLEET_FULL="9")

@@ -97,6 +97,10 @@ class _Worker:
                 if not (self.folder.results(chunk) / f"{e.key}.json").exists():
                     self._log(chunk, e)
             self.folder.close(chunk, entries)
+        except FileNotFoundError:  # who stood still long enough may find that another has finished, and cleared up
+            if chunk not in self.folder.finished() and self.leases.mine(chunk, number):
+                raise
+            return
         finally:
             self.leases.give_back(chunk, number)
         self.journal.note("closed", chunk=chunk)
