@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["COUNT", "DEGREE", "LEVEL", "Basis", "basis_of"]
+__all__ = ["COUNT", "DEGREE", "LEVEL", "Basis", "basis_of", "splines"]
 
 DEGREE = 3
 COUNT = 10  # splines of a curve
@@ -52,19 +52,9 @@ class Basis:
         """Where it ends; above, curves stay as here."""
         return float(self.knots[-1])
 
-    def coefficients(self, amplitudes: Array) -> Array:
-        """B-spline coefficients of the curve with these amplitudes of the functions."""
-        return self.turn @ amplitudes
-
-    def values(self, x: Array, amplitudes: Array) -> Array:
-        """The curve at ``x``."""
-        inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
-        return np.asarray(BSpline(self.knots, self.coefficients(amplitudes), DEGREE)(inside))
-
     def design(self, x: Array) -> Array:
-        """The B-splines themselves at ``x``, float64[len(x), splines]; beyond the ends as there."""
-        inside = np.clip(np.asarray(x, dtype=float), self.low, self.high)
-        return np.asarray(BSpline(self.knots, np.eye(len(self.turn)), DEGREE)(inside))
+        """`splines` of its knots at ``x``."""
+        return splines(self.knots, x)
 
     def effect(self, name: str, unit: str, size: float, wiggle: float, mean: bool = True) -> Effect:
         """The curve as an effect: amplitudes in ``unit``, ``size`` large in usual, bends known to be within ``wiggle``.
@@ -81,6 +71,12 @@ class Basis:
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
                        for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
         return Effect(name, tuple(out), starts)
+
+
+def splines(knots: Array, x: Array) -> Array:
+    """The B-splines of these ``knots`` at ``x``, float64[len(x), splines]; beyond the ends as there."""
+    inside = np.clip(np.asarray(x, dtype=float), knots[DEGREE], knots[-DEGREE - 1])
+    return np.asarray(BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(inside))
 
 
 def basis_of(visited: Array, count: int = COUNT) -> Basis | None:

@@ -181,22 +181,16 @@ def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw]) -> Model:
     """The model with the curves as a file has them: coefficients of B-splines."""
     from plant.model import Learned as Table
 
-    effects, curves = dict(model.effects), dict(model.curves)
+    effects, curves, last = dict(model.effects), dict(model.curves), outcome.tried[-1]
     for law, tried in zip(laws, outcome.tried, strict=True):
-        values = [float(v) for v in _last(law, tried, outcome)]
+        c = tried.candidate
+        values = [float(v) for v in c.turn @ last.fit.theta[last.judge.stage.index()[c.name]]]
         curves[law.name] = Table(
             how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), values=values,
-            knots=[float(v) for v in law.knots], unit=law.unit, size=float(tried.candidate.size),
+            knots=[float(v) for v in law.knots], unit=law.unit, size=float(c.size),
         )  # fmt: skip
         effects[law.name] = {f"c{k + 1}": v for k, v in enumerate(values)}
     return model.model_copy(update={"effects": effects, "curves": curves})
-
-
-def _last(law: LearnedLaw, tried: Any, outcome: Outcome) -> Any:
-    """Coefficients of a law's curve as the last fit has them."""
-    c, last = tried.candidate, outcome.tried[-1]
-    turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
-    return turn @ last.fit.theta[last.judge.stage.index()[c.name]]
 
 
 def with_path(answer: Learned, path: str, words: str) -> Learned:

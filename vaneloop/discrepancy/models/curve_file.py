@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from plant.model import Learned
 from vaneloop.base.curve import POINTS
-from vaneloop.discrepancy.curves import DEGREE, LEVEL
+from vaneloop.discrepancy.curves import DEGREE, LEVEL, splines
 from vaneloop.discrepancy.formulas import FORMS
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
@@ -36,7 +35,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     named = {
         "parameter": [p.name for p in s.parameters], "input": signals, "state": list(s.states),
         "force": ["force"] if s.kind == "force" else [],
-        "output": [o if o not in s.inputs and o not in s.states else f"{o}_sensor" for o in s.outputs],
+        "output": [s.reading_of(o) for o in s.outputs],
     }[where]  # fmt: skip
     if law.at not in named:
         raise wrong("at", law.at, ", ".join(named) or f"nothing, with how = {law.how!r}")
@@ -70,9 +69,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
                 f"curves.{name}: knots ({len(law.knots)} of them) must rise, and be {DEGREE + 1} more than the "
                 f"{len(law.values)} values"
             )
-        knots = np.asarray(law.knots, dtype=float)
-        inside = np.clip(x, knots[DEGREE], knots[-DEGREE - 1])
-        design = BSpline(knots, np.eye(len(law.values)), DEGREE)(inside)
+        design = splines(np.asarray(law.knots, dtype=float), x)
         curve = Curve(law.how, named.index(law.at), of, law.of, law.low, law.high, design.__matmul__)
         names = tuple(f"c{k + 1}" for k in range(len(law.values)))
         sizes = [abs(law.size) or 1.0] * len(names)

@@ -57,15 +57,20 @@ class Candidate:
     basis: Basis
 
     @property
+    def turn(self) -> Array:
+        """B-spline coefficients of each of its functions: those of the basis, without the constant where it has no
+        mean.
+        """
+        return self.basis.turn if self.mean else self.basis.turn[:, 1:]
+
+    @property
     def grid(self) -> Array:
         """Where a curve's table has its points."""
         return np.linspace(self.basis.low, self.basis.high, POINTS)
 
     def placed(self, turn: Array | None = None) -> Placed:
-        """What runs; ``turn``: B-spline coefficients of each function, by default those of the basis."""
-        if turn is None:
-            turn = self.basis.turn if self.mean else self.basis.turn[:, 1:]
-        design = self.basis.design(self.grid) @ turn
+        """What runs; ``turn``: B-spline coefficients of each function, by default its own."""
+        design = self.basis.design(self.grid) @ (self.turn if turn is None else turn)
         return self.placed_as(design.__matmul__, design.shape[1])
 
     def placed_as(self, table: Callable[[Array], Array], parameters: int) -> Placed:
@@ -140,42 +145,39 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
                 continue
             out.append(Candidate(name, how, place, at, unit, size, mean, q, basis))
 
-    def allowed(place: str, name: str) -> bool:
-        return s.places is None or place in s.places or name in s.places
-
     def half(rows: Array) -> float:
         good = rows[np.isfinite(rows)]
         return max(0.5 * float(np.ptp(good)) if len(good) else 0.0, 1e-300)
 
     for i, p in enumerate(s.parameters):
-        if allowed("parameter", p.name):
+        if s.allows("parameter", p.name):
             put("parameter times", i, p.name, "-", 0.5, mean=p.tolerance == 0.0)
     if moves:
         states = nominal_course(bound.runner, values).states
         for i, (name, unit) in enumerate(s.states.items()):
             if name in s.rates.values() and name not in s.rates:
                 continue
-            if allowed("force" if name in s.rates else "state", name):
+            if s.allows("force" if name in s.rates else "state", name):
                 pairs = zip(states[i], bound.data.records, strict=True)
                 rate = max(
                     float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300
                 )
                 mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass)
-    if s.kind == "force" and allowed("force", "force"):
+    if s.kind == "force" and s.allows("force", "force"):
         y = bound.measured[0]
         put("force adds", 0, "force", next(iter(s.outputs.values())), 0.5 * float(np.sqrt(np.nanmean(y**2))))
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
-        if allowed("input", name):
+        if s.allows("input", name):
             k = i + (3 if s.kind == "force" else 0)
             rows = next((q.visited for q, _ in known if q.of == INPUT + k), np.array([-1.0, 1.0]))
             put("input adds", k, name, unit, 0.3 * half(rows))
             put("input times", k, name, "-", 0.3, but=name)
     for i, (name, unit) in enumerate(s.outputs.items()):
-        if name in s.commands or not allowed("output", name) or not np.isfinite(bound.measured[i]).any():
+        if name in s.commands or not s.allows("output", name) or not np.isfinite(bound.measured[i]).any():
             continue
-        at = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
+        at = s.reading_of(name)
         if s.kind != "force":
             put("output adds", i, at, unit, 0.3 * half(bound.measured[i]))
         put("output times", i, at, "-", 0.3, but=name)

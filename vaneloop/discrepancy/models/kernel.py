@@ -11,6 +11,7 @@ import numpy as np
 
 from vaneloop.base.curve import on_table
 from vaneloop.discrepancy import laws
+from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
 from vaneloop.discrepancy.models.dispatch import Dispatch, compiled_code
 from vaneloop.discrepancy.models.user_code import UserCode
 
@@ -54,6 +55,7 @@ def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> t
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
             "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table,
+            "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
         }  # fmt: skip
@@ -130,6 +132,17 @@ _BENT = "for w in range(m):\n    dx[w] -= add[w] / mass[w]\n"
 _ROOMS = "ub, pb, add, bent = np.zeros(len(u)), np.zeros(len(p)), np.zeros(m), np.zeros(len(out))"
 _CURVED_FUNCTIONS = f"""
 @jit
+def quantity(of, x, u, y, columns, k):
+    if of < INPUT:
+        return x[of]
+    if of < OUTPUT:
+        return u[of - INPUT]
+    if of < COLUMN:
+        return y[of - OUTPUT]
+    return columns[of - COLUMN, k]
+
+
+@jit
 def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(u)):
         ub[j] = u[j]
@@ -138,19 +151,11 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(x)):
         add[j] = 0.0
     for i in range(len(c_how)):
-        of = c_of[i]
         if c_how[i] > 4:
             continue
-        if of < 100:
-            q = x[of]
-        elif of < 200:
-            q = u[of - 100]
-        elif of < 300:
+        if OUTPUT <= c_of[i] < COLUMN:
             outputs(x, u, p, y)
-            q = y[of - 200]
-        else:
-            q = columns[of - 300, k]
-        c = on_table(q, c_low[i], c_high[i], c_table[i])
+        c = on_table(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i])
         if c_how[i] == 1:
             pb[c_at[i]] *= 1.0 + c
         elif c_how[i] == 2:
@@ -167,16 +172,7 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     outputs(x, ub, pb, y)
     for i in range(len(c_how)):
         if c_how[i] > 4:
-            of = c_of[i]
-            if of < 100:
-                q = x[of]
-            elif of < 200:
-                q = u[of - 100]
-            elif of < 300:
-                q = y[of - 200]
-            else:
-                q = columns[of - 300, k]
-            c = on_table(q, c_low[i], c_high[i], c_table[i])
+            c = on_table(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i])
             if c_how[i] == 5:
                 y[c_at[i]] += c
             else:

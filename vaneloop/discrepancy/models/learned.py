@@ -74,7 +74,6 @@ class LearnedLaw:
     error_before: float
     error_after: float
     knots: Array = field(repr=False)
-    coefficients: Array = field(repr=False)
     formulas: list[Formula] = field(default_factory=list)
     trades: list[str] = field(default_factory=list)
     rivals: list[str] = field(default_factory=list)
@@ -106,10 +105,9 @@ def law_of(logs: Logs, before: tuple[Judge, Fit], tried: Tried, rivals: list[str
     low, high = _band(tried, placed.curve.table)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
-    turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
-        counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots, turn @ amplitudes,
+        counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
         _formulas(logs, tried, y), _trades(logs, tried), rivals,
     )  # fmt: skip
 

@@ -215,10 +215,8 @@ class Learner:
         if basis is None or len(basis.bend) <= len(c.basis.bend):
             return None
         fine = replace(c, basis=basis)
-        turn = c.basis.turn if c.mean else c.basis.turn[:, 1:]
-        curve = c.basis.design(fine.grid) @ (turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
-        own = basis.turn if c.mean else basis.turn[:, 1:]
-        amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ own, curve, rcond=None)[0]
+        curve = c.basis.design(fine.grid) @ (c.turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
+        amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ fine.turn, curve, rcond=None)[0]
         theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
         return self._fitted(current, fine, WIGGLES[-1], theta, 12)
 

@@ -12,7 +12,7 @@ from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.dispatch import Dispatch, try_law
 from vaneloop.discrepancy.models.nominal import Course
 from vaneloop.discrepancy.models.runner import Placed
-from vaneloop.discrepancy.models.system import Record, System
+from vaneloop.discrepancy.models.system import Record
 from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["places"]
@@ -45,7 +45,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 put(f"{prefix}.{own.name}", dispatch.own[family][own.name], place, at, size, 0.0)
 
     outputs = list(s.outputs)
-    if s.kind == "force" and _allowed(s, "force", "force"):
+    if s.kind == "force" and s.allows("force", "force"):
         v = np.concatenate([u[1] for u in data.u])
         x = np.concatenate([u[0] for u in data.u])
         force = float(np.sqrt(np.nanmean(data.measured[0] ** 2)))
@@ -58,7 +58,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         add("force", "force", "force", 0, "force", size)
     if s.kind in ("simulate", "closed_loop"):
         for i, (name, unit) in enumerate(s.states.items()):
-            if not (_allowed(s, "state", name) or (name in s.rates and _allowed(s, "force", name))):
+            if not (s.allows("state", name) or (name in s.rates and s.allows("force", name))):
                 continue
             if name in s.rates.values() and name not in s.rates:
                 continue  # a displacement is the integral of its velocity, whatever else is missing
@@ -84,7 +84,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                         put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, float(j))
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
-        if _allowed(s, "input", name):
+        if s.allows("input", name):
             rows = (
                 course.commands[i]
                 if s.kind == "closed_loop"
@@ -93,7 +93,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
             first = 3 if s.kind == "force" else 0
             add(name, "input", name, i + first, "signal", _size(data.records, rows, unit))
     for i, name in enumerate(outputs):
-        if name in s.commands or not _allowed(s, "output", name):
+        if name in s.commands or not s.allows("output", name):
             continue
         rows = [y[i] for y in data.y]
         if not np.isfinite(np.concatenate(rows)).any():
@@ -101,14 +101,9 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         # a constant force and a constant in the sensor of a force are the same; so are gains
         named = any(p in (s.places or ()) for p in ("output", name))
         leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
-        prefix = name if name not in s.inputs and name not in s.states else f"{name}_sensor"
+        prefix = s.reading_of(name)
         add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
     return out, effects
-
-
-def _allowed(system: System, place: str, name: str) -> bool:
-    chosen = system.places
-    return chosen is None or place in chosen or name in chosen
 
 
 def _size(records: Sequence[Record], rows: list[Array], unit: str, **more: Any) -> Size:

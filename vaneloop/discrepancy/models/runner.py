@@ -11,7 +11,7 @@ import numpy as np
 from vaneloop.base.compiled import compiled_free
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.library import Law
-from vaneloop.discrepancy.models.curve import COLUMN, SENSED, Curve, bent, curves_for_kernel
+from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, SENSED, Curve, bent, curves_for_kernel
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.dispatch import Dispatch, dispatch_of
 from vaneloop.discrepancy.models.kernel import Kernel, build_kernels
@@ -198,11 +198,15 @@ class Runner:
         name = list(self.system.states)[m]
         if name in self.system.start or not np.isfinite(self.data.first_state(log, name, np.nan)):
             return
-        reading = x0[m]
+        reading, u = x0[m], self.data.u[log][:, :1]
         for _ in range(8):
-            u = self.data.u[log][:, 0] if self.data.u[log].size else np.zeros(1)
-            q = x0[curve.of] if curve.of < 100 else u[curve.of - 100] if curve.of < 200 else reading
-            if curve.of >= COLUMN:
+            if curve.of < INPUT:
+                q = x0[curve.of]
+            elif curve.of < OUTPUT:
+                q = u[curve.of - INPUT, 0]
+            elif curve.of < COLUMN:
+                q = reading
+            else:
                 q = self.data.column(log, curve.quantity)[0]
             c = float(curve.at(np.array([q]), row)[0])
             x0[m] = reading - c if curve.how == "output adds" else reading / max(1.0 + c, 0.1)

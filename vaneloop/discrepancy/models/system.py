@@ -210,6 +210,14 @@ class System:
         """Outputs that need not be logged: those that only the loop uses."""
         return set(self.outputs) if self.kind == "closed_loop" else set()
 
+    def allows(self, place: str, name: str) -> bool:
+        """Whether laws may act at ``name`` (a channel or state) or at all places of its kind."""
+        return self.places is None or place in self.places or name in self.places
+
+    def reading_of(self, output: str) -> str:
+        """What an output is called as a place of laws: its sensor, where an input or a state has the same name."""
+        return f"{output}_sensor" if output in self.inputs or output in self.states else output
+
     def bind(
         self,
         records: Sequence[Record],
