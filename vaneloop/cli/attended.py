@@ -54,9 +54,11 @@ def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
 
 def accepted(args: argparse.Namespace) -> list[dict[str, int]]:
     """The acceptance filters: the node's, and those of its tools."""
-    from hil.calibrate.station import MASTER
+    idents: list[int] = []
+    if args.xcp:
+        from hil.calibrate.station import MASTER
 
-    idents = [MASTER] if args.xcp else []
+        idents.append(MASTER)
     if args.uds:
         from hil.uds.station import FUNCTIONAL, REQUEST
 
