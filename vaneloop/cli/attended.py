@@ -94,10 +94,11 @@ def attend(args: argparse.Namespace, node: Any) -> Any:
     if not args.xcp:
         return Attended(node, *services)
     gather(memory.raw, np.zeros((0, 4), np.int64), np.zeros((0, 2), np.int64), 0)  # compiles now, not in a tick
+    text = a2l_of(memory, master=MASTER, slave=SLAVE)  # written now: it takes longer than a tick
     slave = Slave(
         memory,
         ident=SLAVE,
-        a2l=lambda: a2l_of(memory, master=MASTER, slave=SLAVE),
+        a2l=lambda: text,
         save=Path(args.xcp_save) if args.xcp_save else None,
         locked=("cal", "daq") if args.xcp_lock else (),
     )
