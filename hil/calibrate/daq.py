@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hil.calibrate.memory import INPUTS, SHORT, Memory, Refusal
+from hil.calibrate.errors import ACTIVE, CONFIG, FULL, MODE, RANGE, SEQUENCE, Refusal
+from hil.calibrate.memory import INPUTS, SHORT, Memory
 from hil.calibrate.stim import Stimulus
 from vaneloop.base.compiled import in_place
 
@@ -22,7 +23,6 @@ EVENTS = (("1 ms", 1), ("10 ms", 10))  # name, period in ticks; the event's numb
 PAYLOAD, STAMP = 7, 2  # bytes of a frame behind the table's identifier; of them the time's in a list's first table
 MOST_LISTS, MOST_TABLES, MOST_ENTRIES = 16, 64, 7
 MOST_FRAMES = 32  # of one tick; what is beyond is an overload: the bus carries some four
-SEQUENCE, ACTIVE, CONFIG, FULL, RANGE, MODE = 0x29, 0x11, 0x2A, 0x30, 0x22, 0x27
 
 Entry = tuple[int, int, int]  # size, extension, address
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from controller.records import INIT, INPUT_FIELDS, OUTPUT_FIELDS, SCALARS, STANDBY, STATE_FIELDS, Field
 from hil.calibrate import elements
+from hil.calibrate.errors import DENIED, NO_PAGE, PROTECTED, RANGE, VERIFY, Refusal
 from hil.loop.node import Node
 from hil.native.program import own_scalars
 
@@ -33,17 +34,6 @@ __all__ = ["CALIBRATION", "EXACT", "INPUTS", "SHORT", "Memory", "Refusal", "Sign
 INPUTS, OUTPUTS, STATE, CALIBRATION = 0x1000_0000, 0x1100_0000, 0x1200_0000, 0x2000_0000
 EXACT, SHORT = 0, 1  # address extensions: double, single precision
 WORKING, REFERENCE = 0, 1
-
-# what `Memory.write` and the pages answer, numbers of XCP's errors
-OUT_OF_RANGE, PROTECTED, DENIED, NO_PAGE, VERIFY = 0x22, 0x23, 0x24, 0x26, 0x32
-
-
-class Refusal(Exception):
-    """A request that changes nothing: XCP's error code, and why."""
-
-    def __init__(self, code: int, why: str):
-        super().__init__(why)
-        self.code = code
 
 
 class Signal(NamedTuple):
@@ -170,7 +160,7 @@ class Memory:
         kind = np.float32 if ext == SHORT else np.float64
         base = address & ~0xFFFFFF
         if ext not in (EXACT, SHORT):
-            raise Refusal(OUT_OF_RANGE, f"address extension (={ext}) must be 0 or 1")
+            raise Refusal(RANGE, f"address extension (={ext}) must be 0 or 1")
         if base == CALIBRATION:
             row = self.live() if self.xcp_page == self.ecu_page else self.pages[self.xcp_page]
         else:
@@ -179,7 +169,7 @@ class Memory:
             image = row.astype(kind).tobytes()
         at = address - base
         if size < 0 or at + size > len(image):
-            raise Refusal(OUT_OF_RANGE, f"no memory from {address:#x} to {address + size:#x}")
+            raise Refusal(RANGE, f"no memory from {address:#x} to {address + size:#x}")
         return image[at : at + size]
 
     # ---- writing -----------------------------------------------------------------------------------------------------
@@ -196,7 +186,7 @@ class Memory:
         first = address - CALIBRATION
         if ext not in (EXACT, SHORT) or first < 0 or first + len(data) > width * n:
             known = address & ~0xFFFFFF in (INPUTS, OUTPUTS, STATE)
-            raise Refusal(DENIED if known else OUT_OF_RANGE, f"{address:#x} must be in the calibration")
+            raise Refusal(DENIED if known else RANGE, f"{address:#x} must be in the calibration")
         if self.xcp_page != WORKING:
             raise Refusal(PROTECTED, "the reference page cannot be written")
         half = {key: (bytearray(raw), mask) for key, (raw, mask) in self._half.items()}
@@ -227,11 +217,11 @@ class Memory:
         for i, v in new.items():
             e = self.elements[i]
             if not (math.isfinite(v) and e.low <= v <= e.high) or (e.whole and v != math.floor(v)):
-                raise Refusal(OUT_OF_RANGE, f"{e.name} (={v:g} {e.unit}) must be in [{e.low:g}, {e.high:g}]")
+                raise Refusal(RANGE, f"{e.name} (={v:g} {e.unit}) must be in [{e.low:g}, {e.high:g}]")
             if e.fixed:
                 raise Refusal(PROTECTED, f"{e.name} belongs to the machine")
             if e.name == "current_limit" and v > self.pages[REFERENCE][i]:
-                raise Refusal(OUT_OF_RANGE, f"current_limit (={v:g} A) must not exceed the reference page's")
+                raise Refusal(RANGE, f"current_limit (={v:g} A) must not exceed the reference page's")
             if active and e.guarded:
                 self._open_only(e.name)
         if not new:
@@ -250,7 +240,7 @@ class Memory:
 
     def _judge(self, row: np.ndarray, tables: set[str]) -> None:
         if why := elements.complaint(self.elements, row, tuple(sorted(tables - {""}))):
-            raise Refusal(OUT_OF_RANGE, why)
+            raise Refusal(RANGE, why)
 
     def _load(self, row: np.ndarray, numbers: np.ndarray) -> None:
         """Put numbers of a row into the arrays that the firmware reads, and into what an injected effect starts

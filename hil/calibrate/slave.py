@@ -17,16 +17,27 @@ from pathlib import Path
 import numpy as np
 
 from hil.calibrate.daq import EVENTS, PAYLOAD, STAMP, Daq
-from hil.calibrate.memory import CALIBRATION, EXACT, REFERENCE, WORKING, Memory, Refusal
+from hil.calibrate.errors import (
+    DENIED,
+    LOCKED,
+    MODE,
+    NO_PAGE,
+    PROTECTED,
+    RANGE,
+    SEGMENT,
+    SEQUENCE,
+    SYNCH,
+    SYNTAX,
+    UNKNOWN,
+    Refusal,
+)
+from hil.calibrate.memory import CALIBRATION, EXACT, REFERENCE, WORKING, Memory
 
 __all__ = ["NAME", "RESOURCES", "Slave", "key_of"]
 
 NAME = "vgv"  # of the A2L file, without its ending
 RESOURCES = {"cal": 0x01, "daq": 0x04}  # what can be locked
 OK, ERROR, EVENT = 0xFF, 0xFE, 0xFD
-SYNCH, DAQ_ACTIVE, UNKNOWN, SYNTAX, RANGE, LOCKED, MODE, SEGMENT, SEQUENCE, OVERFLOW = (
-    *(0x00, 0x11, 0x20, 0x21, 0x22, 0x25, 0x27, 0x28, 0x29, 0x30),
-)  # fmt: skip
 STORED, OVERLOADED = 0x03, 0x06  # events
 STORE_CAL, DAQ_RUNS = 0x01, 0x40  # bits of the session's status
 MOST_CHECKED = 1 << 20  # bytes of a checksum
@@ -213,7 +224,7 @@ class Slave:
         if data[1] != STORE_CAL:
             raise Refusal(RANGE, f"mode (={data[1]:#x}) must be 1, store the calibration")
         if self.folder is None:
-            raise Refusal(0x24, "there is no folder to save into")
+            raise Refusal(DENIED, "there is no folder to save into")
         if not self._freeze:
             raise Refusal(MODE, "SET_SEGMENT_MODE with freeze comes first")
         self.saved = self.memory.save(self.folder)
@@ -286,7 +297,7 @@ class Slave:
             raise Refusal(SYNTAX, f"{n} bytes were announced, {len(data) - 2} came")
         text, ext, at = self._mta
         if text is not None:
-            raise Refusal(0x23, "a text cannot be written")
+            raise Refusal(PROTECTED, "a text cannot be written")
         self.memory.write(ext, at, data[2 : 2 + n])
         self._mta = None, ext, at + n
         return [bytes([OK])]
@@ -336,7 +347,7 @@ class Slave:
     def _page(self, data: bytes) -> list[bytes]:
         self._of_segment(data[2])
         if data[3] not in (WORKING, REFERENCE):
-            raise Refusal(0x26, f"page (={data[3]}) must be 0 or 1")
+            raise Refusal(NO_PAGE, f"page (={data[3]}) must be 0 or 1")
         # both are used by the firmware and read whoever uses them; page 0 is written
         return [bytes([OK, 0x3F if data[3] == WORKING else 0x0F, 0])]
 
