@@ -20,6 +20,7 @@ __all__ = ["CLEAR_LEARNED", "LVDT", "SWEEP", "Sweep", "clear_learned"]
 SWEEP, LVDT, CLEAR_LEARNED = 0x0201, 0x0202, 0x0203
 LOW, HIGH, RATE = 45.0, 104.0, 12.0  # %, %/s: demands of the sweep, over nearly the whole stroke
 HOLD = 1500  # ticks at each end
+RAMP = round((HIGH - LOW) / RATE * 1000)  # ticks of the way between them
 RUNNING, DONE, ABORTED = 1, 0, 2
 _LEARNED = ("offset", "width", "proved_offset", "proved_width", "learned_up", "learned_down", "trusted")
 
@@ -43,20 +44,19 @@ class Sweep:
 
     def demand(self, k: int) -> float:
         """Speed to ask for at tick ``k``, %."""
-        ramp = round((HIGH - LOW) / RATE * 1000)
         at = k - self.begin
         if at < HOLD:
             return LOW
-        if at < HOLD + ramp:
+        if at < HOLD + RAMP:
             return LOW + RATE * (at - HOLD) * 1e-3
-        if at < 2 * HOLD + ramp:
+        if at < 2 * HOLD + RAMP:
             return HIGH
-        return max(HIGH - RATE * (at - 2 * HOLD - ramp) * 1e-3, LOW)
+        return max(HIGH - RATE * (at - 2 * HOLD - RAMP) * 1e-3, LOW)
 
     @property
     def length(self) -> int:
         """Ticks that it takes."""
-        return 3 * HOLD + 2 * round((HIGH - LOW) / RATE * 1000)
+        return 3 * HOLD + 2 * RAMP
 
     def replace(self, k: int, rows: np.ndarray) -> None:
         """Put the routine's demand into the ECU's good frames, in place."""
@@ -71,14 +71,14 @@ class Sweep:
     def look(self, k: int) -> None:
         """Take note of tick ``k``, which has been run."""
         loop = self.node.loop
-        at, ramp = k - self.begin, round((HIGH - LOW) / RATE * 1000)
+        at = k - self.begin
         if self.node.faults:
             self.state = ABORTED
             return
         if at > HOLD // 2:
             self.worst = max(self.worst, abs(float(loop.state.x_servo - loop.state.x_meas)))
         angle, table = float(loop.angles[0]), loop.calibration.angles
-        if (at % (HOLD + ramp)) > HOLD - 200 and (at % (HOLD + ramp)) <= HOLD:
+        if HOLD - 200 < at % (HOLD + RAMP) <= HOLD:
             self._held.append((float(loop.fed.x_lvdt), float(np.interp(angle, table[1], table[0]))))
         elif self._held:
             mean = tuple(float(v) for v in np.mean(self._held, axis=0))
