@@ -185,19 +185,20 @@ class Server:
         if self.sweep is not None:
             self.sweep.look(k)
             if self.sweep.state != routines.RUNNING:
-                self._results[self._routine] = self.sweep.result(self._routine)
-                self.sweep = None
+                self._end_sweep(self.sweep.state)
         if trouble.changed and self._store is not None:
             trouble.changed = False
             self._store(trouble.dump())
 
     def _freeze(self) -> bytes:
-        return _FRAME.pack(*(self._signal(name) for name, _ in SIGNALS.values()))
+        now = self._signals()
+        return _FRAME.pack(*(now[name] for name, _ in SIGNALS.values()))
 
-    def _signal(self, name: str) -> float:
+    def _signals(self) -> dict[str, float]:
+        """The live signals after the last tick."""
         loop = self.memory.loop
         given, state = loop.given, loop.state
-        now: dict[str, float] = {
+        return {
             "t": (self.node.k - 1) * 1e-3,
             "n_dem": state.n_dem,
             "n_r": state.n_r_raw,
@@ -208,7 +209,6 @@ class Server:
             "faults": given.faults,
             "vigv": np.degrees(loop.angles[0]),
         }
-        return float(now[name])
 
     # ---- sessions ----------------------------------------------------------------------------------------------------
 
@@ -218,8 +218,12 @@ class Server:
         self.silent = self._open = False
         self._seed = self._file = None
         self.trouble.on = True
+        self._end_sweep(routines.ABORTED)
+
+    def _end_sweep(self, state: int) -> None:
+        """Keep the result of the routine that runs, if one does."""
         if self.sweep is not None:
-            self.sweep.state = routines.ABORTED
+            self.sweep.state = state
             self._results[self._routine] = self.sweep.result(self._routine)
             self.sweep = None
 
@@ -348,7 +352,7 @@ class Server:
 
     def _value(self, ident: int) -> bytes:
         if ident in SIGNALS:
-            return struct.pack(">f", self._signal(SIGNALS[ident][0]))
+            return struct.pack(">f", self._signals()[SIGNALS[ident][0]])
         if ident in TEXTS:
             return TEXTS[ident].encode()
         if ident in WRITABLE:
@@ -400,8 +404,7 @@ class Server:
         if what == 2:
             if mine is None:
                 raise Negative(SEQUENCE)
-            mine.state = routines.ABORTED
-            self._results[routine], self.sweep = mine.result(routine), None
+            self._end_sweep(routines.ABORTED)
             return head
         if mine is not None:
             return head + mine.result(routine)
