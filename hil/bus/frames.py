@@ -17,6 +17,7 @@ NaN as the signal's "not available". Everything here works in place and allocate
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +35,7 @@ __all__ = [
     "VGV_SERVO",
     "VGV_STATUS",
     "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes",
-    "to_message", "word0",
+    "to_message", "with_demand", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -328,6 +329,20 @@ def noted(rows: np.ndarray) -> np.ndarray:
     out = rows.copy()
     out[out[:, 0] == PAUSE & HEAD_MASK, 0] = PAUSE
     return out
+
+
+def with_demand(rows: np.ndarray, of: Callable[[float, float, int], tuple[float, float, int] | None]) -> np.ndarray:
+    """Return a copy of frames in which the ECU's good ones carry what ``of`` makes of their n_dem, n_r (%) and
+    mode_request; None leaves a frame as it is.
+    """
+    rows = rows.copy()
+    for row in rows:
+        head, data = int(row[0]), int(row[1])
+        if head & IDENT_MASK == ECU_DEMAND and crc(ECU_DEMAND, data) == data & 0xFF:
+            given = of(*decode_demand(data))
+            if given is not None:
+                row[1] = encode_demand(*given, data >> 8 & 15)
+    return rows
 
 
 # ---- the same for people ---------------------------------------------------------------------------------------------

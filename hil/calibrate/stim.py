@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from controller.records import INPUTS
-from hil.bus.frames import ECU_DEMAND, crc, decode_demand, encode_demand
+from hil.bus.frames import with_demand
 from hil.loop.node import Node
 
 __all__ = ["Stimulus"]
@@ -55,11 +55,9 @@ class Stimulus:
             self.clear()
         if not any(i in self.given for i in _ECU):
             return rows, n
-        rows = rows[:n].copy()
-        for row in rows:
-            head, data = int(row[0]), int(row[1])
-            if head & 0x1FFF_FFFF == ECU_DEMAND and crc(ECU_DEMAND, data) == data & 0xFF:
-                own = decode_demand(data)
-                n_dem, n_r, request = (self.given.get(i, float(v)) for i, v in zip(_ECU, own, strict=True))
-                row[1] = encode_demand(n_dem, n_r, int(min(max(request, 0.0), 3.0)), data >> 8 & 0xF)
-        return rows, n
+        return with_demand(rows[:n], self._given_for), n
+
+    def _given_for(self, *own: float) -> tuple[float, float, int]:
+        """The demand that the ECU's ``own`` becomes: n_dem, n_r, mode_request."""
+        n_dem, n_r, request = (self.given.get(i, float(v)) for i, v in zip(_ECU, own, strict=True))
+        return n_dem, n_r, int(min(max(request, 0.0), 3.0))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from controller.records import STANDBY
-from hil.bus.frames import ECU_DEMAND, crc, decode_demand, encode_demand
+from hil.bus.frames import with_demand
 from hil.loop.node import Node
 
 __all__ = ["CLEAR_LEARNED", "LVDT", "SWEEP", "Sweep", "clear_learned"]
@@ -58,15 +58,10 @@ class Sweep:
         """Ticks that it takes."""
         return 3 * HOLD + 2 * RAMP
 
-    def replace(self, k: int, rows: np.ndarray) -> None:
-        """Put the routine's demand into the ECU's good frames, in place."""
-        for row in rows:
-            head, data = int(row[0]), int(row[1])
-            if head & 0x7FF == ECU_DEMAND and crc(ECU_DEMAND, data) == data & 0xFF:
-                _, _, request = decode_demand(data)
-                if request <= 1:
-                    speed = self.demand(k)
-                    row[1] = encode_demand(speed, speed, 1, data >> 8 & 0xF)
+    def replace(self, k: int, rows: np.ndarray) -> np.ndarray:
+        """Return frames with the routine's demand in the ECU's good ones."""
+        speed = self.demand(k)
+        return with_demand(rows, lambda n_dem, n_r, request: (speed, speed, 1) if request <= 1 else None)
 
     def look(self, k: int) -> None:
         """Take note of tick ``k``, which has been run."""

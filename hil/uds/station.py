@@ -102,8 +102,7 @@ class UdsService:
     def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
         """Put a routine's demand into the ECU's frames."""
         if self.server.sweep is not None:
-            rows = rows[:n].copy()
-            self.server.sweep.replace(k, rows)
+            rows = self.server.sweep.replace(k, rows[:n])
         return rows, n
 
     def before(self, k: int) -> None:
