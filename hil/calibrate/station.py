@@ -51,6 +51,11 @@ def row_of(ident: int, data: bytes) -> tuple[int, int]:
     return ident | len(data) << 32, int.from_bytes(data.ljust(8, b"\0"), "little", signed=True)
 
 
+def data_of(head: int, data: int) -> bytes:
+    """Return the data of a row: `row_of` the other way round."""
+    return data.to_bytes(8, "little", signed=True)[: head >> 32 & 0xFF]
+
+
 class XcpService:
     """An XCP slave on CAN.
 
@@ -110,13 +115,16 @@ class Attended:
         """Run the next tick on the first ``n`` rows of ``received``; return the frames to send."""
         n = len(received) if n is None else n
         k = self.node.k
-        for head, data in received[:n].tolist():
-            if head & _KIND == 0 and (service := self._by_ident.get(head & IDENT_MASK)) is not None:
-                raw = (data & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "little")
-                service.hear(head & IDENT_MASK, raw[: min(head >> 32 & 0xFF, 8)])
+        theirs = []  # frames that are not for the firmware
+        for i, (head, data) in enumerate(received[:n].tolist()):
+            if (service := self._by_ident.get(head & IDENT_MASK)) is not None:
+                theirs.append(i)
+                if head & _KIND == 0:
+                    service.hear(head & IDENT_MASK, data_of(head, data))
         for service in self.services:
             service.before(k)
-        rows, n = self._firmware_s(received, n)
+        rows = np.delete(received[:n], theirs, axis=0) if theirs else received
+        n -= len(theirs)
         for service in self.services:
             rows, n = service.change(k, rows, n)
         out = self.node.tick(rows, n)
@@ -124,15 +132,6 @@ class Attended:
             out = NOTHING
         more = [sent for service in self.services if (sent := service.after(k)) is not None]
         return np.concatenate([out, *more]) if more else out
-
-    def _firmware_s(self, received: np.ndarray, n: int) -> tuple[np.ndarray, int]:
-        """The frames that are not for a service."""
-        idents = received[:n, 0] & IDENT_MASK
-        ours = [i for i, ident in enumerate(idents.tolist()) if ident in self._by_ident]
-        if not ours:
-            return received, n
-        rest = np.delete(received[:n], ours, axis=0)
-        return rest, len(rest)
 
 
 def replay_attended(node: Attended, at: np.ndarray, received: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:

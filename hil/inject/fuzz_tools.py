@@ -18,12 +18,11 @@ from controller import MODES
 from controller.records import INIT, STANDBY
 from hil.calibrate.memory import CALIBRATION, Memory
 from hil.calibrate.slave import Slave, key_of
-from hil.calibrate.station import MASTER, MOST_WAITING, Attended, XcpService, row_of
+from hil.calibrate.station import MASTER, MOST_WAITING, Attended, XcpService, data_of, row_of
 from hil.loop.node import Ecu, Node
 
-__all__ = ["PROTOCOLS", "ToolCampaign", "fuzz_tools"]
+__all__ = ["ToolCampaign", "fuzz_tools"]
 
-PROTOCOLS = ("xcp", "uds")
 EPISODE = 5_000  # frames on one controller
 RECOVERY = 8_000  # ticks within which RUN must be back: the session's end after 5 s, then the firmware's own times
 MOST_HELD = 4 * MOST_WAITING  # commands, answers and frames that services may keep
@@ -99,7 +98,7 @@ class _Target:
             held += self.service._transport.tx_queue.qsize()
         if held > MOST_HELD:
             raise AssertionError(f"{held} frames are kept")
-        return [(d & (1 << 64) - 1).to_bytes(8, "little")[: h >> 32 & 15] for h, d in out[~ours].tolist()]
+        return [data_of(h, d) for h, d in out[~ours].tolist()]
 
 
 def _xcp(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
