@@ -65,8 +65,6 @@ class Curve(NamedTuple):
 
     name: str
     meaning: str
-    unit: str
-    axis_unit: str
     first: int
     axis: int
     n: int
@@ -145,14 +143,14 @@ def curves_of(cal: Calibration) -> tuple[Curve, ...]:
     """Return the curves of a calibration: stroke over speed, and each stage's angle over stroke."""
     n, m, at = cal.table.shape[1], cal.angles.shape[1], len(SCALARS)
     out = [
-        Curve(f"stroke_{key}", f"stroke demand against speed, {key}", "m", "%", at + (q + 1) * n, at, n)
+        Curve(f"stroke_{key}", f"stroke demand against speed, {key}", at + (q + 1) * n, at, n)
         for q, key in enumerate(CURVES)
     ]
     at += 4 * n
     return (
         *out,
         *(
-            Curve(f"angle_{v}", f"vane angle against stroke, {v}", "rad", "m", at + (q + 1) * m, at, m)
+            Curve(f"angle_{v}", f"vane angle against stroke, {v}", at + (q + 1) * m, at, m)
             for q, v in enumerate(cal.vanes)
         ),
     )

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controller.records import INIT, INPUT_FIELDS, OUTPUT_FIELDS, SCALARS, STANDBY, STATE_FIELDS, Field
+from controller.records import INIT, INPUT_FIELDS, OUTPUT_FIELDS, STANDBY, STATE_FIELDS, Field
 from hil.calibrate import elements
 from hil.calibrate.errors import DENIED, NO_PAGE, PROTECTED, RANGE, VERIFY, Refusal
 from hil.loop.node import Node
@@ -48,7 +48,6 @@ class Signal(NamedTuple):
 class Area(NamedTuple):
     """Numbers side by side in memory: ``exact`` are the firmware's own, ``short`` a copy in single precision."""
 
-    name: str
     base: int
     exact: np.ndarray
     short: np.ndarray
@@ -78,30 +77,19 @@ class Memory:
         live = self.live()
         self.pages = [live.copy(), live.copy()]
         self.ecu_page = self.xcp_page = WORKING
-        self.writes = 0  # writes that took effect
         self._places: list[tuple[Any, ...]] = []
+        self._half: dict[int, tuple[bytearray, int]] = {}
+        spans = [(INPUTS, loop.inputs), (OUTPUTS, loop.outputs), (STATE, loop.z)]
         first = 0
         for key in ("k", "table", "angles"):
-            built, flashed = getattr(loop.built, key), getattr(loop.calibration, key)
-            self._places.append((first, built.reshape(-1), flashed.reshape(-1)))
-            first += built.size
+            built, flashed = (getattr(of, key).reshape(-1) for of in (loop.built, loop.calibration))
+            self._places.append((first, built, flashed))
+            spans.append((CALIBRATION + 8 * first, flashed))
+            first += len(built)
         self._places += [(first + i, value) for i, value in enumerate(self._own)]
-        self._half: dict[int, tuple[bytearray, int]] = {}
-        spans = [
-            (INPUTS, "input", loop.inputs),
-            (OUTPUTS, "output", loop.outputs),
-            (STATE, "state", loop.z),
-            (CALIBRATION, "scalars", loop.calibration.k),
-            (CALIBRATION + 8 * len(SCALARS), "table", loop.calibration.table.reshape(-1)),
-            (
-                CALIBRATION + 8 * (len(SCALARS) + loop.calibration.table.size),
-                "angles",
-                loop.calibration.angles.reshape(-1),
-            ),
-        ]
         if own:
-            spans.append((CALIBRATION + 8 * (len(live) - len(own)), "own", np.zeros(len(own))))
-        self.areas = [Area(name, base, a, np.zeros(len(a), np.float32)) for base, name, a in spans]
+            spans.append((CALIBRATION + 8 * first, np.zeros(len(own))))
+        self.areas = [Area(base, a, np.zeros(len(a), np.float32)) for base, a in spans]
         self.raw = tuple(a.exact.view(np.uint8) for a in self.areas) + tuple(a.short.view(np.uint8) for a in self.areas)
         self.refresh()
 
@@ -232,7 +220,6 @@ class Memory:
             self._judge(row, {self.elements[i].table for i in new})
             self._load(row, np.array(list(new)))
         page[list(new)] = list(new.values())
-        self.writes += 1
 
     def _open_only(self, name: str) -> None:
         if int(self.loop.given.mode) not in (INIT, STANDBY):

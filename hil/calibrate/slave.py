@@ -77,7 +77,6 @@ class Slave:
         self.daq = Daq(memory, ident)
         self.connected = False
         self.k = 0  # the next tick
-        self.saved: list[Path] = []
         self.why = ""  # of the last refusal
         self._a2l = a2l
         self._locked = self._lockable = sum(RESOURCES[name] for name in set(locked))
@@ -227,7 +226,7 @@ class Slave:
             raise Refusal(DENIED, "there is no folder to save into")
         if not self._freeze:
             raise Refusal(MODE, "SET_SEGMENT_MODE with freeze comes first")
-        self.saved = self.memory.save(self.folder)
+        self.memory.save(self.folder)
         return [bytes([OK]), bytes([EVENT, STORED])]
 
     def _get_seed(self, data: bytes) -> list[bytes]:
