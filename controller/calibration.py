@@ -27,7 +27,7 @@ from vaneloop.base.vanes import VANES, Staged, vane_in
 __all__ = ["Calibration", "load_calibration", "new_inputs", "new_outputs", "new_state"]
 
 _DEG = np.pi / 180.0
-_SI = {
+SI = {
     "mm": 1e-3,
     "mm/s": 1e-3,
     "mA": 1e-3,
@@ -336,7 +336,7 @@ def scalars_in(table: CalibrationTable) -> list[Scalar]:
         for key, q in getattr(table, section):
             if isinstance(q, Quantity):
                 bound = next(m for m in fields[key].metadata if isinstance(m, Bound))
-                out.append(Scalar(section, key, q.value, q.unit, bound.low, bound.high, _SI.get(q.unit, 1.0)))
+                out.append(Scalar(section, key, q.value, q.unit, bound.low, bound.high, SI.get(q.unit, 1.0)))
     return out
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from math import pi
 
-from controller.records import FAULTS, MODES, STRATEGIES
+from controller.records import FAULTS, MODES
 from hil.calibrate.daq import EVENTS, PAYLOAD
-from hil.calibrate.elements import Element
+from hil.calibrate.elements import CHOICES, Element
 from hil.calibrate.memory import CALIBRATION, SHORT, Memory
 from hil.calibrate.slave import NAME
 
@@ -158,8 +158,7 @@ class _Methods:
     def text(self) -> str:
         """All of them."""
         out = "".join(_method(unit, shown, f) for (unit, shown), f in sorted(self.units.items()))
-        choices = (("mode", MODES), ("strategy", STRATEGIES), ("table_input", ("n_r", "n_dem")))
-        return out + "".join(_choice(name, words) for name, words in choices)
+        return out + "".join(_choice(name, words) for name, words in {"mode": MODES, **CHOICES}.items())
 
 
 def _group(name: str, meaning: str, kind: str, members: list[str]) -> str:
@@ -198,9 +197,7 @@ def _values(memory: Memory, methods: _Methods) -> tuple[str, str]:
     out: list[str] = []
     groups: dict[str, list[str]] = {}
     for i, e in enumerate(memory.elements):
-        if e.table in ("stroke_tables", "vane_angles") and e.section:
-            continue
-        if e.fixed:
+        if e.of_curve or e.fixed:
             continue
         if e.whole:
             method = f"CM_{e.name}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from functools import lru_cache
-from math import nextafter, pi
+from math import nextafter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,23 +17,23 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from controller import STRATEGIES, Calibration
-from controller.calibration import AngleTable, CalibrationTable, StrokeTable
+from controller.calibration import SI, AngleTable, CalibrationTable, StrokeTable
 from controller.records import SCALAR_FIELDS, SCALARS
 from vaneloop.base.tables import Bound
 from vaneloop.base.vanes import vane_in
 
-__all__ = ["CURVES", "Curve", "Element", "complaint", "curves_of", "documents", "elements_of", "write_tables"]
+__all__ = ["CHOICES", "Curve", "Element", "complaint", "curves_of", "documents", "elements_of", "write_tables"]
 
-SI = {"mm": 1e-3, "mm/s": 1e-3, "mA": 1e-3, "deg": pi / 180.0, "deg/s": pi / 180.0}  # as `controller.calibration`
 MODELS: dict[str, type[BaseModel]] = {
     "calibration": CalibrationTable,
     "stroke_tables": StrokeTable,
     "vane_angles": AngleTable,
 }
+CHOICES = {"strategy": STRATEGIES, "table_input": ("n_r", "n_dem")}  # scalars that are a word in the table
 CURVES = ("extension", "retraction", "single")  # rows of the stroke tables behind the speeds
-# What limits the current, watches the loop or chooses another law: not to be changed while the loop is closed.
+# What limits the current or watches the loop: like `CHOICES`, not to be changed while the loop is closed.
 GUARDED_SECTIONS = ("fail_safe", "demand_monitor", "lvdt_monitor", "servo_monitor")
-GUARDED = ("current_limit", "stroke_min", "stroke_max", "strategy", "table_input")
+GUARDED = ("current_limit", "stroke_min", "stroke_max")
 ORIGIN = "chosen: frozen from a calibration page by XCP"
 
 
@@ -42,7 +42,8 @@ class Element(NamedTuple):
 
     factor   from the table's unit, ``border``, into SI
     guarded  not to be changed while the loop is closed
-    whole    only whole numbers are allowed
+    whole    the number of one of `CHOICES`
+    fixed    not to be changed at all
     """
 
     name: str
@@ -58,6 +59,11 @@ class Element(NamedTuple):
     guarded: bool = False
     whole: bool = False
     fixed: bool = False
+
+    @property
+    def of_curve(self) -> bool:
+        """Whether it is one of the numbers of an axis or a curve."""
+        return self.table in ("stroke_tables", "vane_angles") and self.section != ""
 
 
 class Curve(NamedTuple):
@@ -87,15 +93,14 @@ def _bounds() -> dict[str, tuple[str, str, Bound]]:
 
 
 def _scalar(name: str, unit: str, meaning: str, vanes: tuple[str, ...]) -> Element:
-    if name == "strategy":
+    if name in CHOICES:
+        last = len(CHOICES[name]) - 1.0
         return Element(
-            *(name, unit, meaning, 0.0, len(STRATEGIES) - 1.0, "calibration", "schedule", name, "", 1.0), True, True
+            *(name, unit, meaning, 0.0, last, "calibration", "schedule", name, "", 1.0), guarded=True, whole=True
         )
-    if name == "table_input":
-        return Element(name, unit, meaning, 0.0, 1.0, "calibration", "schedule", name, "", 1.0, True, True)
     stage = vane_in(name)
     if name not in _bounds() or (stage is not None and stage not in vanes):
-        return Element(name, unit, meaning, 0.0, 8.0, "", "", name, "", 1.0, True, False, True)
+        return Element(name, unit, meaning, 0.0, 8.0, "", "", name, "", 1.0, guarded=True, fixed=True)
     section, table, b = _bounds()[name]
     factor = SI.get(b.unit, 1.0)
     guarded = section in GUARDED_SECTIONS or name in GUARDED
@@ -175,13 +180,11 @@ def documents(elements: tuple[Element, ...], row: np.ndarray, tables: tuple[str,
         if e.table not in out:
             continue
         v = border(value, e.factor)
-        if e.key == "strategy":
-            entry: Any = STRATEGIES[int(value)]
-        elif e.key == "table_input":
-            entry = ("n_r", "n_dem")[int(value)]
+        if e.whole:
+            entry: Any = CHOICES[e.name][int(value)]
         else:
             entry = {"value": v, "unit": e.border, "origin": ORIGIN}
-        if e.table in ("stroke_tables", "vane_angles") and e.section:
+        if e.of_curve:
             axis = out[e.table].setdefault(e.key, {"unit": e.border, "origin": ORIGIN, "values": []})
             axis["values"].append(v)
         elif e.table == "own_calibration":
