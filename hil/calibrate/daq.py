@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 import numpy as np
 
@@ -182,6 +183,7 @@ class Daq:
         if what == 0:
             self._stop(own)
         elif what == 1:
+            self._compile(own)
             self._start(own)
         elif what == 2:
             self._compile(own)
@@ -209,12 +211,8 @@ class Daq:
         """Work out which byte goes where. Raises Refusal for a list that is not complete."""
         if own.event < 0 or not own.tables or any(e is None for t in own.tables for e in t):
             raise Refusal(CONFIG, "the list has no event, no tables or entries that were not written")
-        pid = 0
-        for of in self.lists:
-            if of is own:
-                break
-            pid += len(of.tables)
-        own.first_pid = pid
+        before = takewhile(lambda of: of is not own, self.lists)
+        own.first_pid = pid = sum(len(of.tables) for of in before)
         if own.stim:
             entries = [e for t in own.tables for e in t if e is not None]
             if not all(e[0] == 4 and e[1] == SHORT and self.stimulus.allowed((e[2] - INPUTS) // 4) for e in entries):
@@ -236,7 +234,6 @@ class Daq:
         own.plan, own.heads = np.array(plan, np.int64).reshape(-1, 4), np.array(heads, np.int64)
 
     def _start(self, own: DaqList) -> None:
-        self._compile(own)
         own.running = True
         self._order()
 
