@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import struct
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from hil.calibrate.memory import CALIBRATION, Memory
-from hil.loop.node import Node
-from tests.conftest import ROOT
+from tests.installed_run import installed_run
 from tests.vcan.run import INTERFACE
 
 pytestmark = pytest.mark.socketcan
@@ -21,15 +16,9 @@ pytestmark = pytest.mark.socketcan
 @pytest.fixture
 def controller(tmp_path: Path) -> Iterator[Path]:
     """The controller on vcan0 with both services; the folder that it saves into."""
-    command = [sys.executable, "-m", "vaneloop.cli.main", "run", "--bus", INTERFACE, "--xcp", "--uds", "--xcp-save"]
-    with subprocess.Popen([*command, str(tmp_path / "tuned")], stdout=subprocess.PIPE, text=True, cwd=ROOT) as run:
-        try:
-            assert run.stdout is not None
-            assert any("Ctrl-C" in line for line in run.stdout)
-            yield tmp_path / "tuned"
-        finally:
-            run.terminate()
-            run.wait(60)
+    tuned = tmp_path / "tuned"
+    with installed_run("--bus", INTERFACE, "--xcp", "--uds", "--xcp-save", str(tuned), within=60):
+        yield tuned
 
 
 @pytest.mark.any_speed
@@ -44,17 +33,12 @@ def test_both_clients_talk_to_the_controller_on_vcan0(controller: Path) -> None:
     from hil.bus.port import open_bus
     from hil.uds.station import REQUEST, RESPONSE
     from tests.test_uds import client
-    from tests.test_xcp import application
+    from tests.test_xcp import application, save_kp
 
     app = application(interface="socketcan", channel=INTERFACE)
     with Master("can", config=app) as x:
         x.connect()
-        x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
-        raw = struct.pack("<d", 11.0)
-        x.download(raw[:6])
-        x.download(raw[6:])
-        x.setSegmentMode(1, 0)
-        x.setRequest(1, 0)
+        save_kp(x, 11.0)
         x.disconnect()
     assert load(controller / "calibration.toml").scalars.kp == 11.0
     bus = open_bus(INTERFACE, can_filters=[{"can_id": RESPONSE, "can_mask": 0x7FF}])

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from hil.uds import TroubleMemory
 from hil.uds.server import SIGNALS, key_of
 from hil.uds.station import FUNCTIONAL, REQUEST, RESPONSE
 from hil.uds.trouble import AGE, CODES
+from tests.installed_run import installed_run
 from tests.uds_bus import Bench, Lockstep
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
@@ -238,14 +237,7 @@ def test_udsoncan_reads_the_installed_command_on_the_embedded_bus(tmp_path: Path
     from hil.bus.port import open_bus
 
     channel, memory = f"uds{os.getpid()}", tmp_path / "codes.json"
-    run = subprocess.Popen(
-        [sys.executable, "-m", "vaneloop", "run", "--bus", f"local:{channel}", "--uds", "--uds-memory", str(memory),
-         "--duration", "120"],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    try:
-        assert run.stdout is not None
-        assert any("Ctrl-C" in line for line in run.stdout)
+    with installed_run("--bus", f"local:{channel}", "--uds", "--uds-memory", str(memory), "--duration", "120"):
         bus = open_bus(f"local:{channel}", can_filters=[{"can_id": RESPONSE, "can_mask": 0x7FF}])
         stack = isotp.CanStack(
             bus, address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=REQUEST, rxid=RESPONSE)
@@ -266,7 +258,4 @@ def test_udsoncan_reads_the_installed_command_on_the_embedded_bus(tmp_path: Path
                 except TimeoutException:
                     assert attempt < 9
         bus.shutdown()
-    finally:
-        run.terminate()
-        run.wait(20)
     assert TroubleMemory.load(memory).texts == {"F199": "20260101"}

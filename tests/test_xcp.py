@@ -28,6 +28,7 @@ from hil.loop.node import Ecu, Node
 from hil.native import Program
 from hil.native.program import own_scalars
 from tests.conftest import ROOT
+from tests.installed_run import installed_run
 from tests.native_builds import build
 from vaneloop.base.tables import path as table_path
 
@@ -345,6 +346,16 @@ def application(**options: Any) -> Any:
     return app
 
 
+def save_kp(x: Any, value: float) -> None:
+    """Set kp as a master on classic CAN does, and let the working page be saved."""
+    x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
+    raw = struct.pack("<d", value)
+    x.download(raw[:6])
+    x.download(raw[6:])
+    x.setSegmentMode(1, 0)
+    x.setRequest(1, 0)
+
+
 @pytest.mark.parametrize("seconds", [6, pytest.param(60, marks=pytest.mark.slow)])
 def test_pyxcp_records_at_1_ms_bit_for_bit(seconds: int) -> None:
     pytest.importorskip("pyxcp")
@@ -402,29 +413,15 @@ def test_pyxcp_calibrates_the_installed_command_on_the_embedded_bus(tmp_path: Pa
     from pyxcp.master import Master
 
     channel = f"xcp{os.getpid()}"
-    run = subprocess.Popen(
-        [sys.executable, "-m", "vaneloop", "run", "--bus", f"local:{channel}", "--xcp", "--xcp-save",
-         str(tmp_path / "tuned"), "--duration", "120"],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    try:
-        assert run.stdout is not None
-        assert any("Ctrl-C" in line for line in run.stdout)
-        with Master("can", config=app) as x:
-            x.connect()
-            kp = Memory(Node()).by_name()["kp"]
-            x.setMta(CALIBRATION + 8 * kp)
-            assert struct.unpack("<d", x.upload(8))[0] == 16.0
-            x.setMta(CALIBRATION + 8 * kp)
-            raw = struct.pack("<d", 11.0)
-            x.download(raw[:6])
-            x.download(raw[6:])
-            x.setSegmentMode(1, 0)
-            x.setRequest(1, 0)
-            x.disconnect()
-    finally:
-        run.terminate()
-        run.wait(20)
+    with (
+        installed_run("--bus", f"local:{channel}", "--xcp", "--xcp-save", str(tmp_path / "tuned"), "--duration", "120"),
+        Master("can", config=app) as x,
+    ):
+        x.connect()
+        x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
+        assert struct.unpack("<d", x.upload(8))[0] == 16.0
+        save_kp(x, 11.0)
+        x.disconnect()
     assert load_calibration(tmp_path / "tuned" / "calibration.toml").scalars.kp == 11.0
 
 
