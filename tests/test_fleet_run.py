@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -364,6 +365,23 @@ def test_two_starters_make_one_run(tmp_path: Path, undisturbed: list[tuple[str, 
         assert p.returncode == 0, err
     folder = Folder(tmp_path / "run")
     assert len(folder.entries()) == 40 and [tuple(r.values()) for r in rows(folder)] == undisturbed
+
+
+def test_a_log_is_taken_up_once_where_another_starter_is_quicker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vaneloop.fleet import folder
+
+    (tmp_path / "a.csv").write_text("log 1")
+    logs, run, look = sources.find([str(tmp_path / "a.csv")]), Folder.begin(tmp_path / "run", JOB, {}, {}), folder._look
+
+    def slowly(*what: Any) -> Any:
+        monkeypatch.setattr(folder, "_look", look)
+        assert Folder(run.path).add(logs) == 1, "the other one takes it up meanwhile"
+        return look(*what)
+
+    monkeypatch.setattr(folder, "_look", slowly)
+    assert run.add(logs) == 0 and len(run.chunks()) == 1
 
 
 # ---- leases and journals ---------------------------------------------------------------------------------------------

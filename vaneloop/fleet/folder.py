@@ -18,7 +18,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -120,24 +120,18 @@ class Folder:
 
     def entries(self) -> list[Entry]:
         """Every log, each path once: as the latest batch has it, in the order of the batches."""
-        import pyarrow.parquet as pq
-
         found: dict[str, Entry] = {}
-        for batch in self._batches():
-            for row in pq.read_table(batch).to_pylist():
-                found.pop(row["path"], None)
-                found[row["path"]] = Entry(**row)
+        for e in _rows(self._batches()):
+            found.pop(e.path, None)
+            found[e.path] = e
         return list(found.values())
 
     def chunks(self) -> dict[str, list[Entry]]:
         """The chunks of all batches and their logs; a chunk never changes."""
-        import pyarrow.parquet as pq
-
         out: dict[str, list[Entry]] = {}
-        for batch in self._batches():
-            for row in pq.read_table(batch).to_pylist():
-                if row["chunk"]:
-                    out.setdefault(row["chunk"], []).append(Entry(**row))
+        for e in _rows(self._batches()):
+            if e.chunk:
+                out.setdefault(e.chunk, []).append(e)
         return out
 
     def finished(self) -> set[str]:
@@ -157,14 +151,16 @@ class Folder:
         import pyarrow.parquet as pq
 
         while True:
-            known = {e.path: e for e in self.entries()}
-            keys = {e.key for c in self.chunks().values() for e in c} - again
+            batches = self._batches()
+            before = list(_rows(batches))
+            known = {e.path: e for e in before}
+            keys = {e.key for e in before if e.chunk} - again
             with ThreadPoolExecutor(8) as pool:
                 looked = pool.map(lambda s, known=known: _look(s, known.get(s.path), again), logs)
                 new = [e for e in looked if e is not None]
             if not new:
                 return 0
-            batch = len(self._batches())
+            batch = len(batches)  # as many as were read: what came while the logs were looked at has this number
             size = in_chunk or min(max(len(new) // 200, 1), 64)
             n, rows = 0, []
             for e in new:
@@ -227,6 +223,15 @@ class Folder:
         for folder in sorted((self.path / "results").glob("*")):
             if folder.name not in done:
                 yield folder.name, sum(1 for f in folder.glob("*.json") if f.name[0] != ".")
+
+
+def _rows(batches: Iterable[Path]) -> Iterator[Entry]:
+    """Every row of these batches."""
+    import pyarrow.parquet as pq
+
+    for batch in batches:
+        for row in pq.read_table(batch).to_pylist():
+            yield Entry(**row)
 
 
 def _schema() -> Any:
