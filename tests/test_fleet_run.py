@@ -178,6 +178,13 @@ def test_a_run_of_another_machine_or_version_is_not_gone_on_with(tmp_path: Path)
         work(folder.path)
 
 
+def test_a_copy_of_a_folder_with_a_dot_in_its_name_is_where_the_job_says(tmp_path: Path) -> None:
+    (tmp_path / "bench.v2").mkdir()
+    (tmp_path / "bench.v2" / "plant.toml").write_text("a = 1\n")
+    folder = Folder.begin(tmp_path / "run", JOB, {}, {"tables": str(tmp_path / "bench.v2")})
+    assert (folder.path / folder.job["files"]["tables"] / "plant.toml").read_text() == "a = 1\n"
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(InputError, match="holds other files"):

@@ -116,19 +116,19 @@ def _run(args: argparse.Namespace) -> int:
 
 def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     """Options of the job, and the files that it needs."""
+    from vaneloop.base import tables
+    from vaneloop.fleet.folder import copies_of
+
     options.machine_of(args)  # refuses what cannot be read, before anything is begun
     files = {"tables": args.tables, "model": args.model, "plant": args.plant, "controller": args.controller,
              "dbc": args.dbc, "mapping": args.mapping}  # fmt: skip
     given = {name: str(f) for name, f in files.items() if f is not None}
-    if args.plant and not Path(args.plant).is_file():
-        from vaneloop.base import tables
-
-        given["plant"] = str(tables.path(args.plant))
+    if args.plant:
+        given["plant"] = str(tables.file_of(args.plant))
     reading = options.log_options(args, source="LOGS")
     for in_files in ("dbc", "mapping_file"):
         reading.pop(in_files)
-    inside = {name: f"machine/{name}{Path(f).suffix}" for name, f in given.items()}
-    return {"files": inside, "reading": reading, "limit": args.limit}, given
+    return {"files": copies_of(given), "reading": reading, "limit": args.limit}, given
 
 
 def _work(args: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, digest_of, passed, read_json, whole
 from vaneloop.fleet.sources import Source
 
-__all__ = ["DONE", "Entry", "Folder", "sources_version"]
+__all__ = ["DONE", "Entry", "Folder", "copies_of", "sources_version"]
 
 DONE = ("done", "refused", "defect", "died", "timeout", "changed", "unreadable")  # what may come of a log
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
@@ -54,6 +54,11 @@ class Entry:
     engine: str
     time: float | None
     reason: str = ""
+
+
+def copies_of(files: dict[str, str]) -> dict[str, str]:
+    """Where in a run's folder the copies of files and folders stand, by the same names."""
+    return {name: f"machine/{name}{Path(f).suffix}" for name, f in files.items()}
 
 
 def sources_version() -> str:
@@ -99,7 +104,7 @@ class Folder:
         digest = _digest_of_all(files)
         job = {
             "schema": 1, "function": function, "options": options, "version": sources_version(), "machine": digest,
-            "files": {name: f"machine/{name}{Path(f).suffix}" for name, f in files.items()},
+            "files": copies_of(files),
         }  # fmt: skip
         if not (root / "run.json").is_file():
             try:
@@ -287,12 +292,9 @@ def _copy(files: dict[str, str], to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(prefix=".machine-", dir=to.parent))
     try:
-        for name, f in files.items():
-            path = Path(f)
-            if path.is_dir():
-                shutil.copytree(path, made / name)
-            else:
-                shutil.copyfile(path, made / f"{name}{path.suffix}")
+        for name, copy in copies_of(files).items():
+            take = shutil.copytree if Path(files[name]).is_dir() else shutil.copyfile
+            take(files[name], made / Path(copy).name)
         made.chmod(0o755)
         os.rename(made, to)
     except OSError:
