@@ -30,7 +30,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, digest_of, passed, read_json, whole
 from vaneloop.fleet.sources import Source
 
-__all__ = ["DONE", "Entry", "Folder", "copies_of", "sources_version"]
+__all__ = ["DONE", "Entry", "Folder", "copies_of", "key_of", "sources_version"]
 
 DONE = ("done", "refused", "defect", "died", "timeout", "changed", "unreadable")  # what may come of a log
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
@@ -54,6 +54,11 @@ class Entry:
     engine: str
     time: float | None
     reason: str = ""
+
+
+def key_of(path: str) -> str:
+    """Key of a log: what is in it, and its suffix, which says how to read it. Raises OSError."""
+    return f"{digest_of(path)}{Path(path).suffix.lower()}"
 
 
 def copies_of(files: dict[str, str]) -> dict[str, str]:
@@ -259,7 +264,7 @@ def _look(s: Source, known: Entry | None, again: Set[str]) -> Entry | None:
         if same and known is not None and s.engine in ("", known.engine) and s.time in (None, known.time):
             return replace(known, chunk="") if known.key in again else None
         s = s.described()
-        key = known.key if same and known is not None else f"{digest_of(s.path)}{Path(s.path).suffix.lower()}"
+        key = known.key if same and known is not None else key_of(s.path)
         return Entry(s.path, key, there.st_size, there.st_mtime_ns, "", s.engine, s.time)
     except OSError as e:
         reason = f"cannot be read ({e.strerror})"

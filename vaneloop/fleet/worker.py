@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base.errors import InputError
-from vaneloop.fleet.files import digest_of, passed, whole_json
-from vaneloop.fleet.folder import Entry, Folder, sources_version
+from vaneloop.fleet.files import passed, whole_json
+from vaneloop.fleet.folder import Entry, Folder, key_of, sources_version
 from vaneloop.fleet.journal import Journal
 from vaneloop.fleet.leases import Leases, Me
 from vaneloop.fleet.reader import Died, Reader, Stopped, TimedOut
@@ -162,7 +162,7 @@ def _given_up(before: Sequence[str]) -> dict[str, Any] | None:
 def _unlike(e: Entry) -> dict[str, Any] | None:
     """The row of a log that is not what the run took up; None: it is."""
     try:
-        if f"{digest_of(e.path)}{Path(e.path).suffix.lower()}" == e.key:
+        if key_of(e.path) == e.key:
             return None
     except OSError as why:
         return {"status": "unreadable", "reason": f"cannot be read ({why.strerror})"}
