@@ -53,8 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--queue", action="append", default=[], metavar="NAME=value", help="option of the Slurm queue")
     run.add_argument("--limit", type=float, default=3600.0, metavar="S", help="s for one log, then it is given up")
     run.add_argument("--retry", action="store_true", help="once more what died, took too long or met a defect")
-    run.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
-                     "worker takes over (default 60)")  # fmt: skip
+    _add_patience(run)
     options.add_reading_options(run.add_argument_group("reading the logs (docs/logs.md)"))
     options.add_machine_options(run)
     run.add_argument("--controller", metavar="PATH.so", help="your own controller in place of the firmware")
@@ -70,14 +69,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     demo.add_argument("--workers", type=int, default=2, metavar="N", help="logs simulated side by side (default 2)")
     for part in (work, status, report):
         part.add_argument("run", metavar="RUN", help="folder of the run")
-    work.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
-                      "worker takes over (default 60)")  # fmt: skip
+    _add_patience(work)
     report.add_argument("--limits", metavar="F.csv", help="columns quantity, limit: where an effect's parameter or a "
                         "nominal one ends its life; of a nominal one without, the end of its tolerance")  # fmt: skip
     report.add_argument("--tables-out", metavar="DIR", help="write every table as Parquet and CSV")
     for part in (run, work, status, demo):
         terminal.add_output_options(part)
     terminal.add_output_options(report, report=True)
+
+
+def _add_patience(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
+                        "worker takes over (default 60)")  # fmt: skip
 
 
 def command(args: argparse.Namespace) -> int:
@@ -92,6 +95,7 @@ def command(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from vaneloop.fleet import sources, state
     from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.leases import BEATS
     from vaneloop.fleet.rent import rent
 
     if not 1 <= args.workers <= 10_000:
@@ -109,7 +113,7 @@ def _run(args: argparse.Namespace) -> int:
     if left:
         with terminal.progress_bar(args, "diagnosing the fleet") as progress:
             queue = terminal.pairs(args.queue, "queue")
-            rent(folder, args.on, args.workers, queue, _patience(args) / 12.0,
+            rent(folder, args.on, args.workers, queue, _patience(args) / BEATS,
                  lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
     return _show(args, folder)
 
@@ -133,10 +137,11 @@ def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
 
 def _work(args: argparse.Namespace) -> int:
     from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.leases import BEATS
     from vaneloop.fleet.worker import work
 
     patience = _patience(args)
-    came = work(args.run, every=patience / 12.0, patience=patience)
+    came = work(args.run, every=patience / BEATS, patience=patience)
     terminal.say(args, "this worker: " + (", ".join(f"{n} {s}" for s, n in sorted(came.items())) or "nothing to do"))
     return _show(args, Folder(args.run))
 

@@ -20,7 +20,9 @@ from typing import Any
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, read_json, whole_json
 
-__all__ = ["Leases", "Me", "gone"]
+__all__ = ["BEATS", "Leases", "Me", "gone"]
+
+BEATS = 12.0  # heartbeats that may fail to come until a worker is taken for dead
 
 
 def _host() -> str:
@@ -57,7 +59,7 @@ class Me:
     """This process as a worker of a run: its name, and a heartbeat as long as it lives.
 
     starter  the process that rents it
-    orphan   set when this one is to stop: the starter is gone, or somebody asked for it
+    stopped  set when this one is to stop: the starter is gone, or somebody asked for it
     """
 
     def __init__(self, run: Path, every: float = 5.0, starter: str = "", kind: str = "worker"):
@@ -67,9 +69,9 @@ class Me:
         who = {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid()), "kind": kind}
         whole_json(self.folder / f"{self.name}.json", who)
         self.every, self.beats = every, 0
-        self.orphan = self.stopped = threading.Event()
+        self.stopped = threading.Event()
         self._starter = starter
-        self._watch = Leases(run, 12.0 * every) if starter else None
+        self._watch = Leases(run, BEATS * every) if starter else None
         self._beat()
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
@@ -93,7 +95,7 @@ class Me:
         while not self.stopped.wait(self.every):
             self._beat()
             if self._watch is not None and self._watch.dead(self._starter):
-                self.orphan.set()
+                self.stopped.set()
 
 
 class Leases:
@@ -143,7 +145,7 @@ class Leases:
 
     def take(self, chunks: Iterable[str], me: str) -> tuple[str, int] | None:
         """Take the first chunk that is free or left alone: its name and the lease's number; None: all are in work."""
-        held = self.held()
+        held, text = self.held(), f'{{"worker": "{me}"}}'
         workers: dict[str, bool] = {}
         for chunk in chunks:
             number = held.get(chunk, -1)
@@ -152,8 +154,7 @@ class Leases:
                     workers[holder] = self.dead(holder)
                 if not workers[holder]:
                     continue
-            text = f'{{"worker": "{me}"}}'
-            if create(self.folder / f"{chunk}.{number + 1}", lambda f, t=text: f.write_text(t)):  # type: ignore[misc]
+            if create(self.folder / f"{chunk}.{number + 1}", lambda f: f.write_text(text)):
                 return chunk, number + 1
         return None
 

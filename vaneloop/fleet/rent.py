@@ -5,14 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
-import os
 import threading
 from collections.abc import Callable
 from typing import Any
 
 from vaneloop.base.errors import InputError, meant
 from vaneloop.fleet.folder import Folder
-from vaneloop.fleet.leases import Me
+from vaneloop.fleet.leases import BEATS, Me
 
 __all__ = ["PLACES", "needs", "rent"]
 
@@ -109,5 +108,4 @@ def _work(run: str, starter: str, every: float) -> dict[str, int]:
     """Work on the run, in a process of the cluster."""
     from vaneloop.fleet.worker import work
 
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return work(run, starter=starter, every=every, patience=12.0 * every)
+    return work(run, starter=starter, every=every, patience=BEATS * every)

@@ -56,7 +56,7 @@ def work(
 class _Worker:
     def __init__(self, folder: Folder, me: Me, leases: Leases):
         self.folder, self.me, self.leases = folder, me, leases
-        self.reader = Reader(folder.job["function"], str(folder.path), me.orphan)
+        self.reader = Reader(folder.job["function"], str(folder.path), me.stopped)
         self.limit = float(folder.job["options"].get("limit", LIMIT))
         self.counts: dict[str, int] = {}
         self.journal = Journal(folder.path, me.name)
@@ -68,7 +68,7 @@ class _Worker:
         at = random.Random(self.me.name).randrange(max(len(order), 1))
         order = order[at:] + order[:at]
         try:
-            while not self.me.orphan.is_set():
+            while not self.me.stopped.is_set():
                 done = self.folder.finished()
                 order = [c for c in order if c not in done]
                 if not order:
@@ -77,7 +77,7 @@ class _Worker:
                 taken = self.leases.take(order, self.me.name)
                 if taken is not None:
                     self._chunk(*taken, chunks[taken[0]])
-                elif not wait or self.me.orphan.wait(min(self.me.every, 1.0)):
+                elif not wait or self.me.stopped.wait(min(self.me.every, 1.0)):
                     break
         finally:
             self.reader.stop()
@@ -92,7 +92,7 @@ class _Worker:
         self.journal.note("took", chunk=chunk, lease=number)
         try:
             for e in entries:
-                if self.me.orphan.is_set() or not self.leases.mine(chunk, number):
+                if self.me.stopped.is_set() or not self.leases.mine(chunk, number):
                     return
                 if not (self.folder.results(chunk) / f"{e.key}.json").exists():
                     self._log(chunk, e)
@@ -116,7 +116,7 @@ class _Worker:
                 self.journal.note("begin", key=e.key, path=e.path)
                 passed("begin")
                 row = self._read(e, tried, before)
-            if self.me.orphan.is_set():
+            if self.me.stopped.is_set():
                 return
         whole_json(self.folder.results(chunk) / f"{e.key}.json", {"key": e.key, **row})
         passed("result")
@@ -188,7 +188,7 @@ def _append(file: Path, line: str) -> None:
 @contextlib.contextmanager
 def _terminable(me: Me) -> Iterator[None]:
     """SIGTERM (a queue that wants its node back) ends the work in order; only a main thread can hear it."""
-    stop: Callable[..., None] = lambda *_: me.orphan.set()  # noqa: E731
+    stop: Callable[..., None] = lambda *_: me.stopped.set()  # noqa: E731
     try:
         before = signal.signal(signal.SIGTERM, stop)
     except ValueError:
