@@ -14,14 +14,13 @@ from scipy import stats
 
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.trends import ODD, SURE, Trend, limit_of, odd, trend
-from vaneloop.pages.fleet import FleetView, Series
+from vaneloop.pages.fleet import YEAR, FleetView, Series
 
 if TYPE_CHECKING:
     import duckdb
 
 __all__ = ["FALSE", "YEAR", "limits_of", "view_of", "write_pages"]
 
-YEAR = 365.25 * 86400.0  # s
 FALSE = (
     0.05  # of the logs of an engine that lacks nothing, in which some one effect is named: docs/diagnosis.md has less
 )
@@ -199,14 +198,12 @@ def _outliers(found: Sequence[Series]) -> list[dict[str, Any]]:
     """Engines whose present level of a nominal parameter is unlike that of their sisters."""
     by: dict[str, list[Series]] = {}
     for s in found:
-        if s.kind == "nominal" and s.trend.get("now") is not None:
+        if s.kind == "nominal" and "now" in s.trend:
             by.setdefault(s.quantity, []).append(s)
     out = []
     for quantity, group in sorted(by.items()):
-        level = [float(s.trend.get("now", np.nan)) for s in group]
-        own = [
-            float(s.trend["now_high"] - s.trend["now_low"]) / SPREAD if "now_high" in s.trend else 0.0 for s in group
-        ]
+        level = [float(s.trend["now"]) for s in group]
+        own = [float(s.trend["now_high"] - s.trend["now_low"]) / SPREAD for s in group]
         for s, v, p in zip(group, level, odd(level, own, len(by)), strict=True):
             if p < ODD:
                 sisters = float(np.nanmedian([x for x, g in zip(level, group, strict=True) if g is not s]))

@@ -19,7 +19,7 @@ __all__ = ["FleetView", "Series", "fleet_page", "log_page"]
 SHOWN = 12  # trends drawn
 ROWS = 200  # of a table
 EFFECTS = 24  # columns of the heat map
-YEAR = 365.25 * 86400.0
+YEAR = 365.25 * 86400.0  # s
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,10 @@ class Series:
     def changes(self) -> bool:
         """Whether it has changed."""
         return self.trend.get("kind") in ("growth", "step")
+
+    def first(self) -> str:
+        """The first log after its onset, of a quantity that has changed."""
+        return self.keys[int(np.searchsorted(self.t, self.trend["onset"]).clip(0, len(self.t) - 1))]
 
     def json(self) -> dict[str, Any]:
         """A row of the table ``trends``."""
@@ -108,8 +112,7 @@ class FleetView:
 
     def keys(self) -> list[str]:
         """Logs that the page leads to."""
-        changed = [s.keys[int(np.searchsorted(s.t, s.trend["onset"]).clip(0, len(s.t) - 1))] for s in self.changed]
-        return sorted({*(r["key"] for r in self.lacking), *changed[:ROWS]})
+        return sorted({*(r["key"] for r in self.lacking), *(s.first() for s in self.changed[:ROWS])})
 
     def json(self) -> dict[str, Any]:
         """The answer as plain data."""
@@ -194,11 +197,10 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
         when = day(x["limit_time"]) if x["limit_time"] else "–"
         if x["limit_time"]:
             when += f" ({day(x['limit_low'])} to {day(x['limit_high']) if x['limit_high'] else 'no latest time'})"
-        at = int(np.searchsorted(s.t, x["onset"]).clip(0, len(s.t) - 1))
         change = f"{x['rate']:.3g} ({x['rate_low']:.3g} to {x['rate_high']:.3g}) {s.unit}{'' if step else '/year'}"
         rows.append([
             s.engine, s.quantity, x["kind"], f"{day(x['onset'])} ({day(x['onset_low'])} to {day(x['onset_high'])})",
-            change, f"{x['now']:.4g} {s.unit}", when, x["limit_why"] or "–", _to(s.keys[at], logs),
+            change, f"{x['now']:.4g} {s.unit}", when, x["limit_why"] or "–", _to(s.first(), logs),
         ])  # fmt: skip
     if rows:
         columns = ["engine", "quantity", "change", "since", "rate or height", "now", "limit reached", "remark", "log"]
