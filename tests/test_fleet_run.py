@@ -437,6 +437,22 @@ def test_a_worker_that_stands_still_while_it_writes_its_heartbeat_loses_its_leas
     still.leave()
 
 
+@pytest.mark.parametrize("look", [state.state_of, state.tidy])
+def test_a_worker_that_leaves_while_somebody_looks_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Folder], Any]
+) -> None:
+    folder = fleet(tmp_path, many(1))
+    me, read = Me(folder.path, every=3600.0), state.read_json
+
+    def late(file: Path) -> Any:
+        me.leave()
+        return read(file)
+
+    monkeypatch.setattr(state, "read_json", late)
+    look(folder)
+    assert state.state_of(folder).workers == {}
+
+
 def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
     journal = Journal(tmp_path, "w")
     journal.note("begin", key="a")

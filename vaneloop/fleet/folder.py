@@ -223,7 +223,7 @@ class Folder:
     def tidy(self) -> None:
         """Clear up after processes that were killed between a part and its clearing."""
         done = self.finished()
-        for folder in (self.path / "results").glob("*") if (self.path / "results").is_dir() else ():
+        for folder in (self.path / "results").glob("*"):
             if folder.name in done:
                 self.clear(folder.name)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,26 +54,29 @@ def came_to(folder: Folder) -> dict[str, str]:
 def state_of(folder: Folder) -> State:
     """Look how far a run is."""
     entries, statuses = folder.entries(), came_to(folder)
-    came: dict[str, int] = {}
-    for status in statuses.values():
-        came[status] = came.get(status, 0) + 1
     unreadable = sum(e.key == "" for e in entries)
-    if unreadable:
-        came["unreadable"] = came.get("unreadable", 0) + unreadable
+    came = Counter(statuses.values()) + Counter(unreadable=unreadable)  # without what is zero
     contents = len({e.key for e in entries if e.key} | statuses.keys()) + unreadable
     done = len(statuses) + unreadable + sum(n for _, n in folder.begun())
-    workers = {}
-    for file in sorted((folder.path / "workers").glob("*.json")):
-        who = read_json(file)
-        if not Leases(folder.path).dead(file.stem):
-            workers[file.stem] = str(who["kind"])
+    leases = Leases(folder.path)
+    workers = {file.stem: str(who["kind"]) for file, who in _workers(folder) if not leases.dead(file.stem)}
     return State(len(entries), contents, min(done, contents), dict(sorted(came.items())), workers)
 
 
 def tidy(folder: Folder) -> None:
     """Clear up after processes that were killed: files of finished chunks, names of workers that are gone."""
     folder.tidy()
-    for file in (folder.path / "workers").glob("*.json"):
-        if gone(read_json(file)):
-            for f in (file, Path(str(file).removesuffix("json") + "beat")):
+    for file, who in _workers(folder):
+        if gone(who):
+            for f in (file, file.with_suffix(".beat")):
                 f.unlink(missing_ok=True)
+
+
+def _workers(folder: Folder) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The files of the workers, and what they say; one that leaves meanwhile is left out."""
+    for file in sorted((folder.path / "workers").glob("*.json")):
+        try:
+            who = read_json(file)
+        except FileNotFoundError:
+            continue
+        yield file, who
