@@ -465,9 +465,18 @@ def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
 # ---- rented workers --------------------------------------------------------------------------------------------------
 
 RENT = (
-    "import sys; from vaneloop.fleet.folder import Folder; from vaneloop.fleet.rent import rent\n"
-    "if __name__ == '__main__': print(rent(Folder(sys.argv[1]), sys.argv[2], 2, {}, 0.2, lambda n, of: None))"
+    "import sys; from vaneloop.base import terminal\n"
+    "from vaneloop.fleet.folder import Folder; from vaneloop.fleet.rent import rent\n"
+    "def main(): print(rent(Folder(sys.argv[1]), sys.argv[2], 2, {}, 0.2, lambda n, of: None)); return 0\n"
+    "if __name__ == '__main__': sys.exit(terminal.run(main))"
 )
+
+
+def starter(tmp: Path, folder: Folder, on: str) -> subprocess.Popen[str]:
+    """A process that rents two workers for a run."""
+    (tmp / "rent.py").write_text(RENT)
+    words = [sys.executable, str(tmp / "rent.py"), str(folder.path), on]
+    return subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
@@ -476,10 +485,8 @@ def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
     import psutil
 
     pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
-    (tmp_path / "rent.py").write_text(RENT)
     folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
-    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
-    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    p = starter(tmp_path, folder, "local")
     until(lambda: len(folder.finished()) >= 3, p)
     rented = psutil.Process(p.pid).children(recursive=True)
     p.kill()
@@ -499,10 +506,8 @@ def test_a_killed_rented_worker_has_a_successor_and_the_run_ends(
     import psutil
 
     pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
-    (tmp_path / "rent.py").write_text(RENT)
     folder = fleet(tmp_path, many(40), in_chunk=2)
-    words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), "local"]
-    p = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    p = starter(tmp_path, folder, "local")
     until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)
     worker = int(next(line["worker"] for line in lines(folder.path)).split("-")[-2])
     psutil.Process(worker).kill()
@@ -539,27 +544,20 @@ def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
     pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
     folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
     file = tmp_path / "scheduler.json"
-    dask = [sys.executable, "-m", "distributed.cli"]
     runs = ["dask_scheduler", "dask_worker"]
     options = [["--port", "0", "--no-dashboard"], ["--nthreads", "1", "--nworkers", "2", "--no-dashboard"]]
     cluster = [
         subprocess.Popen(
-            [*dask[:2], f"distributed.cli.{name}", "--scheduler-file", str(file), *more], env=ENV,
+            [sys.executable, "-m", f"distributed.cli.{name}", "--scheduler-file", str(file), *more], env=ENV,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         ) for name, more in zip(runs, options, strict=True)
     ]  # fmt: skip
     started = None
     try:
-        until(file.exists, None)
-        until(lambda: bool(file.read_text()), None)
+        until(file.exists)
+        until(lambda: bool(file.read_text()))
         address = json.loads(file.read_text())["address"]
-        (tmp_path / "rent.py").write_text(
-            RENT.replace(
-                "print(rent(", "from vaneloop.base import terminal; sys.exit(terminal.run(lambda: rent("
-            ).replace("None))", "None) and 0))")
-        )
-        words = [sys.executable, str(tmp_path / "rent.py"), str(folder.path), address]
-        started = subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started = starter(tmp_path, folder, address)
         until(lambda: len(folder.finished()) >= 3, started)
         cluster[0].kill()
         _, err = started.communicate()
