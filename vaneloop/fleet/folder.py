@@ -6,7 +6,8 @@
     leases/CHUNK.N         who works on a chunk; the greatest N counts
     workers/W.json, W.beat who a worker is, and that it lives
     journal/W.jsonl        what a worker did, a line each, never changed
-    results/CHUNK/KEY.json what came of one log of a chunk in work
+    results/CHUNK/KEY.json what came of one log of a chunk in work: its status is done, refused, defect, died, timeout,
+                           changed or unreadable
     parts/CHUNK.parquet    what came of all logs of a finished chunk
 
 A result belongs to the content of a log (KEY: SHA-256 and suffix), not to its name: a copy is not diagnosed again.
@@ -30,9 +31,8 @@ from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, digest_of, passed, read_json, whole
 from vaneloop.fleet.sources import Source
 
-__all__ = ["DONE", "Entry", "Folder", "copies_of", "key_of", "sources_version"]
+__all__ = ["Entry", "Folder", "copies_of", "key_of", "sources_version"]
 
-DONE = ("done", "refused", "defect", "died", "timeout", "changed", "unreadable")  # what may come of a log
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
 
 
