@@ -20,8 +20,10 @@ from hypothesis import strategies as st
 from hil.figures import error_figures
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
+from vaneloop.discrepancy.locate import Regime
 from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
 from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
+from vaneloop.pages.failures import failure_map
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.replay import replay_page
@@ -302,6 +304,17 @@ def test_a_waterfall_hangs_each_fall_from_the_level_before():
     assert 0.0 < bottom < 0.1  # the axis is logarithmic
     assert bar["base"] == [bottom, 0.4, 0.1, bottom]
     assert bar["y"] == pytest.approx([1.0 - bottom, 0.6, 0.3, 0.1 - bottom])
+
+
+def test_the_worst_moment_of_a_failure_map_is_that_of_a_cell_that_it_shows():
+    samples, ratio = np.array([500, 500, 12]), np.array([1.2, 3.0, 9.0])
+    at = Regime(
+        "x", "mm", "direction", "", np.array([-1.5, -0.5, 0.5, 1.5]), ratio, ratio, samples, ratio > 2.0, 0.5,
+        np.array([1.0, 2.0, 3.0]),
+    )  # fmt: skip
+    figure = failure_map([at])
+    assert figure["data"][0]["z"] == [[1.2, 3.0, None]]
+    assert figure["layout"]["meta"]["worst"] == 2.0
 
 
 def test_steps_are_named_by_what_they_add_and_what_they_drop():

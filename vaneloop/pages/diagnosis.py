@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import Located, Regime, locate
+from vaneloop.discrepancy.locate import Located, locate
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.stage import Bound, Stage
 from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
-from vaneloop.pages.figures import Figure, Line, Panel, heat, loop, overlay, ranking, waterfall
+from vaneloop.pages.failures import failure_map
+from vaneloop.pages.figures import Line, Panel, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import (
     CANNOT,
@@ -33,12 +34,11 @@ from vaneloop.pages.story import (
 from vaneloop.pages.style import TONE_OF, Tone, number
 
 __all__ = [
-    "compare_page", "diagnosis_page", "experiment_page", "extended_page", "failure_map", "located_sentence",
-    "located_tone", "verdict_sentence",
+    "compare_page", "diagnosis_page", "experiment_page", "extended_page", "located_sentence", "located_tone",
+    "verdict_sentence",
 ]  # fmt: skip
 
 Columns = list[tuple[str, np.ndarray, str]]
-MOST_CONDITIONS = 9  # rows of a failure map
 
 
 def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
@@ -359,35 +359,12 @@ def _curves(page: Page, judge: Judge, models: Columns, caption: str) -> int:
     return len(page.figures) - 1
 
 
-def failure_map(regimes: Sequence[Regime]) -> Figure:
-    """Error in noise floors under each condition: every cell has its range of values, and the moment it is worst at."""
-    width = max(len(r.ratio) for r in regimes)
-    cells: list[list[float | None]] = []
-    places, moments = [], []
-    for r in regimes:
-        empty = width - len(r.ratio)
-        cells.append([float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty)
-        places.append([_range(r, b) for b in range(len(r.ratio))] + [""] * empty)
-        moments.append([*(float(v) for v in r.moments), *[None] * empty])
-    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in regimes]
-    columns = [f"eighth {i + 1}" for i in range(width)]
-    return heat(cells, columns, names, "noise floors", "an eighth of the samples each, lowest values to highest", "",
-                places=places, moments=moments)  # fmt: skip
-
-
-def _range(r: Regime, b: int) -> str:
-    """The values of a bin, short enough for a cell."""
-    if r.condition == "direction":
-        return r.place(b).partition(" ")[2]
-    return f"{r.edges[b]:.3g} … {r.edges[b + 1]:.3g}"
-
-
 def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> None:
     """Draw where a stage fails; ``drawn``: the plot of its curves, which a click on a cell moves to the moment."""
     if located.onset is not None:
         page.text(f"The error of the {located.stage} stage begins at t = {located.onset:.0f} s.")
     for output in dict.fromkeys(r.output for r in located.hot):
-        mine = [r for r in located.hot if r.output == output][:MOST_CONDITIONS]
+        mine = [r for r in located.hot if r.output == output]
         figure = failure_map(mine)
         figure["layout"]["meta"] |= {"shows": drawn}
         said = f" {when} anything was added" if when else ""

@@ -65,13 +65,6 @@
     Plotly.relayout(plot, {"xaxis.range": [t - 2, t + 2], "xaxis.autorange": false});
     plot.scrollIntoView({behavior: "smooth", block: "center"});
   };
-  const worst = map => {
-    let best = [0, null];
-    map.data[0].z.forEach((row, i) => row.forEach((z, j) => {
-      if (z > best[0]) best = [z, map.data[0].customdata[i][j]];
-    }));
-    return best[1];
-  };
   const connect = (map, caption) => {
     if (!map.layout.meta || map.layout.meta.shows === undefined) return;
     map.on("plotly_click", e => show(map, e.points[0].customdata));
@@ -79,7 +72,7 @@
     b.type = "button";
     b.className = "show";
     b.textContent = "Show me the worst moment";
-    b.onclick = () => show(map, worst(map));
+    b.onclick = () => show(map, map.layout.meta.worst);
     caption.append(b);
   };
   const draw = (name, width) => figures.forEach((figure, i) => {

@@ -9,7 +9,7 @@ from nicegui import events, ui
 
 from plant.effects import EFFECTS
 from vaneloop.discrepancy.locate import AGREES, Located
-from vaneloop.pages.diagnosis import MOST_CONDITIONS, failure_map
+from vaneloop.pages.failures import failure_map
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
@@ -134,9 +134,9 @@ class _Page:
         if located.onset is not None:
             ui.label(f"The error begins at t = {located.onset:.0f} s.")
         output = hot[0].output
-        mine = [r for r in hot if r.output == output][:MOST_CONDITIONS]
+        mine = [r for r in hot if r.output == output]
         figure = failure_map(mine)
-        worst = max((v, t) for r in mine for v, t in zip(r.ratio, r.moments, strict=True) if t == t)[1]
+        worst = figure["layout"]["meta"]["worst"]
         with ui.element("div").classes("scroll").props('tabindex="0" role="group" aria-label="failure map"'):
             figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
         with ui.element("div").classes("rowc"):

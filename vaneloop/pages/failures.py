@@ -1,0 +1,43 @@
+"""Where a stage fails: the map of its error under each condition, light enough for whoever only draws it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vaneloop.discrepancy.locate import Regime
+from vaneloop.pages.figures import Figure, heat
+
+__all__ = ["failure_map"]
+
+MOST_CONDITIONS = 9  # rows of a failure map
+
+
+def failure_map(regimes: Sequence[Regime]) -> Figure:
+    """Error in noise floors under each condition: every cell has its range of values, and the moment it is worst at.
+
+    ``layout.meta.worst`` is the moment (s) of the worst cell.
+    """
+    regimes = regimes[:MOST_CONDITIONS]
+    width = max(len(r.ratio) for r in regimes)
+    cells: list[list[float | None]] = []
+    places, moments = [], []
+    for r in regimes:
+        empty = width - len(r.ratio)
+        cells.append([float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty)
+        places.append([_range(r, b) for b in range(len(r.ratio))] + [""] * empty)
+        moments.append([*(float(v) for v in r.moments), *[None] * empty])
+    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in regimes]
+    columns = [f"eighth {i + 1}" for i in range(width)]
+    figure = heat(cells, columns, names, "noise floors", "an eighth of the samples each, lowest values to highest", "",
+                  places=places, moments=moments)  # fmt: skip
+    filled = ((v, k, b) for k, row in enumerate(cells) for b, v in enumerate(row) if v is not None)
+    _, k, b = max(filled, key=lambda cell: cell[0])
+    figure["layout"]["meta"] |= {"worst": moments[k][b]}
+    return figure
+
+
+def _range(r: Regime, b: int) -> str:
+    """The values of a bin, short enough for a cell."""
+    if r.condition == "direction":
+        return r.place(b).partition(" ")[2]
+    return f"{r.edges[b]:.3g} … {r.edges[b + 1]:.3g}"
