@@ -31,7 +31,7 @@ from vaneloop.pages.story import (
     word_of_located,
     worths,
 )
-from vaneloop.pages.style import TONE_OF, Tone, number
+from vaneloop.pages.style import TONE_OF, Tone, capital, number
 
 __all__ = [
     "compare_page", "diagnosis_page", "experiment_page", "extended_page", "located_sentence", "located_tone",
@@ -59,7 +59,7 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
     if not parts:
         return "Nothing is missing: every observed stage fits its measurements down to the noise floor."
     text = "; ".join([*parts, by_log.sentence()] if by_log is not None else parts)
-    return text[0].upper() + text[1:] + "."
+    return f"{capital(text)}."
 
 
 def located_sentence(located: Sequence[Located]) -> str:
@@ -151,7 +151,7 @@ def _notes(page: Page, notes: Sequence[str]) -> None:
     if notes:
         page.section("Notes")
         for n in notes:
-            page.text(n[0].upper() + n[1:] + ".")
+            page.text(f"{capital(n)}.")
 
 
 def extended_page(
@@ -165,7 +165,7 @@ def extended_page(
 ) -> Page:
     """The page of ``vaneloop extend``: the model with its effects, and the error that is left."""
     good = not refused and all(reached(s) for s in d.stages)
-    sentence = " ".join([extended_sentence(d, refused), *([_capital(by_log.sentence()) + "."] if by_log else [])])
+    sentence = " ".join([extended_sentence(d, refused), *([f"{capital(by_log.sentence())}."] if by_log else [])])
     page = Page(f"Extended model: {Path(log).name}", sentence, tone="good" if good else "bad", command=command, log=log)
     return _told(page, d, bound, None, by_log, tested, True)
 
@@ -254,7 +254,7 @@ def _told(
             continue
         _stage_story(page, s, bound, extended)
         for x in d.shapes.get(s.stage, []):
-            page.text(x.text[0].upper() + x.text[1:] + ".")
+            page.text(f"{capital(x.text)}.")
             page.plot(
                 loop(
                     [Line("what is left", x.x, x.y, "error", 2.0)],
@@ -373,7 +373,3 @@ def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> No
             f"Where the {located.stage} stage fails{said}: error of {output} in noise floors. "
             f"Worst: {mine[0].worst()}. A click on a cell shows its moment in the curves above.",
         )
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:]

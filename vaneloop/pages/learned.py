@@ -14,7 +14,7 @@ from vaneloop.discrepancy.models.learning import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
-from vaneloop.pages.style import number
+from vaneloop.pages.style import capital, number
 
 __all__ = ["curve_figure", "learned_page", "visited_figure"]
 
@@ -62,10 +62,9 @@ def learned_page(
         figures = f"{number(law.error_before)} to {number(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
     for law in laws:
-        text = law.sentence()
         page.section(
             law.name,
-            f"{text[0].upper()}{text[1:]}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no "
+            f"{capital(law.sentence())}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no "
             "log has been there, and the curve stays as at its end.",
         )
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
@@ -85,5 +84,5 @@ def learned_page(
     if notes:
         page.section("Notes")
         for note in notes:
-            page.text(f"{note[0].upper()}{note[1:]}.")
+            page.text(f"{capital(note)}.")
     return page

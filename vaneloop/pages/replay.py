@@ -15,7 +15,7 @@ from vaneloop.pages.figures import Line, Panel, histogram, overlay
 from vaneloop.pages.page import Page
 from vaneloop.pages.run import ZOOM, Result, against_speed, axis_title, loops, signal_name, speed_lines
 from vaneloop.pages.series import break_at_holes
-from vaneloop.pages.style import Tone, number
+from vaneloop.pages.style import Tone, capital, number
 
 __all__ = ["replay_page"]
 
@@ -199,7 +199,7 @@ def _figures_table(page: Page, signals: Sequence[SignalError]) -> None:
 
 def _in_words(s: SignalError) -> str:
     text = (
-        f"{_capital(signal_name(s.signal))}: on average {number(s.mean_abs)} {s.unit} off, at worst "
+        f"{capital(signal_name(s.signal))}: on average {number(s.mean_abs)} {s.unit} off, at worst "
         f"{number(s.max_abs)} {s.unit}"
     )
     if s.noise_floor:
@@ -208,10 +208,6 @@ def _in_words(s: SignalError) -> str:
             f"{number(s.noise_floor)} {s.unit}"
         )
     return text + "."
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _ratio(s: SignalError) -> float:
@@ -322,7 +318,7 @@ def _worst_moment(page: Page, result: Result, s: SignalError) -> None:
     ]
     page.section(
         "The worst moment",
-        f"{_capital(signal_name(s.signal))} around t = {number(at, 4)} s, where its error is greatest. What the rotor "
+        f"{capital(signal_name(s.signal))} around t = {number(at, 4)} s, where its error is greatest. What the rotor "
         "speed does just then is the first hint at the cause: an error that changes sign with the direction of motion "
         "is hysteresis or friction, one that appears only in motion is a lag, one that stays is a bias.",
     )

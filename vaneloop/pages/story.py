@@ -11,7 +11,7 @@ import numpy as np
 from vaneloop.discrepancy.locate import Located, agrees
 from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
-from vaneloop.pages.style import Tone
+from vaneloop.pages.style import Tone, capital
 
 __all__ = [
     "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
@@ -82,7 +82,7 @@ def extended_sentence(d: Diagnosis, refused: str = "") -> str:
         end = EXPLAINED if reached(s) else "an error remains"
         parts.append(f"with {names} the error of {s.outputs[k]} falls from {before} to {after} noise floors: {end}")
     text = "; ".join(parts) or "nothing was extended"
-    return text[0].upper() + text[1:] + "."
+    return f"{capital(text)}."
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "number", "painted"]
+__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "capital", "number", "painted"]
 
 Tone = Literal["neutral", "good", "bad"]
 # colours of the vane stages side by side, VIGV first
@@ -82,6 +82,11 @@ def number(value: object, digits: int = 3) -> str:
             decimals -= 1
         return f"{v:,.{decimals}f}"
     return str(value)
+
+
+def capital(text: str) -> str:
+    """``text`` as a sentence begins."""
+    return text[:1].upper() + text[1:]
 
 
 def painted(figure: Any, theme: str = "light") -> Any:

@@ -14,7 +14,7 @@ from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
 from vaneloop.pages.story import CANNOT, doubt, fall, falling, floors, reached, worths
-from vaneloop.pages.style import number
+from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
@@ -305,15 +305,11 @@ class _Page:
                 for n, p in f.parameters.items()
             ]
             text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
-            return (
-                text
-                + (f". {doubt(f)[0].upper()}{doubt(f)[1:]}" if doubt(f) else "")
-                + (f". {summary}" if summary else "")
-            )
+            return ". ".join(part for part in (text, capital(doubt(f)), summary) if part)
         if name in named:
             return f"Rival of {named[name]}: this log cannot tell them apart. {summary}"
         if c is not None and c.reason:
-            return f"{CANNOT[0].upper()}{CANNOT[1:]}; needs: {c.reason}"
+            return f"{capital(CANNOT)}; needs: {c.reason}"
         left = f"Alone it leaves {floors(c.left)} noise floors. " if c is not None and c.left == c.left else ""
         return left + summary
 
