@@ -132,7 +132,7 @@ def compare_page(
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
-        _notes(page, by_log.notes)
+        page.notes(by_log.notes)
     return page
 
 
@@ -145,13 +145,6 @@ def _tested(page: Page, rows: Sequence[Any]) -> None:
             columns,
             [[r.stage, r.signal, r.error_before, r.error_after, r.noise_floor, r.unit, r.samples] for r in rows],
         )
-
-
-def _notes(page: Page, notes: Sequence[str]) -> None:
-    if notes:
-        page.section("Notes")
-        for n in notes:
-            page.text(f"{capital(n)}.")
 
 
 def extended_page(
@@ -276,7 +269,7 @@ def _told(
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
         page.table(["effect", "stage", "what would excite it"], unseen)
-    _notes(page, d.notes)
+    page.notes(d.notes)
     return page
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -14,11 +13,11 @@ from vaneloop.discrepancy.models.learning import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
-from vaneloop.pages.style import capital, number
+from vaneloop.pages.style import Tone, capital, number
 
 __all__ = ["curve_figure", "learned_page", "visited_figure"]
 
-TONES: dict[str, Literal["good", "neutral", "bad"]] = {
+TONES: dict[str, Tone] = {
     "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
 }  # fmt: skip
 BEYOND = 0.15  # of the range, drawn beyond its ends
@@ -81,8 +80,5 @@ def learned_page(
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
-    if notes:
-        page.section("Notes")
-        for note in notes:
-            page.text(f"{capital(note)}.")
+    page.notes(notes)
     return page

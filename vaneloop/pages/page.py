@@ -28,7 +28,7 @@ import numpy as np
 
 from vaneloop.base.errors import InputError
 from vaneloop.pages.figures import Figure
-from vaneloop.pages.style import THEMES, Tone, number
+from vaneloop.pages.style import THEMES, Tone, capital, number
 
 __all__ = ["Link", "Page", "write_atomically"]
 
@@ -93,6 +93,13 @@ class Page:
         """Add paragraphs."""
         self._end_grid()
         self._body += [f"<p>{html.escape(p.strip())}</p>" for p in text.split("\n\n") if p.strip()]
+
+    def notes(self, notes: Sequence[str]) -> None:
+        """Add what the reader should know, a sentence each, in a section of its own; nothing where there is none."""
+        if notes:
+            self.section("Notes")
+            for note in notes:
+                self.text(f"{capital(note)}.")
 
     def plot(self, figure: Any, caption: str = "", *, half: bool = False) -> None:
         """Add a plot; two ``half`` ones in a row stand side by side where the screen is wide enough."""
