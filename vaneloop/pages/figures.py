@@ -132,7 +132,7 @@ def _band_and_marks(layout: Figure, panel: Panel, axis: str) -> None:
                 "x": 1,
                 "xanchor": "right",
                 "yref": axis,
-                "y": level,
+                "y": math.log10(level) if panel.log else level,  # placed by exponent on such an axis
                 "yanchor": "bottom",
                 "text": _label(name),
                 "showarrow": False,
@@ -322,15 +322,9 @@ def waterfall(
             for i, (level, b, d) in enumerate(zip(levels, base, size, strict=True))
         ],
     }
-    _band_and_marks(
-        layout,
-        Panel(
-            "", [], marks={} if floor is None else {f"floor {number(floor)}" if steps[-1][1] != floor else "": floor}
-        ),
-        "y",
-    )
-    for mark in layout["annotations"][len(levels) :]:
-        mark["y"] = math.log10(mark["y"])  # annotations are placed by exponent on such an axis
+    if floor is not None:  # named where no bar stands at it
+        named = "" if steps[-1][1] == floor else f"floor {number(floor)}"
+        _band_and_marks(layout, Panel("", [], log=True, marks={named: floor}), "y")
     bar = {
         "type": "bar",
         "x": names,
