@@ -20,6 +20,8 @@ from vaneloop.pages.figures import Line, Panel, loop, overlay, ranking, waterfal
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import (
     CANNOT,
+    EXPLAINED,
+    MISSING,
     doubt,
     extended_sentence,
     fall,
@@ -37,8 +39,6 @@ __all__ = [
     "compare_page", "diagnosis_page", "experiment_page", "extended_page", "located_sentence", "located_tone",
     "verdict_sentence",
 ]  # fmt: skip
-
-Columns = list[tuple[str, np.ndarray, str]]
 
 
 def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
@@ -201,7 +201,7 @@ def _told(
         note = f"{number(s.error_before[k])} to {number(s.error_after[k])} {s.units[k]}; floor {number(s.floor[k])}"
         value = before if s.verdict == "none" else f"{before} → {after}"
         said = word(s, extended)
-        if said in ("missing", "explained") and s.effects:
+        if said in (MISSING, EXPLAINED) and s.effects:
             said = f"{said}: {', '.join(f.effect for f in s.effects)}"
         page.tile(f"{s.stage}: {s.outputs[k]}", value, "noise floors", f"{said}; {note}", stage_tone(s, extended))
     if experiment:
@@ -304,7 +304,7 @@ def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) ->
         waterfall(falling(s), "held-out error [noise floors]", floor=1.0),
         "How the error falls as effects are added, down to the noise floor. All outputs of the stage together.",
     )
-    if s.effects and (worth := worths(s)):
+    if worth := worths(s):
         page.plot(
             ranking(
                 [w.effect for w in worth], [w.without for w in worth], "error without it [noise floors]",
@@ -335,7 +335,7 @@ def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) ->
         )  # fmt: skip
 
 
-def _curves(page: Page, judge: Judge, models: Columns, caption: str) -> int:
+def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]], caption: str) -> int:
     """Draw measured curves and errors; return the number of the plot."""
     stage = judge.stage
     e = judge.errors(np.array([m[1] for m in models])) * judge.floor[None, :, None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,13 +97,12 @@ class Worth:
     share: float
 
 
-def worths(s: StageDiagnosis, effects: Sequence[Found] | None = None) -> list[Worth]:
+def worths(s: StageDiagnosis) -> list[Worth]:
     """Worth of every effect of the final model, the greatest first."""
     nominal = s.steps[0][1] if s.steps else 1.0
     way = math.log(max(nominal / max(s.excess, 1e-300), 1.0 + 1e-9))
     out = [
-        Worth(f.effect, f.fall * s.excess, min(1.0, max(0.0, math.log(max(f.fall, 1e-300))) / way))
-        for f in (s.effects if effects is None else effects)
+        Worth(f.effect, f.fall * s.excess, min(1.0, max(0.0, math.log(max(f.fall, 1e-300))) / way)) for f in s.effects
     ]
     return sorted(out, key=lambda w: -w.without)
 
