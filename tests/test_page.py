@@ -306,6 +306,12 @@ def test_a_waterfall_hangs_each_fall_from_the_level_before():
     assert bar["y"] == pytest.approx([1.0 - bottom, 0.6, 0.3, 0.1 - bottom])
 
 
+def test_a_page_without_a_plot_has_no_script():
+    page = Page("Engines", "Two engines.")
+    page.table(["engine"], [["one"], ["two"]])
+    assert "<script" not in page.html()
+
+
 def test_the_worst_moment_of_a_failure_map_is_that_of_a_cell_that_it_shows():
     samples, ratio = np.array([500, 500, 12]), np.array([1.2, 3.0, 9.0])
     at = Regime(

@@ -135,8 +135,6 @@ class Page:
 
     def html(self) -> str:
         """Return the whole page."""
-        from plotly.offline import get_plotlyjs
-
         self._end_grid()
         e = html.escape
         toc = "".join(f'<a href="#s{i}">{e(s)}</a>' for i, s in enumerate(self._sections, start=1))
@@ -158,13 +156,21 @@ class Page:
             *self._body,
             f"<footer><dl>{facts}</dl></footer>",
             "</main>",
-            f'<script type="application/json" id="figures">{_json(self.figures)}</script>',
-            f'<script type="application/json" id="themes">{_json(THEMES)}</script>',
-            f"<script>{get_plotlyjs()}</script>" if self.figures else "",
-            f"<script>\n{_beside('page.js')}</script>",
+            *(self._scripts() if self.figures else []),
             "</body></html>",
         ]
         return "\n".join(parts) + "\n"
+
+    def _scripts(self) -> list[str]:
+        """What draws the figures."""
+        from plotly.offline import get_plotlyjs
+
+        return [
+            f'<script type="application/json" id="figures">{_json(self.figures)}</script>',
+            f'<script type="application/json" id="themes">{_json(THEMES)}</script>',
+            f"<script>{get_plotlyjs()}</script>",
+            f"<script>\n{_beside('page.js')}</script>",
+        ]
 
     def write(self, path: str | Path) -> Path:
         """Write the page in one go: a reader never sees half of it. Raises InputError when it cannot be written."""
