@@ -23,7 +23,6 @@ from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import THEMES
 
 __all__ = [
-    "MODE_ROLES",
     "Band",
     "Chart",
     "Curves",
@@ -33,6 +32,7 @@ __all__ = [
     "Trace",
     "bands",
     "figure",
+    "mode_bands",
     "of_log",
     "painted",
     "view",
@@ -40,6 +40,7 @@ __all__ = [
 
 Array = np.ndarray
 MOST_BANDS = 400
+MODE_ROLES = {"DEGRADED": "model", "FAIL_SAFE": "bad"}  # modes that are drawn as bands
 MOST_POINTS = 4000  # a line and view, whatever the browser asks for
 
 
@@ -108,6 +109,11 @@ def bands(t: Array, values: Array, names: Mapping[int, tuple[str, str]]) -> list
         for i, j in zip(at, ends, strict=True)
         if names.get(int(v[i]), ("", ""))[1]
     ][:MOST_BANDS]
+
+
+def mode_bands(t: Array, state: Array) -> list[Band]:
+    """Stretches in which the controller is in a mode that is drawn."""
+    return bands(t, state, {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
 
 
 def view(curves: Curves, start: float | None, end: float | None, pixels: int) -> bytes:
@@ -183,11 +189,8 @@ def of_log(channels: Channels, key: str, over: Channels | None = None, later: fl
     spans = []
     if "state" in channels:
         _, t, values = channels["state"]
-        spans = bands(np.asarray(t), np.asarray(values), {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
+        spans = mode_bands(np.asarray(t), np.asarray(values))
     return Curves(panels, key, bands=spans)
-
-
-MODE_ROLES = {"DEGRADED": "model", "FAIL_SAFE": "bad"}  # modes that are drawn as bands
 
 
 class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):

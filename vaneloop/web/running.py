@@ -15,7 +15,7 @@ from controller import FAULTS, MODES
 from hil.inject.scenario import load_scenario
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.style import STAGE_ROLES
-from vaneloop.web.charts import MODE_ROLES, Curves, Mark, Panel, Trace, bands
+from vaneloop.web.charts import Curves, Mark, Panel, Trace, bands, mode_bands
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS, COMPILING
 from vaneloop.web.session import LogFile, Session
@@ -355,6 +355,5 @@ class Loop:
         ]
         marks = [m for m in self.injected if t[0] <= m.t <= t[-1]]
         state, faults = rows[:, COLUMNS.index("state")], rows[:, COLUMNS.index("faults")]
-        spans = bands(t, state, {k: (m, MODE_ROLES.get(m, "")) for k, m in enumerate(MODES)})
-        spans += bands(t, np.where(np.isfinite(faults), faults, 0.0) > 0, {1: ("fault", "noise")})
+        spans = [*mode_bands(t, state), *bands(t, faults > 0.0, {1: ("fault", "noise")})]
         self.session.curves["run"] = Curves(panels, "run", marks, spans)
