@@ -315,19 +315,22 @@ class Loop:
 
     def _note(self, rows: np.ndarray) -> None:
         """Write changes of mode and faults into the list of events."""
-        before = len(self.events), self.events[-1] if self.events else ""
+        new: list[str] = []
         columns = [COLUMNS.index(c) for c in ("t", "state", "faults")]
         for t, state, faults in rows[:, columns].tolist():
             mode, bits = int(state) if state == state else -1, int(faults) if faults == faults else 0
+            if (mode, bits) == self.last:
+                continue
             if mode != self.last[0] and 0 <= mode < len(MODES):
-                self.events.append(f"{t:.1f} s  mode {MODES[mode]}")
+                new.append(f"{t:.1f} s  mode {MODES[mode]}")
             for i, fault in enumerate(FAULTS):
                 if (bits ^ self.last[1]) >> i & 1:
-                    self.events.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
+                    new.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
                     if self.trigger and self.held is None and bits >> i & 1:
                         self.held = t
             self.last = mode, bits
-        if before != (len(self.events), self.events[-1] if self.events else ""):
+        if new:
+            self.events.extend(new)
             self.session.touch("events")
 
     def _draw(self) -> None:
