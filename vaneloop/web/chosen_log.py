@@ -9,7 +9,7 @@ from nicegui import events, ui
 from vaneloop.base.signals import UNITS
 from vaneloop.web.charts import Chart
 from vaneloop.web.frame import Live, card, drop, opened, table
-from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, LogFile, Session, safe_name
+from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
 
@@ -147,7 +147,7 @@ class ChosenLog:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
 
     def _wrong(self) -> bool:
-        return any(not self.s.errors.get(x, "stopped").startswith("stopped") for x in ("log", "compare"))
+        return any(self.s.errors.get(x, STOPPED) != STOPPED for x in ("log", "compare"))
 
     def _form_shows(self) -> tuple[Any, ...]:
         s, c = self.s, self.s.choice

@@ -18,7 +18,7 @@ from vaneloop.discrepancy.locate import agrees
 from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
 from vaneloop.web.jobs import Job
-from vaneloop.web.session import Session
+from vaneloop.web.session import STOPPED, Session
 
 __all__ = ["PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "opened", "table", "tone"]
 
@@ -143,7 +143,7 @@ class Live:
         def draw() -> None:
             for text in shows():
                 if text:
-                    ui.label(text if text.startswith("stopped") else f"vaneloop: {text}").classes("complaint").props(
+                    ui.label(text if text == STOPPED else f"vaneloop: {text}").classes("complaint").props(
                         'role="alert"'
                     )
 

@@ -21,8 +21,9 @@ from vaneloop.web.charts import Curves, Panel, Trace, of_log
 from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, safe_name
 from vaneloop.web.jobs import Cancelled, Job, Worker, WorkError
 
-__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "Session", "safe_name"]
+__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
 
+STOPPED = "stopped; nothing is kept of it, start it again when you like"  # in place of a complaint
 LEADERS = 4  # candidate effects whose fits are made ahead
 
 
@@ -105,7 +106,7 @@ class Session:
             except WorkError as e:
                 self.errors[section] = self.clean(str(e))
             except Cancelled:
-                self.errors[section] = "stopped; nothing is kept of it, start it again when you like"
+                self.errors[section] = STOPPED
 
         def ended(task: asyncio.Task[None]) -> None:
             self.tasks.discard(task)
