@@ -112,6 +112,11 @@ export default {
       this.scale();
       this.fetch();
     },
+    everything() {
+      this.view = null;
+      this.scale();
+      this.fetch();
+    },
     colours() {
       const css = getComputedStyle(document.body);
       return (role) => css.getPropertyValue("--" + role).trim() || "#888";
@@ -250,7 +255,7 @@ export default {
       const step = (e.shiftKey ? 0.1 : 0.01) * w;
       const cursor = (t) => { u.setCursor({ left: u.valToPos(Math.min(b, Math.max(a, t)), "x"), top: 10 }); this.$refs.said.textContent = this.plots.map((p) => this.head.panels[p.panel].title + " " + p.readout.textContent).join("; "); };
       const acts = { ArrowLeft: () => cursor(at - step), ArrowRight: () => cursor(at + step), "+": () => this.look(at - w / 4, at + w / 4), "-": () => this.look(at - w, at + w),
-        PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => { this.view = null; this.scale(); this.fetch(); }, Enter: () => this.refer(at) };
+        PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => this.everything(), Enter: () => this.refer(at) };
       if (!acts[e.key] || this.live) return;
       e.preventDefault();
       acts[e.key]();
@@ -258,13 +263,6 @@ export default {
     refer(t) {
       this.at = this.at !== null && Math.abs(this.at - t) < 1e-9 ? null : t;
       this.plots.forEach((p) => p.redraw(false));
-    },
-    near(u, t) {
-      // index of the sample next to a time
-      const x = u.data[0];
-      let a = 0, b = x.length - 1;
-      while (b - a > 1) { const m = (a + b) >> 1; if (x[m] <= t) a = m; else b = m; }
-      return t - x[a] < x[b] - t ? a : b;
     },
     save(name, href) { const a = document.createElement("a"); a.href = href; a.download = name; a.click(); },
     name(suffix) { return this.src.split("/").pop() + "." + suffix; },
@@ -328,7 +326,7 @@ export default {
       const text = panel.lines.map((l, j) => { const v = u.data[j + 1][k]; return v === null || v === undefined ? "" : (panel.lines.length > 1 ? l.name + " " : "") + Number(v).toPrecision(5); });
       let apart = "";
       if (this.at !== null && u.data[0].length) {
-        const r = this.near(u, this.at), d = panel.lines.map((l, j) => { const v = u.data[j + 1][k], w = u.data[j + 1][r]; return v === null || w === null || v === undefined || w === undefined ? "" : (v - w).toPrecision(4); });
+        const r = u.valToIdx(this.at), d = panel.lines.map((l, j) => { const v = u.data[j + 1][k], w = u.data[j + 1][r]; return v === null || w === null || v === undefined || w === undefined ? "" : (v - w).toPrecision(4); });
         apart = "  | to the reference: " + (u.data[0][k] - this.at).toFixed(3) + " s, " + d.filter((x) => x).join(", ") + " " + panel.unit;
       }
       u.readout.textContent = Number(u.data[0][k]).toFixed(3) + " s  " + text.filter((x) => x).join("   ") + " " + panel.unit + apart;
@@ -356,7 +354,7 @@ export default {
       let down = 0;
       over.addEventListener("pointerdown", (e) => { down = e.clientX; });
       over.addEventListener("click", (e) => { if (!this.live && Math.abs(e.clientX - down) < 4 && e.detail === 1) this.refer(plot.posToVal(e.offsetX, "x")); });
-      over.addEventListener("dblclick", () => { this.view = null; this.scale(); this.fetch(); });
+      over.addEventListener("dblclick", () => this.everything());
     },
     resize() {
       const w = this.width();
