@@ -49,9 +49,8 @@ def command(args: argparse.Namespace) -> int:
             answer = own_model.ask(args, "diagnose", progress=progress)
     else:
         chain = chain_of(args)
-        with terminal.progress_bar(args, "searching the library of effects") as progress:
-            tell = progress and (lambda n: progress(n.fraction, n.text))
-            answer = diagnosed(chain, args.log, args.workers, news=tell)
+        with options.search_bar(args) as news:
+            answer = diagnosed(chain, args.log, args.workers, news=news)
     show(args, answer)
     terminal.write_json(args, answer.to_dict())
     if args.report:

@@ -37,9 +37,8 @@ def command(args: argparse.Namespace) -> int:
     from vaneloop.verbs.search import experiment as recommend
 
     chain = chain_of(args)
-    with terminal.progress_bar(args, "searching the library of effects") as progress:
-        tell = progress and (lambda n: progress(n.fraction, n.text))
-        found = diagnosed(chain, args.log, news=tell)
+    with options.search_bar(args) as news:
+        found = diagnosed(chain, args.log, news=news)
     with terminal.progress_bar(args, "trying profiles") as progress:
         answer = recommend(None, found, progress=progress)
     e = answer.recommended

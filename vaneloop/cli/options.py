@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ __all__ = [
     "read_log_of",
     "say_located",
     "say_tested",
+    "search_bar",
     "tables_of",
     "tell_search",
     "warm_up_for",
@@ -72,6 +74,13 @@ def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
     for note in chain.notes:
         terminal.say(args, f"note: {note}")
     return chain
+
+
+@contextmanager
+def search_bar(args: argparse.Namespace) -> Iterator[Callable[[Any], None] | None]:
+    """A bar of the search of the library, as `terminal.progress_bar` draws one, for the search's ``news``."""
+    with terminal.progress_bar(args, "searching the library of effects") as progress:
+        yield progress and (lambda n: progress(n.fraction, n.text))
 
 
 def parts_to_test(args: argparse.Namespace) -> list[str]:
