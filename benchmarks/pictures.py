@@ -42,7 +42,7 @@ def run(page: Any) -> None:
 def take(folder: Path) -> list[Path]:
     """Take every picture; return the files."""
     out = []
-    with workbench(ROOT / "examples") as (browser, url):
+    with workbench(ROOT / "examples") as (browser, url, _):
         for path, name, scene in (("", "missing", missing), ("schedule", "schedule", schedule), ("run", "run", run)):
             page = browser.new_context(viewport=WIDE, color_scheme="light").new_page()
             page.set_default_timeout(PATIENCE)

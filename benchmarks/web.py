@@ -18,7 +18,6 @@ from benchmarks.measure import ROOT, Row
 
 __all__ = ["MEASUREMENTS"]
 
-SERVER: list[int] = []  # process of the server that was started last
 REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
 PATIENCE = 240_000  # ms
 
@@ -64,8 +63,8 @@ def long_log(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
-    """A browser, and the address of ``vaneloop web``."""
+def workbench(folder: Path) -> Iterator[tuple[Any, str, int]]:
+    """A browser, the address of ``vaneloop web``, and the number of its process."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(
@@ -86,13 +85,12 @@ def workbench(folder: Path) -> Iterator[tuple[Any, str]]:
         str(folder),
     ]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    SERVER.append(server.pid)
     try:
         assert server.stdout is not None
         url = server.stdout.readline().strip()
         with sync_playwright() as p:
             browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-            yield browser, url
+            yield browser, url, server.pid
             browser.close()
     finally:
         server.terminate()
@@ -113,7 +111,7 @@ def web() -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         long_log(folder / "long.parquet")
-        with workbench(folder) as (browser, url):
+        with workbench(folder) as (browser, url, _):
             first = []
             for k in range(6):
                 context = browser.new_context(viewport={"width": 1920, "height": 1000})
@@ -186,7 +184,7 @@ def resident(pid: int) -> int:
 
 def two_minutes() -> Iterator[Row]:
     """The way of a user with a log of 200 s: where it fails, the first finding, the diagnosis, a switch."""
-    with workbench(ROOT / "examples") as (browser, url):
+    with workbench(ROOT / "examples") as (browser, url, _):
         page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
         page.set_default_timeout(PATIENCE)
         page.goto(url)
@@ -219,7 +217,7 @@ def two_minutes() -> Iterator[Row]:
 
 def half_an_hour() -> Iterator[Row]:
     """Memory of the server, and of all that it started, while the live loop runs for half an hour of its own time."""
-    with workbench(ROOT / "examples") as (browser, url):
+    with workbench(ROOT / "examples") as (browser, url, server):
         page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
         page.set_default_timeout(PATIENCE)
         page.goto(url.replace("/?", "/run?"))
@@ -228,7 +226,6 @@ def half_an_hour() -> Iterator[Row]:
         page.get_by_role("button", name="Start", exact=True).click()
         page.locator('[data-lamp="RUN"].good').wait_for()
         time.sleep(LIVE / 3.0)
-        server = SERVER[-1]
         before = resident(server)
         time.sleep(LIVE)
         after, reached = resident(server), page.locator(".tiles .v").first.inner_text()
