@@ -15,10 +15,9 @@ from pathlib import Path
 from controller import Calibration
 from controller.calibration import CalibrationTable
 from hil.fmu.description import OPTIONS, SOURCES, build_description, model_description
-from hil.fmu.kernel import PARTS
 from hil.fmu.memory import first
 from hil.fmu.source import SHELL, kept_source, model_source, part_source
-from hil.fmu.variables import Variable, variables_of
+from hil.fmu.variables import PARTS, Variable, variables_of
 from plant import Model, Plant
 from vaneloop.base.errors import InputError
 

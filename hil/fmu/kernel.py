@@ -17,7 +17,7 @@ from numba.np import arrayobj
 
 from controller import Calibration, new_inputs, new_state
 from controller.records import SLOW, as_inputs, as_outputs
-from hil.fmu.memory import FED, SHOWN, Shape, places_of
+from hil.fmu.memory import FED, HELD_N_DEM, HELD_N_R, NEXT, OWN_ENGINE, SHOWN, Shape, places_of
 from hil.loop.lockstep import WARM_UP
 from hil.loop.tick import Loop, control, hear, mean_stroke, move, reflash
 from hil.native.call import firmware
@@ -25,12 +25,10 @@ from plant import chain, places
 from plant.parameters import derive_lane
 from vaneloop.base.compiled import inlined
 
-__all__ = ["PARTS", "entry"]
+__all__ = ["entry"]
 
-PARTS = ("plant", "controller", "loop")
 (F_N_DEM, F_N_R, F_I_CMD, F_X_LVDT, F_P_S, F_T_OIL, F_MODE_REQUEST, F_FRESH, F_REJECTED, F_PAUSE) = range(len(FED))
 F_POTS, S_VANES = len(FED), len(SHOWN)
-NEXT, OWN_ENGINE, HELD_N_DEM, HELD_N_R = range(4)
 SUBSTEP = chain.TICK / chain.SUBSTEPS
 _types: Any = types  # numba's own have no types
 _arrays: Any = arrayobj

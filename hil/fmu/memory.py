@@ -16,11 +16,12 @@ from hil.loop.tick import KEPT
 from plant import Plant, chain
 from plant.parameters import N_PARAMETERS
 
-__all__ = ["FED", "SHOWN", "Place", "Shape", "first", "places_of"]
+__all__ = ["FED", "HELD_N_DEM", "HELD_N_R", "NEXT", "OWN_ENGINE", "SHOWN", "Place", "Shape", "first", "places_of"]
 
 # what is fed to an FMU and what it shows, SI, beside the potentiometers of its stages
 FED = ("n_dem", "n_r", "i_cmd", "x_lvdt", "p_s", "t_oil", "mode_request", "demand_fresh", "demand_rejected", "pause")
 SHOWN = ("i_cmd", "x_dem", "x_lvdt", "x", "n_engine", "i_motor", "state", "faults")
+NEXT, OWN_ENGINE, HELD_N_DEM, HELD_N_R = range(4)  # numbers of the clock
 
 
 class Shape(NamedTuple):

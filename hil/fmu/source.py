@@ -52,7 +52,7 @@ def _digest() -> str:
 
 
 def part_source(part: str, shape: Shape) -> str:
-    """Return ``part.c`` of a part (`hil.fmu.kernel.PARTS`) for a machine of this shape."""
+    """Return ``part.c`` of a part (`hil.fmu.variables.PARTS`) for a machine of this shape."""
     kept = kept_source(part, shape)
     folder = kept.parent
     if kept.is_file():

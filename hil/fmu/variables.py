@@ -15,7 +15,7 @@ import numpy as np
 from controller import STRATEGIES, Calibration
 from controller.calibration import CalibrationTable, scalars_in
 from controller.records import FAULTS, MODES, SCALAR_FIELDS, SCALARS
-from hil.fmu.memory import FED, SHOWN, Shape, places_of
+from hil.fmu.memory import FED, OWN_ENGINE, SHOWN, Shape, places_of
 from plant import Model, Plant
 from plant.effects import EFFECTS
 from plant.layout import PLAY
@@ -23,11 +23,11 @@ from plant.model import allowed_of
 from plant.parameters import nominal
 from vaneloop.base.vanes import MOST
 
-__all__ = ["FIXED", "INPUT", "OUTPUT", "REAL", "TIME", "TRUTH", "TUNABLE", "WHOLE", "Variable", "variables_of"]
+__all__ = ["FIXED", "INPUT", "OUTPUT", "PARTS", "REAL", "TIME", "TRUTH", "TUNABLE", "WHOLE", "Variable", "variables_of"]
 
 REAL, WHOLE, TRUTH = range(3)
 TIME, INPUT, OUTPUT, FIXED, TUNABLE = range(5)
-_OWN_ENGINE = 1  # number in the clock
+PARTS = ("plant", "controller", "loop")
 
 
 class Variable(NamedTuple):
@@ -140,7 +140,7 @@ def _signals(part: str, plant: Plant, memory: np.ndarray, shape: Shape) -> Itera
             description = f"angle of stage {vane} as its stem potentiometer gives it"
             yield Variable(vane, REAL, OUTPUT, "rad", description, at=shown + len(SHOWN) + k, shown="deg")
         description = "true: the machine's own engine turns after n_dem; false: its speed is n_r"
-        yield Variable("own_engine", TRUTH, FIXED, "", description, 1.0, 0.0, 1.0, places["clock"].at + _OWN_ENGINE)
+        yield Variable("own_engine", TRUTH, FIXED, "", description, 1.0, 0.0, 1.0, places["clock"].at + OWN_ENGINE)
 
 
 def _machine(plant: Plant, model: Model, shape: Shape) -> Iterator[Variable]:
