@@ -21,9 +21,9 @@ _C = {"double": "double", "i64": "int64_t", "i32": "int32_t", "i8": "int8_t", "i
 _SIZE = {"double": 8, "i64": 8, "i32": 4, "i8": 1, "ptr": 8}
 _UNSIGNED = {"i64": "uint64_t", "i32": "uint32_t", "i8": "uint8_t", "i1": "unsigned"}
 _FLOAT = {"fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/"}
-_WRAPPING = {"add": "+", "sub": "-", "mul": "*", "shl": "<<", "and": "&", "or": "|", "xor": "^", "lshr": ">>"}
-_UNSIGNED_ONLY = {"udiv": "/", "urem": "%"}
-_SIGNED_ONLY = {"sdiv": "/", "srem": "%", "ashr": ">>"}
+_AS_UNSIGNED = {"add": "+", "sub": "-", "mul": "*", "shl": "<<", "and": "&", "or": "|", "xor": "^", "lshr": ">>"}
+_AS_UNSIGNED |= {"udiv": "/", "urem": "%"}
+_AS_SIGNED = {"sdiv": "/", "srem": "%", "ashr": ">>"}
 _ORDER = {"lt": "<", "gt": ">", "le": "<=", "ge": ">="}
 _OPPOSITE = {"lt": ">=", "gt": "<=", "le": ">", "ge": "<"}
 _FLAGS = re.compile(r"\b(nuw|nsw|exact|disjoint|nneg|samesign|inbounds|tail|musttail|notail|volatile)\b ")
@@ -128,11 +128,9 @@ class _Function:
         """Lines of each block without comments and notes; a switch in one line."""
         out: dict[str, list[str]] = {}
         now: list[str] = []
-        for line in re.sub(r"\[\n((?:\s+i\d+ .*\n)+)\s*\]", lambda m: "[" + m[1].replace("\n", ";") + "]", body).split(
-            "\n"
-        ):
-            line = re.sub(r"(, ![\w.]+ !\d+)+$|\s+#\d+$|\s+;.*$", "", line.rstrip())
-            line = re.sub(r"(, ![\w.]+ !\d+)+$", "", re.sub(r"\s+#\d+$", "", line))
+        joined = re.sub(r"\[\n((?:\s+i\d+ .*\n)+)\s*\]", lambda m: "[" + m[1].replace("\n", ";") + "]", body)
+        for line in joined.split("\n"):
+            line = re.sub(r"(?:\s+#\d+|, ![\w.]+ !\d+)*(?:\s+;.*)?$", "", line.rstrip())
             if label := re.fullmatch(rf"({_NAME}):", line):
                 now = out.setdefault(label[1], [])
             elif line.strip():
@@ -209,9 +207,7 @@ class _Function:
     def _lines(self, line: str, here: str) -> Iterator[str]:
         line = _FLAGS.sub("", line)
         line = re.sub(r", align \d+$", "", line)
-        target, _, rest = line.rpartition(" = ") if re.match(rf"%{_NAME} = ", line) else ("", "", line)
-        if target:
-            target, rest = line.split(" = ", 1)
+        target, rest = line.split(" = ", 1) if re.match(rf"%{_NAME} = ", line) else ("", line)
         op, _, args = rest.partition(" ")
         if op == "br":
             yield from self._branch(args, here)
@@ -322,15 +318,12 @@ class _Function:
         a, b = values
         if op in _FLOAT:
             return kind, f"{a} {_FLOAT[op]} {b}"
-        if op in _WRAPPING:
+        if op in _AS_UNSIGNED:
             u = _UNSIGNED[kind]
-            whole = f"({_C[kind]})(({u}){a} {_WRAPPING[op]} ({u}){b})"
+            whole = f"({_C[kind]})(({u}){a} {_AS_UNSIGNED[op]} ({u}){b})"
             return kind, f"({whole}) & 1" if kind == "i1" else whole
-        if op in _UNSIGNED_ONLY:
-            u = _UNSIGNED[kind]
-            return kind, f"({_C[kind]})(({u}){a} {_UNSIGNED_ONLY[op]} ({u}){b})"
-        if op in _SIGNED_ONLY and kind != "i1":
-            return kind, f"{a} {_SIGNED_ONLY[op]} {b}"
+        if op in _AS_SIGNED and kind != "i1":
+            return kind, f"{a} {_AS_SIGNED[op]} {b}"
         raise NotImplementedError(line)
 
 
