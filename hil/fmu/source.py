@@ -35,20 +35,20 @@ _PLAIN = {
 
 
 def kept_source(part: str, shape: Shape) -> Path:
-    """Return where ``part.c`` is kept; the folder's name has a digest of what it follows from."""
-    return cache_folder().parent / f"fmu-{_digest()}" / f"{part}-{'-'.join(map(str, shape))}.c"
+    """Return where ``part.c`` is kept."""
+    return _folder() / f"{part}-{'-'.join(map(str, shape))}.c"
 
 
 @lru_cache(maxsize=1)
-def _digest() -> str:
-    """Of the sources that the C text follows from."""
+def _folder() -> Path:
+    """Its name has a digest of the sources that the C text follows from."""
     root = Path(__file__).parents[2]
     h = hashlib.sha256(f"{numba.__version__} {WARM_UP}".encode())
     own = ("hil/fmu/kernel.py", "hil/fmu/memory.py", "hil/fmu/ir_to_c.py", "hil/loop/tick.py", "hil/native/call.py")
     rooms = (f for room in ("controller", "plant", "vaneloop/base") for f in sorted((root / room).rglob("*.py")))
     for f in (*(root / name for name in own), *rooms):
         h.update(f.name.encode() + f.read_bytes())
-    return h.hexdigest()[:16]
+    return cache_folder().parent / f"fmu-{h.hexdigest()[:16]}"
 
 
 def part_source(part: str, shape: Shape) -> str:
