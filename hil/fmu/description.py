@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any
 from xml.etree import ElementTree as ET
 
-from hil.fmu.variables import FIXED, INPUT, OUTPUT, REAL, WHOLE, Variable
+from hil.fmu.variables import FIXED, INPUT, OUTPUT, REAL, TRUTH, WHOLE, Variable
+from hil.logs.units import registry
 
 __all__ = ["OPTIONS", "SOURCES", "base_unit", "build_description", "model_description"]
 
@@ -30,13 +29,6 @@ _ABILITIES = {
 }
 
 
-@lru_cache(maxsize=1)
-def _units() -> Any:
-    import pint
-
-    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
-
-
 def base_unit(unit: str) -> dict[str, str]:
     """Attributes of FMI's BaseUnit: exponents of the SI's base units, factor and offset."""
     if unit == "%":
@@ -46,8 +38,8 @@ def base_unit(unit: str) -> dict[str, str]:
     if unit == "degC":
         return {"K": "1", "offset": "273.15"}
     words = unit.replace("m2", "m**2").replace("%", "0.01").replace(" ", "*").replace("Ohm", "ohm")
-    q = _units().Quantity(1.0, "dimensionless") * _units().parse_expression(words)
-    q = q.to_base_units()
+    units = registry()
+    q = (units.Quantity(1.0, "dimensionless") * units.parse_expression(words)).to_base_units()
     out = {_BASE[name]: f"{power:g}" for name, power in q.unit_items()}
     if abs(q.magnitude - 1.0) > 1e-15:
         out["factor"] = repr(float(q.magnitude))
@@ -89,7 +81,7 @@ def _of_type(v: Variable) -> dict[str, str]:
     if v.kind in (REAL, WHOLE):
         out |= {key: _number(x) for key, x in (("min", v.low), ("max", v.high)) if math.isfinite(x)}
     if v.role != OUTPUT:
-        out["start"] = ("true" if v.start else "false") if v.kind == 2 else _number(v.start)
+        out["start"] = ("true" if v.start else "false") if v.kind == TRUTH else _number(v.start)
     return out
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
-__all__ = ["NO_UNIT", "Units", "factor_of"]
+__all__ = ["NO_UNIT", "Units", "factor_of", "registry"]
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
@@ -34,7 +34,8 @@ _POWER_TOWER = re.compile(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}")
 
 
 @functools.lru_cache(maxsize=1)
-def _registry() -> Any:
+def registry() -> Any:
+    """Return pint's units, read once."""
     import pint
 
     return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
@@ -53,10 +54,10 @@ def factor_of(unit: str, into: str) -> tuple[float, float] | None | str:
     text = _ALIASES.get(text.casefold(), text)
     if len(text) > 32 or not _UNIT.fullmatch(text) or _POWER_TOWER.search(text):
         return None
-    registry = _registry()
+    units = registry()
     into = _ALIASES.get(into.casefold(), into)
     try:
-        parsed = registry.parse_units(text)
+        parsed = units.parse_units(text)
     except (
         pint.errors.PintError,
         ValueError,
@@ -73,7 +74,7 @@ def factor_of(unit: str, into: str) -> tuple[float, float] | None | str:
             return None
         raise
     try:
-        a, b = (float(registry.Quantity(v, parsed).to(into).magnitude) for v in (0.0, 1.0))
+        a, b = (float(units.Quantity(v, parsed).to(into).magnitude) for v in (0.0, 1.0))
     except (pint.errors.PintError, ValueError, TypeError, ArithmeticError):
         return text
     if not (math.isfinite(a) and math.isfinite(b)) or a == b:
