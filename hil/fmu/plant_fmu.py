@@ -74,8 +74,8 @@ class PlantFmu:
         self._in_refs = [v.reference for v in inputs]
         folder = tempfile.mkdtemp(prefix="vaneloop-fmu-")
         self._end = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        new = fmpy.fmi3.FMU3Slave if described.fmiVersion.startswith("3") else fmpy.fmi2.FMU2Slave
-        self._three = described.fmiVersion.startswith("3")
+        three = described.fmiVersion.startswith("3")
+        new = fmpy.fmi3.FMU3Slave if three else fmpy.fmi2.FMU2Slave
         try:
             fmpy.extract(path, folder)
             self._fmu = new(
@@ -84,12 +84,14 @@ class PlantFmu:
                 modelIdentifier=described.coSimulation.modelIdentifier,
                 instanceName="plant",
             )
+            self._write = self._fmu.setFloat64 if three else self._fmu.setReal
+            self._read = self._fmu.getFloat64 if three else self._fmu.getReal
             self._fmu.instantiate()
-            if not self._three:
+            if three:
+                self._fmu.enterInitializationMode(startTime=0.0)
+            else:
                 self._fmu.setupExperiment(startTime=0.0)
                 self._fmu.enterInitializationMode()
-            else:
-                self._fmu.enterInitializationMode(startTime=0.0)
             self._feed({"i_cmd": 0.0, "n_dem": n_r, "n_r": n_r, "p_s": p_s, "t_oil": t_oil})
             self._fmu.exitInitializationMode()
         except InputError:
@@ -100,11 +102,11 @@ class PlantFmu:
 
     def _feed(self, signals: Mapping[str, float]) -> None:
         values = [(signals[v.signal] - v.offset) / v.factor for v in self._inputs]
-        (self._fmu.setFloat64 if self._three else self._fmu.setReal)(self._in_refs, values)
+        self._write(self._in_refs, values)
 
     def outputs(self) -> dict[str, float]:
         """What it gives now, SI."""
-        values = (self._fmu.getFloat64 if self._three else self._fmu.getReal)(self._out_refs)
+        values = self._read(self._out_refs)
         return {v.signal: x * v.factor + v.offset for v, x in zip(self._outputs, values, strict=True)}
 
     def step(self, signals: Mapping[str, float]) -> dict[str, float]:
