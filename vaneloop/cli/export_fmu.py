@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 
 from vaneloop.base import terminal
 from vaneloop.cli import options
@@ -36,6 +37,7 @@ def command(args: argparse.Namespace) -> int:
     """Write the FMU; return the exit code."""
     from controller.calibration import CalibrationTable
     from hil.fmu import is_made, write_fmu
+    from hil.fmu.variables import FIXED, INPUT, OUTPUT, TUNABLE
     from vaneloop.base.tables import read
 
     machine = options.machine_of(args, strategy=args.strategy)
@@ -43,15 +45,12 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, "making the source for such a machine (once, about a minute) ...")
     table = read(machine.files["calibration"], CalibrationTable)
     made = write_fmu(args.out, args.part, machine.plant, machine.calibration, table, machine.added, version=args.fmi)
-    roles = {name: sum(v.role == role for v in made.variables) for role, name in enumerate(_ROLES)}
-    what = ", ".join(f"{roles[name]} {name}" for name in ("inputs", "outputs"))
-    parameters = roles["fixed"] + roles["tunable"]
+    roles = Counter(v.role for v in made.variables)
+    what = f"{roles[INPUT]} inputs, {roles[OUTPUT]} outputs"
+    parameters = roles[FIXED] + roles[TUNABLE]
     terminal.say(args, f"{made.path}: {made.part}, FMI {made.version}, co-simulation, {what}, {parameters} parameters")
     terminal.write_json(args, {
         "schema": 1, "path": made.path, "part": made.part, "fmi": made.version, "token": made.token, "inputs":
-        roles["inputs"], "outputs": roles["outputs"], "parameters": parameters,
+        roles[INPUT], "outputs": roles[OUTPUT], "parameters": parameters,
     })  # fmt: skip
     return 0
-
-
-_ROLES = ("time", "inputs", "outputs", "fixed", "tunable")
