@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-__all__ = ["page", "pictures", "printed"]
+__all__ = ["page", "pictures"]
 
 
 def cells(file: Path) -> list[dict[str, Any]]:

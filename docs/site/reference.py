@@ -9,7 +9,6 @@ import importlib
 import inspect
 import json
 import re
-import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,12 @@ import cantools
 from cantools.database.can import Message, Signal
 
 import vaneloop
-from controller import calibration
+from controller.calibration import CalibrationTable
 from hil.inject.scenario import library, load_scenario
 from hil.logs import Channel, Log, read_log
 from vaneloop.base import terminal
 from vaneloop.base.signals import UNITS
-from vaneloop.base.tables import Bound, Table, load_toml, path
+from vaneloop.base.tables import Bound, load_toml, path
 from vaneloop.cli.main import COMMANDS
 from vaneloop.discrepancy.library import LAWS, Size
 
@@ -304,40 +303,25 @@ def signal_row(s: Signal) -> tuple[str, ...]:
 
 def calibration_page() -> str:
     """Every number of the controller's calibration: value, bounds, origin."""
-    shipped = load_toml(path("calibration.toml"))
-    sections = {
-        re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower(): model
-        for name, model in vars(calibration).items()
-        if isinstance(model, type) and issubclass(model, Table) and model.__module__ == calibration.__name__
-    }
     out = [
         "# Calibration",
         MADE,
         "The file is `tables/calibration.toml`. The bounds are those of `controller/calibration.py`: a value outside "
         "is refused. [The tables](../tables.md) says how to change one.",
     ]
-    for section, values in shipped.items():
-        bounds = bounds_of(sections[section])
-        out += [f"## {section}", doc(sections[section])]
+    for section, values in load_toml(path("calibration.toml")).items():
+        model: Any = CalibrationTable.model_fields[section].annotation
+        out += [f"## {section}", doc(model)]
         rows = []
         for name, entry in values.items():
             value, unit, origin = (
                 (entry["value"], entry["unit"], entry.get("origin", "")) if isinstance(entry, dict) else (entry, "", "")
             )
-            low, high = bounds.get(name, ("", ""))
+            bound = next((m for m in model.model_fields[name].metadata if isinstance(m, Bound)), None)
+            low, high = (f"{bound.low:.10g}", f"{bound.high:.10g}") if bound else ("", "")
             rows.append((f"`{name}`", f"{value}", unit, low, high, origin))
         out.append(table(("name", "value", "unit", "from", "to", "origin"), rows))
     return "\n\n".join(x for x in out if x) + "\n"
-
-
-def bounds_of(model: type[Table]) -> dict[str, tuple[str, str]]:
-    """The bounds of a section's numbers."""
-    out = {}
-    for name, hint in typing.get_type_hints(model, include_extras=True).items():
-        for bound in getattr(hint, "__metadata__", ()):
-            if isinstance(bound, Bound):
-                out[name] = (f"{bound.low:.10g}", f"{bound.high:.10g}")
-    return out
 
 
 # ---- physics and scenarios -------------------------------------------------------------------------------------------
