@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from benchmarks.measure import ROOT, Row
 
@@ -172,14 +173,9 @@ GROWTH = 0.1  # of the memory after the first minute that the rest may add
 
 
 def resident(pid: int) -> int:
-    """Memory of a process and all that it started, in kB."""
-    total = 0
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS"):
-            total = int(line.split()[1])
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        total += sum(resident(int(child)) for child in task.read_text().split())
-    return total
+    """Memory of a process and all that it started, in bytes."""
+    process = psutil.Process(pid)
+    return sum(p.memory_info().rss for p in (process, *process.children(recursive=True)))
 
 
 def two_minutes() -> Iterator[Row]:
@@ -230,7 +226,7 @@ def half_an_hour() -> Iterator[Row]:
         time.sleep(LIVE)
         after, reached = resident(server), page.locator(".tiles .v").first.inner_text()
         grown = after / before - 1.0
-        note = f"{before / 1024:,.0f} to {after / 1024:,.0f} MB; {reached} s of the loop's own time"
+        note = f"{before / 2**20:,.0f} to {after / 2**20:,.0f} MB; {reached} s of the loop's own time"
         yield Row(
             "web: growth of memory",
             f"{100 * grown:.1f} %",
