@@ -88,11 +88,7 @@ class Driven:
 
     def set(self, **values: float) -> None:
         for name, value in values.items():
-            kind = {"Real": "Real", "Integer": "Integer"}.get(self.kind[name], self.kind[name])
-            getattr(self.f, f"set{kind}")([self.reference[name]], [value])
-
-    def put(self, values: dict[str, float]) -> None:
-        self.set(**values)
+            getattr(self.f, f"set{self.kind[name]}")([self.reference[name]], [value])
 
     def get(self, *names: str) -> list[float]:
         read = self.f.getFloat64 if self.described.fmiVersion == "3.0" else self.f.getReal
@@ -203,7 +199,7 @@ def test_what_cannot_be_is_refused_with_a_line(fmus: dict[str, Path], tmp_path: 
         ({"n_dem": float("inf")}, "n_dem"),
     ):
         with pytest.raises(fmpy.fmi1.FMICallException):
-            fmu.put(values)
+            fmu.set(**values)
         assert re.search(line, fmu.said[-1]), fmu.said
     with pytest.raises(fmpy.fmi1.FMICallException):
         fmu.step(5000)
@@ -214,7 +210,7 @@ def test_a_parameter_tuned_while_it_runs_acts_from_then_on(fmus: dict[str, Path]
     fmu = Driven(fmus["loop3"], tmp_path, n_dem=60.0)
     fmu.step(0, 1000)
     (before,) = fmu.get("vigv")
-    fmu.put({"effects.pot_bias.vigv": 2.0})
+    fmu.set(**{"effects.pot_bias.vigv": 2.0})
     fmu.step(1000, 2000)
     assert (fmu.get("vigv")[0] - before) * DEG == pytest.approx(2.0, abs=0.01)
 
@@ -231,7 +227,7 @@ def test_every_fmu_is_valid_and_names_its_units(fmus: dict[str, Path]) -> None:
             )
             assert v.description or v.causality == "independent", v.name
     units = {u.name: u.baseUnit for u in described.unitDefinitions}
-    assert (units["mA"].A, units["mA"].factor) == (1, 0.001) if "mA" in units else True
+    assert (units["mA"].A, units["mA"].factor) == (1, 0.001)
 
 
 def test_a_hundred_instances_in_one_process_do_not_share_anything(fmus: dict[str, Path], tmp_path: Path) -> None:
