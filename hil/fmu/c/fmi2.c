@@ -15,14 +15,13 @@ const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
-    (void)n, (void)categories;
-    ((Instance *)c)->logging = on;
+    (void)c, (void)on, (void)n, (void)categories;
     return fmi2OK;
 }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
-    (void)resources, (void)visible;
+    (void)resources, (void)visible, (void)logging;
     Instance *i = kind == fmi2CoSimulation ? fmu_new(name, guid) : NULL;
     if (!i) {
         if (functions && functions->logger)
@@ -32,7 +31,6 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type kind, fmi2String guid, f
     }
     i->callback = (void *)functions;
     i->log = say;
-    i->logging = logging;
     return i;
 }
 

@@ -15,8 +15,7 @@ static void say(void *instance, int status, const char *message) {
 const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[]) {
-    (void)n, (void)categories;
-    ((Instance *)instance)->logging = on;
+    (void)instance, (void)on, (void)n, (void)categories;
     return fmi3OK;
 }
 
@@ -25,7 +24,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
                                          const fmi3ValueReference required[], size_t n,
                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
                                          fmi3IntermediateUpdateCallback update) {
-    (void)resources, (void)visible, (void)events, (void)early, (void)required, (void)n, (void)update;
+    (void)resources, (void)visible, (void)logging, (void)events, (void)early, (void)required, (void)n, (void)update;
     Instance *i = fmu_new(name, token);
     if (!i) {
         if (log) log(environment, fmi3Error, "logStatusError", "the instantiation token is another FMU's");
@@ -34,7 +33,6 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     memcpy(&i->callback, &log, sizeof log);
     i->environment = environment;
     i->log = say;
-    i->logging = logging;
     return i;
 }
 

@@ -41,7 +41,6 @@ typedef struct {
     char *name;
     void (*log)(void *instance, int status, const char *message);
     void *environment, *callback;
-    int logging;
 } Instance;
 
 extern const Variable variables[VARIABLES];
