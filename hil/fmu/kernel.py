@@ -28,6 +28,7 @@ from vaneloop.base.compiled import inlined
 __all__ = ["entry"]
 
 (F_N_DEM, F_N_R, F_I_CMD, F_X_LVDT, F_P_S, F_T_OIL, F_MODE_REQUEST, F_FRESH, F_REJECTED, F_PAUSE) = range(len(FED))
+S_I_CMD, S_X_DEM, S_X_LVDT, S_X, S_N_ENGINE, S_I_MOTOR, S_STATE, S_FAULTS = range(len(SHOWN))
 F_POTS, S_VANES = len(FED), len(SHOWN)
 SUBSTEP = chain.TICK / chain.SUBSTEPS
 _types: Any = types  # numba's own have no types
@@ -146,9 +147,9 @@ def plant_run(a: Loop, clock: np.ndarray, fed: np.ndarray, still: np.ndarray, ti
 def _show(a: Loop, fed: np.ndarray, shown: np.ndarray) -> None:
     """Fill ``shown`` with what the sensors give now, and what the firmware gave in the last tick."""
     out = as_outputs(a.outputs)
-    shown[0], shown[1], shown[6], shown[7] = out.i_cmd, out.x_dem, out.mode, out.faults
-    shown[2] = chain.sample_lvdt(a.s, a.p, 0, 0.0, fed[F_T_OIL])
-    shown[3], shown[4], shown[5] = a.s[places.X, 0], a.s[places.N_R, 0], a.s[places.I_MOTOR, 0]
+    shown[S_I_CMD], shown[S_X_DEM], shown[S_STATE], shown[S_FAULTS] = out.i_cmd, out.x_dem, out.mode, out.faults
+    shown[S_X_LVDT] = chain.sample_lvdt(a.s, a.p, 0, 0.0, fed[F_T_OIL])
+    shown[S_X], shown[S_N_ENGINE], shown[S_I_MOTOR] = a.s[places.X, 0], a.s[places.N_R, 0], a.s[places.I_MOTOR, 0]
     for q in range(a.angles.shape[0]):
         shown[S_VANES + q] = a.s[places.POT + q, 0]
 
