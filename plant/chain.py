@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from plant import drive, electromechanical, stem
+from plant import curve, drive, electromechanical, stem
 from plant.actuator import speed_factor, stroke_step
 from plant.effect import T_REF
 from plant.effects import (
+    CURVES,
     N_STATE,
     STATE,
     acceleration_limit_error,
@@ -119,6 +120,7 @@ __all__ = [
     "STATE",
     "SUBSTEPS",
     "TICK",
+    "bent_reading",
     "drive_step",
     "measured_stroke",
     "rest",
@@ -126,6 +128,7 @@ __all__ = [
     "sample_lvdt",
     "stem_angle",
     "straight_reading",
+    "straightened",
     "true_stroke",
     "unloaded_ring_angle",
     "vane_step",
@@ -141,6 +144,10 @@ def rotor_step(s: np.ndarray, p: np.ndarray, j: int, n_dem: float, dt: float = T
     """Engine: one step ``dt`` (s) towards the demand ``n_dem`` (%)."""
     lag = rotor_lag_error.step(p[LAG, j], p[ROTOR_LAG_ERROR, j])
     acceleration = acceleration_limit_error.step(p[ACCELERATION, j], p[ACCELERATION_LIMIT_ERROR, j])
+    if p[CURVES, j] != 0.0:
+        n_dem += curve.bend(s, p, j, curve.ENGINE_ADDS)
+        lag *= curve.factor(s, p, j, curve.LAG_TIMES)
+        acceleration *= curve.factor(s, p, j, curve.RISE_TIMES)
     s[N_R, j] = engine_step(s[N_R, j], n_dem, lag, acceleration, p[DECELERATION, j], dt)
 
 
@@ -191,8 +198,13 @@ def _drive_step(
     y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j], p[VALVE_HYSTERESIS + 1, j])
     i = valve_hysteresis.mean(y1, y2, y3, y4)
     gain = oil_viscosity.step(p[FLOW_GAIN, j], t_oil, p[OIL_VISCOSITY, j])
+    load = aero_load.step(n_r, p[AERO_LOAD, j])
+    if p[CURVES, j] != 0.0:
+        i += curve.bend(s, p, j, curve.CURRENT_ADDS)
+        gain *= curve.factor(s, p, j, curve.FLOW_TIMES)
+        load += curve.bend(s, p, j, curve.LOAD_ADDS)
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
-    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), aero_load.step(n_r, p[AERO_LOAD, j]))
+    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), load)
     d, z = drive.prepare(p, j), drive.taken(s, j)
     for _ in range(substeps):
         z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True)
@@ -206,7 +218,11 @@ def _motor_step(
 ) -> None:
     """`drive_step` of an electromechanical actuator."""
     d, z = electromechanical.prepare(p, j, t_oil), electromechanical.taken(s, j)
-    load, friction = electromechanical.load_torques(d, aero_load.step(n_r, p[AERO_LOAD, j]))
+    force = aero_load.step(n_r, p[AERO_LOAD, j])
+    if p[CURVES, j] != 0.0:
+        i_cmd += curve.bend(s, p, j, curve.CURRENT_ADDS)
+        force += curve.bend(s, p, j, curve.LOAD_ADDS)
+    load, friction = electromechanical.load_torques(d, force)
     many = motor_steps(dt / substeps)
     h = dt / (substeps * many)
     for _ in range(substeps):
@@ -225,7 +241,10 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
         s[row, j] = 0.0
     s[N_R, j] = n_r
     s[X, j] = s[X_LVDT, j] = s[READING, j] = stroke
+    curve.begin(s, p, j, t_oil)
     load = aero_load.step(n_r, p[AERO_LOAD, j])
+    if p[CURVES, j] != 0.0:
+        load += curve.bend(s, p, j, curve.LOAD_ADDS)
     s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
     for q in range(4):
         s[CURRENT + q, j] = p[VALVE_NULL_BIAS, j]
@@ -238,6 +257,7 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
         s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
         stage = stem.prepare(p, j, k)
         s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
+    curve.begin(s, p, j, t_oil)  # once more, now that the potentiometers have their angles
 
 
 @in_place
@@ -286,12 +306,28 @@ def true_stroke(reading: float, p: np.ndarray, j: int, t_oil: float) -> float:
     return x
 
 
+@inlined
+def bent_reading(x: float, s: np.ndarray, p: np.ndarray, j: int) -> float:
+    """What the LVDT's curves make of its reading ``x`` (m)."""
+    if p[CURVES, j] == 0.0:
+        return x
+    return x * curve.factor(s, p, j, curve.LVDT_TIMES) + curve.bend(s, p, j, curve.LVDT_ADDS)
+
+
+@inlined
+def straightened(reading: float, s: np.ndarray, p: np.ndarray, j: int) -> float:
+    """The inverse of `bent_reading` at the same signals."""
+    if p[CURVES, j] == 0.0:
+        return reading
+    return (reading - curve.bend(s, p, j, curve.LVDT_ADDS)) / curve.factor(s, p, j, curve.LVDT_TIMES)
+
+
 @in_place
 def sample_lvdt(s: np.ndarray, p: np.ndarray, j: int, noise: float, t_oil: float = T_REF) -> float:
     """Return the LVDT's sample (m): lagged stroke plus ``noise`` (m), in steps of the converter."""
     x = s[X_LVDT, j]
     if p[DRIVE_EFFECTS, j] != 0.0:
-        x = measured_stroke(s[READING, j], p, j, t_oil)
+        x = bent_reading(measured_stroke(s[READING, j], p, j, t_oil), s, p, j)
     return quantise(x + noise, p[LVDT_STEP, j])
 
 
@@ -312,10 +348,17 @@ def stem_angle(
     """
     stage = stem.prepare(p, j, k)
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
-    theta = stem.drive(stage, theta, n_r, t_oil, True)
-    z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.friction != 0.0)
+    theta, play = stem.drive(stage, theta, n_r, t_oil, True), 0.0
+    if p[CURVES, j] != 0.0:
+        theta += curve.bend(s, p, j, curve.RING_ADDS) + curve.bend(s, p, j, curve.RING_ADDS + 1 + k)
+        play = curve.bend(s, p, j, curve.PLAY_ADDS) + curve.bend(s, p, j, curve.PLAY_ADDS + 1 + k)
+    z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.friction != 0.0, play)
     stem.stored(s, j, k, z)
-    return stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
+    reading = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
+    if p[CURVES, j] != 0.0:
+        reading *= curve.factor(s, p, j, curve.POT_TIMES + 1 + k)
+        reading += curve.bend(s, p, j, curve.POT_ADDS + 1 + k)
+    return reading
 
 
 @in_place

@@ -8,12 +8,19 @@ follow behind (`plant.effects`).
 from __future__ import annotations
 
 from plant.linkage import N_GEOMETRY
+from vaneloop.base.curve import POINTS
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
     "ACCELERATION",
     "AREA",
     "BANDWIDTH",
+    "CURVE_ROWS",
+    "C_HIGH",
+    "C_LOW",
+    "C_OF",
+    "C_SITE",
+    "C_TABLE",
     "DAMPING",
     "DECELERATION",
     "FLOW_GAIN",
@@ -22,6 +29,7 @@ __all__ = [
     "LVDT_FACTOR",
     "LVDT_LAG",
     "LVDT_STEP",
+    "MOST_CURVES",
     "MOTOR_NAMES",
     "MOTOR_STATE",
     "NAMES",
@@ -33,6 +41,7 @@ __all__ = [
     "POT_LAG",
     "P_REF",
     "RATED_CURRENT",
+    "SIGNALS",
     "STROKE",
     "VALVE_A11",
     "VALVE_A12",
@@ -91,6 +100,30 @@ NOMINAL_STATE = (
     "x_lvdt",  # m, LVDT after its lag
     *(f"ring_{v}" for v in VANES),  # rad, ring angle behind its play
     *(f"pot_{v}" for v in VANES),  # rad, vane angle after the potentiometer's lag
+)
+
+# ---- curves that were learned (`plant.curve`): behind all others too
+MOST_CURVES = 4
+(C_SITE, C_OF, C_LOW, C_HIGH, C_TABLE) = range(5)  # rows of one: where, of which signal, its range, its table
+CURVE_ROWS = C_TABLE + POINTS
+SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature in degC)
+    "i_cmd",
+    "x",
+    "speed",
+    "n_r",
+    "p_s",
+    "t_oil",
+    "time",
+    "n_dem",
+    "x_dem",
+    "direction",  # of the stroke, -1 or 1; 0 before it first moves
+    "distance",  # m since the stroke last turned
+    "since",  # s since then
+    *VANES,
+    "farthest",  # m: memory of the last three
+    "turned",  # m
+    "reached",  # s
+    "turned_at",  # s
 )
 
 # ---- electromechanical actuator: its rows stand behind all others (`plant.effects`)

@@ -13,10 +13,10 @@ command as ``--model``.
     [effects.valve_dead_band]               # in the units of docs/effects.md; what is not named stays neutral
     half_width = 1.2
 
-    [curves."outflow.gain_of_oil"]          # of a user's own system, written by `vaneloop learn`: a law that nobody
-    how = "parameter times"                 # listed, its numbers as learned; those of now are in its table of effects
-    at = "outflow"
-    of = "oil"
+    [curves."flow_gain_of_oil"]             # written by `vaneloop learn`: a law that nobody listed, its numbers as
+    how = "times"                           # learned; those of now are in its table of effects (docs/learn.md)
+    at = "actuator.flow_gain"
+    of = "t_oil"
     low = 15.2
     high = 64.9
     knots = [15.2, 15.2, 15.2, 15.2, 64.9, 64.9, 64.9, 64.9]
@@ -28,22 +28,26 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from plant import chain
+from plant.curve import PLACES, QUANTITIES, at_curve
 from plant.effects import EFFECTS
 from plant.geometry import Stage
-from plant.layout import PLAY
+from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
 from plant.parameters import Nominal, derive, nominal
+from vaneloop.base.curve import DEGREE, POINTS, splines
 from vaneloop.base.errors import InputError
+from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import Bound, Finite, Table, read
-from vaneloop.base.vanes import MOST, vane_in
+from vaneloop.base.vanes import MOST, VANES, vane_in
 
 __all__ = ["Learned", "Model", "allowed_of", "load_model", "write_model"]
 
@@ -51,7 +55,7 @@ FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, so
 
 
 class Learned(Table):
-    """A law that was learned: a function of one quantity at one place of a user's own model.
+    """A law that was learned: a function of one quantity at one place.
 
     how, at, of  what it does, where, of what (docs/learn.md)
     low, high    where its quantity has been; beyond, the function stays as at its end
@@ -71,6 +75,40 @@ class Learned(Table):
     unit: str = ""
     size: Finite = 1.0
 
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of its values: c1, c2, ... of splines, those of its formula."""
+        if self.form:
+            return next((f.numbers for f in FORMS if f.name == self.form), ())
+        return tuple(f"c{k + 1}" for k in range(len(self.values)))
+
+    def now(self, values: Mapping[str, float]) -> Learned:
+        """The law with these values; what is not named stays as learned."""
+        return self.model_copy(
+            update={"values": [values.get(n, v) for n, v in zip(self.numbers, self.values, strict=True)]}
+        )
+
+    def check(self, name: str) -> None:
+        """Refuse a table that is no curve: InputError, one line, with its ``name``."""
+        if not self.low < self.high:
+            raise InputError(f"{name}: low (={self.low:g}) must be below high (={self.high:g})")
+        if self.form and len(self.numbers) != len(self.values):
+            allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
+            raise InputError(f"{name}: form (={self.form!r}, {len(self.values)} values) must be one of {allowed}")
+        if not self.form and (len(self.knots) != len(self.values) + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0)):
+            raise InputError(
+                f"{name}: knots ({len(self.knots)} of them) must rise, and be {DEGREE + 1} more than the "
+                f"{len(self.values)} values"
+            )
+
+    def table(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Function from its values to the curve at `POINTS` points, evenly from low to high."""
+        x = np.linspace(self.low, self.high, POINTS)
+        if self.form:
+            form = next(f for f in FORMS if f.name == self.form)
+            return lambda values: np.broadcast_to(form.value(x, values), x.shape).astype(float)
+        return splines(np.asarray(self.knots, dtype=float), x).__matmul__
+
 
 class Model(Table):
     """What a machine has beyond its tables.
@@ -78,7 +116,7 @@ class Model(Table):
     parameters  name of a nominal parameter (`plant.parameters.nominal`) -> value in its table's unit
     effects     name of an effect -> its parameters, in their declared units
     meta        free text and lists of it
-    curves      of a user's own system: effects that are functions which were learned
+    curves      effects that are functions which were learned
     """
 
     parameters: dict[str, Finite] = Field(default_factory=dict)
@@ -104,8 +142,7 @@ class Model(Table):
         """Refuse what is not in the library or out of bounds: InputError in one line, naming ``source``."""
         if system := self.meta.get("system"):
             raise InputError(f"{source}: is a model of the system {system!r}; --system says where that is")
-        if self.curves:
-            raise InputError(f"{source}: curves: {next(iter(self.curves))!r} is a law of a user's own system")
+        self._check_curves(plant, source)
         known = {n.name: n for n in nominal(plant.table, plant.geometry)}
         for name, value in self.parameters.items():
             if name not in known:
@@ -116,6 +153,8 @@ class Model(Table):
             low, high = allowed_of(plant, n)
             _within(value, low, high, n.unit, f"{source}: parameters: {name}")
         for effect, values in self.effects.items():
+            if effect in self.curves:
+                continue
             if effect not in EFFECTS:
                 raise InputError(
                     f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
@@ -135,6 +174,28 @@ class Model(Table):
                 p = allowed[key]
                 _within(value, p.low, p.high, p.unit, f"{source}: effects.{effect}.{key}")
 
+    def _check_curves(self, plant: Plant, source: str | Path) -> None:
+        """Refuse curves that this machine has no place or quantity for."""
+        if len(self.curves) > MOST_CURVES:
+            raise InputError(f"{source}: curves (={len(self.curves)}) must be at most {MOST_CURVES}")
+        for name, curve in self.curves.items():
+            where = f"{source}: curves.{name}"
+            places = {k: v for k, v in PLACES.items() if plant.kind in v.kinds and v.vane in ("", *plant.vanes)}
+            own = {q: v for q, v in QUANTITIES.items() if q not in VANES or q in plant.vanes}
+            if f"{curve.at} {curve.how}" not in places:
+                raise InputError(
+                    f"{where}: at, how (={curve.at!r}, {curve.how!r}) is {_not(curve.at, plant, ())}; allowed: "
+                    f"{', '.join(places)}"
+                )
+            if curve.of not in own:
+                raise InputError(f"{where}: of (={curve.of!r}) is unknown; allowed: {', '.join(own)}")
+            curve.check(where)
+            values = self.effects.get(name, {})
+            if unknown := next((k for k in values if k not in curve.numbers), None):
+                raise InputError(
+                    f"{source}: effects.{name}: {unknown!r} is unknown; allowed: {', '.join(curve.numbers)}"
+                )
+
     def plant(self, base: Plant | None = None) -> Plant:
         """Return the machine: ``base`` (default: the shipped tables) with this model's parameters and effects.
 
@@ -151,10 +212,20 @@ class Model(Table):
                 ldp, lever = machine.lever(row - PLAY)
                 p[row] *= lever / ldp
         for effect, values in self.effects.items():
+            if effect in self.curves:
+                put_curve(p, self.curves[effect], values)
+                continue
             for row, parameter in machine.parameters_of(effect).items():
                 p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
         derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
         return replace(machine, p=p)
+
+
+def put_curve(p: np.ndarray, curve: Learned, values: Mapping[str, float]) -> None:
+    """Put a curve with these ``values`` (what is not named: as learned) behind those that ``p`` has, in every lane."""
+    numbers = np.array(curve.now(values).values)
+    place, of = PLACES[f"{curve.at} {curve.how}"], QUANTITIES[curve.of]
+    at_curve(p, place, of, curve.low, curve.high, curve.table()(numbers)[:, None])
 
 
 def load_model(path: str | Path, plant: Plant | None = None) -> Model:

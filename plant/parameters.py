@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from plant.curve import LOAD_ADDS, acts
 from plant.effect import KINDS
-from plant.effects import DERIVED, MOTOR, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
+from plant.effects import CURVES, DERIVED, MOTOR, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
 from plant.geometry import Geometry, length_tolerances, load_geometry
 from plant.layout import (
     ACCELERATION,
@@ -378,6 +379,10 @@ def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
     p[DRIVE_EFFECTS, j] = 1.0 if p[KIND, j] != 0.0 else _changed(p, j, _DRIVE_ROWS)
     p[DRIVE_LOADED, j] = _changed(p, j, _LOAD_ROWS)
     p[VANE_EFFECTS, j] = _changed(p, j, _VANE_ROWS)
+    if p[CURVES, j] != 0.0:  # nor have curves
+        p[DRIVE_EFFECTS, j] = p[VANE_EFFECTS, j] = 1.0
+        if acts(p, j, LOAD_ADDS):
+            p[DRIVE_LOADED, j] = 1.0
 
 
 @in_place

@@ -138,12 +138,17 @@ def drive(d: Stem, theta: float, n_r: float, t_oil: float, eccentric: bool) -> f
 
 
 @inlined
-def follow(z: StemState, d: Stem, theta: float, t_oil: float, t: float, rubbed: bool) -> tuple[StemState, float]:
+def follow(
+    z: StemState, d: Stem, theta: float, t_oil: float, t: float, rubbed: bool, more: float = 0.0
+) -> tuple[StemState, float]:
     """Let the ring follow ``theta`` at time ``t`` (s from the start of the log); return its state, and its angle.
 
     rubbed  False leaves out friction, and what it remembers: for a stage that has none
+    more    rad of play at the ring, beyond the stage's own; all of it is never negative
     """
     play = linkage_wear.step(d.play, d.wear, d.ratio, t)
+    if more != 0.0:
+        play = max(play + more, 0.0)
     ring = play_step(z.ring, theta, play)
     if not rubbed:
         return StemState(ring, z.bristle, z.driven), ring

@@ -293,7 +293,8 @@ def test_without_noise_only_model_form_is_left():
 
 def test_every_effect_of_the_design_can_be_hidden():
     assert set(EFFECTS) == set(DESIGN_LIBRARY)
-    assert len(OUTSIDE) >= 10
+    assert len(OUTSIDE) >= 16
+    assert {e.stage for e in OUTSIDE.values()} == {"demand", "servo", "engine", "actuator", "linkage"}
     assert not set(OUTSIDE) & set(EFFECTS)
 
 

@@ -105,6 +105,7 @@ EXPORTS: dict[str, list[str]] = {
         "write_model",
     ],
     "plant.effects": [
+        "CURVES",
         "DERIVED",
         "EFFECTS",
         "MOTOR",
@@ -113,12 +114,13 @@ EXPORTS: dict[str, list[str]] = {
         "N_PARAMETERS",
         "N_STATE",
         "ROW",
+        "SIGNAL_AT",
         "STATE",
         "STATE_ROW",
         "rows_at",
         "states_of",
     ],
-    "plant.stages": ["actuator_run", "engine_run", "linkage_run", "step_currents"],
+    "plant.stages": ["actuator_run", "engine_run", "linkage_run", "run_bends", "step_currents"],
     "vaneloop": [
         *(
             "Channel",

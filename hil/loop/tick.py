@@ -20,8 +20,8 @@ import numpy as np
 from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state, state_rows
 from hil.native.call import firmware
-from plant import Plant, chain, places
-from plant.effects import can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
+from plant import Plant, chain, curve, places
+from plant.effects import CURVES, can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place, inlined
 from vaneloop.base.vanes import same_stages
 
@@ -142,18 +142,16 @@ def new_loop(
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
     cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy(), program=None)
-    _flash(calibration._replace(program=None), cal, np.empty(3), plant.p)
+    _flash(calibration._replace(program=None), cal, np.empty(3), plant.p, plant.p[places.SCHEDULE_ERROR, 0])
     return cal
 
 
 @in_place
-def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarray) -> None:
-    """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``."""
-    flash[0], flash[1], flash[2] = (
-        p[places.SCHEDULE_ERROR, 0],
-        p[places.TREND_THRESHOLD_ERROR, 0],
-        p[places.CONTROLLER_GAIN_ERROR, 0],
-    )
+def _flash(built: Calibration, cal: Calibration, flash: np.ndarray, p: np.ndarray, offset: float) -> None:
+    """Write ``built``, with the effects in ``p`` that change tables and gains, into ``cal``; ``offset`` (m): of the
+    tables.
+    """
+    flash[0], flash[1], flash[2] = (offset, p[places.TREND_THRESHOLD_ERROR, 0], p[places.CONTROLLER_GAIN_ERROR, 0])
     for row in range(1, built.table.shape[0]):
         for i in range(built.table.shape[1]):
             cal.table[row, i] = schedule_error.step(built.table[row, i], flash[0])
@@ -217,12 +215,15 @@ def arrive(k: int, a: Loop, n_dem: float, n_r: float, mode_request: float) -> No
 def reflash(a: Loop) -> None:
     """Flash the calibration anew where the parameters of an effect that changes it are others than those flashed."""
     p = a.p
+    offset = p[places.SCHEDULE_ERROR, 0]
+    if p[CURVES, 0] != 0.0:
+        offset += curve.bend(a.s, p, 0, curve.DEMAND_ADDS)
     if (
-        p[places.SCHEDULE_ERROR, 0] != a.flash[0]
+        offset != a.flash[0]
         or p[places.TREND_THRESHOLD_ERROR, 0] != a.flash[1]
         or p[places.CONTROLLER_GAIN_ERROR, 0] != a.flash[2]
     ):
-        _flash(a.built, a.calibration, a.flash, p)
+        _flash(a.built, a.calibration, a.flash, p, offset)
 
 
 @inlined
@@ -261,6 +262,10 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         for q in range(a.angles.shape[0]):
             inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
     firmware(a.inputs, a.outputs, a.z, a.calibration, a.foreign)
+    if p[CURVES, 0] != 0.0:
+        out, most = as_outputs(a.outputs), as_scalars(a.calibration.k).current_limit
+        bent = out.i_cmd * curve.factor(s, p, 0, curve.SERVO_TIMES) + curve.bend(s, p, 0, curve.SERVO_ADDS)
+        out.i_cmd = min(max(bent, -most), most)
     a.mean[0] += as_outputs(a.outputs).i_cmd
     a.mean[1] += 1.0
 
@@ -279,6 +284,9 @@ def move(k: int, a: Loop, n_dem: float, n_r: float, p_s: float, t_oil: float) ->
     ``n_r`` (%).
     """
     s, p = a.s, a.p
+    if p[CURVES, 0] != 0.0:
+        out = as_outputs(a.outputs)
+        curve.follow(s, p, 0, out.i_cmd, as_state(a.z).x_dem, n_dem, n_r, p_s, t_oil, k * chain.TICK)
     chain.rotor_step(s, p, 0, n_dem, chain.TICK)
     chain.drive_step(s, p, 0, as_outputs(a.outputs).i_cmd, n_r, p_s, t_oil, chain.TICK, chain.SUBSTEPS)
     chain.vane_step(s, p, 0, n_r, t_oil, (k + 1) * chain.TICK)

@@ -11,12 +11,12 @@ import importlib
 import pkgutil
 
 from plant.effect import Effect
-from plant.layout import MOTOR_NAMES, MOTOR_STATE, N_NOMINAL, NOMINAL_STATE
+from plant.layout import CURVE_ROWS, MOST_CURVES, MOTOR_NAMES, MOTOR_STATE, N_NOMINAL, NOMINAL_STATE, SIGNALS
 from vaneloop.base.vanes import MOST
 
 __all__ = [
-    "DERIVED", "EFFECTS", "MOTOR", "MOTOR_AT", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "STATE", "STATE_ROW",
-    "rows_at", "states_of",
+    "CURVES", "DERIVED", "EFFECTS", "MOTOR", "MOTOR_AT", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "SIGNAL_AT",
+    "STATE", "STATE_ROW", "rows_at", "states_of",
 ]  # fmt: skip
 
 
@@ -45,9 +45,11 @@ for _name, _effect in EFFECTS.items():
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
 MOTOR = DERIVED + 5 + MOST  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
-N_PARAMETERS = MOTOR + 1 + len(MOTOR_NAMES) + 2
+CURVES = MOTOR + 1 + len(MOTOR_NAMES) + 2  # rows of curves that were learned: their number, and each (`plant.layout`)
+N_PARAMETERS = CURVES + 1 + MOST_CURVES * CURVE_ROWS
 MOTOR_AT = len(_states)  # first row of `MOTOR_STATE` in s
-STATE: tuple[str, ...] = (*_states, *MOTOR_STATE)
+SIGNAL_AT = MOTOR_AT + len(MOTOR_STATE)  # first row of `SIGNALS` in s
+STATE: tuple[str, ...] = (*_states, *MOTOR_STATE, *(f"signal_{name}" for name in SIGNALS))
 N_STATE = len(STATE)
 
 
@@ -57,8 +59,10 @@ def rows_at(*sites: str) -> list[int]:
 
 
 def states_of(kind: str) -> list[int]:
-    """Return the rows of s that a machine with an actuator of this ``kind`` has, in their order."""
+    """Return the rows of s that a machine with an actuator of this ``kind`` has, in their order; not those that only
+    curves look at.
+    """
     hydraulic = kind == "hydraulic"
     absent = set(MOTOR_STATE) if hydraulic else {"spool", "spool_rate"}
     absent |= {f"{e.name}.{state}" for e in EFFECTS.values() if kind not in e.kinds for state in e.states}
-    return [row for row, name in enumerate(STATE) if name not in absent]
+    return [row for row, name in enumerate(STATE[:SIGNAL_AT]) if name not in absent]

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from plant import chain, electromechanical
-from plant.chain import measured_stroke, true_stroke
-from plant.effects import aero_load, oil_compressibility, valve_null_bias
+from plant import chain, curve, electromechanical
+from plant.chain import bent_reading, measured_stroke, straightened, true_stroke
+from plant.effects import CURVES, aero_load, oil_compressibility, valve_null_bias
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
 from plant.places import (
     AERO_LOAD,
@@ -30,7 +30,7 @@ from plant.places import (
     X,
 )
 from plant.stages import hydraulic_blocks, motor_blocks
-from plant.stages.blocks import W, between, elsewhere, in_blocks
+from plant.stages.blocks import NOTHING, W, between, elsewhere, in_blocks
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["actuator_run"]
@@ -50,6 +50,7 @@ def actuator_run(
     out: np.ndarray,
     x_lvdt: np.ndarray | None = None,
     window: int = 0,
+    known: np.ndarray = NOTHING,
 ) -> None:
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
@@ -59,6 +60,7 @@ def actuator_run(
     x_lvdt, window    measured stroke (m): every ``window`` samples, from the first on, the piston is put where the LVDT
                       saw it, so that a small error of speed does not carry it away; without them it starts from ``s``
                       and runs free
+    known             signals of curves (`plant.curve.take`); the current's is that of every step
 
     The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where
     the share of a constant input, 1 - exp(-h / tau), would be early by h / 2.
@@ -73,7 +75,7 @@ def actuator_run(
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
     motor = p[KIND, 0] != 0.0  # all lanes are of one machine
-    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED)
+    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED) | (p[CURVES] != 0.0)
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
     order = np.lexsort(
         (
@@ -98,7 +100,7 @@ def actuator_run(
             block = np.empty(1, hydraulic_blocks.BLOCK)
             hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block)
         else:
-            _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some)
+            _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)
 
     if len(work) == 1:
         run(work[0])
@@ -134,21 +136,28 @@ def _actuator_lanes(
     x_lvdt: np.ndarray,
     window: int,
     lanes: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """These ``lanes``, one after the other; out[lane, k]."""
     n, substeps = current.shape
     h = dt / substeps
     for j in lanes:
-        effects = p[DRIVE_EFFECTS, j] != 0.0
+        effects, curved = p[DRIVE_EFFECTS, j] != 0.0, p[CURVES, j] != 0.0
         for k in range(n):
             if k > 0:
                 speed, supply, warm = between(n_r, k), between(p_s, k), between(t_oil, k)
+                if curved:
+                    curve.take(s, p, j, known, k - 1, k)
                 for m in range(substeps):
+                    if curved:
+                        s[curve.S_CURRENT, j] = current[k, m]
                     chain.drive_step(s, p, j, current[k, m], speed, supply, warm, h, 1)
             if not effects:
                 s[READING, j] = s[X_LVDT, j]
+            if curved:
+                curve.take(s, p, j, known, k, k)
             if window > 0 and k % window == 0:
-                x = true_stroke(x_lvdt[k], p, j, t_oil[k])
+                x = true_stroke(straightened(x_lvdt[k], s, p, j), p, j, t_oil[k])
                 if k == 0:
                     s[X, j] = s[X_LVDT, j] = s[READING, j] = x
                 else:
@@ -156,4 +165,6 @@ def _actuator_lanes(
                     s[X, j] += shift
                     s[X_LVDT, j] += shift
                     s[READING, j] += shift
-            out[j, k] = measured_stroke(s[READING, j], p, j, t_oil[k]) if effects else s[READING, j]
+            out[j, k] = s[READING, j]
+            if effects:
+                out[j, k] = bent_reading(measured_stroke(s[READING, j], p, j, t_oil[k]), s, p, j)

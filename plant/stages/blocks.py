@@ -11,8 +11,9 @@ from plant.effects import EFFECTS, NEUTRAL, ROW
 from plant.layout import N_NOMINAL
 from vaneloop.base.compiled import inlined
 
-__all__ = ["W", "between", "elsewhere", "in_blocks", "put_where_seen"]
+__all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "put_where_seen"]
 
+NOTHING = np.empty((0, 0))  # where no lane has a curve
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
 
 # A block's memory comes from the caller, who keeps it: a record that compiled code takes out of an array of its own

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from plant import places
-from plant.effects import acceleration_limit_error, rotor_lag_error
+from plant import chain, curve, places
+from plant.effects import CURVES, acceleration_limit_error, rotor_lag_error
 from plant.engine import engine_step
 from plant.parameters import ACCELERATION, DECELERATION, LAG
 from plant.places import N_R
-from plant.stages.blocks import W
+from plant.stages.blocks import NOTHING, W
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["engine_run"]
@@ -19,11 +19,33 @@ __all__ = ["engine_run"]
 ENGINE_STEP = 2e-3  # s: the engine's explicit step is within 0.1 % of a change at this length
 
 
-def engine_run(n_dem: np.ndarray, dt: float, p: np.ndarray, s: np.ndarray, out: np.ndarray) -> None:
+def engine_run(
+    n_dem: np.ndarray, dt: float, p: np.ndarray, s: np.ndarray, out: np.ndarray, known: np.ndarray = NOTHING
+) -> None:
     """Fill out[k, lane] with the rotor speed (%) at sample k; n_dem[k] (%) holds until sample k + 1. ``s`` is
     moved on.
+
+    known  signals of curves (`plant.curve.take`); the speed's is the rotor's own
     """
-    _engine_run(np.ascontiguousarray(n_dem), dt, max(1, math.ceil(dt / ENGINE_STEP - 1e-6)), p, s, out)
+    steps = max(1, math.ceil(dt / ENGINE_STEP - 1e-6))
+    if p[CURVES].any():  # lane by lane, through the chain
+        _engine_lanes(np.ascontiguousarray(n_dem), dt, steps, p, s, out, known)
+    else:
+        _engine_run(np.ascontiguousarray(n_dem), dt, steps, p, s, out)
+
+
+@compiled_free
+def _engine_lanes(
+    n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.ndarray, out: np.ndarray, known: np.ndarray
+) -> None:
+    for j in range(p.shape[1]):
+        for k in range(len(n_dem)):
+            if k > 0:
+                curve.take(s, p, j, known, k - 1, k - 1)
+                for _ in range(steps):
+                    s[curve.S_N_R, j] = s[N_R, j]
+                    chain.rotor_step(s, p, j, n_dem[k - 1], dt / steps)
+            out[k, j] = s[N_R, j]
 
 
 @compiled_free

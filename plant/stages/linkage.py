@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant import chain, lanes, stem
-from plant.chain import true_stroke
-from plant.effects import pot_lag
+from plant import chain, curve, lanes, stem
+from plant.chain import straightened, true_stroke
+from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
 from plant.places import LVDT_LAG_ERROR, POT, POT_LAG_ERROR, X
 from plant.series import arctangent, tangent
-from plant.stages.blocks import elsewhere, in_blocks
+from plant.stages.blocks import NOTHING, elsewhere, in_blocks
 from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = ["linkage_run"]
@@ -38,6 +38,7 @@ def linkage_run(
     p: np.ndarray,
     s: np.ndarray,
     out: np.ndarray,
+    known: np.ndarray = NOTHING,
 ) -> None:
     """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise.
     ``s`` is moved on.
@@ -45,6 +46,7 @@ def linkage_run(
     x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading
              moves all stages
     n_r, t_oil, t   %, degC, s from the start of the log
+    known    signals of curves (`plant.curve.take`)
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
     reach = max(
@@ -55,13 +57,13 @@ def linkage_run(
         np.maximum(np.arange(len(x_lvdt)) - reach, 0),
     )
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
-    alone = elsewhere(p, ("linkage", "pot"), CALLED)
+    alone = elsewhere(p, ("linkage", "pot"), CALLED) | (p[CURVES] != 0.0)
     order = np.argsort(alone, kind="stable")
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     if wide:
         _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _linkage(out.shape[1])))
     if wide < p.shape[1]:
-        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:])
+        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:], known)
 
 
 @inlined
@@ -87,14 +89,19 @@ def _linkage_lanes(
     s: np.ndarray,
     out: np.ndarray,
     lanes: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """These ``lanes``, one after the other."""
     g, stages = GEOMETRY, out.shape[1]
     before = np.empty(stages)
     for j in lanes:
-        late = max(p[LVDT_LAG, j], 0.0) + p[LVDT_LAG_ERROR, j]
+        late, curved = max(p[LVDT_LAG, j], 0.0) + p[LVDT_LAG_ERROR, j], p[CURVES, j] != 0.0
         for m in range(len(x_lvdt)):
-            x = true_stroke(x_lvdt[m] + late * speed[m], p, j, t_oil[m])
+            seen = x_lvdt[m] + late * speed[m]
+            if curved:
+                curve.take(s, p, j, known, m, m)
+                seen = straightened(seen, s, p, j)
+            x = true_stroke(seen, p, j, t_oil[m])
             s[X, j] = x
             c, d = crank(x, p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
             for k in range(stages):

@@ -258,6 +258,21 @@ OUTSIDE = _table(
     _one("ring_snag", "linkage", "linkage", "depth", P.snag_depth, "rad", 0.0,
          "the VIGV ring is drawn towards and away from one angle", (1e-5, 1e-4, 1e-3, 3e-3, 8e-3),
          more={"angle": Parameter(P.snag_angle, "rad", 0.0, "ring angle of the snag")}, others={"angle": 0.0}),
+    _one("return_spring", "actuator", "actuator", "stiffness", P.spring, "N/m", 0.0,
+         "force towards mid-stroke", (1e3, 1e4, 1e5, 3e5, 6e5)),
+    _one("null_over_temperature", "actuator", "valve", "coefficient", P.null_thermal, "A/K", 0.0,
+         "shift of the valve's null per kelvin above 40 degC", (1e-7, 1e-6, 1e-5, 4e-5, 1.5e-4), signed=True),
+    _one("null_over_pressure", "actuator", "valve", "coefficient", P.null_pressure, "A/Pa", 0.0,
+         "shift of the valve's null per supply pressure", (1e-13, 2e-12, 5e-11, 2e-10, 6e-10), signed=True),
+    _one("lvdt_over_pressure", "linkage", "lvdt", "coefficient", P.lvdt_pressure, "m/Pa", 0.0,
+         "reading per supply pressure", (1e-13, 1e-12, 5e-11, 2e-10, 8e-10), signed=True),
+    _one("acceleration_by_speed", "engine", "engine", "slope", P.rise_slope, "1/%", 0.0,
+         "relative change of the acceleration limit per % above 70 %", (1e-5, 1e-4, 3e-3, 8e-3, 1.5e-2), signed=True),
+    _one("servo_gain_warm", "servo", "demand", "coefficient", P.gain_thermal, "1/K", 0.0,
+         "relative change of the controller's current per kelvin above 40 degC", (1e-5, 1e-4, 2e-3, 6e-3, 1.5e-2),
+         signed=True),
+    _one("schedule_bent", "demand", "demand", "amplitude", P.schedule_bend, "m", 0.0,
+         "bend of the stroke table round 75 % speed", (5e-7, 5e-6, 5e-5, 3e-4, 1.5e-3), signed=True),
 )
 # fmt: on
 

@@ -231,6 +231,14 @@ class P(IntEnum):
     pitch_error = 189  # m
     pitch_phase = 190  # rad
     rod_friction = 191  # N, of the vanes' stems and the linkage
+    # ---- more hidden effects outside the library
+    spring = 192  # N/m, towards mid-stroke
+    null_thermal = 193  # A/K
+    null_pressure = 194  # A/Pa
+    lvdt_pressure = 195  # m/Pa
+    rise_slope = 196  # 1/% relative change of the acceleration limit with speed
+    gain_thermal = 197  # 1/K of the controller's current
+    schedule_bend = 198  # m at 75 % speed
 
 
 N_P = len(P)
@@ -308,7 +316,7 @@ def orifice(dp):
 def acceleration(e, p, n):
     """Rotor acceleration (%/s) for the speed error ``e``: the wanted rate, bent smoothly into the limit."""
     rate = e / (p[P.engine_lag] * (1.0 + p[P.lag_slope] * (n - 70.0)))
-    limit = p[P.acceleration] if rate > 0.0 else p[P.deceleration]
+    limit = p[P.acceleration] * (1.0 + p[P.rise_slope] * (n - 70.0)) if rate > 0.0 else p[P.deceleration]
     return rate / (1.0 + (abs(rate) / limit) ** p[P.knee]) ** (1.0 / p[P.knee])
 
 
@@ -322,11 +330,11 @@ def engine(s, p, n_dem):
 
 
 @njit(cache=True, error_model="numpy")
-def torque_motor(s, p, i, t):
-    """Current that moves the spool: null bias, dither, magnetic hysteresis (Preisach: plays in parallel), silt after
-    long rest.
+def torque_motor(s, p, i, t, p_s, t_oil):
+    """Current that moves the spool: null bias and what shifts it, dither, magnetic hysteresis (Preisach: plays in
+    parallel), silt after long rest.
     """
-    i = i + p[P.null_bias]
+    i = i + p[P.null_bias] + p[P.null_thermal] * (t_oil - p[P.t_ref]) + p[P.null_pressure] * (p_s - p[P.p_ref])
     if p[P.dither_amplitude] != 0.0:
         i += p[P.dither_amplitude] * math.sin(2.0 * math.pi * p[P.dither_frequency] * t)
     if p[P.valve_hysteresis] > 0.0:
@@ -432,7 +440,7 @@ def hydraulics(s, p, p_s, t_oil, n, h, steps):
         p1 = clip(p1, 0.0, 4e7)
         p2 = clip(p2, 0.0, 4e7)
 
-        f = area * (p1 - p2) - force
+        f = area * (p1 - p2) - force - p[P.spring] * (x - 0.5 * stroke)
         b = p[P.viscous] + p[P.cushion] * abs(v)
         if x > high:
             f -= p[P.stop_stiffness] * (x - high)
@@ -611,7 +619,7 @@ def advance(s, p, ring_table, i_cmd, n_dem, p_s, t_oil, t, steps):
     """Move the machine from ``t`` to ``t`` + 1 ms under a constant current, in ``steps`` hydraulic steps (a multiple of
     LINKS).
     """
-    torque_motor(s, p, i_cmd, t)
+    torque_motor(s, p, i_cmd, t, p_s, t_oil)
     if p[P.dip_depth] != 0.0:
         phase = (t / p[P.dip_period]) % 1.0
         if phase < 0.15:
@@ -633,6 +641,7 @@ def read_lvdt(s, p, t, t_oil, noise):
     """Stroke as the LVDT gives it at time ``t`` (m); ``noise`` is a standard normal number."""
     x = s[S.x_sensor_2]
     y = x * p[P.lvdt_gain] + p[P.lvdt_bias] + p[P.lvdt_thermal] * (t_oil - p[P.t_ref])
+    y += p[P.lvdt_pressure] * (s[S.p_valve] - p[P.p_ref])
     if p[P.lvdt_nonlinearity] != 0.0:
         y += p[P.lvdt_nonlinearity] * math.sin(math.pi * (x - HALF_STROKE) / HALF_STROKE)
     if p[P.lvdt_cubic] != 0.0:
@@ -723,7 +732,7 @@ def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, vi
     view[0] = frames[seen, 0]
     view[1] = frames[seen, 1]
     # a shifted stroke table, as seen from outside the controller: the servo works towards x_dem + offset
-    view[2] = x - p[P.schedule_offset]
+    view[2] = x - schedule_error(p, frames[seen, 1])
     # frames go on arriving every 10 ms, whatever they hold
     late = int(math.floor(p[P.can_delay] / TICK + 0.5))
     sent = max(k - late, 0) // FRAME
@@ -733,11 +742,19 @@ def before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, vi
 
 
 @njit(cache=True, error_model="numpy")
-def current(i, p, limit):
+def schedule_error(p, n):
+    """By how much (m) the stroke table is off at the speed ``n`` (%): a shift, and a bend round 75 %."""
+    d = (n - 75.0) / 8.0
+    return p[P.schedule_offset] + p[P.schedule_bend] * math.exp(-d * d)
+
+
+@njit(cache=True, error_model="numpy")
+def current(i, p, limit, t_oil):
     """Current that leaves the controller: its own, or changed by an error of its gain."""
-    if p[P.controller_gain] == 1.0:
+    gain = p[P.controller_gain] * (1.0 + p[P.gain_thermal] * (t_oil - p[P.t_ref]))
+    if gain == 1.0:
         return i
-    return clip(i * p[P.controller_gain], -limit, limit)
+    return clip(i * gain, -limit, limit)
 
 
 @njit(cache=True, error_model="numpy")
@@ -747,7 +764,7 @@ def write_row(row, k, warm, s, p, frames, view, x_dem, mode, i_mean, p_s, t_oil,
     log[row, 0] = (k - warm) * TICK
     log[row, 1] = frames[f, 0]
     log[row, 2] = frames[f, 1]
-    log[row, 3] = math.floor((x_dem + p[P.schedule_offset]) * 1e6 + 0.5) * 1e-3
+    log[row, 3] = math.floor((x_dem + schedule_error(p, view[1])) * 1e6 + 0.5) * 1e-3
     log[row, 4] = math.floor(view[4] * 1e6 + 0.5) * 1e-3
     log[row, 5] = math.floor(i_mean * 1e3 / 0.002 + 0.5) * 0.002
     log[row, 6] = math.floor(p_s * 1e-3 + 0.5) * 1e-3
@@ -816,7 +833,7 @@ def run_compiled(
             for j in range(pot_noise.shape[1]):
                 inputs[slots[7] + j] = read_pot(s, p, j, pot_noise[sample, j])
         tick(inputs, state, calibration)
-        i = current(state[slots[4]], p, limit)
+        i = current(state[slots[4]], p, limit, t_oil[f])
         if k == warm:
             total, count = 0.0, 0
         if through:

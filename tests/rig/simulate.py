@@ -303,7 +303,7 @@ def _run_object(
         p, f = par[segment], k // FRAME
         kernel.before_tick(k, warm, s, p, frames, speed_noise, lvdt_noise, n_dem, t_oil, view)
         i = controller.step(view[0], view[1], view[2], view[3] == 1.0, int(view[5]))
-        i = kernel.current(i, p, getattr(controller, "current_limit", 0.040))
+        i = kernel.current(i, p, getattr(controller, "current_limit", 0.040), t_oil[f])
         if k == warm:
             currents.clear()
         if through:

@@ -46,6 +46,7 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import Model
     from vaneloop.pages.story import floors, word
+    from vaneloop.verbs.learn import with_law_files
     from vaneloop.verbs.search import extended, known
 
     wanted = list(dict.fromkeys(e for group in args.effect for e in group))
@@ -59,8 +60,10 @@ def command(args: argparse.Namespace) -> int:
     if own_model.asked(args):
         answer = own_model.ask(args, "extend", effects=wanted)
     else:
-        known(wanted)
-        answer = extended(chain_of(args, Model()), wanted, options.machine_of(args).added, args.log)
+        machine = options.machine_of(args)
+        wanted, added = with_law_files(wanted, machine)
+        known([e for e in wanted if e not in added.curves])
+        answer = extended(chain_of(args, Model()), wanted, added, args.log)
     if answer.refused:
         print(f"vaneloop extend: {args.log}: {answer.refused}; {args.out} is not written", file=sys.stderr)
         return 1

@@ -11,6 +11,7 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ the controller is for some seconds in another mode.
 examples:
   vaneloop hidden-effect --logs 40 --out out/blind.parquet
   vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
+  vaneloop hidden-effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
   vaneloop hidden-effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -60,6 +62,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="plant's table of the machine, one of the two that the rig has: plant.toml (default) or "
         "plant_electromechanical.toml",
     )
+    parser.add_argument(
+        "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
+    )
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
+        help=f"draw only logs of these kinds: {', '.join(KINDS)} (default: all)",
+    )  # fmt: skip
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
     parser.add_argument(
         "--out",
@@ -74,11 +83,14 @@ def _rig() -> Any:
     return from_checkout(("tests.rig", "tests.firmware_on_rig"), "hidden-effect needs the independent rig in tests/rig")
 
 
-def draw_case(seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic") -> dict[str, Any]:
+def draw_case(
+    seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic", kinds: Sequence[str] = KINDS
+) -> dict[str, Any]:
     """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing
     simulated yet.
 
     machine  of `MACHINES`: what can be hidden in it
+    kinds    of `KINDS`, that are drawn
     """
     import numpy as np
 
@@ -87,7 +99,8 @@ def draw_case(seed: int, index: int, duration: float = 300.0, machine: str = "hy
     library = list(rig.WITH_MOTOR if motor else rig.EFFECTS)
     outside = [k for k, e in rig.OUTSIDE.items() if not motor or e.stage != "actuator" or e.site == "lvdt"]
     rng = np.random.default_rng([seed, index])
-    kind = str(rng.choice(KINDS, p=SHARES))
+    shares = np.array([share if kind in kinds else 0.0 for kind, share in zip(KINDS, SHARES, strict=True)])
+    kind = str(rng.choice(KINDS, p=shares / shares.sum()))
     hidden = []
     if kind == "single":
         hidden = [rig.draw(str(rng.choice(library)), int(rng.integers(0, 5)), rng)]
@@ -140,6 +153,52 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
     return out
 
 
+def _learned(chain: Any, d: Any, name: str) -> dict[str, Any]:
+    """What `learn` answers on the diagnosed log: each law with its rivals, formulas and errors."""
+    from plant import Model
+    from vaneloop.verbs.learn import learned
+    from vaneloop.verbs.search import Diagnosed
+
+    started = time.process_time()
+    answer = learned(chain, name, Model(), 1, None, Diagnosed(chain, d, name))
+    laws = [
+        {"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas], "before": law.error_before,
+         "after": law.error_after}
+        for law in answer.laws
+    ]  # fmt: skip
+    return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
+            "nearest": answer.outcome.nearest, "processor_s": time.process_time() - started}  # fmt: skip
+
+
+def learned_right(row: dict[str, Any]) -> bool:
+    """Whether a curve that was learned, or a rival of it, is at the place of what is hidden and of its quantity; or an
+    effect of the library is named that has its law, and its cause is said.
+    """
+    said = json.loads(row["learned"])
+    names = {n for law in said["laws"] for n in law["names"]}
+    return bool(names & CURVES_OF[row["truth"][0]]) or (said["verdict"] == "named" and _told(row))
+
+
+def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Count what was learned, of rows where that was asked."""
+    asked = [r for r in rows if json.loads(r.get("learned") or "{}")]
+    if not asked:
+        return {}
+    outside = [r for r in asked if r["kind"] == "outside" and r["detectable"][0]]
+    plain = [r for r in outside if CURVES_OF[r["truth"][0]]]
+    right = [r for r in outside if learned_right(r)]
+    errors = [laws[-1]["after"] for r in right if (laws := json.loads(r["learned"])["laws"])]
+    spent = sorted(json.loads(r["learned"])["processor_s"] for r in asked if json.loads(r["learned"])["laws"])
+    clean = [not json.loads(r["learned"])["laws"] for r in asked if r["kind"] == "clean"]
+    return {
+        "learned: outside the library, right place and quantity": share([r in right for r in outside]),
+        "learned: of those that are a curve at all": share([r in right for r in plain]),
+        "learned: of these, held-out error within 1.5 noise floors": share([e <= 1.5 for e in errors]),
+        "learned: nothing hidden, nothing learned": share(clean),
+        "learned: longest processor seconds beyond the diagnosis": spent[-1] if spent else None,
+    }
+
+
 def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
     """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
     from dataclasses import replace
@@ -171,8 +230,9 @@ def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: 
 
 
 def judge_case(
-    seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic"
-) -> dict[str, Any]:
+    seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic",
+    learn: bool = False, kinds: Sequence[str] = KINDS,
+) -> dict[str, Any]:  # fmt: skip
     """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
     import numpy as np
 
@@ -183,7 +243,7 @@ def judge_case(
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
 
     rig, on_rig = _rig()
-    case = draw_case(seed, index, duration, machine)
+    case = draw_case(seed, index, duration, machine, kinds)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
 
@@ -205,6 +265,7 @@ def judge_case(
     d = diagnose(chain.stages, chain.not_observed, workers=1)
     elapsed, used = time.perf_counter() - started, time.process_time() - used
     answer = diagnosis_json(d, f"case {index}")
+    said = _learned(chain, d, f"case {index}") if learn else {}
     truth = [h.name for h in case["hidden"]]
     # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3
     # spreads of the floor
@@ -242,6 +303,7 @@ def judge_case(
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
         "after_over_floor": max(ratios) if ratios else None, "elapsed_s": elapsed,
         "processor_s": used,
+        "learned": json.dumps(terminal.plain(said)),
         "answer": json.dumps(terminal.plain(answer)),
         "intervals": json.dumps(terminal.plain(_intervals(case["hidden"], answer))),
         "experiment": json.dumps(terminal.plain(tried)),
@@ -280,6 +342,45 @@ OTHER_CAUSE = {
     "piston_cushion": ({"valve_flow_saturation"}, "a drag that grows with the square of the speed"),
     "pot_cross_talk": ({"pot_gain", "pot_bias"}, "a share of another stage's reading"),
 }
+
+
+def _of(places: str, quantities: str) -> set[str]:
+    return {
+        f"{place}.{'gain' if place in TIMES else 'curve'}_of_{q}"
+        for place in places.split()
+        for q in quantities.split()
+    }
+
+
+# what is outside the library and a function of one quantity at one place: the curves that say so. Of two quantities
+# that go together in every log of the rig, such as the angles of its stages and its stroke, either is right; so is
+# either place where two are one in the logged signals: a valve's curve and a drag are both a speed of the current.
+TIMES = ("actuator.flow_gain", "engine.lag", "engine.acceleration", "servo.current")
+STROKE = "x_lvdt vigv vgv1 vgv2"
+SPEED = "i_cmd speed_of_x_lvdt"
+CURVES_OF: dict[str, set[str]] = {
+    "play_temperature": _of("linkage.play linkage.vigv_play linkage.vgv1_play linkage.vgv2_play", "t_oil"),
+    "area_growth": _of("actuator.flow_gain", "x_lvdt"),
+    "supply_dips": _of("actuator.flow_gain", "time"),
+    "pot_cross_talk": _of("sensors.vigv", STROKE),
+    "pot_track_wear": _of("sensors.vigv", STROKE),
+    "piston_cushion": _of("actuator.load valve.current actuator.flow_gain", SPEED),
+    "speed_dependent_lag": _of("engine.lag", "n_r n_dem"),
+    "ring_snag": _of("linkage.vigv_ring sensors.vigv", STROKE),
+    "return_spring": _of("actuator.load", STROKE),
+    "null_over_temperature": _of("valve.current", "t_oil"),
+    "null_over_pressure": _of("valve.current", "p_s"),
+    "schedule_bent": _of("controller.demand", "n_r"),
+    "servo_gain_warm": _of("servo.current", "t_oil"),
+    "lvdt_over_pressure": _of("sensors.lvdt", "p_s"),
+    "acceleration_by_speed": _of("engine.acceleration", "n_r n_dem"),
+}
+# what is no function of one quantity at one place: shaking, resonance, memory, a signal's own clock
+NO_CURVE = (
+    "lvdt_ripple", "vane_vibration", "valve_silting", "ring_creep", "linkage_resonance", "driver_oscillation",
+    "stall_rumble", "lvdt_lost_bits",
+)  # fmt: skip
+CURVES_OF |= {name: set() for name in NO_CURVE}
 
 
 def _told(row: dict[str, Any]) -> bool:
@@ -335,6 +436,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "median seconds": sorted(r["elapsed_s"] for r in rows)[len(rows) // 2] if rows else None,
         "median processor seconds": used[len(used) // 2] if used else None,
         "longest processor seconds": used[-1] if used else None,
+        **learned_summary(rows),
     }  # fmt: skip
 
 
@@ -443,7 +545,12 @@ def command(args: argparse.Namespace) -> int:
     terminal.say(args, f"seed {seed}; {len(rows)} logs done before")
     path.parent.mkdir(parents=True, exist_ok=True)
     warm_up(lambda text: terminal.say(args, text))
-    run(args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine)
+    if args.learn and any(json.loads(r.get("learned") or "{}") == {} for r in rows):
+        raise InputError(f"{path}: has rows without --learn; allowed: no --learn, or another --out")
+    run(
+        args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine,
+        args.learn, tuple(k for k in KINDS if k in args.kinds),
+    )  # fmt: skip
     s = summary(rows)
     spent = f"{s['median seconds']:.1f} s a diagnosis"
     if s["median processor seconds"] is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -12,7 +13,7 @@ from vaneloop.cli import options, own_model
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Learn a law that the library does not have, from logs of a model of your own.
+DESCRIPTION = """Learn a law that the library does not have, of the vane chain or of a model of your own.
 
 Where diagnose says "unknown", learn looks for the law itself: at every place of the model, as a function of every
 quantity that the logs or the model know. It says where the law acts, of what it is a function, its curve with a band,
@@ -20,6 +21,7 @@ and the simplest formulas that fit it. A law must earn its place on data that it
 and do clearly better than laws with names. Where no honest law is there, it says so. docs/learn.md
 
 examples:
+  vaneloop learn LOG --fit :200 --test 200: --out LAW.toml --report LAW.html
   vaneloop learn LOG --test OTHER --system MY.py --out LAW.toml --report LAW.html
   vaneloop extend NEW --system MY.py --effect LAW.toml --out BETTER.toml
   vaneloop compare NEW --system MY.py --model BETTER.toml
@@ -31,23 +33,29 @@ law was found; 2 bad input"""
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
-    parser.add_argument("--model", metavar="M.toml", help="model file: what the model has by now")
+    options.add_machine_options(parser)
+    options.add_controller_options(parser)
     parser.add_argument("--out", metavar="LAW.toml", help="law file to write, a model file with the learned laws in it")
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
+    parser.set_defaults(learns=True)
 
 
+@options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.verbs.learn import with_path
+    from vaneloop.verbs.learn import learned, with_path
 
-    if not args.system:
-        raise InputError("learn needs --system MY.py, a model of your own (docs/learn.md)")
     if args.out and (Path(args.out).is_dir() or not Path(args.out).parent.is_dir()):
         raise InputError(f"{args.out}: cannot be written")
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
+    own = own_model.asked(args)
+    chain: Any = None if own else options.chain_of(args)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
-        answer = own_model.ask(args, "learn", progress=tell)
+        if own:
+            answer = own_model.ask(args, "learn", progress=tell)
+        else:
+            answer = learned(chain, args.log, options.machine_of(args).added, progress=tell)
     if answer.model is not None and args.out:
         answer = with_path(answer, args.out, words)
     if answer.by_log is not None:

@@ -53,7 +53,8 @@ def asked(args: argparse.Namespace) -> bool:
                 raise InputError(f"--{name}{what} needs --system MY.py")
         return False
     for name in ("strategy", "tolerance", "tables", "out"):
-        if getattr(args, name, None) and not (name == "out" and hasattr(args, "effect")):
+        model_file = name == "out" and (hasattr(args, "effect") or hasattr(args, "learns"))
+        if getattr(args, name, None) and not model_file:
             raise InputError(f"--{name} does not go with --system")
     return True
 

@@ -16,11 +16,11 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import eigh
 
+from vaneloop.base.curve import DEGREE, splines
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["COUNT", "DEGREE", "LEVEL", "Basis", "basis_of", "splines"]
+__all__ = ["COUNT", "LEVEL", "Basis", "basis_of"]
 
-DEGREE = 3
 COUNT = 10  # splines of a curve
 LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
@@ -71,12 +71,6 @@ class Basis:
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
                        for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
         return Effect(name, tuple(out), starts)
-
-
-def splines(knots: Array, x: Array) -> Array:
-    """The B-splines of these ``knots`` at ``x``, float64[len(x), splines]; beyond the ends as there."""
-    inside = np.clip(np.asarray(x, dtype=float), knots[DEGREE], knots[-DEGREE - 1])
-    return np.asarray(BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(inside))
 
 
 def basis_of(visited: Array, count: int = COUNT) -> Basis | None:

@@ -18,7 +18,7 @@ from vaneloop.discrepancy.search import Criterion, Search
 from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
 from vaneloop.discrepancy.stage_answer import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
 
-__all__ = ["Judged", "diagnose_stage", "extend_stage", "floor_of"]
+__all__ = ["Judged", "diagnose_stage", "excerpt_of", "extend_stage", "floor_of"]
 
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
@@ -59,7 +59,7 @@ def diagnose_stage(
     base = recalibrate(judge)
     left = base
     for _ in range(2):
-        at = _excerpt(judge, left)
+        at = excerpt_of(judge, left)
         part = stage.excerpt(at)
         said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick, judged)
         found = _confirm(stage, keep, floor, base, said, judged)
@@ -77,19 +77,19 @@ def _unless_coarse(stage: Stage, said: StageDiagnosis) -> StageDiagnosis:
     return said
 
 
-def _excerpt(judge: Judge, fit: Fit) -> Array:
-    """Samples to search on: pieces of whole windows, half of them evenly spaced, the others where ``fit`` fails
-    most.
+def excerpt_of(judge: Judge, fit: Fit, piece: int = PIECE, searched: int = SEARCHED) -> Array:
+    """Samples to search on, about ``searched``: pieces of whole windows, about ``piece`` long, half of them evenly
+    spaced, the others where ``fit`` fails most.
     """
     stage = judge.stage
     n = len(stage.t)
     dt = float(np.median(np.diff(stage.t)))
     window = max(1, round((stage.window or dt) / dt))
-    length = max(1, round(PIECE / window)) * window
+    length = max(1, round(piece / window)) * window
     pieces = n // length
     squares = np.sum(judge.errors(fit.theta[None])[0] ** 2, axis=0)
     cost = squares[: pieces * length].reshape(pieces, length).sum(axis=1)
-    many = max(2, SEARCHED // length)
+    many = min(max(2, searched // length), pieces)
     chosen = set(np.linspace(0, pieces - 1, many - many // 2).round().astype(int).tolist())
     for k in np.argsort(-cost):
         if len(chosen) >= many:

@@ -1,101 +1,19 @@
 """Simple formulas of one quantity: which of them is a curve that was learned?
 
-Each is y = a f(q) with at most two numbers inside f and operators of mechanics and heat: powers, roots, exponentials,
-tanh, magnitudes, dead zones, limits, quotients, Arrhenius' law, sines. ``complexity`` counts operators and numbers.
+The formulas are in `vaneloop.base.forms`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from vaneloop.base.forms import Form
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["FORMS", "Form", "begin", "text_of"]
-
-KELVIN = 273.15
-
-
-@dataclass(frozen=True)
-class Form:
-    """A formula: ``value(q, numbers)``; ``text`` with the quantity as q and the numbers by name.
-
-    numbers   its names; the first multiplies the whole
-    inner     sizes of the numbers inside f to begin from, as shares: of q's range (``per``: of one over it, ``at``: of
-              the way from lowest to highest, ``kelvin``: of 10,000 K, ``plain``: as they are)
-    positive  only for a quantity that stays above 0; ``signed``: only for one that does not, else it is another form
-    magnitudes  which of the numbers have a sign that changes nothing
-    """
-
-    name: str
-    text: str
-    complexity: int
-    value: Callable[[Array, Array], Array]
-    numbers: tuple[str, ...] = ("a",)
-    inner: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    positive: bool = False
-    signed: bool = False
-    magnitudes: tuple[int, ...] = ()
-
-    def plain(self, numbers: Array) -> Array:
-        """The same numbers, without signs that change nothing."""
-        out = np.array(numbers, dtype=float)
-        out[list(self.magnitudes)] = np.abs(out[list(self.magnitudes)])
-        return out
-
-
-def _power(q: Array, n: Array) -> Array:
-    return np.asarray(n[0] * np.sign(q) * np.abs(q) ** n[1])
-
-
-def _exp(q: Array, n: Array) -> Array:
-    return np.asarray(n[0] * np.expm1(np.clip(n[1] * q, -50.0, 50.0)))
-
-
-_PER = ("per", (0.3, -0.3, 1.0, -1.0, 3.0, -3.0))
-_AT = ("at", (0.15, 0.4, 0.6, 0.85))
-_WIDTH = ("share", (0.05, 0.15, 0.3))
-
-FORMS: tuple[Form, ...] = (
-    Form("constant", "a", 1, lambda q, n: n[0] + 0.0 * q),
-    Form("line", "a q", 2, lambda q, n: n[0] * q),
-    Form("magnitude", "a |q|", 3, lambda q, n: n[0] * np.abs(q), signed=True),
-    Form("sign", "a sign(q)", 3, lambda q, n: n[0] * np.sign(q), signed=True),
-    Form("square", "a q^2", 3, lambda q, n: n[0] * q * q),
-    Form("signed square", "a q |q|", 4, lambda q, n: n[0] * q * np.abs(q), signed=True),
-    Form("cube", "a q^3", 3, lambda q, n: n[0] * q**3),
-    Form("root", "a sign(q) sqrt(|q|)", 4, lambda q, n: n[0] * np.sign(q) * np.sqrt(np.abs(q))),
-    Form("inverse", "a / q", 3, lambda q, n: n[0] / np.maximum(q, 1e-12), positive=True),
-    Form("power", "a sign(q) |q|^b", 5, _power, ("a", "b"), (("plain", (0.5, 0.8, 1.5, 2.5, 4.0)),)),
-    Form("exponential", "a (exp(b q) - 1)", 5, _exp, ("a", "b"), (_PER,)),
-    Form("tanh", "a tanh(b q)", 4, lambda q, n: n[0] * np.tanh(n[1] * q), ("a", "b"), (("per", (1.0, 3.0, 10.0)),)),
-    Form("quotient", "a q / (1 + b |q|)", 5, lambda q, n: n[0] * q / np.maximum(1.0 + n[1] * np.abs(q), 1e-3),
-         ("a", "b"), (("per", (0.3, 1.0, 5.0)),)),
-    Form("above", "a max(q - b, 0)", 4, lambda q, n: n[0] * np.maximum(q - n[1], 0.0), ("a", "b"), (_AT,)),
-    Form("below", "a min(q - b, 0)", 4, lambda q, n: n[0] * np.minimum(q - n[1], 0.0), ("a", "b"), (_AT,)),
-    Form("step", "a (q > b)", 4, lambda q, n: n[0] * (q > n[1]), ("a", "b"),
-         (("at", tuple(np.linspace(0.02, 0.98, 97))),)),
-    Form("gentle step", "a / (1 + exp(-(q - b)/c))", 6,
-         lambda q, n: n[0] / (1.0 + np.exp(np.clip(-(q - n[1]) / max(abs(n[2]), 1e-9), -50.0, 50.0))),
-         ("a", "b", "c"), (_AT, _WIDTH), magnitudes=(2,)),
-    Form("dead zone", "a sign(q) max(|q| - b, 0)", 5,
-         lambda q, n: n[0] * np.sign(q) * np.maximum(np.abs(q) - abs(n[1]), 0.0), ("a", "b"), (_WIDTH,),
-         signed=True, magnitudes=(1,)),
-    Form("limit to one side", "a clip(q, min(b, 0), max(b, 0))", 4,
-         lambda q, n: n[0] * np.clip(q, min(n[1], 0.0), max(n[1], 0.0)), ("a", "b"),
-         (("share", (0.05, 0.15, 0.3, -0.05, -0.15, -0.3)),)),
-    Form("limit", "a clip(q, -b, b)", 4, lambda q, n: n[0] * np.clip(q, -abs(n[1]), abs(n[1])), ("a", "b"),
-         (("share", (0.1, 0.2, 0.35)),), magnitudes=(1,)),
-    Form("Arrhenius", "a exp(b/300 - b/(q + 273.15))", 6,
-         lambda q, n: n[0] * np.exp(np.clip(-n[1] / (q + KELVIN) + n[1] / 300.0, -50.0, 50.0)), ("a", "b"),
-         (("kelvin", (0.1, 0.5, -0.3)),)),
-    Form("sine", "a sin(b q + c)", 5, lambda q, n: n[0] * np.sin(n[1] * q + n[2]), ("a", "b", "c"),
-         (("per", (3.0, 6.0, 12.0, 25.0)), ("plain", (0.0, 1.6, 3.1)))),
-)  # fmt: skip
+__all__ = ["begin", "text_of"]
 
 
 def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | None:
@@ -107,7 +25,7 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
         return None
     if form.name == "Arrhenius" and not q.min() > -200.0:
         return None
-    if level and form.name == "constant":
+    if level and form.name in ("constant", "straight line"):
         return None
     span, low = float(np.ptp(q)), float(q.min())
     total = float(np.sum((y - y.mean()) ** 2)) if level else float(np.sum(y**2))
@@ -139,9 +57,11 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
     return form.plain(best[1]), best[0] / total
 
 
-def text_of(form: Form, numbers: Array, quantity: str, above_zero: bool = False) -> str:
-    """The formula with its numbers; ``above_zero``: its quantity never turns negative."""
+def text_of(form: Form, numbers: Array, quantity: str, above_zero: bool = False, mean: float = 0.0) -> str:
+    """The formula with its numbers, less its ``mean``; ``above_zero``: its quantity never turns negative."""
     values = dict(zip(form.numbers, numbers, strict=True))
     text = form.text.replace("sign(q) ", "").replace("|q|", "q") if above_zero else form.text
     text = re.sub(r"\b([abc])\b", lambda m: f"{values[m.group(1)]:.4g}", text)
+    if mean:
+        text = f"{text} + {-mean:.4g}"
     return re.sub(r"\bq\b", quantity, text).replace("+ -", "- ").replace("- -", "+ ").replace("(--", "(")

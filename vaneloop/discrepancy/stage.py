@@ -117,6 +117,7 @@ class Stage:
     quick     a run costs next to nothing: slopes are taken at every start
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
+    made      how and from what it was made, for who makes others like it
     """
 
     name: str
@@ -144,6 +145,7 @@ class Stage:
     begins: Array | None = None
     quick: bool = False
     excerpt: Callable[[Array], Stage] | None = None
+    made: object = None
 
     def __post_init__(self) -> None:
         """Check shapes and names."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import StageError, System
 from vaneloop.verbs.answer import Answer
+from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.search import Diagnosed, diagnose
+from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
     from plant import Model
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.learned import LearnedLaw
     from vaneloop.discrepancy.models.learning import Outcome
+    from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.discrepancy.stage_answer import StageDiagnosis
     from vaneloop.pages.page import Page
 
 __all__ = ["Learned", "learn"]
@@ -111,23 +115,46 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def with_law_files(effects: Sequence[str], machine: Machine) -> tuple[list[str], Model]:
+    """Effects with those of law files (``X.toml``) by their names, and the machine's model with these laws."""
+    from plant import load_model
+
+    added, wanted = machine.added, []
+    for e in effects:
+        if not e.endswith(".toml"):
+            wanted.append(e)
+            continue
+        law = load_model(e, machine.plant)
+        if not law.curves:
+            raise InputError(f"--effect {e}: has no table curves; allowed: a law file of vaneloop learn")
+        wanted += list(law.curves)
+        own = {name: law.effects.get(name, {}) for name in law.curves}
+        added = added.model_copy(update={"curves": {**added.curves, **law.curves}, "effects": {**added.effects, **own}})
+    return wanted, added
+
+
 def learn(
     log: Any,
-    model: System,
+    model: Machine | System | None = None,
     *,
     fit: Any = (),
     test: Any = (),
     added: Model | None = None,
+    workers: int = 2,
     progress: Callable[[float], None] | None = None,
 ) -> Learned:
-    """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`, of a `System`.
+    """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`.
 
     The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
     InputError for logs that the system cannot be held against.
     """
-    if not isinstance(model, System):
-        raise InputError("learn needs a model of your own (--system MY.py); of the vane chain it learns nothing yet")
     tell = progress or (lambda _: None)
+    if not isinstance(model, System):
+        from vaneloop.verbs.search import chain_for
+
+        machine = model or Machine()
+        chain, name = chain_for(log, machine, fit, test)
+        return learned(chain, name, machine.added, workers=workers, progress=tell)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, progress=lambda f: tell(0.5 * f))
     try:
         return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f))
@@ -135,21 +162,101 @@ def learn(
         raise InputError(str(e)) from None
 
 
+def learned(
+    chain: Chain,
+    log: str,
+    before: Model,
+    workers: int = 2,
+    progress: Callable[[float], None] | None = None,
+    found: Diagnosed | None = None,
+) -> Learned:
+    """`learn` of a log that has been put into the stages of the vane chain.
+
+    before  what the machine has by now
+    found   the diagnosis of this log, where that has been made
+    """
+    from vaneloop.discrepancy.models.learned import law_of
+    from vaneloop.discrepancy.models.learning import Learner, Outcome
+    from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
+
+    tell = progress or (lambda _: None)
+    found = found or of_chain(chain, log, workers, lambda f: tell(0.4 * f))
+    stages = found.diagnosis.stages
+    open_ones = [s for s in stages if s.verdict == "unknown" and chain.stage(s.stage).made is not None]
+    laws: list[LearnedLaw] = []
+    model, said, out = before, [], None
+    for i, d in enumerate(open_ones):
+        stage = chain.stage(d.stage)
+        if stage.coarse and any(o in stage.coarse for o in stage.outputs):
+            said.append(f"{d.stage}: {'; '.join(stage.coarse.values())}")
+            continue
+        test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
+        ground = VaneGround(stage, d.floor, test)
+        learner = Learner(ground, d, lambda f, i=i: tell(0.4 + 0.6 * (i + f) / len(open_ones)))  # type: ignore[misc]
+        one = learner.learned()
+        out = out or one
+        said += [f"{d.stage}: {note}" for note in one.notes]
+        if one.verdict != "learned":
+            said.append(f"{d.stage}: {one.why}")
+            out.nearest += [n for n in one.nearest if n not in out.nearest]
+            continue
+        last = before_it = learner.judge, learner.base
+        for tried, rivals in zip(one.tried, one.rivals, strict=True):
+            laws.append(law_of(ground, before_it, tried, rivals))
+            last = before_it = tried.judge, tried.fit
+        model = _with_stage(_as_model(model, one, laws[-len(one.tried) :]), *last)
+    verdict = "learned" if laws else "unknown" if open_ones else "named" if found.effects else "none"
+    why = {
+        "named": f"{', '.join(found.effects)} of the library",
+        "none": "the model comes down to the noise of the log's sensors: nothing is missing",
+    }.get(verdict, "; ".join(said))
+    if laws:
+        model = _with_named(model, stages)
+    outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
+    tell(1.0)
+    return Learned(found, outcome, laws, None, model if laws else None, log)
+
+
+def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
+    """The model with a stage's own parameters as they were fitted."""
+    from vaneloop.discrepancy.stage_answer import recalibrated
+
+    moved = {str(r["parameter"]): float(str(r["value"])) for r in recalibrated(judge.stage, fit)}
+    return model.model_copy(update={"parameters": {**model.parameters, **moved}})
+
+
+def _with_named(model: Model, stages: Sequence[StageDiagnosis]) -> Model:
+    """The model with the effects that the library has for other stages."""
+    from plant.effects import EFFECTS
+
+    effects, parameters = dict(model.effects), dict(model.parameters)
+    for s in stages:
+        if s.verdict != "missing":
+            continue
+        parameters |= {str(r["parameter"]): float(str(r["value"])) for r in s.recalibrated}
+        for f in s.effects:
+            own = {p.name for p in EFFECTS[f.effect].parameters}
+            effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items() if k in own}
+    return model.model_copy(update={"effects": effects, "parameters": parameters})
+
+
 def _learned(diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None]) -> Learned:
     from vaneloop.discrepancy.models.by_log import ByLog
+    from vaneloop.discrepancy.models.curved import OwnGround, on_logs
     from vaneloop.discrepancy.models.learned import law_of
-    from vaneloop.discrepancy.models.learning import Learner, on_logs
+    from vaneloop.discrepancy.models.learning import Learner
     from vaneloop.discrepancy.stage_answer import answer_of, found_of, rms_of
 
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
-    learner = Learner(logs, diagnosed.diagnosis.stages[0], progress)
+    ground = OwnGround(logs)
+    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress)
     outcome = learner.learned()
     if outcome.verdict != "learned":
         return Learned(diagnosed, outcome, [], log=diagnosed.log)
     laws, before = [], (learner.judge, learner.base)
     for tried, rivals in zip(outcome.tried, outcome.rivals, strict=True):
-        laws.append(law_of(logs, before, tried, rivals))
+        laws.append(law_of(ground, before, tried, rivals))
         before = tried.judge, tried.fit
     last = outcome.tried[-1]
     names = tuple(e.name for _, e in last.curves)

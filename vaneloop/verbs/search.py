@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from vaneloop.pages.page import Page
 
 __all__ = [
-    "Diagnosed", "Experiment", "Extended", "Stages", "compare", "diagnose", "experiment", "extend", "locate",
-    "read_record",
+    "Diagnosed", "Experiment", "Extended", "Stages", "chain_for", "compare", "diagnose", "experiment", "extend",
+    "locate", "read_record",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]
@@ -222,7 +222,8 @@ def _tested_json(rows: Sequence[Tested]) -> dict[str, Any]:
     return {"tested": [asdict(row) for row in rows]} if rows else {}
 
 
-def _chain(log: Log | str | Path, machine: Machine, fit: Any = (), test: Any = ()) -> tuple[Chain, str]:
+def chain_for(log: Log | str | Path, machine: Machine, fit: Any = (), test: Any = ()) -> tuple[Chain, str]:
+    """A log in the stages of a machine, and the log's name."""
     read = log_of(log, require=())
     to_fit, to_test, others = split(fit, test)
     if others:
@@ -272,7 +273,7 @@ def compare(
         logs, name = _logs(log, model, fit, test, added)
         located = locate_stages(logs.fitted.stages)
         return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
-    chain, name = _chain(log, model or Machine(), fit, test)
+    chain, name = chain_for(log, model or Machine(), fit, test)
     return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
 
 
@@ -308,7 +309,7 @@ def diagnose(
         by_log = ByLog.of(logs, d.stages[0], added)
         d.notes = by_log.notes
         return Diagnosed(logs.fitted, d, name, by_log)
-    chain, name = _chain(log, model or Machine(), fit, test)
+    chain, name = chain_for(log, model or Machine(), fit, test)
     return diagnosed(chain, name, workers, progress)
 
 
@@ -350,9 +351,12 @@ def extend(
     if isinstance(model, System):
         return _extended(*_logs(log, model, fit, test, added), effects, added)
     machine = model or Machine()
-    known(effects)
-    chain, name = _chain(log, Machine(machine.tables, None, machine.strategy, machine.table), fit, test)
-    return extended(chain, effects, machine.added, name)
+    from vaneloop.verbs.learn import with_law_files
+
+    wanted, more = with_law_files(effects, machine)
+    known([e for e in wanted if e not in more.curves])
+    chain, name = chain_for(log, Machine(machine.tables, None, machine.strategy, machine.table), fit, test)
+    return extended(chain, wanted, more, name)
 
 
 def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None) -> Extended:
@@ -396,12 +400,24 @@ def known(effects: Sequence[str]) -> None:
 def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:
     """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
     from plant import Model
+    from plant.curve import PLACES
     from plant.effects import EFFECTS
+    from vaneloop.discrepancy.models.vane_stages.ground import SCALE, curve_effect, with_laws
 
     started = time.perf_counter()
     by_stage: dict[str, list[str]] = {}
     effects: dict[str, dict[str, float]] = {}
+    curves: dict[str, list[Any]] = {}
+    laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
     for name in dict.fromkeys([*before.effects, *wanted]):
+        if law := laws.get(name):
+            where = PLACES[f"{law.at} {law.how}"].stage
+            if all(where != c.name for c in chain.stages):
+                why = chain.not_observed.get(where, "not observed")
+                raise InputError(f"{log}: --effect {name}: the log does not show its stage ({where}: {why})")
+            by_stage.setdefault(where, []).append(name)
+            curves.setdefault(where, []).append(curve_effect(name, law))
+            continue
         if (kind := chain.plant.kind) not in EFFECTS[name].kinds:
             raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
         stage = next((s for s in EFFECTS[name].stages if any(s == c.name for c in chain.stages)), None)
@@ -412,14 +428,21 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
         else:
             effects[name] = before.effects[name]
-    results = [as_compared(chain.stage(s), extend_stage(chain.stage(s), tuple(names))) for s, names in by_stage.items()]
+    results = []
+    for s, names in by_stage.items():
+        part = with_laws(chain.stage(s), [n for n in names if n not in laws], curves.get(s, ()), log)
+        results.append(as_compared(chain.stage(s), extend_stage(part, tuple(names))))
     parameters: dict[str, Any] = dict(before.parameters)
     for r in results:
         parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
         for f in r.effects:
-            own = [p.name for p in EFFECTS[f.effect].parameters]
-            effects[f.effect] = {k: float(cast(float, v["value"])) for k, v in f.parameters.items() if k in own}
-    model = Model(parameters=parameters, effects=effects, meta=before.meta)
+            fitted = {k: float(cast(float, v["value"])) for k, v in f.parameters.items()}
+            if law := laws.get(f.effect):
+                effects[f.effect] = {n: v * fitted[SCALE] for n, v in zip(law.numbers, law.values, strict=True)}
+            else:
+                own = [p.name for p in EFFECTS[f.effect].parameters]
+                effects[f.effect] = {k: v for k, v in fitted.items() if k in own}
+    model = Model(parameters=parameters, effects=effects, meta=before.meta, curves=before.curves)
     seconds = time.perf_counter() - started
     d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
     return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
@@ -433,7 +456,7 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
     from vaneloop.discrepancy.models.experiment import recommend
 
     if not isinstance(model, Diagnosed):
-        chain, name = _chain(log, model or Machine())
+        chain, name = chain_for(log, model or Machine())
         model = diagnosed(chain, name)
     return Experiment(model, recommend(model.diagnosis, progress, model.bound), model.log)
 

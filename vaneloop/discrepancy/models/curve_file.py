@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from plant.model import Learned
-from vaneloop.base.curve import POINTS
-from vaneloop.discrepancy.curves import DEGREE, LEVEL, splines
-from vaneloop.discrepancy.formulas import FORMS
+from vaneloop.base.errors import InputError
+from vaneloop.discrepancy.curves import LEVEL
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.data import Data
@@ -48,31 +47,13 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     of = known.get(law.of, COLUMN)
     if of == COLUMN and law.of not in (TIME, *columns, *shaped):
         raise wrong("of", law.of, ", ".join([*known, TIME, *sorted(columns - set(known))]))
-    if not law.low < law.high:
-        raise StageError(f"curves.{name}: low (={law.low:g}) must be below high (={law.high:g})")
-    x = np.linspace(law.low, law.high, POINTS)
-    if law.form:
-        forms = {f.name: f for f in FORMS}
-        if law.form not in forms or len(forms[law.form].numbers) != len(law.values):
-            allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
-            raise StageError(f"curves.{name}: form (={law.form!r}, {len(law.values)} values) must be one of {allowed}")
-        form = forms[law.form]
-        names = form.numbers
-        curve = Curve(
-            law.how, named.index(law.at), of, law.of, law.low, law.high,
-            lambda v: np.broadcast_to(form.value(x, v), x.shape).astype(float),
-        )  # fmt: skip
-        sizes = [max(abs(v), 1e-9) for v in law.values]
-    else:
-        if len(law.knots) != len(law.values) + DEGREE + 1 or np.any(np.diff(law.knots) < 0.0):
-            raise StageError(
-                f"curves.{name}: knots ({len(law.knots)} of them) must rise, and be {DEGREE + 1} more than the "
-                f"{len(law.values)} values"
-            )
-        design = splines(np.asarray(law.knots, dtype=float), x)
-        curve = Curve(law.how, named.index(law.at), of, law.of, law.low, law.high, design.__matmul__)
-        names = tuple(f"c{k + 1}" for k in range(len(law.values)))
-        sizes = [abs(law.size) or 1.0] * len(names)
+    try:
+        law.check(f"curves.{name}")
+    except InputError as e:
+        raise StageError(str(e)) from None
+    curve = Curve(law.how, named.index(law.at), of, law.of, law.low, law.high, law.table())
+    names = law.numbers
+    sizes = [max(abs(v), 1e-9) for v in law.values] if law.form else [abs(law.size) or 1.0] * len(names)
     wide = np.sqrt(3.0) * LEVEL if not law.form else 0.0  # a curve's values are known to be of its size
     ps = tuple(
         Parameter(n, 0.0, law.unit, -FAR * z, FAR * z, scale=z, tolerance=float(wide * z))

@@ -13,14 +13,15 @@ import numpy as np
 from vaneloop.base.curve import POINTS
 from vaneloop.discrepancy.curves import COUNT, Basis, basis_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
+from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["Candidate", "Quantity", "candidates", "quantities", "with_curves"]
+__all__ = ["Candidate", "OwnGround", "Quantity", "candidates", "on_logs", "quantities", "with_curves"]
 
 
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
@@ -207,3 +208,31 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     )
     out.stages = [out.thinned]
     return out
+
+
+def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
+    """The model with these curves on all its logs."""
+    test = with_curves(logs.test, (), curves) if logs.test is not None else None
+    return Logs(with_curves(logs.fitted, (), curves), test)
+
+
+class OwnGround:
+    """A user's own model, held against logs (`vaneloop.discrepancy.models.learning.Ground`)."""
+
+    def __init__(self, logs: Logs):
+        self.logs, self.floor = logs, logs.fitted.floor
+        self.whole = logs.fitted.stage
+        self.tests = frozenset(logs.test.logs if logs.test else ())
+
+    def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
+        """The same with only these laws of the library, and these curves, as effects."""
+        return with_curves(self.logs.fitted, laws, curves).thinned
+
+    def candidates(self, theta: Array) -> list[Candidate]:
+        """Every curve that may be missing."""
+        starts = len(self.logs.fitted.system.parameters) + len(self.logs.fitted.runner.free_starts)
+        return candidates(with_curves(self.logs.fitted, (), ()), theta[:starts])
+
+    def figures(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+        """RMS error of each output, log by log, test logs too."""
+        return on_logs(self.logs, curves).figures(theta)

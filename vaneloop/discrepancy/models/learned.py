@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vaneloop.base.curve import POINTS
+from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.error_share import RIVAL, score
 from vaneloop.discrepancy.fit import Fit, Judge
-from vaneloop.discrepancy.formulas import FORMS, Form, begin, text_of
-from vaneloop.discrepancy.models.by_log import Logs
-from vaneloop.discrepancy.models.curved import Candidate, with_curves
-from vaneloop.discrepancy.models.learning import Tried, with_held_out
+from vaneloop.discrepancy.formulas import begin, text_of
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.learning import Ground, Tried, with_held_out
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
@@ -28,6 +28,7 @@ SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitt
 DEGREES = ("degC", "°C", "C")
 SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 BINS = 24
+MEANT = 2_000  # values of a quantity of which a formula's mean is taken
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
 
@@ -88,13 +89,15 @@ class LearnedLaw:
             "force adds": f"a function of {self.of} is added to the force",
             "output adds": f"a function of {self.of} is added to the reading {self.at}",
             "output times": f"the reading {self.at} is multiplied by 1 + a function of {self.of}",
+            "adds": f"a function of {self.of} is added to {self.at}",
+            "times": f"{self.at} is multiplied by 1 + a function of {self.of}",
         }[self.how]
         best = self.formulas[0] if self.formulas else None
         said = f", {best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
         return f"{does}{said}"
 
 
-def law_of(logs: Logs, before: tuple[Judge, Fit], tried: Tried, rivals: list[str]) -> LearnedLaw:
+def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list[str]) -> LearnedLaw:
     """Everything that is said of the last curve of ``tried``."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     amplitudes = fit.theta[judge.stage.index()[c.name]]
@@ -108,7 +111,7 @@ def law_of(logs: Logs, before: tuple[Judge, Fit], tried: Tried, rivals: list[str
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
-        _formulas(logs, tried, y), _trades(logs, tried), rivals,
+        _formulas(ground, tried, y), _trades(ground, tried), rivals,
     )  # fmt: skip
 
 
@@ -133,7 +136,7 @@ def _band(tried: Tried, table: object) -> tuple[Array, Array]:
     return np.minimum(low, y), np.maximum(high, y)
 
 
-def _trades(logs: Logs, tried: Tried) -> list[str]:
+def _trades(ground: Ground, tried: Tried) -> list[str]:
     """Nominal parameters that stand elsewhere where the curve may only bend."""
     c, fit = tried.candidate, tried.fit
     bending = c.basis.turn[:, 2:]
@@ -141,8 +144,7 @@ def _trades(logs: Logs, tried: Tried) -> list[str]:
         return []
     whole = c.effect(tried.wiggle)
     effect = Effect(c.name, whole.parameters[-bending.shape[1] :], tuple(s[-bending.shape[1] :] for s in whole.starts))
-    bound = with_curves(logs.fitted, (), (*tried.curves[:-1], (c.placed(bending), effect)))
-    judge = Judge(bound.thinned, logs.fitted.floor)
+    judge = Judge(ground.stage((), (*tried.curves[:-1], (c.placed(bending), effect))), ground.floor)
     names = tuple(e.name for e in judge.stage.effects)
     theta = np.concatenate([fit.theta[: tried.judge.stage.index()[c.name].start], fit.theta[-bending.shape[1] :]])
     other = with_held_out(judge, judge.fit(names, theta, 8))
@@ -160,7 +162,7 @@ def _trades(logs: Logs, tried: Tried) -> list[str]:
 # ---- formulas --------------------------------------------------------------------------------------------------------
 
 
-def _formulas(logs: Logs, tried: Tried, y: Array) -> list[Formula]:
+def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
     """Formulas that come within `NEAR` of the best, simplest first, each fitted in the simulation."""
     c = tried.candidate
     x = c.grid
@@ -174,7 +176,7 @@ def _formulas(logs: Logs, tried: Tried, y: Array) -> list[Formula]:
         if got is not None and got[1] < SHAPED:
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
-    fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(logs, tried, form, numbers))]
+    fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
     if not fitted:
         return []
     fitted.sort(key=lambda f: np.log(f.error) + PER_NUMBER * len(f.numbers))
@@ -194,18 +196,26 @@ def values_of(formula: Formula, q: Array) -> Array:
     return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)
 
 
-def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Formula | None:
+def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> Formula | None:
     """A formula in the curve's place, fitted with the model's own parameters."""
     c = tried.candidate
     size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
     ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
     effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
     grid = c.grid
-    placed = c.placed_as(lambda n: np.broadcast_to(form.value(grid, n), grid.shape).astype(float), len(numbers))
-    bound = with_curves(logs.fitted, (), (*tried.curves[:-1], (placed, effect)))
-    judge = Judge(bound.thinned, logs.fitted.floor)
+    been = c.quantity.visited[np.isfinite(c.quantity.visited)]
+    been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
+
+    def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
+        return 0.0 if c.mean else float(np.mean(form.value(been, n)))
+
+    def table(n: Array) -> Array:
+        return np.broadcast_to(form.value(grid, n) - mean(n), grid.shape).astype(float)
+
+    placed = c.placed_as(table, len(numbers))
+    judge = Judge(ground.stage((), (*tried.curves[:-1], (placed, effect))), ground.floor)
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
-    if not np.all(np.isfinite(bound.run(theta[None]))):
+    if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
     fit = with_held_out(judge, judge.fit(tuple(e.name for e in judge.stage.effects), theta, 12))
     if not np.isfinite(score(judge, fit)):
@@ -215,7 +225,7 @@ def _in_simulation(logs: Logs, tried: Tried, form: Form, numbers: Array) -> Form
     law = library_name(c, form)
     return Formula(
         form.name,
-        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0)),
+        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0), mean(values)),
         said,
         rms_of(judge, fit),
         form.complexity,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -18,23 +19,51 @@ from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.error_share import HARM, LEAST_USE, MOST_LEFT, RIVAL, UNKNOWN, ErrorShare, score, worth
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
-from vaneloop.discrepancy.models.bound import Bound
-from vaneloop.discrepancy.models.by_log import Logs
-from vaneloop.discrepancy.models.curved import Candidate, candidates, with_curves
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, WAY
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect, Stage
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
-__all__ = ["Learner", "Outcome", "Tried"]
+__all__ = ["Ground", "Learner", "Outcome", "Placings", "Tried"]
 
 MOST_CURVES = 2
 WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
-QUICK, FINISHED = 10, 4  # candidates that are fitted for a few steps, and of these to the end
-SHORTER = (1.0, 0.5, 0.2)  # of the step that the slopes promise, which are simulated
+SCREENED = 1.0  # of them, where candidates are screened
+QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
+DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
+# quantities that are at a place of the vane chain itself
+PLAIN = {
+    "valve.current": ("i_cmd",), "actuator.load": ("x_lvdt", "speed_of_x_lvdt"), "sensors.lvdt": ("x_lvdt",),
+    "servo.current": ("i_cmd",), "actuator.flow_gain": ("x_lvdt", "t_oil"), "linkage.ring": ("x_lvdt",),
+    "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
+}  # fmt: skip
 Placings = tuple[tuple[Placed, Effect], ...]
+
+
+class Ground(Protocol):
+    """What curves are learned on: one stage of a model, held against logs.
+
+    whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
+    tests  names of the logs that nothing is fitted to
+    """
+
+    whole: Stage
+    floor: Array
+    tests: frozenset[str]
+
+    def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
+        """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
+        samples as tell which candidates to fit.
+        """
+
+    def candidates(self, theta: Array) -> list[Candidate]:
+        """Every curve that may be missing, at parameters ``theta`` of a stage without any."""
+
+    def figures(self, curves: Placings, theta: Array) -> dict[str, Array]:
+        """RMS error of each output, log by log, test logs too."""
 
 
 @dataclass
@@ -46,7 +75,6 @@ class Tried:
 
     candidate: Candidate
     wiggle: float
-    bound: Bound
     judge: Judge
     fit: Fit
     curves: Placings
@@ -59,18 +87,29 @@ class Outcome:
     verdict  learned; named: laws of the library do as well; none: nothing is missing; unknown: no honest law is there
     tried    the model with its curves, curve by curve; ``rivals``: candidates that do as well in the last one's place
     nearest  the candidates that come nearest, where nothing was learned
-    base     the model with nothing added
     why      in words, where nothing was learned
     """
 
     verdict: str
-    base: Fit
-    judge: Judge
     tried: list[Tried] = field(default_factory=list)
     rivals: list[list[str]] = field(default_factory=list)
     nearest: list[str] = field(default_factory=list)
     why: str = ""
     notes: list[str] = field(default_factory=list)
+
+
+def _strange(candidate: Candidate) -> int:
+    """Which of several candidates that do as well is meant: the lower, the plainer.
+
+    What is at a place itself is plainer than what another signal says of it. Reversals follow from every quantity that
+    turns, and time from every one that drifts.
+    """
+    name = candidate.quantity.name
+    if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or name in PLAIN.get(candidate.at, ()):
+        return 0
+    if name.startswith((WAY, DISTANCE, SINCE)):
+        return 3
+    return 2 if name == TIME else 1
 
 
 def held_out(cost: Array, gradients: Array, normals: Array, mine: Array, prior: Array, deviation: Array) -> Array:
@@ -98,27 +137,27 @@ def with_held_out(judge: Judge, fit: Fit) -> Fit:
 
 
 class Learner:
-    """The search for curves on one system.
+    """The search for curves on one stage.
 
-    logs      the model on its logs
-    d         what `diagnose` says of them
+    ground    the stage on its logs
+    d         what `diagnose` says of it
     progress  called with the share that is done
     """
 
-    def __init__(self, logs: Logs, d: StageDiagnosis, progress: Callable[[float], None] | None = None):
-        self.logs, self.d, self.progress = logs, d, progress or (lambda _: None)
-        self.bound = with_curves(logs.fitted, (), ())
-        self.judge = Judge(self.bound.thinned, logs.fitted.floor)
-        columns = len(self.bound.stage.parameters)
-        self.base = self.judge.fit((), d.base.theta[:columns], 4)
+    def __init__(self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None):
+        self.ground, self.d, self.progress = ground, d, progress or (lambda _: None)
+        self.judge = self._judge((), ())
+        self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
         self.form = ErrorShare(self.judge)
         self.form.begin(self.base)
-        starts = len(logs.fitted.system.parameters) + len(logs.fitted.runner.free_starts)
-        self.candidates = candidates(self.bound, self.base.theta[:starts])
+        self.candidates = ground.candidates(self.base.theta)
+
+    def _judge(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Judge:
+        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor)
 
     def learned(self) -> Outcome:
         """Curves one after the other, each earning its place; at most two."""
-        out = Outcome("none", self.base, self.judge)
+        out = Outcome("none")
         if not self.form.fails(self.base):
             out.why = "the model comes down to the noise of its samples: nothing is missing"
             return out
@@ -127,7 +166,7 @@ class Learner:
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
             return out
-        current = Tried(self.candidates[0], 0.0, self.bound, self.judge, self.base, ()) if self.candidates else None
+        current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
         fit = self.base
         while current is not None and len(out.tried) < MOST_CURVES and self.form.fails(fit):
             finalists = self._finalists(current)
@@ -135,9 +174,8 @@ class Learner:
             good = [t for t in finalists if self._earns(fit, t)]
             if not good:
                 break
-            # reversals follow from every quantity that turns: a plain one that does as well is meant
             near = [t for t in good if score(self.judge, t.fit) < score(self.judge, good[0].fit) + RIVAL]
-            best = next((t for t in near if not t.candidate.quantity.name.startswith((WAY, DISTANCE, SINCE))), good[0])
+            best = min(near, key=lambda t: _strange(t.candidate))
             why = self._harmful(current, best)
             if why:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
@@ -153,16 +191,15 @@ class Learner:
         effects = self.d.final.effects or tuple(self.d.nearest[:1])
         if not effects:
             return None
-        bound = with_curves(self.logs.fitted, effects, ())
-        judge = Judge(bound.thinned, self.logs.fitted.floor)
-        theta = bound.stage.neutral()
-        whole, part = self.logs.fitted.stage.index(), bound.stage.index()
+        judge = self._judge(effects, ())
+        theta = judge.stage.neutral()
+        whole, part = self.ground.whole.index(), judge.stage.index()
         theta[: len(self.base.theta)] = self.d.final.theta[: len(self.base.theta)]
         for e in effects:
             if self.d.final.effects:
                 theta[part[e]] = self.d.final.theta[whole[e]]
             else:
-                theta[part[e]] = self.logs.fitted.stage.effect(e).starts[0]
+                theta[part[e]] = self.ground.whole.effect(e).starts[0]
         return judge, judge.fit(effects, theta, 8)
 
     def _concluded(self, out: Outcome, named: tuple[Judge, Fit] | None) -> Outcome:
@@ -189,12 +226,11 @@ class Learner:
 
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
-        promised = self._screened(current)
         quick = []
-        for k, (_, candidate, wiggle, theta) in enumerate(promised[:QUICK]):
-            quick.append(self._fitted(current, candidate, wiggle, theta, 3))
+        for k, (_, candidate, theta) in enumerate(self._screened(current)[:QUICK]):
+            quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
-        quick.sort(key=lambda t: score(self.judge, t.fit))
+        quick.sort(key=lambda t: score(t.judge, t.fit))
         done = []
         for k, t in enumerate(quick[:FINISHED]):
             options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
@@ -220,80 +256,64 @@ class Learner:
         theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
         return self._fitted(current, fine, WIGGLES[-1], theta, 12)
 
-    def _fitted(self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int) -> Tried:
+    def _fitted(
+        self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int, quick: bool = False
+    ) -> Tried:
         curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
-        bound = with_curves(self.logs.fitted, (), curves)
-        judge = Judge(bound.thinned, self.logs.fitted.floor)
+        judge = self._judge((), curves, quick)
         names = tuple(e.name for _, e in curves)
         fit = with_held_out(judge, judge.fit(names, theta, iterations))
-        return Tried(candidate, wiggle, bound, judge, fit, curves)
+        return Tried(candidate, wiggle, judge, fit, curves)
 
-    def _screened(self, current: Tried) -> list[tuple[float, Candidate, float, Array]]:
-        """Each candidate with what it would leave, how much it may bend, and parameters to begin from; best first."""
-        fit, judge = current.fit, current.judge
-        slopes = Slopes(judge, fit.theta, fit.free, fit.prior)
-        out = []
+    def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
+        """Each candidate with what it would leave, and parameters to begin from; best first."""
+        quick = self._judge((), current.curves, True)
+        slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
         have = {q.effect for q, _ in current.curves}
-        for candidate in self.candidates:
-            if candidate.name not in have:
-                out.append(self._promise(current, candidate, slopes))
+        out = [self._promise(current, c, slopes) for c in self.candidates if c.name not in have]
         return sorted(out, key=lambda o: o[0])
 
-    def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, float, Array]:
-        fit, jac = current.fit, slopes.jac
-        bound = with_curves(
-            self.logs.fitted, (), (*current.curves, (candidate.placed(), candidate.effect(WIGGLES[-1])))
-        )
-        judge = Judge(bound.thinned, self.logs.fitted.floor)
-        theta = np.concatenate([fit.theta, np.zeros(len(candidate.effect(1.0).parameters))])
+    def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, Array]:
+        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best.
+
+        Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
+        """
+        fit = current.fit
+        effect = candidate.effect(SCREENED)
+        judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
+        theta = np.concatenate([fit.theta, np.zeros(len(effect.parameters))])
         own = np.arange(len(fit.theta), len(theta))
         moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
-        rows = np.concatenate([jac, derivative(judge.errors(moved))[1]])
-        cost, gradients, normals = judge._blocks(slopes.error, rows)
+        rows = np.concatenate([slopes.jac, derivative(judge.errors(moved))[1]])
+        _, gradients, normals = judge._blocks(slopes.error, rows)
         free = np.concatenate([fit.free, own])
-        scale, neutral = judge.scale[free], judge.stage.neutral()
-        mine = np.arange(len(free)) >= len(fit.free)
-        best: tuple[float, float, Array] | None = None
-        for wiggle in WIGGLES:
-            tolerance = np.array([p.tolerance for p in candidate.effect(wiggle).parameters])
-            prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
-            deviation = (theta - neutral)[free] / scale
-            a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
-            step = np.linalg.solve(a, g)
-            g_at = gradients - normals @ step
-            c_at = cost - 2.0 * gradients @ step + np.einsum("i,bij,j->b", step, normals, step)
-            held = held_out(np.maximum(c_at, 0.0), g_at, normals, mine, prior, deviation + step)
-            promised = float(held.sum())
-            if best is None or promised < best[0]:
-                best = promised, wiggle, step
-        assert best is not None
-        trials = np.repeat(theta[None], len(SHORTER), axis=0)
+        scale = judge.scale[free]
+        tolerance = np.array([p.tolerance for p in effect.parameters])
+        prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
+        deviation = (theta - judge.stage.neutral())[free] / scale
+        a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
+        trials = np.repeat(theta[None], len(DAMPED), axis=0)
         low, high = judge.bounds()
-        for row, share in zip(trials, SHORTER, strict=True):
-            row[free] = np.clip(row[free] + share * best[2] * scale, low[free], high[free])
+        for row, damping in zip(trials, DAMPED, strict=True):
+            step = np.linalg.solve(a + damping * np.diag(np.diag(a)), g)
+            row[free] = np.clip(row[free] + step * scale, low[free], high[free])
         left = judge.totals(judge.errors(trials), trials)
         k = int(np.argmin(left))
-        # what slopes promise is held out; what was simulated is true: between them
-        value = float(np.sqrt(max(best[0], 1e-300) * left[k]))
-        return value, candidate, best[1], trials[k]
+        return float(left[k]), candidate, trials[k]
 
     # ---- other logs --------------------------------------------------------------------------------------------------
 
-    def figures(self, tried: Tried) -> dict[str, Array]:
-        """RMS error of each output, log by log, test logs too."""
-        return on_logs(self.logs, tried.curves).figures(tried.fit.theta)
-
     def _harmful(self, before: Tried, tried: Tried) -> str:
         """Why the logs speak against a curve; "": they do not."""
-        floor = self.logs.fitted.floor
+        floor = self.ground.floor
 
         def levels(of: Tried) -> dict[str, float]:
-            by = self.figures(of)
+            by = self.ground.figures(of.curves, of.fit.theta)
             good = {log: v for log, v in by.items() if np.isfinite(v).all()}
             return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in good.items()}
 
         was, now = levels(before), levels(tried)
-        tests = set(self.logs.test.logs if self.logs.test else ())
+        tests = self.ground.tests
         change = {log: now[log] - was[log] for log in was if log in now}
         worst = max((log for log in change if log in tests), key=lambda log: change[log], default=None)
         if worst is not None and change[worst] > HARM:
@@ -301,9 +321,3 @@ class Learner:
         if change and min(change.values()) > -LEAST_USE:
             return f"no log is better by {LEAST_USE:.0%} for it"
         return ""
-
-
-def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
-    """The model with these curves on all its logs."""
-    test = with_curves(logs.test, (), curves) if logs.test is not None else None
-    return Logs(with_curves(logs.fitted, (), curves), test)

@@ -27,12 +27,16 @@ from hil.figures import noise_floor, resolution
 from hil.logs import Log, LogError
 from hil.loop.tick import flashed
 from plant import Plant, build_plant
+from plant.curve import QUANTITIES
+from plant.effects import CURVES
+from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.discrepancy.models.vane_stages.actuator import actuator_stage
 from vaneloop.discrepancy.models.vane_stages.current import SAMPLED, between_rows, other_current, servo_law
 from vaneloop.discrepancy.models.vane_stages.demand import demand_stage
 from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.engine import engine_stage
+from vaneloop.discrepancy.models.vane_stages.ground import OF_STROKE, reversals, room_for
 from vaneloop.discrepancy.models.vane_stages.linkage import linkage_stage
 from vaneloop.discrepancy.models.vane_stages.own_controller import own_demand_stage
 from vaneloop.discrepancy.models.vane_stages.raster import (
@@ -130,6 +134,12 @@ def build_chain(
             )
     foreign = [v for v in VANES if v in columns and v not in machine.vanes]
     notes += [f"{v}: this machine has no such stage (geometry); not judged" for v in foreign]
+    if room_for(machine.p) < MOST_CURVES:
+        logged = {*columns, *machine.usual, "time", *(OF_STROKE if "x_lvdt" in columns else ())}
+        curves = range(CURVES + 1, CURVES + 1 + CURVE_ROWS * int(machine.p[CURVES].max()), CURVE_ROWS)
+        of = {int(machine.p[r + C_OF, 0]) for r in curves}
+        if lost := next((q.name for q in QUANTITIES.values() if q.of in of and q.name not in logged), None):
+            raise LogError(f"{log.path}: has no {lost}, of which a learned law of the model is a function")
     filled = machine.usual
     have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
     have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
@@ -161,6 +171,8 @@ def build_chain(
                 between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    if "x_lvdt" in columns:
+        have |= reversals(t, have.get("stroke", columns["x_lvdt"]), machine.table.actuator.stroke.value)
     regimes, units = regimes_of(t, columns)
     bits = _lost_bits(log, machine)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {

@@ -8,8 +8,9 @@ from plant import chain, places
 from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
+from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
-from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
 from vaneloop.discrepancy.models.vane_stages.twins import like_time
 from vaneloop.discrepancy.stage import Array, Named, Stage, without_jumps
@@ -25,8 +26,9 @@ SIMPLER = {"hydraulic": 4e-4, "electromechanical": 1.1e-3}
 
 def actuator_stage(driven: Driven) -> Stage:
     """Stroke from the current of every tick, started anew in each window."""
-    t, c, machine, _, outputs, run, present = driven
-    parameters, effects, rows, si = declared("actuator", machine, present)
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("actuator", driven)
+    signals = driven.signals() if driven.curved else NOTHING
     dt = float(t[1] - t[0])
     # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
     substeps = c["ticks"].shape[1] if "ticks" in c else SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
@@ -39,12 +41,12 @@ def actuator_stage(driven: Driven) -> Stage:
     logged = step_currents(i, dt, substeps)
 
     def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil) -> Array:
-        p = lanes(machine, thetas, rows, si)
+        p = lanes(driven, thetas, rows, si)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[places.X] = s[places.X_LVDT] = x[0]
         out = np.empty((len(thetas), 1, len(t)))
-        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)))
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), signals)
         out *= 1e3
         return out
 
@@ -86,7 +88,7 @@ def actuator_stage(driven: Driven) -> Stage:
             keep[b : b + window] = False
         return keep
 
-    stage.excerpt = excerpts(actuator_stage, driven, stage, kept)
+    stage.excerpt, stage.made = excerpts(actuator_stage, driven, stage, kept), Made(actuator_stage, driven)
     return stage
 
 

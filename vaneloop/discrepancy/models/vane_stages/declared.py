@@ -6,14 +6,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from plant import Plant
+from plant import chain
+from plant.curve import PLACES, QUANTITIES, Place, at_curve
 from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
 from plant.parameters import nominal
+from plant.stages import run_bends
 from vaneloop.base.vanes import VANES, vane_in
+from vaneloop.discrepancy.models.curve import Curve
+from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["FREE", "SHAPES", "declared", "lanes"]
+__all__ = ["ALL_PLACES", "FREE", "SHAPES", "bends", "declared", "lanes"]
+
+ALL_PLACES = tuple(PLACES.values())  # a curve's place is a number of these
 
 FREE = {  # nominal parameters that a stage refits within their tolerance, those of them that the machine has
     "demand": (),
@@ -44,12 +50,11 @@ KNOWN = {
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
 
 
-def declared(
-    stage: str, machine: Plant, present: tuple[str, ...]
-) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
+def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
     """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors
-    to SI.
+    to SI. Its curves are the last effects; they have no rows.
     """
+    machine = driven.machine
     known = {n.name: n for n in nominal(machine.table, machine.geometry)}
     parameters, rows, si = [], [], []
     for name in FREE[stage]:
@@ -68,7 +73,9 @@ def declared(
         rows.append(n.row)
     effects = []
     for e in EFFECTS.values():
-        if stage not in e.stages or e.name in present or machine.kind not in e.kinds:
+        if stage not in e.stages or e.name in driven.present or machine.kind not in e.kinds:
+            continue
+        if driven.laws is not None and e.name not in driven.laws:
             continue
         own = machine.parameters_of(e.name)
         ps = tuple(
@@ -88,6 +95,7 @@ def declared(
         effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
         rows += list(own)
         si += [p.si for p in own.values()]
+    effects += [e for _, e in driven.curves]
     return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
 
 
@@ -130,8 +138,35 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
     return tuple(out)
 
 
-def lanes(machine: Plant, thetas: Array, rows: Array, si: Array) -> Array:
+def lanes(driven: Driven, thetas: Array, rows: Array, si: Array) -> Array:
     """The plant's parameter array with one lane per parameter set."""
-    p = np.repeat(machine.p, len(thetas), axis=1)
-    p[rows] = (thetas * si).T
+    p = np.repeat(driven.machine.p, len(thetas), axis=1)
+    p[rows] = (thetas[:, : len(rows)] * si).T
+    for place, curve, tables in tables_of(driven, thetas):
+        at_curve(p, place, QUANTITIES[curve.quantity], curve.low, curve.high, tables)
     return p
+
+
+def tables_of(driven: Driven, thetas: Array) -> list[tuple[Place, Curve, Array]]:
+    """Each curve of a stage with its place, and its table in every parameter set, float64[POINTS, sets]."""
+    at = thetas.shape[1] - sum(len(e.parameters) for _, e in driven.curves)
+    out = []
+    for placed, effect in driven.curves:
+        columns = slice(at, at + len(effect.parameters))
+        at = columns.stop
+        assert placed.curve is not None
+        tables = np.array([placed.curve.table(theta[columns]) for theta in thetas]).T
+        out.append((ALL_PLACES[placed.curve.place], placed.curve, tables))
+    return out
+
+
+def bends(driven: Driven, thetas: Array, known: Array, site: int) -> Array:
+    """What the curves at a site of the controller give at the signals of a log, float64[sets, samples], border units:
+    those of the machine, and those that are tried.
+    """
+    out = np.zeros((len(thetas), len(driven.t)))
+    p = lanes(driven, thetas, np.zeros(0, dtype=int), np.zeros(0))
+    s = np.zeros((chain.N_STATE, len(thetas)))
+    si = next(place.si for place in ALL_PLACES if place.site == site)
+    run_bends(known, p, s, site, out)
+    return out / si

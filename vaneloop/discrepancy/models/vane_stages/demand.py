@@ -8,10 +8,11 @@ from controller import Calibration, new_state
 from controller.records import SLOW_TICK, Record, as_scalars, as_state
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
+from plant.curve import DEMAND_ADDS
 from plant.effects import ROW
 from vaneloop.base.compiled import compiled
-from vaneloop.discrepancy.models.vane_stages.declared import declared
-from vaneloop.discrepancy.models.vane_stages.driven import Driven
+from vaneloop.discrepancy.models.vane_stages.declared import bends, declared
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, lately, pieces_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
 
@@ -31,10 +32,11 @@ def _demand_run(
     k: Record,
     table: np.ndarray,
     z: Record,
+    offset: np.ndarray,
     out: np.ndarray,
 ) -> None:
     """The firmware's 10 ms part on the logged frames from row ``first`` to before ``last``: x_dem (m) of every
-    frame.
+    frame. ``offset`` (m) is added to the tables' stroke.
     """
     dt = t[1] - t[0]
     for i in range(first, last):
@@ -58,6 +60,7 @@ def _demand_run(
         z.n_r += (b - z.n_r) * SLOW_TICK / (k.speed_filter + SLOW_TICK)
         trend_step(z, k, a)
         schedule_step(z, k, table)
+        z.x_target += offset[i]
         if i == first:
             z.x_dem = z.x_target
         move_demand(z, k, z.x_target, k.stroke_rate)
@@ -92,8 +95,10 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
 
 def demand_stage(driven: Driven) -> Stage:
     """Stroke demand from logged speeds, by the firmware as it is flashed."""
-    t, c, machine, cal, outputs, run, present = driven
-    _, effects, _, _ = declared("demand", machine, present)
+    t, c, machine, cal, outputs, run = driven[:6]
+    _, effects, _, _ = declared("demand", driven)
+    signals = driven.signals()
+    none = np.zeros((1, len(t)))
     n_dem, n_r = np.ascontiguousarray(c["n_dem"]), np.ascontiguousarray(c["n_r"])
     pieces = pieces_of(c["spell"])
     run = (
@@ -110,6 +115,7 @@ def demand_stage(driven: Driven) -> Stage:
     def simulate(thetas: Array) -> Array:
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
+        shift = bends(driven, thetas, signals, DEMAND_ADDS) * 1e-3 if driven.curved else none
         for i, theta in enumerate(thetas):
             k, table = as_scalars(cal.k.copy()), cal.table.copy()
             factor = value(theta, "trend_threshold_error", 1.0)
@@ -131,7 +137,7 @@ def demand_stage(driven: Driven) -> Stage:
                     z = as_state(new_state())
                     z.demand_seen = 1.0
                     z.direction, z.blend = (1.0, 1.0) if up else (-1.0, 0.0)
-                    _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, x)
+                    _demand_run(first, last, t, n_dem, n_r, delay, hold, phase, k, table, z, shift[i % len(shift)], x)
                 if first:
                     one, two = (np.nansum((x[piece] * 1e3 - measured[piece]) ** 2) for x in (out[i, 0], other))
                     if two < one:
@@ -148,4 +154,6 @@ def demand_stage(driven: Driven) -> Stage:
         held.append(e)
     effects = tuple(held)
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
-    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, measured[None])
+    stage = Stage("demand", outputs, ("mm",), (), effects, simulate, t, measured[None])
+    stage.made = Made(demand_stage, driven)
+    return stage

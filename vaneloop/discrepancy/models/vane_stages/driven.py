@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from controller import Calibration
 from plant import Plant
-from vaneloop.discrepancy.stage import Array, Stage
+from plant.curve import KNOWN, QUANTITIES
+from plant.effects import CURVES
+from plant.layout import C_OF, CURVE_ROWS
+from vaneloop.base.vanes import VANES
+from vaneloop.discrepancy.models.motion import smoothed
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["Driven", "excerpts"]
+__all__ = ["Driven", "Made", "excerpts"]
 
 
 class Driven(NamedTuple):
@@ -20,6 +28,8 @@ class Driven(NamedTuple):
     outputs              channels that the stage explains, of those that the log has
     run                  bool[samples]: rows that count
     present              effects that the model already has: not tried again
+    laws                 effects of the library that may be tried; None: all that the stage can have
+    curves               what may be tried besides: curves as they run, and as the search has them
     """
 
     t: Array
@@ -29,6 +39,43 @@ class Driven(NamedTuple):
     outputs: tuple[str, ...]
     run: Array
     present: tuple[str, ...]
+    laws: tuple[str, ...] | None = None
+    curves: tuple[tuple[Placed, Effect], ...] = ()
+
+    @property
+    def curved(self) -> bool:
+        """Whether any curve can be there."""
+        return bool(self.curves) or bool(self.machine.p[CURVES].any())
+
+    def quantity(self, name: str) -> Array | None:
+        """One of `plant.curve.QUANTITIES` on the log, in its unit; None: the log has it not."""
+        if name == "time":
+            return self.t
+        if name == "x_lvdt":  # with less noise, where it can be had
+            return self.columns.get("stroke", self.columns.get(name))
+        values = self.columns.get(name)
+        return values if values is None or name not in VANES else smoothed(self.t, values)
+
+    def signals(self) -> Array:
+        """What curves are of, as the log has it, float64[KNOWN, samples], SI; NaN: what it has not, and what no curve
+        here is of.
+        """
+        out = np.full((KNOWN, len(self.t)), np.nan)
+        have = {int(of) for of in self.machine.p[CURVES + 1 + C_OF :: CURVE_ROWS, 0]}
+        tried = {c.curve.quantity for c, _ in self.curves if c.curve is not None}
+        for q in QUANTITIES.values():
+            if q.of in have or q.name in tried:
+                values = self.quantity(q.name)
+                if values is not None:
+                    out[q.of] = values * q.si
+        return out
+
+
+class Made(NamedTuple):
+    """How a stage was made: by ``make`` from ``driven``."""
+
+    make: Callable[[Driven], Stage]
+    driven: Driven
 
 
 def excerpts(

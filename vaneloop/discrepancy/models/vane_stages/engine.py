@@ -6,8 +6,9 @@ import numpy as np
 
 from plant import chain, places
 from plant.stages import engine_run
+from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
-from vaneloop.discrepancy.models.vane_stages.driven import Driven
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, pieces_of
 from vaneloop.discrepancy.stage import Array, Stage
 
@@ -16,19 +17,20 @@ __all__ = ["engine_stage"]
 
 def engine_stage(driven: Driven) -> Stage:
     """Rotor speed from its demand; the speed at the start of each stretch is what suits its first second."""
-    t, c, machine, _, outputs, run, present = driven
-    parameters, effects, rows, si = declared("engine", machine, present)
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("engine", driven)
     dt = float(t[1] - t[0])
     n_dem = np.ascontiguousarray(c["n_dem"])
     inner = 1
     if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
         inner = int(round(dt / RASTER))
         n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+    signals = np.repeat(driven.signals(), inner, axis=1) if driven.curved else NOTHING
     pieces = pieces_of(c["stretch"])
     second = max(1, int(round(1.0 / dt)))
 
     def simulate(thetas: Array) -> Array:
-        p = lanes(machine, thetas, rows, si)
+        p = lanes(driven, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
         out = np.empty((len(n_dem), len(thetas)))
         for piece in pieces:
@@ -39,10 +41,13 @@ def engine_stage(driven: Driven) -> Stage:
             for stop in (head, piece.stop):
                 inside = slice(piece.start * inner, stop * inner)
                 s[places.N_R] = start
-                engine_run(n_dem[inside], dt / inner, p, s, out[inside])
+                engine_run(n_dem[inside], dt / inner, p, s, out[inside], np.ascontiguousarray(signals[:, inside]))
                 start = start + np.mean(
                     c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
                 )
         return out[::inner].T[:, None, :]
 
-    return Stage("engine", outputs, ("%",), parameters, effects, simulate, t, np.where(run, c["n_r"], np.nan)[None])
+    measured = np.where(run, c["n_r"], np.nan)[None]
+    stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)
+    stage.made = Made(engine_stage, driven)
+    return stage

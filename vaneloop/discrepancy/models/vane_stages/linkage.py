@@ -10,8 +10,9 @@ import numpy as np
 
 from plant.parameters import derive
 from plant.stages import linkage_run
+from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
-from vaneloop.discrepancy.models.vane_stages.driven import Driven, excerpts
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
 from vaneloop.discrepancy.models.vane_stages.twins import like_temperature, like_time
 from vaneloop.discrepancy.stage import Array, Named, Stage
@@ -21,8 +22,9 @@ __all__ = ["linkage_stage"]
 
 def linkage_stage(driven: Driven) -> Stage:
     """Vane angles that the log has, from the stroke."""
-    t, c, machine, _, outputs, run, present = driven
-    parameters, effects, rows, si = declared("linkage", machine, present)
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("linkage", driven)
+    signals = driven.signals() if driven.curved else NOTHING
     dt = float(t[1] - t[0])
     x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
@@ -31,13 +33,13 @@ def linkage_stage(driven: Driven) -> Stage:
     first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in machine.vanes]
 
     def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
-        p = lanes(machine, thetas, rows, si)
+        p = lanes(driven, thetas, rows, si)
         derive(p, dt, dt)
         start = machine.start(stroke=x[0], n_r=n_r[0])
         machine.place_rings(start, tuple(first))
         s = np.repeat(start, len(thetas), axis=1)
         out = np.empty((len(t), len(first), len(thetas)))
-        linkage_run(x, n_r, t_oil, t, dt, p, s, out)
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out, signals)
         return np.rad2deg(out[:, which].transpose(2, 1, 0))
 
     # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
@@ -68,7 +70,7 @@ def linkage_stage(driven: Driven) -> Stage:
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
         return keep
 
-    stage.excerpt = excerpts(linkage_stage, driven, stage, kept)
+    stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage
 
 

@@ -68,8 +68,8 @@ def own_demand_stage(driven: Driven) -> Stage:
     What it remembers from before the log is not known: it is run twice, with a demand that came from below and one that
     came from above, and only rows where both agree count.
     """
-    t, c, machine, cal, outputs, run, present = driven
-    _, effects, _, _ = declared("demand", machine, present)
+    t, c, machine, cal, outputs, run = driven[:6]
+    _, effects, _, _ = declared("demand", driven)
     effects = tuple(e for e in effects if e.name != "frame_hold")
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
     n_dem, n_r, start = c["n_dem"], c["n_r"], float(c["x_dem"][0]) * 1e-3

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hil.figures import noise_floor
-from vaneloop.discrepancy.models.vane_stages.declared import declared
-from vaneloop.discrepancy.models.vane_stages.driven import Driven
+from plant.curve import QUANTITIES, SERVO_ADDS, SERVO_TIMES
+from vaneloop.discrepancy.models.vane_stages.declared import bends, declared
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.models.vane_stages.raster import WINDOW, no_gap_in_window, rms
 from vaneloop.discrepancy.stage import KNOWN_TO, Array, Stage, without_jumps
 
@@ -15,13 +16,19 @@ __all__ = ["servo_stage"]
 
 def servo_stage(driven: Driven) -> Stage:
     """Current from logged demand and stroke, by the firmware's law."""
-    t, c, machine, cal, outputs, run, present = driven
-    parameters, effects, _, _ = declared("servo", machine, present)
+    t, c, _, cal, outputs, run = driven[:6]
+    parameters, effects, _, _ = declared("servo", driven)
     mean, hidden = c["law"].mean(axis=1), c["law_error"].T
+    named = len(effects) > len(driven.curves)  # controller_gain_error
+    signals = driven.signals()
+    signals[QUANTITIES["i_cmd"].of] = mean * 1e-3  # of the law's own current, which has no noise of the logged one
 
     def simulate(thetas: Array) -> Array:
-        factor = thetas[:, :1] if len(effects) else np.ones((len(thetas), 1))
+        factor = thetas[:, :1] if named else np.ones((len(thetas), 1))
         i = factor * mean[None]
+        if driven.curved:
+            i *= 1.0 + bends(driven, thetas, signals, SERVO_TIMES)
+            i += bends(driven, thetas, signals, SERVO_ADDS)
         return i[:, None, :]
 
     # at the limit the integral stands still: its constant is another one before and after
@@ -46,4 +53,5 @@ def servo_stage(driven: Driven) -> Stage:
     whole = np.mean([rms(stage, h[None]) ** 2 for h in hidden], axis=0)
     stage.raster_error = np.sqrt(np.maximum(whole - seen**2, 0.0))
     stage.lost = hidden[:, None]
+    stage.made = Made(servo_stage, driven)
     return stage

@@ -1,0 +1,231 @@
+"""Curves that were learned: at one place of the plant, a function of one signal.
+
+The library's effects are laws that somebody wrote down. A curve is a law that nobody did: a table of `POINTS` values,
+at a `PLACES` of the machine, of one of `plant.layout.SIGNALS`. What adds, adds its value there; what multiplies, does
+so with 1 + its value. Beyond the table's range a curve stays as at its end. Rows of a curve: `plant.layout`.
+
+The signals are what the machine itself has at the last tick: a curve of the stroke is one of the true stroke. Where a
+stage is held against a log, they are what the log says (`take`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from plant.effect import HYDRAULIC, KINDS, UNITS
+from plant.effects import CURVES, SIGNAL_AT
+from plant.layout import (
+    C_HIGH,
+    C_LOW,
+    C_OF,
+    C_SITE,
+    C_TABLE,
+    CURVE_ROWS,
+    MOST_CURVES,
+    P_REF,
+    SIGNALS,
+    STROKE,
+    VANE_COUNT,
+)
+from plant.places import N_R, POT, SPEED, X
+from vaneloop.base.compiled import in_place, inlined
+from vaneloop.base.curve import POINTS, between_points
+from vaneloop.base.vanes import MOST, VANES
+
+__all__ = [
+    "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS", "LVDT_ADDS",
+    "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
+    "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow", "take",
+    "turn",
+]  # fmt: skip
+
+(
+    DEMAND_ADDS, SERVO_ADDS, SERVO_TIMES, ENGINE_ADDS, LAG_TIMES, RISE_TIMES, CURRENT_ADDS, FLOW_TIMES, LOAD_ADDS,
+    LVDT_ADDS, LVDT_TIMES,
+) = range(1, 12)  # fmt: skip
+# of all stages; of each stage k: the number behind it and k
+RING_ADDS, PLAY_ADDS, POT_ADDS, POT_TIMES = (100 * n for n in range(1, 5))
+LEAST = 0.05  # a factor 1 + c is not less
+TURN = 0.02  # of the full stroke: a smaller way back is no reversal
+KNOWN = SIGNALS.index(VANES[0]) + MOST  # signals that a curve may be of; behind them the memory of `turn`
+(
+    S_CURRENT, S_X, S_SPEED, S_N_R, S_P_S, S_T_OIL, S_TIME, S_N_DEM, S_X_DEM, S_DIRECTION, S_DISTANCE, S_SINCE, S_VANE,
+) = range(SIGNAL_AT, SIGNAL_AT + 13)  # fmt: skip
+S_FARTHEST = SIGNAL_AT + KNOWN
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A signal as a log and a reader have it: name, unit, factor to SI, its number in `SIGNALS`."""
+
+    name: str
+    unit: str
+    si: float
+    of: int
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a curve may act.
+
+    at, how  name of the place; "adds" or "times"
+    stage    of the diagnosis that shows it
+    unit, si of the curve, "-" where it multiplies; its factor to SI
+    site     number in the plant's parameters
+    vane     the only stage that it moves; "": all
+    kinds    of actuators that have it
+    """
+
+    at: str
+    how: str
+    stage: str
+    unit: str
+    si: float
+    site: int
+    vane: str = ""
+    kinds: tuple[str, ...] = KINDS
+
+
+_DEG = UNITS["deg"]
+QUANTITIES = {
+    q.name: q
+    for q in (
+        Quantity("i_cmd", "mA", 1e-3, 0),
+        Quantity("x_lvdt", "mm", 1e-3, 1),
+        Quantity("speed_of_x_lvdt", "mm/s", 1e-3, 2),
+        Quantity("n_r", "%", 1.0, 3),
+        Quantity("p_s", "MPa", 1e6, 4),
+        Quantity("t_oil", "degC", 1.0, 5),
+        Quantity("time", "s", 1.0, 6),
+        Quantity("n_dem", "%", 1.0, 7),
+        Quantity("x_dem", "mm", 1e-3, 8),
+        Quantity("direction_of_x_lvdt", "-", 1.0, 9),
+        Quantity("distance_since_reversal_of_x_lvdt", "mm", 1e-3, 10),
+        Quantity("time_since_reversal_of_x_lvdt", "s", 1.0, 11),
+        *(Quantity(v, "deg", _DEG, 12 + k) for k, v in enumerate(VANES)),
+    )
+}
+PLACES = {
+    f"{p.at} {p.how}": p
+    for p in (
+        Place("controller.demand", "adds", "demand", "mm", 1e-3, DEMAND_ADDS),
+        Place("servo.current", "adds", "servo", "mA", 1e-3, SERVO_ADDS),
+        Place("servo.current", "times", "servo", "-", 1.0, SERVO_TIMES),
+        Place("engine.demand", "adds", "engine", "%", 1.0, ENGINE_ADDS),
+        Place("engine.lag", "times", "engine", "-", 1.0, LAG_TIMES),
+        Place("engine.acceleration", "times", "engine", "-", 1.0, RISE_TIMES),
+        Place("valve.current", "adds", "actuator", "mA", 1e-3, CURRENT_ADDS),
+        Place("actuator.flow_gain", "times", "actuator", "-", 1.0, FLOW_TIMES, kinds=HYDRAULIC),
+        Place("actuator.load", "adds", "actuator", "N", 1.0, LOAD_ADDS),
+        Place("sensors.lvdt", "adds", "linkage", "mm", 1e-3, LVDT_ADDS),
+        Place("sensors.lvdt", "times", "linkage", "-", 1.0, LVDT_TIMES),
+        Place("linkage.ring", "adds", "linkage", "deg", _DEG, RING_ADDS),
+        Place("linkage.play", "adds", "linkage", "deg", _DEG, PLAY_ADDS),
+        *(
+            Place(f"{at}", how, "linkage", unit, si, base + 1 + k, v)
+            for k, v in enumerate(VANES)
+            for at, how, unit, si, base in (
+                (f"linkage.{v}_ring", "adds", "deg", _DEG, RING_ADDS),
+                (f"linkage.{v}_play", "adds", "deg", _DEG, PLAY_ADDS),
+                (f"sensors.{v}", "adds", "deg", _DEG, POT_ADDS),
+                (f"sensors.{v}", "times", "-", 1.0, POT_TIMES),
+            )
+        ),
+    )
+}
+
+
+def at_curve(p: np.ndarray, place: Place, q: Quantity, low: float, high: float, tables: np.ndarray) -> None:
+    """Put a curve at a place behind those that ``p`` has; its range and ``tables`` (a column a lane, or one for all)
+    are in border units.
+
+    Raises ValueError where there is no room for it.
+    """
+    c = int(p[CURVES].max())
+    if c >= MOST_CURVES:
+        raise ValueError(f"a machine has room for {MOST_CURVES} curves")
+    r = CURVES + 1 + c * CURVE_ROWS
+    p[CURVES] = c + 1
+    p[r + C_SITE], p[r + C_OF], p[r + C_LOW], p[r + C_HIGH] = place.site, q.of, low * q.si, high * q.si
+    p[r + C_TABLE : r + CURVE_ROWS] = tables * place.si
+
+
+@in_place
+def bend(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
+    """Return the sum of lane ``j``'s curves at a site, SI, at the signals in ``s``."""
+    total = 0.0
+    for c in range(int(p[CURVES, j])):
+        r = CURVES + 1 + c * CURVE_ROWS
+        if p[r + C_SITE, j] == site:
+            x = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
+            k, share = between_points(x, p[r + C_LOW, j], p[r + C_HIGH, j], POINTS)
+            a = p[r + C_TABLE + k, j]
+            total += a + share * (p[r + C_TABLE + k + 1, j] - a)
+    return total
+
+
+@inlined
+def factor(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
+    """Return 1 + `bend`, above 0."""
+    return max(1.0 + bend(s, p, j, site), LEAST)
+
+
+@in_place
+def acts(p: np.ndarray, j: int, site: int) -> bool:
+    """Whether lane ``j`` has a curve at a site."""
+    found = False
+    for c in range(int(p[CURVES, j])):
+        found |= p[CURVES + 1 + c * CURVE_ROWS + C_SITE, j] == site
+    return found
+
+
+@in_place
+def turn(s: np.ndarray, j: int, x: float, t: float, band: float) -> None:
+    """Let the stroke come to ``x`` (m) at time ``t`` (s): its direction, and how far and long ago it turned.
+
+    band  m: a smaller way back is no reversal
+    """
+    farthest, way = s[S_FARTHEST, j], s[S_DIRECTION, j]
+    if way != 0.0 and way * (x - farthest) >= 0.0:
+        s[S_FARTHEST, j], s[S_FARTHEST + 2, j] = x, t
+    elif abs(x - farthest) > band:
+        s[S_DIRECTION, j] = 1.0 if x > farthest else -1.0
+        s[S_FARTHEST + 1, j], s[S_FARTHEST + 3, j] = farthest, s[S_FARTHEST + 2, j]
+        s[S_FARTHEST, j], s[S_FARTHEST + 2, j] = x, t
+    s[S_DISTANCE, j], s[S_SINCE, j] = abs(x - s[S_FARTHEST + 1, j]), t - s[S_FARTHEST + 3, j]
+
+
+@in_place
+def follow(
+    s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, x_dem: float, n_dem: float, n_r: float, p_s: float,
+    t_oil: float, t: float,
+) -> None:  # fmt: skip
+    """Take the machine's own signals at time ``t`` (s): what curves are a function of until the next tick."""
+    s[S_CURRENT, j], s[S_X, j], s[S_SPEED, j], s[S_N_R, j] = i_cmd, s[X, j], s[SPEED, j], n_r
+    s[S_P_S, j], s[S_T_OIL, j], s[S_TIME, j], s[S_N_DEM, j], s[S_X_DEM, j] = p_s, t_oil, t, n_dem, x_dem
+    for k in range(int(p[VANE_COUNT, j])):
+        s[S_VANE + k, j] = s[POT + k, j]
+    turn(s, j, s[X, j], t, TURN * p[STROKE, j])
+
+
+@in_place
+def begin(s: np.ndarray, p: np.ndarray, j: int, t_oil: float) -> None:
+    """The signals of a machine at rest, with oil at ``t_oil`` (degC)."""
+    s[S_X, j] = s[S_X_DEM, j] = s[S_FARTHEST, j] = s[S_FARTHEST + 1, j] = s[X, j]
+    s[S_N_R, j] = s[S_N_DEM, j] = s[N_R, j]
+    s[S_P_S, j], s[S_T_OIL, j] = p[P_REF, j], t_oil
+    for k in range(int(p[VANE_COUNT, j])):
+        s[S_VANE + k, j] = s[POT + k, j]
+
+
+@in_place
+def take(s: np.ndarray, p: np.ndarray, j: int, known: np.ndarray, before: int, k: int) -> None:
+    """Take the signals that lane ``j``'s curves are of from a log: their mean at samples ``before`` and ``k``.
+
+    known  float64[KNOWN, samples], SI
+    """
+    for c in range(int(p[CURVES, j])):
+        q = int(p[CURVES + 1 + c * CURVE_ROWS + C_OF, j])
+        s[SIGNAL_AT + q, j] = 0.5 * (known[q, before] + known[q, k])

@@ -1,0 +1,210 @@
+"""Curves that nobody named on a stage of the vane chain: every place there, of every quantity that the log has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from plant.curve import KNOWN, QUANTITIES, Place, turn
+from plant.effects import CURVES, N_STATE, SIGNAL_AT
+from plant.layout import AREA, MOST_CURVES, P_REF
+from plant.model import Learned
+from vaneloop.base.compiled import compiled
+from vaneloop.base.errors import InputError
+from vaneloop.base.vanes import VANES
+from vaneloop.discrepancy.curves import COUNT, basis_of
+from vaneloop.discrepancy.diagnose import excerpt_of
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.curve import COLUMN, Curve
+from vaneloop.discrepancy.models.curve_file import CURVE_LAW
+from vaneloop.discrepancy.models.curved import IN_TIME, Candidate, Quantity
+from vaneloop.discrepancy.models.motion import smoothed
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
+from vaneloop.discrepancy.models.vane_stages.driven import Made
+from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
+
+__all__ = ["OF_STROKE", "SCALE", "VaneGround", "curve_effect", "remade", "reversals", "room_for", "with_laws"]
+
+WHOLE = 12_000  # samples; of a longer log an excerpt is learned on, and the rest tests it
+QUICK = 4_000  # samples of the excerpt that tells which candidates to fit
+PIECE = 1_000  # samples in a row
+SCALE = "scale"  # of a law from a file
+LOG, REST, TEST = "log", "rest of the log", "test"
+# a quantity that is the place's own output, or nothing but the reading there: it multiplies by the same as it adds
+OWN = {"sensors.lvdt": "x_lvdt", "servo.current": "i_cmd", "controller.demand": "x_dem"}
+OF_STROKE = (  # what `reversals` works out
+    "speed_of_x_lvdt", "direction_of_x_lvdt", "distance_since_reversal_of_x_lvdt", "time_since_reversal_of_x_lvdt",
+)  # fmt: skip
+
+
+@compiled
+def _turns(x: Array, t: Array, band: float, s: Array, out: Array) -> None:
+    s[SIGNAL_AT + 9 :, 0] = 0.0
+    s[SIGNAL_AT + KNOWN, 0] = s[SIGNAL_AT + KNOWN + 1, 0] = x[0]
+    for k in range(len(x)):
+        turn(s, 0, x[k], t[k], band)
+        out[0, k], out[1, k], out[2, k] = s[SIGNAL_AT + 9, 0], s[SIGNAL_AT + 10, 0], s[SIGNAL_AT + 11, 0]
+
+
+def reversals(t: Array, stroke: Array, full: float) -> dict[str, Array]:
+    """Speed (mm/s) and direction of a stroke (mm), way (mm) and time (s) since it turned, by name of the quantity.
+
+    full  mm, the machine's stroke
+    """
+    out = np.empty((3, len(t)))
+    x = smoothed(t, stroke)
+    _turns(np.ascontiguousarray(x * 1e-3), t, 0.02e-3 * full, np.zeros((N_STATE, 1)), out)
+    return dict(zip(OF_STROKE, (np.gradient(x, t), out[0], out[1] * 1e3, out[2]), strict=True))
+
+
+def room_for(p: Array) -> int:
+    """How many curves more a machine with these parameters can have."""
+    return MOST_CURVES - int(p[CURVES].max())
+
+
+def curve_effect(name: str, law: Learned) -> tuple[Placed, Effect]:
+    """A law from a model file, as it runs and as the search has it: its curve times a scale, which is 1 as learned.
+
+    Another log need not have been everywhere where the law was learned, so that it cannot tell each of its numbers.
+    """
+    number = next(i for i, p in enumerate(ALL_PLACES) if (p.at, p.how) == (law.at, law.how))
+    table = law.table()(np.array(law.values))
+    curve = Curve(law.how, number, COLUMN, law.of, law.low, law.high, lambda scale: scale[0] * table)
+    effect = Effect(name, (Parameter(SCALE, 0.0, "-", scale=1.0),), ((1.0,),), "a function that was learned")
+    return Placed(name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(1), curve=curve), effect
+
+
+def remade(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]]) -> Stage:
+    """A stage of the vane chain with only these laws of the library, and these curves, as effects."""
+    assert isinstance(stage.made, Made)
+    make, driven = stage.made
+    out = make(driven._replace(laws=tuple(laws), curves=tuple(curves)))
+    for name in ("floor", "quiet", "noise", "raster_error", "memory", "regimes", "regime_units"):
+        setattr(out, name, getattr(stage, name))
+    return out
+
+
+def with_laws(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], log: str) -> Stage:
+    """`remade`, where the log has what the curves are of; InputError, one line, where it has not. Without curves: the
+    stage.
+    """
+    if not curves:
+        return stage
+    assert isinstance(stage.made, Made)
+    for placed, effect in curves:
+        assert placed.curve is not None
+        if stage.made.driven.quantity(placed.curve.quantity) is None:
+            raise InputError(f"{log}: {effect.name}: the log has no {placed.curve.quantity}")
+    return remade(stage, laws, curves)
+
+
+class VaneGround:
+    """A stage of the vane chain on its log (`vaneloop.discrepancy.models.learning.Ground`).
+
+    stage  with all laws that it can have
+    floor  noise of its outputs; None: its own
+    test   the same stage on a part of the log that nothing is fitted to
+    """
+
+    def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
+        assert isinstance(stage.made, Made) and stage.floor is not None
+        self.driven, self.all, self.test = stage.made.driven, stage, test
+        self.floor = stage.floor if floor is None else floor
+        self.tests: frozenset[str] = frozenset()
+        self.whole = stage
+        judge = Judge(stage, stage.floor)
+        fit = judge.fit((), stage.neutral(), 1)
+        if stage.excerpt is not None and len(stage.t) > WHOLE:
+            at = excerpt_of(judge, fit, PIECE, WHOLE)
+            self.rest = np.ones(len(stage.t), dtype=bool)
+            self.rest[at] = False
+            self.whole, self.tests = stage.excerpt(at), frozenset((REST,))
+        if test is not None:
+            self.tests |= {TEST}
+        self.small = self.whole
+        if stage.excerpt is not None and len(stage.t) > QUICK:
+            self.small = stage.excerpt(excerpt_of(judge, fit, PIECE, QUICK))
+
+    def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
+        """The same stage with only these laws of the library, and these curves, as effects."""
+        return remade(self.small if quick else self.whole, laws, curves)
+
+    def figures(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+        """RMS error of each output on what was fitted, and on the rest of the log where there is one."""
+        rest = self.rest if REST in self.tests else np.zeros(len(self.all.t), dtype=bool)
+        asked = [(LOG, self.all, ~rest), (REST, self.all, rest), (TEST, self.test, None)]
+        out = {}
+        for name, stage, part in asked:
+            if stage is None or (name == REST and REST not in self.tests):
+                continue
+            judge = Judge(remade(stage, (), curves), self.floor, part)
+            error = judge.errors(theta[None])[0] * judge.floor[:, None]
+            out[name] = np.sqrt(np.sum(error**2, axis=1, where=judge.valid) / np.maximum(judge.valid.sum(axis=1), 1))
+        return out
+
+    # ---- candidates --------------------------------------------------------------------------------------------------
+
+    def candidates(self, theta: Array) -> list[Candidate]:
+        """Every curve that may be missing, at parameters ``theta`` of the stage without any.
+
+        All may have a mean: a nominal parameter is known within its tolerance, and takes no more of it than that.
+        """
+        if not room_for(self.driven.machine.p):
+            return []
+        stage = self.stage((), ())
+        assert isinstance(stage.made, Made)
+        driven = stage.made.driven
+        judge = Judge(stage, self.floor)
+        fit = judge.fit((), theta, 1)
+        error = float(np.max(np.sqrt(np.sum((judge.errors(fit.theta[None])[0] * judge.floor[:, None]) ** 2, axis=1)
+                                     / np.maximum(judge.valid.sum(axis=1), 1))))  # fmt: skip
+        known = []
+        rows = np.isfinite(stage.measured).any(axis=0)
+        for signal in QUANTITIES.values():
+            values = driven.quantity(signal.name)
+            if values is None or (signal.name in VANES and signal.name not in driven.machine.vanes):
+                continue
+            basis = basis_of(values[rows], IN_TIME if signal.name == "time" else COUNT)
+            if basis is not None:
+                known.append((Quantity(signal.name, signal.unit, COLUMN, values[rows]), basis))
+        out = []
+        for number, place in enumerate(ALL_PLACES):
+            if place.stage != stage.name or driven.machine.kind not in place.kinds:
+                continue
+            if place.vane and place.vane not in stage.outputs:
+                continue
+            for q, basis in known:
+                if self._idle(place, q.name):
+                    continue
+                word = "gain" if place.how == "times" else "curve"
+                name = f"{place.at}.{word}_of_{q.name}"
+                size = self._size(place, error)
+                out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis))
+        return out
+
+    def _idle(self, place: Place, q: str) -> bool:
+        """Whether a curve there would say nothing of its own."""
+        own = OWN.get(place.at, place.at.removeprefix("sensors."))
+        if q == own and place.how == "times":
+            return True
+        if place.stage == "demand":
+            return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
+        if place.stage == "engine":
+            return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
+        if place.stage == "servo":
+            return q in VANES
+        if place.stage == "actuator":
+            return q in VANES or q == "x_dem"
+        return q in ("i_cmd", "x_dem", "n_dem")
+
+    def _size(self, place: Place, error: float) -> float:
+        """How large a curve there is in usual, in its unit; ``error``: RMS of the stage, in its output's."""
+        if place.how == "times":
+            return 0.3
+        p = self.driven.machine.p[:, 0]
+        return {
+            "engine.demand": 5.0, "valve.current": 1.0, "actuator.load": 0.2 * float(p[AREA] * p[P_REF]),
+            "linkage.play": 0.3, "sensors.lvdt": max(error, 0.05),
+        }.get(place.at, 0.3 if place.at.endswith("_play") else error)  # fmt: skip
