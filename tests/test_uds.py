@@ -19,6 +19,7 @@ import udsoncan
 from udsoncan.client import Client
 from udsoncan.exceptions import NegativeResponseException, TimeoutException
 
+from hil.calibrate.prepare import PATIENCE
 from hil.uds import TroubleMemory
 from hil.uds.server import SIGNALS, key_of
 from hil.uds.station import FUNCTIONAL, REQUEST, RESPONSE
@@ -185,6 +186,55 @@ def test_a_calibration_file_is_loaded_whole_or_not_at_all() -> None:
         answers = bench.ask("37", 400)
         assert answers == (["7F 37 78", "77"] if good else ["7F 37 78", "7F 37 72"]), answers
         assert bench.node.loop.calibration.scalars.kp == 12.0 != kp
+
+
+def given_a_file(bench: Bench, change: str) -> None:
+    """Transfer a calibration.toml with another kp."""
+    raw = path("calibration.toml").read_text(encoding="utf-8").replace("kp = { value = 16.0", change).encode()
+    unlock(bench, 2)
+    bench.ask(b"\x34\x00\x44" + struct.pack(">II", 0, len(raw)))
+    for n, at in enumerate(range(0, len(raw), 254), 1):
+        bench.ask(bytes([0x36, n & 255]) + raw[at : at + 254])
+
+
+def test_a_file_is_refused_where_the_loop_was_closed_while_it_was_checked() -> None:
+    bench = Bench(request=0).run(500)
+    given_a_file(bench, "kp = { value = 12.0")
+    assert bench.server.request(bench.node.k, b"\x37") == []
+    # whoever else asks in the same tick is answered
+    assert bench.server.request(bench.node.k, b"\x3e\x00") == [b"\x7e\x00"]
+    assert bench.server.request(bench.node.k, b"\x22\xf1\x86") == [b"\x7f\x22\x21"]
+    assert bench.ecu is not None
+    bench.ecu.set_demand(70.0, mode_request=1)
+    answers = []
+    for _ in range(200):
+        answers += [a.hex() for a in bench.server.before(bench.node.k)]
+        bench.tick()
+    assert answers == ["7f3778", "7f3722"] and bench.node.mode == "RUN"
+    assert bench.node.loop.calibration.scalars.kp == 16.0
+
+
+def test_a_file_waits_for_its_check_as_long_as_that_takes() -> None:
+    bench = Bench(request=0).run(500)
+    given_a_file(bench, "kp = { value = 12.0")
+    desk = bench.memory.desk
+    runner, desk.runner = desk.runner, Never()  # type: ignore[assignment]
+    bench.server.request(bench.node.k, b"\x37")
+    answers = [frame[1:4].hex() for _ in range(PATIENCE + 10) for frame in bench.tick()]
+    assert answers == ["7f3778", "7f3772"] and bench.node.loop.calibration.scalars.kp == 16.0
+    desk.runner = runner
+    given_a_file(bench, "kp = { value = 12.0")
+    assert bench.ask("37", 400) == ["7F 37 78", "77"] and bench.node.loop.calibration.scalars.kp == 12.0
+
+
+class Never:
+    """Work that is never done."""
+
+    def begin(self, *of: Any) -> None:
+        """Forget it."""
+
+    def done(self) -> tuple[int, Any]:
+        return 0, None
 
 
 def test_nothing_that_opens_the_loop_is_done_in_run() -> None:

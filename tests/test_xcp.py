@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller import INPUTS, MODES, load_calibration
+from controller import FAULTS, INPUTS, MODES, load_calibration
 from controller.records import STATE
+from hil.bus.frames import HEAD_MASK, noted
 from hil.calibrate import Attended, Memory, Slave
 from hil.calibrate.a2l import a2l_of
 from hil.calibrate.memory import CALIBRATION, Refusal
+from hil.calibrate.prepare import PATIENCE, WORK, Desk, Outside, Task
 from hil.calibrate.slave import key_of
-from hil.calibrate.station import MASTER, SLAVE, XcpService, row_of
+from hil.calibrate.station import MASTER, SLAVE, XcpService, data_of, replay_attended, row_of
 from hil.loop.node import Ecu, Node
 from hil.native import Program
 from hil.native.program import own_scalars
@@ -33,6 +35,12 @@ from tests.native_builds import build
 from vaneloop.base.tables import path as table_path
 
 NOTHING = np.zeros((0, 2), np.int64)
+
+
+def done(memory: Memory, task: Task | None) -> None:
+    """Let what a task changes take effect now."""
+    if task is not None:
+        task.finish(WORK[task.name](memory.elements, *task.arguments))
 
 
 class Bench:
@@ -55,10 +63,18 @@ class Bench:
         self.sent = out[~own].copy()
         return [(d & (1 << 64) - 1).to_bytes(8, "little")[: h >> 32 & 15] for h, d in out[own].tolist()]
 
+    def answers(self, command: str | bytes, n: int = 1) -> list[bytes]:
+        """The ``n`` answers to a command; one that is checked outside of the tick comes later."""
+        out = self.tick(bytes.fromhex(command) if isinstance(command, str) else command)
+        for _ in range(3):
+            if len(out) < n:
+                out += self.tick()
+        assert len(out) == n, out
+        return out
+
     def ask(self, command: str | bytes) -> bytes:
         """The one answer to a command."""
-        (answer,) = self.tick(bytes.fromhex(command) if isinstance(command, str) else command)
-        return answer
+        return self.answers(command)[0]
 
     def run(self, ticks: int = 500) -> Bench:
         """Run until the controller is in RUN."""
@@ -181,7 +197,7 @@ def test_other_nodes_of_the_same_tables_are_left_alone() -> None:
     node = Node(calibration=tables)
     kp = float(tables.scalars.kp)
     memory = Memory(node)
-    memory.change({memory.by_name()["kp"]: 0.5 * kp})
+    done(memory, memory.change({memory.by_name()["kp"]: 0.5 * kp}))
     assert node.loop.calibration.scalars.kp == 0.5 * kp and tables.scalars.kp == kp
 
 
@@ -192,10 +208,10 @@ def test_a_frozen_page_is_loaded_as_the_same_bits(tmp_path: Path) -> None:
     for name in ("kp", "ki", "kff", "trend_hold", "lead"):
         i = bench.memory.by_name()[name]
         e = bench.memory.elements[i]
-        bench.memory.change({i: float(rng.uniform(e.low, min(e.high, 0.4)))})
+        done(bench.memory, bench.memory.change({i: float(rng.uniform(e.low, min(e.high, 0.4)))}))
     assert bench.ask("F9 01 00 00") == b"\xfe\x27"
     bench.ask("E6 01 00")
-    assert bench.tick(bytes.fromhex("F9010000")) == [b"\xff", b"\xfd\x03"]
+    assert bench.answers("F9010000", 2) == [b"\xff", b"\xfd\x03"]
     back = load_calibration(
         tmp_path / "tuned" / "calibration.toml",
         tmp_path / "tuned" / "stroke_tables.toml",
@@ -256,10 +272,181 @@ def test_stimulated_speeds_and_angles_reach_the_firmware_and_end_by_themselves()
     assert bench.node.mode == "RUN" and bench.node.counts["wrong_crc"] == 0
     bench.run(130)
     assert fed.n_dem == pytest.approx(70.0, abs=0.002) and fed.pots[0] != 0.25
-    bench.ask("DE 00 00 00")
-    bench.ask("E2 00 00 00 00 00")
-    bench.ask(struct.pack("<BBBBI", 0xE1, 0xFF, 4, 1, 0x10000000 + 4 * INPUTS.index("x_lvdt")))
-    assert bench.ask("DE 01 00 00") == b"\xfe\x2a"
+
+
+INPUT = 0x10000000  # address of the first
+
+
+def stim_list(bench: Bench) -> None:
+    """A list of one entry, and the pointer at it."""
+    for command in ("D6", "D5 00 01 00", "D4 00 00 00 01", "D3 00 00 00 00 01", "E2 00 00 00 00 00"):
+        assert bench.ask(command) == b"\xff", command
+
+
+def entry(size: int, ext: int, address: int) -> bytes:
+    """WRITE_DAQ of whole bytes."""
+    return struct.pack("<BBBBI", 0xE1, 0xFF, size, ext, address)
+
+
+def test_a_stimulated_stroke_is_what_the_monitors_judge() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    stim_list(bench)
+    assert bench.ask("E0 02 00 00 00 00 01 00") == b"\xff"
+    assert bench.ask(entry(4, 1, INPUT + 4 * INPUTS.index("x_lvdt"))) == b"\xff"
+    assert bench.ask("DE 01 00 00") == b"\xff\x00"
+    loop, alone = bench.node.loop, Node(seed=3)
+    own = loop.fed.x_lvdt
+    assert bench.tick(b"\0" + struct.pack("<f", own)) == [] and loop.fed.x_lvdt == np.float32(own)
+    assert bench.node.faults == 0
+    high = float(loop.calibration.scalars.lvdt_high) + 1e-3
+    for _ in range(60):
+        bench.tick(b"\0" + struct.pack("<f", high))
+    assert loop.fed.x_lvdt == np.float32(high)
+    assert bench.node.faults >> FAULTS.index("lvdt_range") & 1 and bench.node.mode == "FAIL_SAFE"
+    assert abs(loop.given.i_cmd) <= loop.calibration.scalars.current_limit
+    bench.run(130)
+    assert loop.fed.x_lvdt != np.float32(high) and np.isnan(alone.loop.lvdt).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "ext", "address", "code"),
+    [
+        (4, 1, INPUT + 4 * INPUTS.index("n_r") + 2, "fe22"),  # between two inputs
+        (2, 1, INPUT, "fe22"),
+        (4, 0, INPUT, "fe22"),
+        (4, 1, INPUT + 4 * INPUTS.index("demand_fresh"), "fe23"),  # monitors judge by it
+        (4, 1, INPUT + 4 * INPUTS.index("pause"), "fe23"),
+        (4, 1, 0x12000000, "fe22"),
+        (4, 1, CALIBRATION, "fe22"),
+    ],
+)
+def test_what_is_not_one_input_cannot_be_stimulated(size: int, ext: int, address: int, code: str) -> None:
+    bench = Bench().run(1)
+    bench.ask("FF00")
+    stim_list(bench)
+    assert bench.ask(entry(size, ext, address)) == b"\xff"  # it may be measured
+    assert bench.ask("E0 02 00 00 00 00 01 00").hex() == code
+    stim_list(bench)
+    assert bench.ask("E0 02 00 00 00 00 01 00") == b"\xff"
+    assert bench.ask(entry(size, ext, address)).hex() == code
+
+
+def test_an_overload_says_so_by_itself() -> None:
+    bench = Bench().run(20)
+    bench.ask("FF00")
+    tables = 33  # one more than a tick takes
+    for command in ("D6", "D5 00 01 00", f"D4 00 00 00 {tables:02X}"):
+        bench.ask(command)
+    for t in range(tables):
+        bench.ask(f"D3 00 00 00 {t:02X} 01")
+        bench.ask(f"E2 00 00 00 {t:02X} 00")
+        bench.ask(entry(4, 1, 0x12000000))
+    bench.ask("E0 10 00 00 00 00 01 00")
+    assert b"\xfd\x06" in bench.tick(b"\xde\x01\x00\x00")
+    seen = [frame for _ in range(1000) for frame in bench.tick()]
+    assert set(seen) == {b"\xfd\x06"} and 9 <= len(seen) <= 11, "again as long as it lasts, but not in every tick"
+
+
+class Held:
+    """Work that is done when a test says so."""
+
+    def __init__(self, memory: Memory):
+        self.memory, self.held, self.free = memory, (0, None), False
+
+    def begin(self, number: int, name: str, arguments: tuple[Any, ...]) -> None:
+        self.held = number, WORK[name](self.memory.elements, *arguments)
+
+    def done(self) -> tuple[int, Any]:
+        return self.held if self.free else (0, None)
+
+
+@pytest.mark.parametrize("what", ["value", "page", "copy", "save"])
+def test_no_tick_waits_for_a_check_and_what_it_changes_acts_whole_with_its_answer(what: str, tmp_path: Path) -> None:
+    bench = Bench(save=tmp_path).run()
+    bench.ask("FF00")
+    write(bench, "kp", 12.5)
+    bench.memory.desk = bench.attended.desk = Desk(held := Held(bench.memory))  # type: ignore[arg-type]
+    command = {"page": "EB 01 00 01", "copy": "E4 00 01 00 00", "save": "F9 01 00 00"}.get(what, "F0 02 26 40")
+    if what == "value":
+        bench.ask(struct.pack("<BxxBI", 0xF6, 0, number(bench, "kp")))
+        bench.ask("F0 06 00 00 00 00 00 00")
+    bench.ask("E6 01 00")
+    was = bench.memory.live()
+    for frames in (bench.tick(bytes.fromhex(command)), bench.tick(b"\xfd"), *(bench.tick() for _ in range(40))):
+        assert frames == [] and (bench.memory.live() == was).all() and not list(tmp_path.glob("*"))[3:]
+    held.free = True
+    assert bench.tick()[0] == b"\xff"
+    kp = bench.node.loop.calibration.scalars.kp
+    assert kp == {"value": 11.0, "page": 16.0, "copy": 16.0, "save": 12.5}[what]
+    assert (tmp_path / "calibration.toml").exists() == (what == "save")
+
+
+def test_a_check_that_does_not_end_is_given_up_and_changes_nothing() -> None:
+    bench = Bench().run()
+    bench.ask("FF00")
+    bench.memory.desk = bench.attended.desk = Desk(Held(bench.memory))  # type: ignore[arg-type]
+    bench.memory.desk.k = bench.node.k
+    bench.tick(b"\xeb\x01\x00\x01")
+    answers = [frame.hex() for _ in range(PATIENCE + 2) for frame in bench.tick()]
+    assert answers == ["fe10"] and bench.memory.ecu_page == 0
+    assert bench.ask("EA 01 00") == b"\xff\x00\x00\x00"
+
+
+def test_whether_a_monitor_may_be_set_is_asked_again_when_it_would_act() -> None:
+    bench = Bench()
+    bench.ask("FF00")
+    bench.memory.desk = bench.attended.desk = Desk(held := Held(bench.memory))  # type: ignore[arg-type]
+    raw = struct.pack("<d", 0.004)
+    bench.ask(struct.pack("<BxxBI", 0xF6, 0, number(bench, "tracking_limit")))
+    bench.ask(b"\xf0\x06" + raw[:6])
+    was = bench.memory.live()
+    assert bench.node.mode == "INIT" and bench.tick(b"\xf0\x02" + raw[6:]) == []
+    bench.run()
+    assert bench.node.mode == "RUN"
+    held.free = True
+    assert bench.tick() == [b"\xfe\x23"] and (bench.memory.live() == was).all()
+
+
+def test_a_session_in_real_time_is_repeated_from_its_record(tmp_path: Path) -> None:
+    """The record has the notes of `heed`; whenever the checks were done, they act in the same ticks again."""
+    bench = Bench().run()
+    bench.attended.told = True
+    bench.memory.desk = bench.attended.desk = Desk(Outside(bench.memory.elements))
+    taken: list[tuple[int, list[Any]]] = []
+    sent: list[tuple[int, list[int]]] = []
+    rows, k0 = np.zeros((64, 2), np.int64), bench.node.k
+    start = (bench.node.loop.z.copy(), bench.node.loop.s.copy())
+
+    def tick(*commands: bytes) -> list[bytes]:
+        frames = [*bench.ecu.tick(bench.sent).tolist(), *(list(row_of(MASTER, c)) for c in commands)]
+        rows[: len(frames)] = np.array(frames, np.int64).reshape(-1, 2)
+        n = bench.attended.heed(rows, len(frames))
+        k = bench.node.k
+        taken.extend((k - k0, row) for row in (rows[:n] & [HEAD_MASK, -1]).tolist())
+        out = bench.attended.tick(rows, n)
+        sent.extend((k - k0, row) for row in out.tolist())
+        own = out[:, 0] & 0x7FF == SLAVE
+        bench.sent = out[~own].copy()
+        return [data_of(h, d) for h, d in out[own].tolist()]
+
+    for command in ("FF 00", "F6 00 00 00 60 00 00 20", "F0 06 00 00 00 00 00 00", "F0 02 29 40", "EB 03 00 01"):
+        answers = tick(bytes.fromhex(command))
+        while not answers:
+            time.sleep(0.001)
+            answers = tick()
+        assert answers == [b"\xff" + answers[0][1:]], command
+    for _ in range(50):
+        tick()
+    assert bench.memory.ecu_page == 1
+
+    other = Bench().run()
+    assert (other.node.loop.z == start[0]).all() and (other.node.loop.s == start[1]).all()
+    other.attended.told = True
+    at, frames = np.array([t for t, _ in taken]), np.array([row for _, row in taken], np.int64)
+    k, again = replay_attended(other.attended, at, noted(frames), bench.node.k - k0)
+    assert k.tolist() == [t for t, _ in sent] and again.tolist() == [row for _, row in sent]
+    assert other.node.fingerprint() == bench.node.fingerprint() and (other.memory.live() == bench.memory.live()).all()
 
 
 def test_a_flood_is_bounded() -> None:
@@ -448,12 +635,12 @@ def test_scalars_of_a_controller_in_c_are_calibrated_in_its_own_memory(tmp_path:
     (name, told), *_ = own.items()
     i = memory.by_name()[f"own_{name}"]
     wanted = told["low"] + 0.25 * (told["high"] - told["low"])
-    memory.change({i: wanted})
+    done(memory, memory.change({i: wanted}))
     assert own_scalars(node.loop.foreign)[name]["value"][0] == wanted == memory.live()[i]
     assert memory.read(0, CALIBRATION + 8 * i, 8) == struct.pack("<d", wanted)
     with pytest.raises(Refusal, match="must be in"):
         memory.change({i: told["high"] * 2.0 + 1.0})
-    memory.save(tmp_path / "tuned")
+    done(memory, memory.save(tmp_path / "tuned"))
     again = Program(library, str(tmp_path / "tuned" / "own_calibration.toml"))
     other = Node(calibration=load_calibration()._replace(program=again))
     assert own_scalars(other.loop.foreign)[name]["value"][0] == wanted

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "ANGLES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "REMOTE", "VGV_ANGLES",
-    "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
+    "ANGLES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "PREPARED", "REMOTE",
+    "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
     "VGV_SERVO",
     "VGV_STATUS",
     "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes",
@@ -64,6 +64,8 @@ _CRC.setflags(write=False)
 # "this node stood still before this tick": word 1 is for how many ticks. In a record it is a frame under an identifier
 # that no node takes.
 PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
+# "work for a tool is done, and takes effect before this tick" (`hil.calibrate.prepare`): word 1 is its number
+PREPARED = NOTE | EXTENDED | CLASSIC | 0x1FFFFF51
 
 
 # ---- bits ------------------------------------------------------------------------------------------------------------
@@ -325,9 +327,10 @@ def refused(r: np.ndarray) -> int:
 
 
 def noted(rows: np.ndarray) -> np.ndarray:
-    """Return recorded frames as a node has to get them again: notes of pauses are notes."""
+    """Return recorded frames as a node has to get them again: what was a note is one."""
     out = rows.copy()
-    out[out[:, 0] == PAUSE & HEAD_MASK, 0] = PAUSE
+    for note in (PAUSE, PREPARED):
+        out[out[:, 0] == note & HEAD_MASK, 0] = note
     return out
 
 

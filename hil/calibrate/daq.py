@@ -14,7 +14,7 @@ from itertools import takewhile
 import numpy as np
 
 from hil.calibrate.errors import ACTIVE, CONFIG, FULL, MODE, RANGE, SEQUENCE, Refusal
-from hil.calibrate.memory import INPUTS, SHORT, Memory
+from hil.calibrate.memory import Memory
 from hil.calibrate.stim import Stimulus
 from vaneloop.base.compiled import in_place
 
@@ -138,6 +138,8 @@ class Daq:
         taken = sum(e[0] for i, e in enumerate(entries) if e is not None and i != entry)
         if bit != 0xFF or not 1 <= size <= room - taken or self.memory.place(ext, address, size) is None:
             raise Refusal(RANGE, f"{size} bytes at {address:#x} (extension {ext}) cannot be measured here")
+        if own.stim:
+            self.stimulus.number(size, ext, address)
         entries[entry] = size, ext, address
         self.pointer = at, table, entry + 1
 
@@ -169,6 +171,9 @@ class Daq:
             raise Refusal(MODE, f"mode (={mode:#x}) must be 0x10, or 0x02 for STIM")
         if event >= len(EVENTS) or prescaler < 1:
             raise Refusal(RANGE, f"event (={event}) must be below {len(EVENTS)}, prescaler (={prescaler}) 1 or more")
+        if mode == 0x02:
+            for e in (e for t in own.tables for e in t if e is not None):
+                self.stimulus.number(*e)
         own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == 0x02
 
     def mode_of(self, at: int) -> tuple[int, int, int, int]:
@@ -214,9 +219,6 @@ class Daq:
         before = takewhile(lambda of: of is not own, self.lists)
         own.first_pid = pid = sum(len(of.tables) for of in before)
         if own.stim:
-            entries = [e for t in own.tables for e in t if e is not None]
-            if not all(e[0] == 4 and e[1] == SHORT and self.stimulus.allowed((e[2] - INPUTS) // 4) for e in entries):
-                raise Refusal(CONFIG, "STIM takes whole inputs in single precision, but not the LVDT's")
             own.raw = [b""] * len(own.tables)
             return
         plan: list[tuple[int, int, int, int]] = []
@@ -265,7 +267,7 @@ class Daq:
                             return
                         for i, entry in enumerate(table):
                             assert entry is not None
-                            values[(entry[2] - INPUTS) // 4] = struct.unpack_from("<f", raw, 4 * i)[0]
+                            values[self.stimulus.number(*entry)] = struct.unpack_from("<f", raw, 4 * i)[0]
                     own.raw = [b""] * len(own.tables)
                     self.stimulus.give(k, values)
                 return

@@ -11,7 +11,7 @@ Address extension 1 shows the same numbers in single precision, number i at 4 i 
 of them in a frame. Page 0 is the working page, page 1 the reference page, the calibration as it was loaded.
 
 A write is kept back until all bytes of a number are there, then it is checked and takes effect whole. Whoever writes
-calls between two ticks.
+calls between two ticks. What takes longer than a tick may is a `hil.calibrate.prepare.Task`, for the `desk`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ import numpy as np
 
 from controller.records import INIT, INPUT_FIELDS, OUTPUT_FIELDS, STANDBY, STATE_FIELDS, Field
 from hil.calibrate import elements
-from hil.calibrate.errors import DENIED, NO_PAGE, PROTECTED, RANGE, VERIFY, Refusal
+from hil.calibrate.errors import DENIED, NO_PAGE, PROTECTED, RANGE, Refusal
+from hil.calibrate.prepare import AtOnce, Desk, Task
 from hil.loop.node import Node
 from hil.native.program import own_scalars
 
@@ -60,6 +61,7 @@ class Memory:
     elements  what each number of the calibration is (`hil.calibrate.elements.Element`)
     pages     float64[n] working page and reference page
     ecu_page, xcp_page  the page that the firmware uses, and the one that the tool sees
+    desk      has done what takes longer than a tick may
     """
 
     def __init__(self, node: Node):
@@ -73,7 +75,9 @@ class Memory:
         own = own_scalars(loop.foreign)
         self._own = [o["value"] for o in own.values()]
         self.elements = elements.elements_of(loop.calibration, own)
+        self._guarded = np.array([e.guarded for e in self.elements])
         self.curves = elements.curves_of(loop.calibration)
+        self.desk = Desk(AtOnce(self.elements))
         live = self.live()
         self.pages = [live.copy(), live.copy()]
         self.ecu_page = self.xcp_page = WORKING
@@ -166,7 +170,7 @@ class Memory:
         """Drop the numbers of which not all bytes have come."""
         self._half.clear()
 
-    def write(self, ext: int, address: int, data: bytes) -> None:
+    def write(self, ext: int, address: int, data: bytes) -> Task | None:
         """Write bytes into the working page; numbers that are complete take effect together. Raises `Refusal`, and then
         nothing has changed.
         """
@@ -188,16 +192,31 @@ class Memory:
             if mask == (1 << width) - 1:
                 del half[2 * number + ext]
                 values[number] = float(np.frombuffer(bytes(raw), np.float32 if ext == SHORT else np.float64)[0])
-        try:
-            self.change(values)
-        except Refusal:
-            for number in values:
-                self._half.pop(2 * number + ext, None)
-            raise
-        self._half = half
+        forgotten = [2 * number + ext for number in values]
 
-    def change(self, values: dict[int, float]) -> None:
-        """Give numbers of the working page other values, all or none. Raises `Refusal`."""
+        def finish(result: Any) -> None:
+            for key in forgotten:
+                self._half.pop(key, None)
+            if task is not None:
+                task.finish(result)
+            self._half = half
+
+        try:
+            task = self.change(values)
+        except Refusal:
+            for key in forgotten:
+                self._half.pop(key, None)
+            raise
+        if task is not None:
+            return task._replace(finish=finish)
+        finish(None)
+        return None
+
+    def change(self, values: dict[int, float], *, judged: bool = False) -> Task | None:
+        """Give numbers of the working page other values, all or none: now, or with the task returned. Raises `Refusal`.
+
+        judged  they are of a whole table that has been read
+        """
         page = self.pages[WORKING]
         active = self.ecu_page == WORKING
         now = self.live() if active else page
@@ -210,24 +229,39 @@ class Memory:
                 raise Refusal(PROTECTED, f"{e.name} belongs to the machine")
             if e.name == "current_limit" and v > self.pages[REFERENCE][i]:
                 raise Refusal(RANGE, f"current_limit (={v:g} A) must not exceed the reference page's")
-            if active and e.guarded:
-                self._open_only(e.name)
-        if not new:
-            return
+        numbers = np.array(list(new), np.int64)
         row = now.copy()
-        row[list(new)] = list(new.values())
+        row[numbers] = list(new.values())
+
+        def finish(why: str = "") -> None:
+            if active:
+                self._accept(row, numbers, why)
+            page[numbers] = row[numbers]
+
         if active:
-            self._judge(row, {self.elements[i].table for i in new})
-            self._load(row, np.array(list(new)))
-        page[list(new)] = list(new.values())
+            self._allowed(numbers)
+        tables = tuple(sorted({self.elements[i].table for i in new} - {""}))
+        if active and tables and not judged:
+            return Task("judge", (row, tables), finish)
+        finish()
+        return None
 
-    def _open_only(self, name: str) -> None:
-        if int(self.loop.given.mode) not in (INIT, STANDBY):
-            raise Refusal(PROTECTED, f"{name} may be changed in INIT and STANDBY only")
+    def _allowed(self, numbers: np.ndarray) -> None:
+        """Refuse numbers that must not be changed while the loop is closed. Raises `Refusal`."""
+        if int(self.loop.given.mode) in (INIT, STANDBY):
+            return
+        guarded = numbers[self._guarded[numbers]]
+        if len(guarded):
+            raise Refusal(PROTECTED, f"{self.elements[guarded[0]].name} may be changed in INIT and STANDBY only")
 
-    def _judge(self, row: np.ndarray, tables: set[str]) -> None:
-        if why := elements.complaint(self.elements, row, tuple(sorted(tables - {""}))):
+    def _accept(self, row: np.ndarray, numbers: np.ndarray, why: str) -> None:
+        """Put numbers of a row into the firmware, unless there is a reason why not or the loop has been closed. Raises
+        `Refusal`.
+        """
+        if why:
             raise Refusal(RANGE, why)
+        self._allowed(numbers)
+        self._load(row, numbers)
 
     def _load(self, row: np.ndarray, numbers: np.ndarray) -> None:
         """Put numbers of a row into the arrays that the firmware reads, and into what an injected effect starts
@@ -240,37 +274,43 @@ class Memory:
 
     # ---- pages -------------------------------------------------------------------------------------------------------
 
-    def use(self, page: int, *, ecu: bool, xcp: bool) -> None:
-        """Choose the page that the firmware uses, the one that the tool sees, or both. Raises `Refusal`."""
+    def use(self, page: int, *, ecu: bool, xcp: bool) -> Task | None:
+        """Choose the page that the firmware uses, the one that the tool sees, or both: now, or with the task returned.
+        Raises `Refusal`.
+        """
         if page not in (WORKING, REFERENCE):
             raise Refusal(NO_PAGE, f"page (={page}) must be 0 or 1")
-        if ecu and page != self.ecu_page:
-            row, now = self.pages[page], self.live()
-            for i in np.flatnonzero(row != now).tolist():
-                if self.elements[i].guarded:
-                    self._open_only(self.elements[i].name)
-            self._judge(row, {e.table for e in self.elements})
-            self._load(row, np.arange(len(row)))
-            self.ecu_page = page
-        if xcp:
-            self.xcp_page = page
-            self.forget()
+        row = self.pages[page].copy()
+        switched = ecu and page != self.ecu_page
 
-    def copy(self, source: int, target: int) -> None:
-        """Copy the reference page over the working page, whole. Raises `Refusal`."""
+        def finish(why: str = "") -> None:
+            if switched:
+                self._accept(row, np.flatnonzero(row != self.live()), why)
+                self.ecu_page = page
+            if xcp:
+                self.xcp_page = page
+                self.forget()
+
+        if switched:
+            self._allowed(np.flatnonzero(row != self.live()))
+            return Task("judge", (row, tuple(sorted({e.table for e in self.elements} - {""}))), finish)
+        finish()
+        return None
+
+    def copy(self, source: int, target: int) -> Task | None:
+        """Copy the reference page over the working page, whole: now, or with the task returned. Raises `Refusal`."""
         if (source, target) != (REFERENCE, WORKING):
             raise Refusal(PROTECTED if target == REFERENCE else NO_PAGE, "only page 1 can be copied to page 0")
-        self.change(dict(enumerate(self.pages[REFERENCE].tolist())))
+        return self.change(dict(enumerate(self.pages[REFERENCE].tolist())))
 
-    def save(self, folder: Path) -> list[Path]:
-        """Write the working page as tables that ``--tables`` takes; return the files. Raises `Refusal`."""
-        page = self.pages[WORKING]
-        if why := elements.complaint(self.elements, page, tuple(elements.MODELS)):
-            raise Refusal(VERIFY, why)
-        try:
-            return elements.write_tables(folder, self.elements, page)
-        except OSError as e:
-            raise Refusal(DENIED, f"{folder}: {e.strerror}") from None
+    def save(self, folder: Path) -> Task:
+        """The task that writes the working page, as it is now, as tables that ``--tables`` takes."""
+
+        def finish(result: tuple[int, str]) -> None:
+            if result[0]:
+                raise Refusal(*result)
+
+        return Task("save", (self.pages[WORKING].copy(), folder), finish)
 
     def by_name(self) -> dict[str, int]:
         """Number of each element, by name."""

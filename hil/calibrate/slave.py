@@ -1,7 +1,9 @@
 """An XCP slave (ASAM MCD-1 XCP 1.x) as a pure machine: a command's bytes in, the answers' bytes out.
 
 It has no clock and no bus. Commands are given between two ticks, so what they change takes effect whole, and what they
-read is what the last tick used. Numbers are little-endian, addresses count bytes (docs/xcp.md has every command).
+read is what the last tick used. The answer to a command whose check takes longer than a tick comes later
+(`Slave.late`); while it waits, `Slave.waiting`, no other command may be given. Numbers are little-endian, addresses
+count bytes (docs/xcp.md has every command).
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from hil.calibrate.errors import (
     Refusal,
 )
 from hil.calibrate.memory import CALIBRATION, EXACT, REFERENCE, WORKING, Memory
+from hil.calibrate.prepare import Task
 
 __all__ = ["NAME", "RESOURCES", "Slave", "key_of"]
 
@@ -43,6 +46,7 @@ STORE_CAL, DAQ_RUNS = 0x01, 0x40  # bits of the session's status
 MOST_CHECKED = 1 << 20  # bytes of a checksum
 SEED = 6  # bytes: seed and key fill one frame
 MILLISECOND = 6  # code of the unit of times
+AGAIN = 100  # ticks between two words about an overload that goes on
 
 
 def key_of(resource: str, seed: bytes) -> bytes:
@@ -84,8 +88,10 @@ class Slave:
         self._seed: tuple[int, bytes] | None = None
         self._freeze = False
         self._mta: tuple[bytes | None, int, int] = (None, EXACT, 0)  # a text of ours or memory: extension, address
-        self._told = 0
-        self._commands: dict[int, tuple[Callable[[bytes], list[bytes]], int, str]] = {
+        self.waiting = False  # for the result of a check
+        self._late: list[bytes] = []
+        self._told, self._told_at = 0, -AGAIN
+        self._commands: dict[int, tuple[Callable[[bytes], list[bytes] | None], int, str]] = {
             0xFE: (self._disconnect, 1, ""),
             0xFD: (self._status, 1, ""),
             0xFC: (self._synch, 1, ""),
@@ -127,7 +133,7 @@ class Slave:
         }
 
     def command(self, data: bytes) -> list[bytes]:
-        """Carry out one command; return the answers, none while nobody is connected."""
+        """Carry out one command; return the answers that are there now, none while nobody is connected."""
         if not data:
             return []
         code = data[0]
@@ -153,7 +159,7 @@ class Slave:
         if resource and self._locked & RESOURCES[resource]:
             return [self._refuse(LOCKED, f"{resource} is locked: GET_SEED, UNLOCK")]
         try:
-            return carry_out(data)
+            return carry_out(data) or []
         except Refusal as e:
             return [self._refuse(e.code, str(e))]
 
@@ -162,12 +168,28 @@ class Slave:
         self.k = k + 1
         return self.daq.sample(k)
 
-    def news(self) -> list[bytes]:
-        """Return event packets: measurements were left out since the last call."""
-        if self.daq.overloads == self._told:
-            return []
-        self._told = self.daq.overloads
-        return [bytes([EVENT, OVERLOADED])]
+    def late(self) -> list[bytes]:
+        """Return the answers and events that have come since the last call: of a check that is done, of measurements
+        that were left out.
+        """
+        out, self._late = self._late, []
+        if self.daq.overloads != self._told and self.k - self._told_at >= AGAIN:
+            self._told, self._told_at = self.daq.overloads, self.k
+            out.append(bytes([EVENT, OVERLOADED]))
+        return out
+
+    def _after(self, task: Task | None, answers: Callable[[], list[bytes]]) -> list[bytes] | None:
+        """Answer when ``task`` has taken effect; at once where there is none."""
+        if task is None:
+            return answers()
+
+        def then(why: Refusal | None) -> None:
+            self.waiting = False
+            self._late += answers() if why is None else [self._refuse(why.code, str(why))]
+
+        self.memory.desk.begin(task, then)
+        self.waiting = True
+        return None
 
     def _refuse(self, code: int, why: str) -> bytes:
         self.why = why
@@ -189,6 +211,7 @@ class Slave:
         """Begin as if nobody had been here; what was calibrated stays."""
         self.daq.free()
         self.daq.step = 0
+        self._told = self.daq.overloads
         self.memory.forget()
         self._locked, self._seed = self._lockable, None
         self._mta = None, EXACT, 0
@@ -219,15 +242,14 @@ class Slave:
         self._mta = text, EXACT, 0
         return [struct.pack("<BBHI", OK, 0, 0, len(text))]
 
-    def _request(self, data: bytes) -> list[bytes]:
+    def _request(self, data: bytes) -> list[bytes] | None:
         if data[1] != STORE_CAL:
             raise Refusal(RANGE, f"mode (={data[1]:#x}) must be 1, store the calibration")
         if self.folder is None:
             raise Refusal(DENIED, "there is no folder to save into")
         if not self._freeze:
             raise Refusal(MODE, "SET_SEGMENT_MODE with freeze comes first")
-        self.memory.save(self.folder)
-        return [bytes([OK]), bytes([EVENT, STORED])]
+        return self._after(self.memory.save(self.folder), lambda: [bytes([OK]), bytes([EVENT, STORED])])
 
     def _get_seed(self, data: bytes) -> list[bytes]:
         resource = data[2]
@@ -288,7 +310,7 @@ class Slave:
             return [struct.pack("<BBHI", ERROR, RANGE, 0, MOST_CHECKED)]
         return [struct.pack("<BBHI", OK, 0x09, 0, zlib.crc32(self._take(n)))]  # CRC-32 of IEEE 802.3
 
-    def _download(self, data: bytes) -> list[bytes]:
+    def _download(self, data: bytes) -> list[bytes] | None:
         n = data[1]
         if n == 0 or n > self.max_cto - 2:
             raise Refusal(RANGE, f"number (={n}) must be 1 to {self.max_cto - 2}")
@@ -297,11 +319,14 @@ class Slave:
         text, ext, at = self._mta
         if text is not None:
             raise Refusal(PROTECTED, "a text cannot be written")
-        self.memory.write(ext, at, data[2 : 2 + n])
-        self._mta = None, ext, at + n
-        return [bytes([OK])]
 
-    def _short_download(self, data: bytes) -> list[bytes]:
+        def written() -> list[bytes]:
+            self._mta = None, ext, at + n
+            return [bytes([OK])]
+
+        return self._after(self.memory.write(ext, at, data[2 : 2 + n]), written)
+
+    def _short_download(self, data: bytes) -> list[bytes] | None:
         n = data[1]
         if not 1 <= n <= self.max_cto - 8:
             raise Refusal(RANGE, f"number (={n}) must be 1 to {self.max_cto - 8}; here a frame has no room for more")
@@ -316,14 +341,13 @@ class Slave:
         if segment != 0:
             raise Refusal(SEGMENT, f"segment (={segment}) must be 0")
 
-    def _set_page(self, data: bytes) -> list[bytes]:
+    def _set_page(self, data: bytes) -> list[bytes] | None:
         mode, segment, page = data[1:4]
         if not mode & 0x80:
             self._of_segment(segment)
         if not mode & 0x03 or mode & ~0x83:
             raise Refusal(MODE, f"mode (={mode:#x}) must say ECU (1), XCP (2) or both")
-        self.memory.use(page, ecu=bool(mode & 1), xcp=bool(mode & 2))
-        return [bytes([OK])]
+        return self._after(self.memory.use(page, ecu=bool(mode & 1), xcp=bool(mode & 2)), _done)
 
     def _get_page(self, data: bytes) -> list[bytes]:
         self._of_segment(data[2])
@@ -361,11 +385,10 @@ class Slave:
         self._of_segment(data[2])
         return [bytes([OK, 0, int(self._freeze)])]
 
-    def _copy(self, data: bytes) -> list[bytes]:
+    def _copy(self, data: bytes) -> list[bytes] | None:
         self._of_segment(data[1])
         self._of_segment(data[3])
-        self.memory.copy(data[2], data[4])
-        return [bytes([OK])]
+        return self._after(self.memory.copy(data[2], data[4]), _done)
 
     # ---- measurement lists -------------------------------------------------------------------------------------------
 
@@ -436,3 +459,7 @@ class Slave:
     def _daq_entries(self, data: bytes) -> list[bytes]:
         self.daq.allocate_entries(*struct.unpack_from("<HBB", data, 2))
         return [bytes([OK])]
+
+
+def _done() -> list[bytes]:
+    return [bytes([OK])]

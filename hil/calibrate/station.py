@@ -1,6 +1,7 @@
 """A node on the bus with the tools that attend to it: frames of theirs are kept from the firmware, and answered.
 
-The tools' commands are carried out before a tick, in order of arrival; answers and measurements are sent after it.
+The tools' commands are carried out before a tick, in order of arrival; answers and measurements are sent after it. What
+takes longer than a tick is done outside of it, and takes effect before the tick whose frames say so.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, NOTE, REMOTE
+from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, NOTE, PREPARED, REMOTE
+from hil.calibrate.memory import Memory
 from hil.calibrate.slave import Slave
 from hil.loop.node import Node
 
@@ -28,6 +30,10 @@ class Service(Protocol):
     """What attends to a node: an XCP slave, a UDS server."""
 
     idents: tuple[int, ...]
+
+    @property
+    def memory(self) -> Memory:
+        """The node's memory, of all its services the same."""
 
     def hear(self, ident: int, data: bytes) -> None:
         """Take a frame under one of ``idents``."""
@@ -71,6 +77,11 @@ class XcpService:
         self._in: deque[bytes] = deque()
         self._out: deque[bytes] = deque()
 
+    @property
+    def memory(self) -> Memory:
+        """What the slave shows."""
+        return self.slave.memory
+
     def hear(self, ident: int, data: bytes) -> None:
         """Keep a command for the next tick."""
         if len(self._in) < MOST_WAITING:
@@ -85,8 +96,9 @@ class XcpService:
     def before(self, k: int) -> None:
         """Carry out commands; a tool that floods the slave waits for its answers."""
         self.slave.k = k
+        self._out += self.slave.late()
         for _ in range(min(MOST_COMMANDS, len(self._in))):
-            if len(self._out) > MOST_WAITING:
+            if self.slave.waiting or len(self._out) > MOST_WAITING:
                 break
             self._out += self.slave.command(self._in.popleft())
 
@@ -94,33 +106,50 @@ class XcpService:
         """Return answers and measurements."""
         slave = self.slave
         measured = slave.sample(k)
+        self._out += slave.late()
         if not self._out and not len(measured):
             return None
-        self._out += slave.news()
         answers = [row_of(slave.ident, self._out.popleft()) for _ in range(min(MOST_ANSWERS, len(self._out)))]
         return np.concatenate([np.array(answers, np.int64).reshape(-1, 2), measured])
 
 
 class Attended:
-    """A node whose frames of service are answered by ``services``; for `run_realtime` it is a node like any other."""
+    """A node whose frames of service are answered by ``services``; for `run_realtime` it is a node like any other.
 
-    def __init__(self, node: Node, *services: Service):
-        self.node, self.services = node, services
+    told  a tick's frames say when work that was prepared takes effect: in real time (`heed`), and in a record of it.
+          False: with the tick after it was asked for
+    """
+
+    def __init__(self, node: Node, *services: Service, told: bool = False):
+        self.node, self.services, self.told = node, services, told
+        self.desk = services[0].memory.desk
         self._by_ident = {ident: s for s in services for ident in s.idents}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.node, name)
+
+    def heed(self, rows: np.ndarray, n: int) -> int:
+        """Put a note behind the ``n`` frames of the next tick where work is done; return how many rows there are."""
+        number = self.desk.note() if n < len(rows) else 0
+        if number:
+            rows[n] = PREPARED, number
+        return n + (number > 0)
 
     def tick(self, received: np.ndarray, n: int | None = None) -> np.ndarray:
         """Run the next tick on the first ``n`` rows of ``received``; return the frames to send."""
         n = len(received) if n is None else n
         k = self.node.k
         theirs = []  # frames that are not for the firmware
+        noted = 0 if self.told else self.desk.note()
         for i, (head, data) in enumerate(received[:n].tolist()):
-            if (service := self._by_ident.get(head & IDENT_MASK)) is not None:
+            if head == PREPARED:
+                theirs.append(i)
+                noted = data
+            elif (service := self._by_ident.get(head & IDENT_MASK)) is not None:
                 theirs.append(i)
                 if head & _KIND == 0:
                     service.hear(head & IDENT_MASK, data_of(head, data))
+        self.desk.before(k, noted)
         for service in self.services:
             service.before(k)
         rows = np.delete(received[:n], theirs, axis=0) if theirs else received

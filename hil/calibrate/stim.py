@@ -1,7 +1,7 @@
-"""Inputs of the firmware that a tool gives instead of the ECU and the stem potentiometers (STIM).
+"""Inputs of the firmware that a tool gives instead of the ECU, the LVDT and the stem potentiometers (STIM).
 
-Speeds and the request to run go into the ECU's good frames, potentiometers into what the sensors give; so the
-firmware's monitors judge them as ever. What is not given again within 100 ms ends, and the loop has its own inputs.
+Speeds and the request to run go into the ECU's good frames, stroke and potentiometers into what the sensors give. So
+the firmware's monitors judge them as ever. What is not given again within 100 ms ends, and the loop has its own inputs.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ import numpy as np
 
 from controller.records import INPUTS
 from hil.bus.frames import with_demand
+from hil.calibrate.errors import PROTECTED, RANGE, Refusal
+from hil.calibrate.memory import INPUTS as AREA
+from hil.calibrate.memory import SHORT
 from hil.loop.node import Node
 
 __all__ = ["Stimulus"]
 
 LASTS = 100  # ticks
 _ECU = tuple(INPUTS.index(name) for name in ("n_dem", "n_r", "mode_request"))
-_POTS = INPUTS.index("vigv")
+_LVDT, _POTS = INPUTS.index("x_lvdt"), INPUTS.index("vigv")
 
 
 class Stimulus:
@@ -30,17 +33,28 @@ class Stimulus:
         self._until = 0
         self._pots = node.loop.pots.copy()
 
-    def allowed(self, number: int) -> bool:
-        """Whether this input can be given: the LVDT and the supervisor's words cannot."""
-        return number in _ECU or _POTS <= number < _POTS + len(self.node.loop.angles)
+    def number(self, size: int, ext: int, address: int) -> int:
+        """Return which input stands there.
+
+        Raises `Refusal` where that is not one whole input in single precision, and for one that cannot be given: what
+        the judge of the frames and the supervisor say, by which monitors judge.
+        """
+        number, rest = divmod(address - AREA, 4)
+        if (size, ext, rest) != (4, SHORT, 0) or not 0 <= number < len(INPUTS):
+            raise Refusal(RANGE, f"{size} bytes at {address:#x} (extension {ext}) must be one input, 4 bytes")
+        if number not in (*_ECU, _LVDT) and not _POTS <= number < _POTS + len(self.node.loop.angles):
+            raise Refusal(PROTECTED, f"{INPUTS[number]} cannot be given")
+        return number
 
     def give(self, k: int, values: dict[int, float]) -> None:
         """Give inputs, finite ones, from tick ``k`` on."""
         self.given |= {i: v for i, v in values.items() if math.isfinite(v)}
         self._until = k + LASTS
-        pots = self.node.loop.pots
+        pots, lvdt = self.node.loop.pots, self.node.loop.lvdt
         for i, v in self.given.items():
-            if i >= _POTS and i not in _ECU:
+            if i == _LVDT:
+                lvdt[0] = v
+            elif i not in _ECU:
                 pots[:, 2 * (i - _POTS)], pots[:, 2 * (i - _POTS) + 1] = 0.0, v
 
     def clear(self) -> None:
@@ -48,6 +62,7 @@ class Stimulus:
         if self.given:
             self.given = {}
             self.node.loop.pots[:] = self._pots
+            self.node.loop.lvdt[:] = math.nan
 
     def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
         """Return the frames of tick ``k`` with the given speeds in the ECU's good ones."""

@@ -269,7 +269,9 @@ def undisturbed(priority: int | None = None, cpu: int | None = None) -> Iterator
 
 
 class Ticking(Protocol):
-    """A node: frames since the last tick in, frames to send out (`hil.loop.node`)."""
+    """A node: frames since the last tick in, frames to send out (`hil.loop.node`). One with ``heed(rows, n) -> n`` puts
+    notes of its own behind the frames of its next tick; they are recorded with them.
+    """
 
     def tick(self, received: np.ndarray, n: int) -> np.ndarray:
         """Run the next tick."""
@@ -362,6 +364,7 @@ def run_realtime(
     rows = np.zeros((MOST_READ, 2), np.int64)
     report = Report()
     read, write, tick, clock = port.read, port.write, node.tick, time.monotonic_ns
+    heed = getattr(node, "heed", None)
     add_begin, add_end, add_work = report.begin.add, report.end.add, report.work.add
     while port.read(rows):  # what came while nobody listened is old
         pass
@@ -380,6 +383,8 @@ def run_realtime(
                 n = 1 if ticker.paused else 0
             else:
                 n = read(rows)
+            if heed is not None:
+                n = heed(rows, n)
             out = tick(rows, n)
             if len(out):
                 report.sent += write(out)

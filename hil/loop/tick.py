@@ -63,6 +63,7 @@ class Loop(NamedTuple):
     angles       float64[stages] rad, the potentiometers' readings at this tick
     pots         float64[frames or 0, 2 stages] what the controller gets of each reading: share of it and offset
                  (rad; NaN = not fitted), stage by stage, a row every 10 ms, the last one held
+    lvdt         float64[0 or 1] stroke (m) that the controller gets in place of the LVDT's; NaN: the LVDT's
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
     foreign      a controller of the user's own (`hil.native.call.Foreign`); (): the firmware here
@@ -82,6 +83,7 @@ class Loop(NamedTuple):
     mean: np.ndarray
     angles: np.ndarray
     pots: np.ndarray
+    lvdt: np.ndarray
     sent: np.ndarray
     foreign: Any = ()
 
@@ -134,6 +136,7 @@ def new_loop(
         np.zeros(2),
         np.zeros(stages),
         np.empty((0, 2 * stages)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
+        np.full(1, np.nan),
         np.full((KEPT, 4), np.nan),
         foreign,
     )
@@ -254,6 +257,8 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
     reflash(a)
     inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
+    if a.lvdt.shape[0] > 0 and a.lvdt[0] == a.lvdt[0]:
+        inputs.x_lvdt = a.lvdt[0]
     for q in range(a.angles.shape[0]):
         a.angles[q] = s[places.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
         inputs.pots[q] = a.angles[q]

@@ -11,20 +11,17 @@ import hashlib
 import hmac
 import random
 import struct
-import tempfile
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from controller import load_calibration, new_state
-from controller.calibration import Calibration
+from controller import new_state
 from controller.records import INIT, STANDBY
 from hil.calibrate.memory import Memory, Refusal
+from hil.calibrate.prepare import Task
 from hil.uds import routines
 from hil.uds.trouble import CODES, MASK, TroubleMemory
-from vaneloop.base.errors import InputError
 
 __all__ = ["MOST_REQUEST", "SIGNALS", "Server", "key_of"]
 
@@ -101,11 +98,12 @@ class Server:
         self._no_seed_until = 0
         self._file: bytearray | None = None
         self._size = self._block = 0
-        self._later: tuple[int, int, Callable[[], bytes]] | None = None  # since, until, what is then answered
+        self._since: int | None = None  # tick at which a file was given; None: none is being checked
+        self._found: list[np.ndarray | None] | None = None  # its scalars, once read; None: it is no calibration
         self._reset = False
         all_sessions, not_default = (DEFAULT, PROGRAMMING, EXTENDED), (PROGRAMMING, EXTENDED)
         # service -> what does it, least length, sessions, whether it has a subfunction
-        self._services: dict[int, tuple[Callable[[bytes], bytes], int, tuple[int, ...], bool]] = {
+        self._services: dict[int, tuple[Callable[[bytes], bytes | None], int, tuple[int, ...], bool]] = {
             0x10: (self._control, 2, all_sessions, True),
             0x11: (self._ecu_reset, 2, all_sessions, True),
             0x14: (self._clear, 4, all_sessions, False),
@@ -133,7 +131,7 @@ class Server:
         known = self._services.get(service)
         quiet = False
         try:
-            if self._later is not None and service != 0x3E:
+            if self._since is not None and service != 0x3E:
                 raise Negative(BUSY)
             if known is None:
                 raise Negative(NO_SERVICE)
@@ -150,9 +148,7 @@ class Server:
             self._last = k
             return [] if functional and e.code in _QUIET else [bytes([0x7F, service, e.code])]
         self._last = k
-        if self._later is not None and self._later[0] == k:
-            return []
-        return [] if quiet else [bytes([service + 0x40]) + answer]
+        return [] if quiet or answer is None else [bytes([service + 0x40]) + answer]
 
     def before(self, k: int) -> list[bytes]:
         """Work before tick ``k``: a reset, the end of a session, answers that took their time."""
@@ -162,19 +158,21 @@ class Server:
             self.memory.loop.z[:] = new_state()
             self.trouble.new_cycle()
             self._end_session()
-        if self.session != DEFAULT and self._later is None and k - self._last >= S3:
+        if self.session != DEFAULT and self._since is None and k - self._last >= S3:
             self._end_session()
-        if self._later is None:
+        if self._since is None:
             return []
-        since, until, finish = self._later
-        if k >= until:
-            self._later = None
+        waited = k - self._since
+        if waited >= CHECKING and self._found is not None and not self.memory.desk.waiting:
+            (found,) = self._found
+            self._since = self._found = None
             self._last = k
             try:
-                return [bytes([0x77]) + finish()]
+                self._flash(found)
             except Negative as e:
                 return [bytes([0x7F, 0x37, e.code])]
-        if k - since == P2 - 10 or (k - since) % (P2_STAR - 100) == P2_STAR - 101:
+            return [bytes([0x77])]
+        if waited == P2 - 10 or waited % (P2_STAR - 100) == P2_STAR - 101:
             return [bytes([0x7F, 0x37, PENDING])]
         return []
 
@@ -442,27 +440,33 @@ class Server:
         self._block += 1
         return data[1:2]
 
-    def _transfer_exit(self, data: bytes) -> bytes:
+    def _transfer_exit(self, data: bytes) -> None:
         if self._file is None or len(self._file) != self._size:
             raise Negative(SEQUENCE)
-        file, self._file = bytes(self._file), None
-        self._later = self._k, self._k + CHECKING, lambda: self._load(file)
-        return b""
 
-    def _load(self, file: bytes) -> bytes:
-        """Take over the values of a calibration.toml, all or none."""
-        memory = self.memory
+        def found(k: np.ndarray | None) -> None:
+            self._found = [k]
+
+        def then(why: Refusal | None) -> None:
+            if why is not None:
+                self._found = [None]
+
         try:
-            with tempfile.TemporaryDirectory() as folder:
-                there = Path(folder) / "calibration.toml"
-                there.write_bytes(file)
-                found: Calibration = load_calibration(there)
-            n = len(found.k)
-            values = {i: float(found.k[i]) for i, e in enumerate(memory.elements[:n]) if e.table == "calibration"}
-            memory.change(values)
-        except (InputError, Refusal):
+            self.memory.desk.begin(Task("load", (bytes(self._file),), found), then)
+        except Refusal:
+            raise Negative(BUSY) from None  # it may be asked for again
+        self._file, self._since = None, self._k
+
+    def _flash(self, found: np.ndarray | None) -> None:
+        """Take over the scalars of a calibration.toml that has been read, all or none."""
+        if found is None:
+            raise Negative(FAILURE)
+        self._idle()  # the loop may have been closed since the file was given
+        of = enumerate(self.memory.elements[: len(found)])
+        try:
+            self.memory.change({i: float(found[i]) for i, e in of if e.table == "calibration"}, judged=True)
+        except Refusal:
             raise Negative(FAILURE) from None
-        return b""
 
     # ---- conditions --------------------------------------------------------------------------------------------------
 

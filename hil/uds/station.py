@@ -10,6 +10,7 @@ import isotp
 import numpy as np
 from isotp.tools import Timer
 
+from hil.calibrate.memory import Memory
 from hil.calibrate.station import row_of
 from hil.uds.server import MOST_REQUEST, Server
 
@@ -90,6 +91,11 @@ class UdsService:
                 "logger_name": LOGGER,
             },
         )
+
+    @property
+    def memory(self) -> Memory:
+        """The node's memory."""
+        return self.server.memory
 
     def hear(self, ident: int, data: bytes) -> None:
         """Keep a frame for the next tick."""

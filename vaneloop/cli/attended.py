@@ -76,8 +76,11 @@ def isotp_is_there() -> None:
         raise InputError("--uds needs the package can-isotp: pip install 'vaneloop[diagnostics]'")
 
 
-def attend(args: argparse.Namespace, node: Any) -> Any:
-    """The node with what answers its tools; the node itself where none may come."""
+def attend(args: argparse.Namespace, node: Any, *, recorded: bool = False) -> Any:
+    """The node with what answers its tools; the node itself where none may come.
+
+    recorded  it gets the frames of a record, in simulated time
+    """
     if not wanted(args):
         return node
     import numpy as np
@@ -85,14 +88,17 @@ def attend(args: argparse.Namespace, node: Any) -> Any:
     from hil.calibrate import Attended, Memory, Slave
     from hil.calibrate.a2l import a2l_of
     from hil.calibrate.daq import gather
+    from hil.calibrate.prepare import Desk, Outside
     from hil.calibrate.station import MASTER, SLAVE, XcpService
 
     memory = Memory(node)
+    if not recorded:
+        memory.desk = Desk(Outside(memory.elements))
     services: list[Any] = []
     if args.uds:
         services.append(_uds(args, memory))
     if not args.xcp:
-        return Attended(node, *services)
+        return Attended(node, *services, told=True)
     gather(memory.raw, np.zeros((0, 4), np.int64), np.zeros((0, 2), np.int64), 0)  # compiles now, not in a tick
     text = a2l_of(memory, master=MASTER, slave=SLAVE)  # written now: it takes longer than a tick
     slave = Slave(
@@ -102,7 +108,7 @@ def attend(args: argparse.Namespace, node: Any) -> Any:
         save=Path(args.xcp_save) if args.xcp_save else None,
         locked=("cal", "daq") if args.xcp_lock else (),
     )
-    return Attended(node, XcpService(slave), *services)
+    return Attended(node, XcpService(slave), *services, told=True)
 
 
 def _uds(args: argparse.Namespace, memory: Any) -> Any:

@@ -367,7 +367,7 @@ def _repeat(args: argparse.Namespace) -> int:
     if attended.wanted(args):
         from hil.calibrate.station import replay_attended
 
-        at, sent = replay_attended(attended.attend(args, node), tick[taken], received, ticks)
+        at, sent = replay_attended(attended.attend(args, node, recorded=True), tick[taken], received, ticks)
     else:
         at, sent = replay(node, tick[taken], received, ticks)
     wall = time.perf_counter() - started
