@@ -9,11 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
 from hil.bus.frames import ERROR, REMOTE
 from hil.calibrate import Memory
+from hil.calibrate.station import MASTER
 from hil.inject import fuzz
 from hil.inject.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
 from hil.inject.fuzz_tools import fuzz_tools
@@ -236,16 +238,41 @@ def test_a_million_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
     hostile(tool, 1_000_000)
 
 
+FREE = np.array([np.inf, np.inf])
+
+
 def hostile(tool: str, frames: int) -> None:
     if tool == "uds":
         pytest.importorskip("isotp")
-    campaign = fuzz_tools(tool, frames, seed=31)
+    campaign = fuzz_tools(tool, frames, seed=31, limits=FREE)
     assert not campaign.failure and campaign.frames >= frames
     refused = [name for name in campaign.answers if name.startswith("fe") or name == "answers"]
     assert len(refused) > (5 if tool == "xcp" else 0), campaign.answers
 
 
 def test_a_campaign_against_tools_notices_a_monitor_that_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Memory, "_open_only", lambda self, name: None)
-    campaign = fuzz_tools("xcp", 30_000, seed=31)
+    monkeypatch.setattr(Memory, "_allowed", lambda self, numbers: None)
+    campaign = fuzz_tools("xcp", 30_000, seed=31, limits=FREE)
     assert "while the loop was closed" in campaign.failure or "RUN is not back" in campaign.failure, campaign
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frames", "7000", "--current-limit", "0.2"], "beyond the limit asked for (=0.0002)"),
+        (["--frames", "7000", "--stroke-limit", "1"], "stroke demand (=0."),
+        (["--frames", "50", "--recovery", "0.01"], "RUN is not back after 0.01 s"),
+    ],
+)
+def test_a_campaign_against_tools_heeds_its_options(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "failed.log"
+    assert main(["fuzz", "--tool", "xcp", *options, "--out", str(log)]) == 1
+    out = capsys.readouterr().out
+    assert "FAILED: episode " in out and said in out and str(log) in out
+    idents = {m.arbitration_id for m in can.CanutilsLogReader(log)}
+    assert idents == {MASTER}
+    nowhere = tmp_path / "no" / "folder.log"
+    assert main(["fuzz", "--tool", "xcp", *options, "--out", str(nowhere)]) == 2
+    assert f"--out {nowhere}: cannot be written" in capsys.readouterr().err

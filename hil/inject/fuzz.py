@@ -22,7 +22,7 @@ runs again.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from controller import Calibration
     from plant import Plant
 
-__all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack"]
+__all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack", "write_frames"]
 
 WARM = 600  # ticks of good frames before an attack on a running controller
 # ticks of good frames after it; docs/controller.md promises RUN within 2 s, silence and a full bucket cost up to 0.2 s
@@ -447,8 +447,6 @@ def run_attack(
 
 def write_attack(path: str | Path, attack: Attack) -> None:
     """Write an episode as a candump log: warm-up, attack and the good frames behind it, one ms a tick."""
-    import can
-
     warm = good_frames(0, WARM // 10) if attack.warm else np.empty((0, 2), np.int64)
     after = good_frames(attack.counter, RECOVERY // 10)
     parts = [
@@ -456,12 +454,18 @@ def write_attack(path: str | Path, attack: Attack) -> None:
         (attack.at, attack.rows),
         (attack.end + 10 * np.arange(len(after)), after),
     ]
+    write_frames(path, [pair for at, rows in parts for pair in zip(at.tolist(), rows.tolist(), strict=True)])
+
+
+def write_frames(path: str | Path, frames: Iterable[tuple[int, Sequence[int]]]) -> None:
+    """Write frames (tick, its two words) as a candump log, one ms a tick. Raises OSError."""
+    import can
+
     with can.CanutilsLogWriter(path) as log:
         count: dict[int, int] = {}
-        for at, rows in parts:
-            for tick, (head, data) in zip(at.tolist(), rows.tolist(), strict=True):
-                order = count[tick] = count.get(tick, -1) + 1
-                log.on_message_received(to_message(head, data, tick * 1e-3 + min(order, 998) * 1e-6, "vcan0"))
+        for tick, (head, data) in frames:
+            order = count[tick] = count.get(tick, -1) + 1
+            log.on_message_received(to_message(head, data, tick * 1e-3 + min(order, 998) * 1e-6, "vcan0"))
 
 
 def read_attack(path: str | Path) -> Attack:

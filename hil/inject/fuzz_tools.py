@@ -1,12 +1,14 @@
 """The safety campaign for the tools' protocols: hostile commands of XCP or UDS against a controller in simulated time.
 
-In every tick: current within the calibration's limit and the limit within the reference page's, a mode that exists, the
-monitors as they were while the loop is closed, memory of the services bounded. At the end of each episode the tool is
-gone, and with the calibration of the beginning good frames of the ECU must have RUN back.
+In every tick: current and stroke demand within their limits and the current's within the reference page's, a mode that
+exists, the monitors as they were while the loop is closed, memory of the services bounded. At the end of each episode
+the tool is gone, and with the calibration of the beginning good frames of the ECU must have RUN back. Over all episodes
+the process does not grow.
 """
 
 from __future__ import annotations
 
+import resource
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,7 +26,10 @@ from hil.loop.node import Ecu, Node
 __all__ = ["ToolCampaign", "fuzz_tools"]
 
 EPISODE = 5_000  # frames on one controller
-RECOVERY = 8_000  # ticks within which RUN must be back: the session's end after 5 s, then the firmware's own times
+# ticks within which RUN must be back: the session's end after 5 s, then the firmware's own times
+RECOVERY = 8_000
+SETTLED = 4  # episodes after which the process has loaded all that it needs
+MOST_GROWTH = 64.0  # MB after them: caches of numba and of the allocator; a leak grows without end
 MOST_HELD = 4 * MOST_WAITING  # commands, answers and frames that services may keep
 
 
@@ -32,7 +37,9 @@ MOST_HELD = 4 * MOST_WAITING  # commands, answers and frames that services may k
 class ToolCampaign:
     """What a campaign saw.
 
+    grown    MB by which the process has grown since its first episodes
     failure  what did not hold, with seed, episode and frame; empty: everything held
+    sent     of the episode that failed: tick and frame, in order
     """
 
     protocol: str
@@ -41,13 +48,17 @@ class ToolCampaign:
     episodes: int = 0
     ticks: int = 0
     answers: dict[str, int] = field(default_factory=dict)
+    grown: float = 0.0
     failure: str = ""
+    sent: list[tuple[int, tuple[int, int]]] = field(default_factory=list)
 
 
 class _Target:
     """A controller with one service, its ECU, and what must hold of it."""
 
-    def __init__(self, protocol: str, seed: int, request: int):
+    def __init__(self, protocol: str, seed: int, request: int, limits: np.ndarray):
+        self.limits = limits
+        self.sent_to: list[tuple[int, tuple[int, int]]] = []
         self.node = Node()
         self.memory = Memory(self.node)
         self.reference = self.memory.pages[1].copy()
@@ -74,10 +85,17 @@ class _Target:
         self.memory._load(self.reference, np.arange(len(self.reference)))
         self.before = self.memory.live()
 
+    @property
+    def given(self) -> bool:
+        """Whether a tool still gives the demand: by STIM, by a routine."""
+        return bool(self.slave.daq.stimulus.given if self.protocol == "xcp" else self.server.sweep)
+
     def tick(self, frames: list[tuple[int, bytes]]) -> list[bytes]:
         """Run a tick; raise AssertionError in words for what does not hold."""
         closed = int(self.node.loop.given.mode) not in (INIT, STANDBY)
-        rows = [*self.ecu.tick(self.sent).tolist(), *(row_of(i, d) for i, d in frames)]
+        mine = [row_of(i, d) for i, d in frames]
+        self.sent_to += [(self.node.k, row) for row in mine]
+        rows = [*self.ecu.tick(self.sent).tolist(), *mine]
         out = self.attended.tick(np.array(rows, np.int64).reshape(-1, 2))
         ours = out[:, 0] & 0x7FF < 0x100
         self.sent = out[ours].copy()
@@ -85,6 +103,11 @@ class _Target:
         limit = float(loop.calibration.scalars.current_limit)
         if not abs(float(loop.given.i_cmd)) <= limit + 1e-12:
             raise AssertionError(f"current (={loop.given.i_cmd:g} A) beyond its limit (={limit:g} A)")
+        for what, value, most in zip(
+            ("current", "stroke demand"), (abs(loop.given.i_cmd), loop.given.x_dem), self.limits, strict=True
+        ):
+            if not value <= most + 1e-12:
+                raise AssertionError(f"{what} (={value:g}) beyond the limit asked for (={most:g})")
         if not limit <= self.reference[self.limit]:
             raise AssertionError(f"current_limit (={limit:g} A) above the reference page's")
         if not 0 <= int(loop.given.mode) < len(MODES):
@@ -137,24 +160,49 @@ def _uds(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[i
             raw[2:4] = bytes([2, int(rng.integers(0, 5))])
     elif kind == 5:
         raw = bytearray([0x10, int(rng.choice([1, 2, 3, 3]))])
-    elif kind == 6 and target.server._seed is not None:  # the whole request, past ISO-TP: it takes two frames
-        target.server.request(target.node.k, b"\x27\x02" + uds_key(target.server._seed))
-        return []
+    elif kind == 6 and target.server._seed is not None:
+        return _in_frames(REQUEST, b"\x27\x02" + uds_key(target.server._seed))
     elif kind == 7:  # pieces of ISO-TP in any order
         return [(REQUEST, bytes([int(rng.choice([0x10, 0x20, 0x21, 0x30, 0x31]))]) + bytes(raw))]
     elif kind == 8:
-        target.server.request(target.node.k, rng.integers(0, 256, rng.integers(8, 300), dtype=np.uint8).tobytes())
-        return []
+        long = bytearray(rng.integers(0, 256, rng.integers(8, 100), dtype=np.uint8).tobytes())
+        long[0] = int(rng.choice([*target.server._services, long[0]]))
+        return _in_frames(REQUEST, bytes(long))
     return [(ident, bytes([len(raw)]) + bytes(raw))]
 
 
-def fuzz_tools(protocol: str, frames: int, seed: int, progress: Callable[[float], None] | None = None) -> ToolCampaign:
-    """Send hostile ``frames`` of ``protocol`` ("xcp", "uds"); the same seed gives the same frames."""
+def _in_frames(ident: int, request: bytes) -> list[tuple[int, bytes]]:
+    """A request of more than seven bytes as ISO-TP's frames."""
+    head = bytes([0x10 | len(request) >> 8, len(request) & 0xFF])
+    rest = [request[i : i + 7] for i in range(6, len(request), 7)]
+    return [(ident, head + request[:6]), *((ident, bytes([0x20 | n & 15]) + part) for n, part in enumerate(rest, 1))]
+
+
+def _resident() -> float:
+    """The most memory that this process has had, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def fuzz_tools(
+    protocol: str,
+    frames: int,
+    seed: int,
+    progress: Callable[[float], None] | None = None,
+    *,
+    limits: np.ndarray,
+    recovery: int = RECOVERY,
+) -> ToolCampaign:
+    """Send hostile ``frames`` of ``protocol`` ("xcp", "uds"); the same seed gives the same frames.
+
+    limits    what current (A) and stroke demand (m) must not exceed, beside the calibration's own limits; inf: nothing
+    recovery  ticks within which RUN must be back
+    """
     campaign = ToolCampaign(protocol, seed)
     make = _xcp if protocol == "xcp" else _uds
+    settled = 0.0
     while campaign.frames < frames and not campaign.failure:
         rng = np.random.default_rng([seed, campaign.episodes])
-        target = _Target(protocol, campaign.episodes, request=campaign.episodes % 2)
+        target = _Target(protocol, campaign.episodes, request=campaign.episodes % 2, limits=limits)
         campaign.episodes += 1
         n, end, last = 0, min(EPISODE, frames - campaign.frames), b""
         try:
@@ -170,15 +218,22 @@ def fuzz_tools(protocol: str, frames: int, seed: int, progress: Callable[[float]
                 campaign.ticks += 1
             target.flash()
             target.ecu.set_demand(70.0, mode_request=1)
-            for _ in range(RECOVERY):
+            for _ in range(recovery):
                 target.tick([])
                 campaign.ticks += 1
-                if target.node.mode == "RUN" and target.node.k % 1000 == 0:
+                if target.node.mode == "RUN" and not target.given:  # by the ECU's own demand
                     break
             else:
-                raise AssertionError(f"RUN is not back after {RECOVERY * 1e-3:g} s: {target.node.mode}")
+                raise AssertionError(f"RUN is not back after {recovery * 1e-3:g} s: {target.node.mode}")
+            if campaign.episodes <= SETTLED:
+                settled = _resident()
+            campaign.grown = _resident() - settled
+            if not campaign.grown <= MOST_GROWTH:
+                raise AssertionError(f"the process has grown by {campaign.grown:.0f} MB; allowed: {MOST_GROWTH:g} MB")
         except Exception as e:
-            campaign.failure = f"episode {campaign.episodes - 1}, frame {n}: {type(e).__name__}: {e}"
+            said = str(e) if isinstance(e, AssertionError) else f"{type(e).__name__}: {e}"
+            campaign.failure = f"episode {campaign.episodes - 1}, frame {n}: {said}"
+            campaign.sent = target.sent_to
         campaign.frames += n
         if progress is not None:
             progress(min(campaign.frames / frames, 1.0))

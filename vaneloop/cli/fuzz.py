@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numba
 import numpy as np
 
 from controller import MODES
-from hil.inject.fuzz import CLAIMS, HELD, KINDS, RECOVERY, Campaign, fuzz, read_attack, run_attack, write_attack
+from hil.inject.fuzz import (
+    CLAIMS,
+    HELD,
+    KINDS,
+    RECOVERY,
+    Campaign,
+    fuzz,
+    read_attack,
+    run_attack,
+    write_attack,
+    write_frames,
+)
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.cli import options
@@ -33,7 +46,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, default=0, metavar="S", help="the same seed gives the same frames (default 0)"
     )
     parser.add_argument(
-        "--out", default="fuzz_failure.log", metavar="F", help="candump log of the fewest frames, if something fails"
+        "--out",
+        default="fuzz_failure.log",
+        metavar="F",
+        help="candump log if something fails: of the fewest frames, with --tool of the episode",
     )
     parser.add_argument("--replay", metavar="F", help="run this candump log from switch-on instead of random frames")
     parser.add_argument(
@@ -56,9 +72,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recovery",
         type=float,
-        default=RECOVERY * 1e-3,
         metavar="S",
-        help="s within which RUN must be back (default 2.5)",
+        help=f"s within which RUN must be back (default {RECOVERY * 1e-3:g}; with --tool 8: its session ends first)",
     )
     options.add_machine_options(parser)
     options.add_controller_options(parser)
@@ -78,22 +93,22 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"--frames (={args.frames}) must be at least 1")
     if not 0 <= args.seed < 2**63:
         raise InputError(f"--seed (={args.seed}) must be 0 to 2^63 - 1")
-    if not 0.01 <= args.recovery <= 3600:
+    if args.recovery is not None and not 0.01 <= args.recovery <= 3600:
         raise InputError(f"--recovery (={args.recovery:g}) must be 0.01 to 3600 s")
+    for option, unit in (("current_limit", "mA"), ("stroke_limit", "mm")):
+        value = getattr(args, option)
+        if value is not None and not 0 < value <= 1000:
+            raise InputError(f"--{option.replace('_', '-')} (={value:g}) must be above 0, at most 1000 {unit}")
     if args.tool:
         return _tool(args)
     machine = options.machine_of(args)
     k = machine.calibration.scalars
     limits = np.array([k.current_limit, k.stroke_min, k.stroke_max])
     if args.current_limit is not None:
-        if not 0 < args.current_limit <= 1000:
-            raise InputError(f"--current-limit (={args.current_limit:g}) must be above 0, at most 1000 mA")
         limits[0] = args.current_limit * 1e-3
     if args.stroke_limit is not None:
-        if not 0 < args.stroke_limit <= 1000:
-            raise InputError(f"--stroke-limit (={args.stroke_limit:g}) must be above 0, at most 1000 mm")
         limits[2] = args.stroke_limit * 1e-3
-    recovery = round(args.recovery * 1e3)
+    recovery = RECOVERY if args.recovery is None else round(args.recovery * 1e3)
     if not any(Path(numba.config.CACHE_DIR).rglob("fuzz._watched_ticks*.nbi")):  # type: ignore[attr-defined]
         terminal.say(args, "compiling the simulator for this machine (once, about 20 s) ...")
     if args.replay:
@@ -123,16 +138,23 @@ def command(args: argparse.Namespace) -> int:
             args,
             f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}",
         )
-        try:
+        with _written(args):
             write_attack(args.out, campaign.failure.attack)
-        except OSError as e:
-            raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
     return 0 if campaign.failure is None else 1
+
+
+@contextlib.contextmanager
+def _written(args: argparse.Namespace) -> Iterator[None]:
+    """Say in one line that the log cannot be written."""
+    try:
+        yield
+    except OSError as e:
+        raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
 
 
 def _tool(args: argparse.Namespace) -> int:
     """The campaign against what answers tools."""
-    from hil.inject.fuzz_tools import fuzz_tools
+    from hil.inject import fuzz_tools
     from vaneloop.cli.attended import isotp_is_there
 
     for option in ("replay", "model", "tables", "plant", "controller"):
@@ -141,12 +163,22 @@ def _tool(args: argparse.Namespace) -> int:
     if args.tool == "uds":
         isotp_is_there()
     with terminal.progress_bar(args, "frames") as progress:
-        c = fuzz_tools(args.tool, args.frames, args.seed, progress)
+        c = fuzz_tools.fuzz_tools(
+            args.tool, args.frames, args.seed, progress,
+            limits=np.array([args.current_limit or np.inf, args.stroke_limit or np.inf]) * 1e-3,
+            recovery=fuzz_tools.RECOVERY if args.recovery is None else round(args.recovery * 1e3),
+        )  # fmt: skip
     terminal.say(args, f"{c.frames:,} frames in {c.episodes:,} episodes, {c.ticks * 1e-3:,.0f} simulated s")
+    terminal.say(args, f"the process has grown by {c.grown:.1f} MB since its first episodes")
     terminal.say(args, f"FAILED: {c.failure}" if c.failure else "held: limits, monitors, memory, recovery to RUN")
+    if c.failure:
+        with _written(args):
+            write_frames(args.out, c.sent)
+        terminal.say(args, f"the {len(c.sent)} frames of the episode: {args.out}; --seed {args.seed} repeats it")
     terminal.write_json(
         args, {"schema": 1, "tool": c.protocol, "seed": c.seed, "frames": c.frames, "episodes": c.episodes,
-               "simulated_s": c.ticks * 1e-3, "answers": c.answers, "held": not c.failure, "failure": c.failure},
+               "simulated_s": c.ticks * 1e-3, "answers": c.answers, "grown_mb": c.grown, "held": not c.failure,
+               "failure": c.failure, "log": args.out if c.failure else None},
     )  # fmt: skip
     return 1 if c.failure else 0
 
