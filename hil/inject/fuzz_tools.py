@@ -90,6 +90,11 @@ class _Target:
         """Whether a tool still gives the demand: by STIM, by a routine."""
         return bool(self.slave.daq.stimulus.given if self.protocol == "xcp" else self.server.sweep)
 
+    @property
+    def busy(self) -> bool:
+        """Whether frames of the tool still wait."""
+        return bool(self.service._in) or self.memory.desk.waiting
+
     def tick(self, frames: list[tuple[int, bytes]]) -> list[bytes]:
         """Run a tick; raise AssertionError in words for what does not hold."""
         closed = int(self.node.loop.given.mode) not in (INIT, STANDBY)
@@ -215,6 +220,9 @@ def fuzz_tools(
                     last = answer
                     name = answer[:2].hex() if answer[0] in (0xFE, 0xFD) else "answers"
                     campaign.answers[name] = campaign.answers.get(name, 0) + 1
+                campaign.ticks += 1
+            while target.busy:  # what was asked for last is done before the tool is gone
+                target.tick([])
                 campaign.ticks += 1
             target.flash()
             target.ecu.set_demand(70.0, mode_request=1)
