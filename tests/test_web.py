@@ -521,6 +521,53 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
 
 
 @needs_browser
+def test_the_loop_is_calibrated_while_it_runs(server: Server, page: Any) -> None:
+    """All by keyboard: gains to nothing, and the stroke stays; the reference page, and it follows."""
+    page.goto(server.at("run"))
+    press(page, "Start", "!!document.querySelector('[data-name=kp] input')")
+    page.locator('[data-lamp="RUN"].good').wait_for()
+    stroke = "parseFloat(document.querySelectorAll('.tiles .v')[2].innerText)"
+    page.wait_for_function(f"Math.abs({stroke} - 6.9) < 0.2")
+    events = page.get_by_role("log", name="events")
+    for name in ("kp", "ki", "kff"):
+        tab_to(page, f'[data-name="{name}"] input')
+        page.keyboard.press("Control+a")
+        page.keyboard.type("0")
+        page.keyboard.press("Enter")
+        events.get_by_text(f"calibration: {name} 0").wait_for()
+    kp = page.locator('[data-name="kp"]')
+    kp.get_by_text("reference 16").wait_for()
+    slider = page.get_by_role("slider", name="speed demand")
+    slider.click(position={"x": 0.8 * slider.bounding_box()["width"], "y": 8})
+    page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[1].innerText) > 79")
+    assert page.evaluate(stroke) < 8.0, "nobody moves the piston"
+
+    # refused in a line, and the field shows what is
+    kp.locator("input").fill("2000")
+    kp.locator("input").press("Enter")
+    alert = page.get_by_role("alert")
+    alert.wait_for()
+    assert alert.inner_text() == "vaneloop: kp (=2000 mA/mm), in [0, 1000] mA/mm: out of range (XCP error 0x22)"
+    page.wait_for_function("document.querySelector('[data-name=kp] input').value === '0'")
+
+    page.get_by_role("button", name="Save the working page").click()
+    with page.expect_download() as download:
+        page.get_by_text("download calibration.toml").click()
+    assert tomllib.loads(Path(download.value.path()).read_text())["servo"]["kp"]["value"] == 0.0
+    page.get_by_role("button", name="reference", exact=True).click()
+    page.wait_for_function(f"{stroke} > 12")  # the shipped gains are back
+    looks(page, "calibrate")
+    page.get_by_role("button", name="Copy reference over working").click()
+    page.wait_for_function("document.querySelector('[data-name=kp] input').value === '16'")
+    page.get_by_label("find a calibration value").fill("greatest current")
+    page.wait_for_function(
+        "[...document.querySelectorAll('.calibrated')].map((e) => e.dataset.name).join() === 'current_limit'"
+    )
+    press(page, "Stop", RECORD_IS_THERE)
+    page.get_by_text("Start the loop: then its calibration is read.").wait_for()
+
+
+@needs_browser
 def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None:
     page.goto(server.at("run"))
     page.locator(".bus").click()
@@ -530,6 +577,13 @@ def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None
     )  # s that the listener has heard
     late = page.get_by_text(re.compile(r"p50 \d+ us"))
     late.wait_for()
+    kp = page.locator('[data-name="kp"] input')  # read over XCP on the bus
+    while not kp.count():  # a loop that is held up drops what came meanwhile
+        again = page.locator(".read-calibration")
+        if again.count() and page.get_by_role("alert").count():
+            again.click()
+        page.wait_for_timeout(200)
+    assert kp.input_value() == "16"
     press(page, "Stop", RECORD_IS_THERE)
     assert not page.get_by_role("alert").count(), page.get_by_role("alert").first.inner_text()
     shot(page, "run_real_time_1280_light")

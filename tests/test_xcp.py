@@ -20,7 +20,7 @@ import pytest
 from controller import FAULTS, INPUTS, MODES, load_calibration
 from controller.records import STATE
 from hil.bus.frames import HEAD_MASK, noted
-from hil.calibrate import Attended, Memory, Slave
+from hil.calibrate import Attended, Memory, Slave, master
 from hil.calibrate.a2l import a2l_of
 from hil.calibrate.memory import CALIBRATION, Refusal
 from hil.calibrate.prepare import PATIENCE, WORK, Desk, Outside, Task
@@ -610,6 +610,34 @@ def test_pyxcp_calibrates_the_installed_command_on_the_embedded_bus(tmp_path: Pa
         save_kp(x, 11.0)
         x.disconnect()
     assert load_calibration(tmp_path / "tuned" / "calibration.toml").scalars.kp == 11.0
+
+
+def test_the_master_of_the_workbench_reads_changes_and_says_why_not() -> None:
+    bench, tool = Bench().run(20), master.Master()
+    n = len(bench.memory.elements)
+    kp = bench.memory.by_name()["kp"]
+    jobs = {
+        1: [master.CONNECT, *master.read_page(1, n)],
+        2: [master.CONNECT, *master.write_number(kp, 12.5)],
+        3: [master.CONNECT, *master.write_number(kp, 1e9)],
+        4: [master.CONNECT, *master.use_page(1), master.PAGE_IN_USE],
+    }
+    for number, commands in jobs.items():
+        tool.ask(number, commands)
+    silent = False
+    for ms in range(9000):
+        command = tool.send(ms)
+        answers = bench.tick(*([command] if command is not None and not silent else []))
+        for answer in answers:
+            tool.hear(answer)
+        if len(tool.done) == 4 and not silent:
+            tool.ask(5, [master.CONNECT])
+            silent = True
+    done = dict(tool.done)
+    assert (master.numbers_of(done[1][1:]) == bench.memory.pages[1]).all()  # type: ignore[arg-type]
+    assert done[2][-1] == struct.pack("<d", 12.5) and done[3] == "out of range (XCP error 0x22)"
+    assert done[4][-1][2] == bench.memory.ecu_page == 1  # type: ignore[index]
+    assert done[5] == "no answer within 2 s"
 
 
 def test_refusals_say_why() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from vaneloop.base import terminal
 from vaneloop.base.vanes import VANES
 from vaneloop.verbs.machine import Machine
-from vaneloop.web.worker import INBOX, Progress, main
+from vaneloop.web.worker import INBOX, Progress, main, parsed
 
 __all__ = ["COLUMNS", "COMPILING", "TASKS"]
 
@@ -79,16 +79,63 @@ class Heard:
         return out
 
 
+class Tool:
+    """The calibration tool on the bus: what the page asks for goes through an XCP master to the controller's slave."""
+
+    def __init__(self) -> None:
+        from hil.calibrate.master import Master
+        from hil.calibrate.station import MASTER, SLAVE, data_of, row_of
+
+        self._master, self._idents, self._row, self._data = Master(), (MASTER, SLAVE), row_of, data_of
+
+    def ask(self, jobs: list[tuple[int, list[bytes]]]) -> None:
+        """Take jobs: their numbers and commands."""
+        for number, commands in jobs:
+            self._master.ask(number, commands)
+
+    def send(self, ms: float) -> list[tuple[int, int]]:
+        """Frames to send now."""
+        command = self._master.send(ms)
+        return [] if command is None else [self._row(self._idents[0], command)]
+
+    def hear(self, head: int, data: int) -> None:
+        """Take one frame of the bus."""
+        if head & ~(0xFF << 32) == self._idents[1]:
+            self._master.hear(self._data(head, data))
+
+    def news(self) -> dict[str, Any]:
+        """Jobs done since the last call."""
+        done, self._master.done = self._master.done, []
+        return {"xcp": done} if done else {}
+
+
+def _attended(progress: Progress, node: Any, tuned: str | None, bus: str = "") -> Any:
+    """The node with its XCP slave, which saves into ``tuned``; tells the page what may be calibrated.
+
+    bus  it runs on in real time; "": in simulated time
+    """
+    from vaneloop.cli.attended import attend
+
+    args = parsed("run", ["--xcp", "--xcp-save", str(tuned)])
+    attended = attend(args, node, recorded=not bus)
+    attended.told = bool(bus)
+    progress(None, {"elements": attended.services[0].memory.elements})
+    return attended
+
+
 def _told() -> dict[str, Any]:
-    """Everything that the server has told since the last call; of a thing told twice the latest, scenarios all."""
+    """Everything that the server has told since the last call; of a thing told twice the latest, of scenarios and of a
+    tool's commands all.
+    """
     out: dict[str, Any] = {}
     while True:
         try:
             news = INBOX.get_nowait()
         except queue.Empty:
             return out
-        if "inject" in news:
-            out.setdefault("inject", []).append(news.pop("inject"))
+        for every in ("inject", "xcp"):
+            if every in news:
+                out.setdefault(every, []).append(news.pop(every))
         out |= news
 
 
@@ -176,11 +223,13 @@ def lockstep(
     tables: str | None = None,
     controller: str | None = None,
     boxes: str | None = None,
+    tuned: str | None = None,
 ) -> dict[str, Any]:
     """Run controller, ECU and bus in simulated time, ``speed`` seconds of it a second, until told to stop.
 
     tables  folder of the machine's tables; None: the shipped ones
     controller, boxes  shared library of the user's own, and the folder of its black boxes; None: the firmware here
+    tuned  folder into which a calibration tool saves
     """
     from hil.bus.lockstep_bus import Channel
     from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
@@ -195,6 +244,7 @@ def lockstep(
     machine = _machine(tables, controller, boxes)
     node = Node(machine.plant, machine.calibration, n_r=demand, seed=seed)
     ecu = EcuStation(typed, ecu=Ecu(machine.plant, n_dem=demand, seed=None if seed is None else seed + 1))
+    attended, tool = _attended(progress, node, tuned), Tool()
     channel = Channel(seed=seed or 0)
     wire = channel.wire
     places = {"ECU": channel.join(), "VGV": channel.join()}
@@ -224,6 +274,10 @@ def lockstep(
                 elif name == "inject":
                     for scenario in value:
                         injected.add(scenario, k + 1)
+                elif name == "xcp":
+                    tool.ask(value)
+                    if "TOOL" not in places:
+                        places["TOOL"] = channel.join()
             due = time.perf_counter() + NEWS
             until = began_k + (time.perf_counter() - began + NEWS) * 1000.0 * speed if speed else np.inf
             first_k = k
@@ -235,12 +289,14 @@ def lockstep(
                 taken = take(wire, places["ECU"], rows)
                 from_ecu = ecu.tick(rows, taken).tolist()
                 taken = take(wire, places["VGV"], rows)
-                from_vgv = node.tick(rows, taken).tolist()
+                from_vgv = attended.tick(rows, taken).tolist()
                 for who, sent in (("ECU", from_ecu), ("VGV", from_vgv)):
                     for gateway in injected.gateways[who]:
                         sent = gateway.feed(k, sent)
                     for head, data in sent:
                         put(wire, places[who], head, data)
+                for head, data in tool.send(k):
+                    put(wire, places["TOOL"], head, data)
                 for place, intruder in injected.intruders:
                     for head, data in intruder.tick(k, int(wire.node[place, TX_N])):
                         put(wire, place, head, data)
@@ -249,6 +305,7 @@ def lockstep(
                 if n:
                     for head, data in rows[:n].tolist():
                         heard.hear(k * 1e-3, head, data)
+                        tool.hear(head, data)
                         injected.recorded.append((k, head, data))
                     if recorder is not None:
                         recorder.put(packed(start_ns + k * 10**6, rows[:n], rows[:0]))
@@ -266,7 +323,14 @@ def lockstep(
             injecting = max(0.0, min(injected.end, 1e6) - k * 1e-3)
             progress(
                 None,
-                {**heard.news(), "speed": reached, "n_dem": typed.n_dem, "load": channel.load, "injecting": injecting},
+                {
+                    **heard.news(),
+                    **tool.news(),
+                    "speed": reached,
+                    "n_dem": typed.n_dem,
+                    "load": channel.load,
+                    "injecting": injecting,
+                },
             )
     finally:
         if recorder is not None:
@@ -282,6 +346,7 @@ def node(
     tables: str | None = None,
     controller: str | None = None,
     boxes: str | None = None,
+    tuned: str | None = None,
 ) -> dict[str, Any]:
     """Controller and plant in real time, as ``vaneloop run`` does: lateness as it goes, until told to stop."""
     from hil.loop.node import Node
@@ -289,7 +354,7 @@ def node(
     progress(None, COMPILING)
     machine = _machine(tables, controller, boxes)
     made = Node(machine.plant, machine.calibration, seed=seed)
-    return _in_real_time(progress, bus, made, record, None)
+    return _in_real_time(progress, bus, _attended(progress, made, tuned, bus), record, None)
 
 
 def ecu(progress: Progress, bus: str, demand: float, profile: str | None, tables: str | None = None) -> dict[str, Any]:
@@ -310,7 +375,7 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
     from hil.logs.recorder import RecorderProcess
     from hil.loop.ecu import builtin
     from hil.loop.realtime import Stop, run_realtime, undisturbed
-    from vaneloop.cli.station import ACCEPTED
+    from vaneloop.cli.attended import accepted
 
     stop = Stop()
     station.tick(np.zeros((1, 2), np.int64), 0)  # compiled before the first deadline
@@ -333,7 +398,7 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
                     typed[0].n_dem = float(curve[min(int((time.perf_counter() - since) * 100.0), len(curve) - 1)])
             time.sleep(0.02)
 
-    bus = open_bus(name, can_filters=ACCEPTED)
+    bus = open_bus(name, can_filters=accepted(parsed("run", [] if typed else ["--xcp"])))
     recorder = RecorderProcess(record, name.replace(":", "-")) if record else None
     threading.Thread(target=follow, daemon=True).start()
 
@@ -356,24 +421,29 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
 
 
 def listen(progress: Progress, bus: str) -> dict[str, Any]:
-    """Hear everything on a bus until told to stop."""
+    """Hear everything on a bus, and be the calibration tool on it, until told to stop."""
     from hil.bus.port import Port, open_bus
 
     opened = open_bus(bus)
-    port, heard = Port(opened), Heard()
+    port, heard, tool = Port(opened), Heard(), Tool()
     rows = np.zeros((512, 2), np.int64)
     began = time.perf_counter()
     try:
-        while "stop" not in _told():
+        while "stop" not in (told := _told()):
+            tool.ask(told.get("xcp", []))
             due = time.perf_counter() + NEWS
             while time.perf_counter() < due:
                 n = port.read(rows)
                 t = time.perf_counter() - began
                 for head, data in rows[:n].tolist():
                     heard.hear(t, head, data)
+                    tool.hear(head, data)
+                commands = tool.send(1000.0 * t)
+                if commands:
+                    port.write(np.array(commands, np.int64))
                 if n < len(rows):
                     time.sleep(0.005)
-            progress(None, {**heard.news(), "lost": port.lost})
+            progress(None, {**heard.news(), **tool.news(), "lost": port.lost})
     finally:
         opened.shutdown()
     return {"frames": heard.frames}

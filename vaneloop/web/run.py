@@ -17,6 +17,7 @@ from hil.bus.frames import IDENT_MASK, NAMES
 from hil.inject.scenario import library, load_scenario
 from hil.loop.ecu import BUILTIN
 from vaneloop.pages.figures import bars
+from vaneloop.web.calibrate import Calibrate
 from vaneloop.web.charts import Chart
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame
 from vaneloop.web.running import Loop
@@ -40,6 +41,7 @@ def build(session: Session, most: int) -> None:
         with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
             page.strips()
             page.inject()
+        Calibrate(page.live, page.loop).draw()
         with ui.element("div").classes("two").style("grid-template-columns:minmax(0,1fr) minmax(330px,28%)"):
             page.trace()
             page.lateness()
@@ -297,7 +299,7 @@ class _Page:
 
     def trace(self) -> None:
         """Decoded frames, with a filter."""
-        with card("4  The bus"):
+        with card("5  The bus"):
             with ui.element("div").classes("rowc"):
                 self.words = ui.input(placeholder="filter: name, 0B0, signal").props(
                     'outlined dense clearable aria-label="filter of the trace"'
@@ -325,7 +327,7 @@ class _Page:
 
     def lateness(self) -> None:
         """Lateness of the ticks in real time."""
-        with card("5  Real time"):
+        with card("6  Real time"):
             ui.label("How late each 1 ms tick of the controller began.").classes("soft small")
             holder = ui.element("div").classes("stackc")
             seen: dict[str, Any] = {"ticks": None, "dark": None}

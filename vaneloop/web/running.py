@@ -19,6 +19,7 @@ from vaneloop.web.charts import Curves, Mark, Panel, Trace, bands, mode_bands
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS, COMPILING
 from vaneloop.web.session import LogFile, Session
+from vaneloop.web.tuning import Tuning
 
 __all__ = ["Loop"]
 
@@ -56,6 +57,7 @@ class Loop:
     recorded: LogFile | None = None
     events: deque[str] = field(default_factory=lambda: deque(maxlen=40))
     injected: list[Mark] = field(default_factory=list)  # scenarios begun, with their times
+    changes: list[Mark] = field(default_factory=list)  # values and pages changed, with their times
     last: tuple[int, int] = (-1, 0)  # latest mode and faults
     trigger: bool = False  # the charts stop at the next fault
     held: float | None = None  # s: the fault that they stop at
@@ -63,6 +65,9 @@ class Loop:
     runs: int = 0
     boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
     lit: dict[str, int] = field(default_factory=dict)  # lamp -> how often news came in which it was on
+
+    def __post_init__(self) -> None:
+        self.tuning = Tuning(self.session, self._calibrate, self._changed)
 
     @property
     def bus_name(self) -> str:
@@ -141,6 +146,7 @@ class Loop:
         self.trace.clear()
         self.events.clear()
         self.injected.clear()
+        self.changes.clear()
         self.last, self.held = (-1, 0), None
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
@@ -178,6 +184,7 @@ class Loop:
                 seed=self.seed,
                 profile=self.profile,
                 tables=self.session.tables,
+                tuned=str(self.tuning.folder),
                 **own,
             )
             await self._watched(worker, call)
@@ -195,7 +202,14 @@ class Loop:
             self._watched(
                 controller,
                 controller.call(
-                    "node", "running", bus=bus, record=record, seed=self.seed, tables=self.session.tables, **self._own()
+                    "node",
+                    "running",
+                    bus=bus,
+                    record=record,
+                    seed=self.seed,
+                    tables=self.session.tables,
+                    tuned=str(self.tuning.folder),
+                    **self._own(),
                 ),
             ),
             engine.call(
@@ -218,6 +232,7 @@ class Loop:
 
     def _ended(self, record: str | None) -> None:
         self.running = False
+        self.tuning.ended()
         path = self.session.folder / f"run{self.runs}.log"
         if record is not None and path.is_file() and path.stat().st_size:
             self.recorded = LogFile(path, f"recorded: {path.name}", path.name)
@@ -239,6 +254,18 @@ class Loop:
         for name, w in self.workers.items():
             if w.jobs and name != "listen":
                 w.tell(**content)
+
+    def _calibrate(self, number: int, commands: list[bytes]) -> None:
+        """Let the process that stands on the bus send a tool's commands."""
+        w = self.workers.get("loop" if self.bus == "lockstep" else "listen")
+        if w is not None and w.jobs:
+            w.tell(xcp=(number, commands))
+
+    def _changed(self, what: str) -> None:
+        """Note that the calibration was changed."""
+        self.changes.append(Mark(self.now(), what))
+        self.events.append(f"{self.now():.1f} s  calibration: {what}")
+        self.session.touch("events")
 
     def inject(self, name: str) -> None:
         """Start a scenario of the library now."""
@@ -286,6 +313,11 @@ class Loop:
         if "late" in news:
             self.late = news
             return
+        if "elements" in news:
+            self.tuning.began(news["elements"])
+            self.tuning.read()
+            return
+        self.tuning.answered(news.pop("xcp", []))
         first = not self.filled
         rows = news.pop("rows")[-KEPT:]
         over = self.filled + len(rows) - KEPT
@@ -356,7 +388,7 @@ class Loop:
             )
             for title, unit, least, lines in STRIPS
         ]
-        marks = [m for m in self.injected if t[0] <= m.t <= t[-1]]
+        marks = [m for m in (*self.injected, *self.changes) if t[0] <= m.t <= t[-1]]
         state, faults = rows[:, COLUMNS.index("state")], rows[:, COLUMNS.index("faults")]
         spans = [*mode_bands(t, state), *bands(t, faults > 0.0, {1: ("fault", "noise")})]
         self.session.curves["run"] = Curves(panels, "run", marks, spans)
