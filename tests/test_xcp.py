@@ -96,9 +96,14 @@ def write(bench: Bench, name: str, value: float) -> list[str]:
     return [a.hex() for a in answers]
 
 
-def test_the_published_vectors_are_what_the_slave_answers() -> None:
+def published() -> list[tuple[str, str]]:
+    """Requests and answers of docs/xcp.md."""
     text = (ROOT / "docs" / "xcp.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| [^|]+ \| `([0-9A-F ]+)` \| `([0-9A-F ,]+)` \|", text, re.M)
+    return re.findall(r"^\| [^|]+ \| `([0-9A-F ]+)` \| `([0-9A-F ,]+)` \|", text, re.M)
+
+
+def test_the_published_vectors_are_what_the_slave_answers() -> None:
+    rows = published()
     assert len(rows) > 30
     bench = Bench(save=None).run()
     for request, answers in rows:
@@ -673,3 +678,41 @@ def test_scalars_of_a_controller_in_c_are_calibrated_in_its_own_memory(tmp_path:
     other = Node(calibration=load_calibration()._replace(program=again))
     assert own_scalars(other.loop.foreign)[name]["value"][0] == wanted
     assert f"own_{name}" in a2l_of(memory, master=MASTER, slave=SLAVE)
+
+
+def test_scapy_reads_every_published_request_and_answer() -> None:
+    """scapy's XCP layer takes each frame apart by the standard's tables, knows the answer as one to its request, and
+    puts the same bytes together again.
+    """
+    pytest.importorskip("scapy", reason="scapy is not installed: pip install -e '.[test]'")
+    from scapy.contrib.automotive.xcp.xcp import CTORequest, CTOResponse
+    from scapy.packet import Raw
+
+    fields: dict[str, dict[str, Any]] = {}
+    refused: dict[str, str] = {}
+    vectors = published()
+    for request, answers in vectors:
+        asked = CTORequest(bytes.fromhex(request))
+        first = answers.split(",")[0].strip()
+        told = CTOResponse(bytes.fromhex(first))
+        name = asked.sprintf("%CTORequest.pid%")
+        if asked.pid == 0xC5 or first == "FE 21":  # not a command; too short
+            continue
+        assert Raw not in asked and asked.build().hex(" ").upper() == request, request
+        assert told.answers(asked), request
+        assert told.build().hex(" ").upper() == first, request
+        if told.packet_code == 0xFE:
+            refused[request] = told.payload.sprintf("%NegativeResponse.error_code%")
+        else:
+            fields[name] = told.payload.fields
+    assert len(fields) > 28
+    connect, resolution = fields["CONNECT"], fields["GET_DAQ_RESOLUTION_INFO"]
+    assert str(connect["resource"]) == "cal_pag+daq+stim" and (connect["max_cto"], connect["max_dto_le"]) == (8, 8)
+    assert str(connect["comm_mode_basic"]) == "slave_block_mode+optional"
+    assert "overload_event" in str(fields["GET_DAQ_PROCESSOR_INFO"]["daq_properties"])
+    assert (resolution["max_odt_entry_size_daq"], resolution["timestamp_ticks"]) == (7, 1)
+    assert fields["READ_DAQ"]["daq_element_address"] == 0x12000000
+    assert set(refused.values()) == {
+        *("ERR_CMD_SYNCH", "ERR_OUT_OF_RANGE", "ERR_WRITE_PROTECTED", "ERR_ACCESS_DENIED", "ERR_SEGMENT_NOT_VALID"),
+        "ERR_SEQUENCE",
+    }

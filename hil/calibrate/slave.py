@@ -109,7 +109,7 @@ class Slave:
             0xEB: (self._set_page, 4, "cal"),
             0xEA: (self._get_page, 3, "cal"),
             0xE9: (self._page_processor, 1, "cal"),
-            0xE8: (self._segment, 4, "cal"),
+            0xE8: (self._segment, 5, "cal"),
             0xE7: (self._page, 4, "cal"),
             0xE6: (self._set_segment_mode, 3, "cal"),
             0xE5: (self._segment_mode, 3, "cal"),
