@@ -62,7 +62,10 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
             "else it runs until Ctrl-C, and meets others on its bus",
         )
     },
-    "docs/bus.md": {"--frames 10000000": ("--frames 20000", "ten million frames take minutes")},
+    "docs/bus.md": {
+        "--frames 10000000": ("--frames 20000", "ten million frames take minutes"),
+        "--frames 1000000 ": ("--frames 2000 ", "a million frames take minutes"),
+    },
     "docs/rig.md": {"manoeuvre(seed=7)": ("manoeuvre(seed=7, duration=30.0)", "300 s take long")},
 }
 
