@@ -346,11 +346,12 @@ class Server:
         if len(data) % 2 == 0 or len(data) > 33:
             raise Negative(LENGTH)
         idents = struct.unpack(f">{len(data) // 2}H", data[1:])
-        return b"".join(struct.pack(">H", i) + self._value(i) for i in idents)
+        now = self._signals() if any(i in SIGNALS for i in idents) else {}
+        return b"".join(struct.pack(">H", i) + self._value(i, now) for i in idents)
 
-    def _value(self, ident: int) -> bytes:
+    def _value(self, ident: int, now: dict[str, float]) -> bytes:
         if ident in SIGNALS:
-            return struct.pack(">f", self._signals()[SIGNALS[ident][0]])
+            return struct.pack(">f", now[SIGNALS[ident][0]])
         if ident in TEXTS:
             return TEXTS[ident].encode()
         if ident in WRITABLE:
