@@ -39,11 +39,29 @@ def run(page: Any) -> None:
     page.wait_for_timeout(8000)
 
 
+def calibrate(page: Any) -> None:
+    """A gain that is changed while the loop runs."""
+    page.get_by_role("button", name="Start", exact=True).click()
+    kp = page.locator('[data-name="kp"] input')
+    kp.wait_for()
+    page.wait_for_timeout(6000)
+    kp.fill("60")
+    kp.press("Enter")
+    page.get_by_text("calibration: kp 60").wait_for()
+    page.wait_for_timeout(4000)
+    page.locator(".vcard", has_text="Calibrate").evaluate("(e) => window.scrollTo(0, e.offsetTop - 480)")
+
+
 def take(folder: Path) -> list[Path]:
     """Take every picture; return the files."""
     out = []
     with workbench(ROOT / "examples") as (browser, url, _):
-        for path, name, scene in (("", "missing", missing), ("schedule", "schedule", schedule), ("run", "run", run)):
+        for path, name, scene in (
+            ("", "missing", missing),
+            ("schedule", "schedule", schedule),
+            ("run", "run", run),
+            ("run", "calibrate", calibrate),
+        ):
             page = browser.new_context(viewport=WIDE, color_scheme="light").new_page()
             page.set_default_timeout(PATIENCE)
             page.goto(url.replace("/?", f"/{path}?"))

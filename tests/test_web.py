@@ -536,7 +536,7 @@ def test_the_loop_is_calibrated_while_it_runs(server: Server, page: Any) -> None
         page.keyboard.press("Enter")
         events.get_by_text(f"calibration: {name} 0").wait_for()
     kp = page.locator('[data-name="kp"]')
-    kp.get_by_text("reference 16").wait_for()
+    kp.locator(".reference.other", has_text="reference 16").wait_for()
     slider = page.get_by_role("slider", name="speed demand")
     slider.click(position={"x": 0.8 * slider.bounding_box()["width"], "y": 8})
     page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[1].innerText) > 79")

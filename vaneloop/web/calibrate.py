@@ -128,9 +128,9 @@ class Calibrate:
             value, was = (shown(page[i] / factor) for page in t.pages)
             if not field.is_deleted and field.value != value:
                 field.set_value(value)
-            if not reference.is_deleted and reference.text != (said := f"reference {was}"):
-                reference.set_text(said)
-                reference.classes(add="other" if was != value else "", remove="" if was != value else "other")
+            if not reference.is_deleted:
+                reference.set_text(f"reference {was}")
+                reference.classes(replace="note reference" + (" other" if was != value else ""))
         if not self.used.is_deleted:
             self.used.set_value(t.page)
 
