@@ -703,13 +703,13 @@ def test_compiling_is_told_before_it_is_done_whatever_the_format(tmp_path: Path,
         "import sys, pathlib\nfrom vaneloop.base import terminal\nimport vaneloop.cli.main\n"
         f"cache = pathlib.Path({str(tmp_path / 'cache')!r})\n"
         "def say(args, text):\n"
-        "    print(text, '|', *sorted({f.name.split('-')[0] for f in cache.rglob('*.nbi')}), flush=True)\n"
+        "    print(text, '|', *sorted({f.name.split('-')[0] for f in cache.rglob('*.nbc')}), flush=True)\n"
         "terminal.say = say\n"
         f"sys.exit(vaneloop.cli.main.main(['replay', {str(tmp_path / f'a{form}')!r}]))\n"
     )
     import os
 
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "VANELOOP_AHEAD": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
@@ -742,7 +742,7 @@ def test_compiled_code_is_known_by_its_function(tmp_path: Path) -> None:
     )
     import os
 
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "VANELOOP_AHEAD": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False,
                           env=environment)  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from controller import Calibration
     from plant import Plant
 
-__all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "write_attack", "write_frames"]
+__all__ = ["Campaign", "Failure", "fuzz", "read_attack", "run_attack", "watched_ticks", "write_attack", "write_frames"]
 
 WARM = 600  # ticks of good frames before an attack on a running controller
 # ticks of good frames after it; docs/controller.md promises RUN within 2 s, silence and a full bucket cost up to 0.2 s
@@ -82,7 +82,7 @@ KINDS = ("noise", "payload", "insane", "mutated", "length", "wrong kind", "repla
 
 
 @in_place
-def _watched_ticks(
+def watched_ticks(
     k0: int,
     k_end: int,
     attack_end: int,
@@ -350,7 +350,7 @@ class Bench:
 
     def _watch(self, k0: int, k_end: int, attack_end: int, at: np.ndarray, rows: np.ndarray) -> tuple[int, int, int]:
         a = self.node.arrays
-        return _watched_ticks(
+        return watched_ticks(
             k0, k_end, attack_end, at, rows, self.noise, a, self._sent, self.limits, self.transitions, self.ticks_in
         )
 

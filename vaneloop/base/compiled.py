@@ -1,13 +1,12 @@
 """How functions of the hot path are compiled, and where the compiled code is kept.
 
 numba keeps compiled code beside a source file and throws it away when that file changes, but not when a file that it
-calls changes. The folder used here carries a digest of all sources in its name, so that an edited effect is never
-served from stale code.
+calls changes. Here it is known by a digest of all sources (`vaneloop.base.kept`), so that an edited effect is never
+served from stale code; the folder carries that digest in its name, too, so that the code of old sources can go.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import tempfile
@@ -18,20 +17,11 @@ from typing import Any, Protocol, TypeVar, cast
 import numba
 from numba import njit
 
+from vaneloop.base.kept import is_kept, keep, sources_digest
+
 __all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached", "sources_digest"]
 
 KEPT = 6
-_PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
-
-
-def sources_digest() -> str:
-    """Digest of all sources that are compiled, and of numba's version."""
-    root = Path(__file__).parents[2]
-    h = hashlib.sha256(numba.__version__.encode())
-    for package in _PACKAGES:
-        for f in sorted((root / package).rglob("*.py")):
-            h.update(f.name.encode() + f.read_bytes())
-    return h.hexdigest()[:16]
 
 
 def cache_folder() -> Path:
@@ -70,22 +60,27 @@ class Compiler(Protocol):
     def __call__(self, function: F, /) -> F: ...
 
 
-compiled = cast("Compiler", njit(cache=True, error_model="numpy"))
+def _compiler(**options: Any) -> Compiler:
+    compile_: Any = njit(error_model="numpy", **options)
+
+    def of(function: F, /) -> F:
+        return cast("F", keep(compile_(function)))
+
+    return of
+
+
+compiled = _compiler()
 # The same for a loop that runs long on arrays of its own: several may run side by side in threads.
-compiled_free = cast("Compiler", njit(cache=True, error_model="numpy", nogil=True))
+compiled_free = _compiler(nogil=True)
 # The same for functions that work in place on their caller's arrays and allocate nothing: without counting references
 # to those arrays, which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes
 # an array does not compile under it.
-in_place = cast("Compiler", njit(cache=True, error_model="numpy", _nrt=False))  # type: ignore[call-overload]
+in_place = _compiler(_nrt=False)
 # For loop bodies of many scalars, which a call would pass on the stack, and for the parts of the firmware's tick. Its
 # strategies inverse and adaptive are `in_place`: inlined, they would double the time that compiling takes, for all.
-inlined = cast("Compiler", njit(cache=True, error_model="numpy", _nrt=False, forceinline=True))  # type: ignore[call-overload]
+inlined = _compiler(_nrt=False, forceinline=True)
 
 
 def is_cached(function: Callable[..., Any]) -> bool:
     """Whether compiled code of a compiled ``function`` of these sources is there already; compiling takes seconds."""
-    plain = getattr(function, "py_func", None)  # what is not compiled has no code to wait for
-    if plain is None:
-        return True
-    name = f"{plain.__module__.rpartition('.')[2]}.{plain.__qualname__}"
-    return any(Path(numba.config.CACHE_DIR).rglob(f"{name}-*.nbi"))  # type: ignore[attr-defined]
+    return is_kept(function)

@@ -7,7 +7,6 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from controller import MODES
@@ -20,10 +19,12 @@ from hil.inject.fuzz import (
     fuzz,
     read_attack,
     run_attack,
+    watched_ticks,
     write_attack,
     write_frames,
 )
 from vaneloop.base import terminal
+from vaneloop.base.compiled import is_cached
 from vaneloop.base.errors import InputError
 from vaneloop.cli import options
 
@@ -109,7 +110,7 @@ def command(args: argparse.Namespace) -> int:
     if args.stroke_limit is not None:
         limits[2] = args.stroke_limit * 1e-3
     recovery = RECOVERY if args.recovery is None else round(args.recovery * 1e3)
-    if not any(Path(numba.config.CACHE_DIR).rglob("fuzz._watched_ticks*.nbi")):  # type: ignore[attr-defined]
+    if not is_cached(watched_ticks):
         terminal.say(args, "compiling the simulator for this machine (once, about 20 s) ...")
     if args.replay:
         attack = read_attack(args.replay)

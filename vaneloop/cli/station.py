@@ -113,12 +113,12 @@ def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[A
 
 def warm_nodes(args: argparse.Namespace) -> None:
     """Compile the nodes' ticks, saying so before a wait of some seconds."""
-    import numba
     import numpy as np
 
-    from hil.loop.node import Ecu, Node
+    from hil.loop.node import Ecu, Node, node_tick
+    from vaneloop.base.compiled import is_cached
 
-    if not any(Path(numba.config.CACHE_DIR).rglob("node.node_tick*.nbi")):  # type: ignore[attr-defined]
+    if not is_cached(node_tick):
         terminal.say(args, "compiling the nodes for this machine (once, about 20 s) ...")
     nothing = np.zeros((1, 2), np.int64)
     Node().tick(nothing, 0)

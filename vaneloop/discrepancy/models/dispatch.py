@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 from numba import njit
 
+from vaneloop.base.kept import kept_njit
 from vaneloop.discrepancy import laws, library
 from vaneloop.discrepancy.models.own_laws import FIRST_CODE, Law
 from vaneloop.discrepancy.models.user_code import cannot, place_of
@@ -66,7 +67,7 @@ def compiled_code(f: Any, done: dict[int, Any] | None = None) -> Any:
         g.__module__ = f.__module__
     else:
         g = f
-    done[id(f)] = njit(error_model="numpy", nogil=True)(g)
+    done[id(f)] = kept_njit(g, error_model="numpy", nogil=True)
     return done[id(f)]
 
 
