@@ -19,8 +19,40 @@ settings.register_profile("vaneloop", deadline=None, print_blob=True)
 settings.load_profile("vaneloop")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs a CAN interface where there is none, except where the run is there for it (tests/vcan/run.py)."""
+# The modules with the longest tests, longest first. Each worker of xdist begins with some of them, so that none is left
+# for the end, when the others have nothing more to do.
+LONG = (
+    "web", "docs", "real_data", "realtime", "vcan", "fleet_run", "your_own_model", "own_laws", "learn", "design",
+    "reading", "machines", "doubts", "record", "search_commands", "hidden_law", "xcp", "rig", "notebooks", "verbs",
+    "strategies", "native", "fmu", "loggers", "lockstep", "effects", "readings", "starts",
+)  # fmt: skip
+
+
+def longest_first(modules: list[str], workers: int) -> list[int]:
+    """Order of tests, given by their modules, for workers that begin with an even share of them each, one after the
+    other: each share begins with long modules.
+    """
+    long = [f"tests.test_{name}" for name in LONG]
+    shares: list[list[int]] = [[] for _ in range(workers)]
+    for n, name in enumerate(long):
+        turn = n % (2 * workers)  # there and back: 0, 1, 1, 0, ...
+        shares[min(turn, 2 * workers - 1 - turn)] += [i for i, m in enumerate(modules) if m == name]
+    rest = [i for i, m in enumerate(modules) if m not in long]
+    size = len(modules) // workers
+    for share in shares[:-1]:
+        missing = max(size - len(share), 0)
+        share += rest[:missing]
+        rest = rest[missing:]
+    return [i for share in shares for i in share] + rest
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip what needs a CAN interface where there is none, except where the run is there for it (tests/vcan/run.py);
+    give each worker of xdist long tests to begin with.
+    """
+    if own := getattr(config, "workerinput", None):
+        modules = [getattr(getattr(item, "module", None), "__name__", "") for item in items]
+        items[:] = [items[i] for i in longest_first(modules, own["workercount"])]
     if os.environ.get("VANELOOP_NEED_VCAN") or is_up():
         return
     skip = pytest.mark.skip(reason=f"this kernel has no {INTERFACE}; `make test-can` boots one that has")
