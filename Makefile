@@ -2,12 +2,14 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can mutants bench pictures docs lint clean
+.PHONY: help demo test test-all test-can mutants bench pictures docs lint clean compiled
 
 VENV := .venv
 PY := $(VENV)/bin/python
 SAY := printf '[vaneloop] %s\n'
 JOBS ?= 2
+# Each of the JOBS has a core: threads of BLAS would wait for each other.
+ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 # Why tests were skipped: pytest writes it there, and the last lines of `make test` say it.
 NOT_TESTED := out/not_tested.txt
 
@@ -23,23 +25,23 @@ help:  ## list the targets
 	@printf 'VaneLoop\n\n'
 	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
 
-demo: $(READY)  ## replay a recorded engine run and the long engine test; writes demo/*.html
+demo: compiled  ## replay a recorded engine run and the long engine test; writes demo/*.html
 	@$(PY) -m vaneloop.cli.demo
 
-test: lint  ## lint, types, and every test but the slow ones
+test: lint compiled  ## lint, types, and every test but the slow ones
 	@$(need_chromium)
 	@$(SAY) 'pytest'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
+	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
 	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
 
-test-all: lint  ## lint, types, and every test, with the slow campaigns
+test-all: lint compiled  ## lint, types, and every test, with the slow campaigns
 	@$(need_chromium)
 	@$(SAY) 'pytest, with the slow campaigns'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
+	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
 	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
 
 test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
@@ -67,8 +69,11 @@ lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'mypy'
 	@$(PY) -m mypy
 
+compiled: $(READY)
+	@$(PY) -m vaneloop.cli.ahead
+
 clean:  ## remove what the other targets made, the environment too
-	@rm -rf $(VENV) build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@rm -rf $(VENV) build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis vaneloop/base/ahead
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(HOME_OF_VENV):

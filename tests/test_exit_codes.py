@@ -104,6 +104,7 @@ def test_bad_input_is_no_defect(capsys: pytest.CaptureFixture[str]) -> None:
 MODULES = {
     "vaneloop": ("hil.logs.read_log", ["locate", LOG]),
     "vaneloop.cli.main": ("hil.logs.read_log", ["locate", LOG]),
+    "vaneloop.cli.ahead": ("vaneloop.base.kept.sources_digest", []),
     "vaneloop.cli.demo": ("os.path.relpath", []),
     "vaneloop.web.worker": ("", ["not a number"]),
     "vaneloop.web.loop": ("", ["not a number"]),

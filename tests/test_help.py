@@ -7,6 +7,8 @@ from __future__ import annotations
 import importlib
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -166,3 +168,17 @@ def test_every_exception_is_an_example_of_some_help() -> None:
     lines = [shlex.join(words) for name in COMMANDS for words in examples(name)]
     assert [k for k in [*NOT_RUN, *LONG, *LONG_EXAMPLES] if not any(x.startswith(k) for x in lines)] == []
     assert [k for k in SMALLER if not any(k in x for x in lines)] == []
+
+
+def test_a_command_reads_can_without_asammdf_unless_it_is_given_mdf() -> None:
+    """asammdf takes most of the time in which python-can is imported, and whoever else wants it gets it."""
+    code = (
+        "import sys\nfrom vaneloop.cli import main\nmain.main = lambda words: 0\n"
+        "try:\n    main.run()\nexcept SystemExit:\n    pass\n"
+        "import can\nprint('asammdf' in sys.modules)\nimport asammdf\nprint(asammdf.__name__)\n"
+    )
+    for words, there in ((["replay", "a.log"], "False"), (["run", "--inputs", "a.MF4"], "True")):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == [there, "asammdf"]

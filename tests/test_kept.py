@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 import os
 import subprocess
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
-from vaneloop.base.kept import digest_of
+from vaneloop.base import terminal
+from vaneloop.base.kept import Waiting, digest_of
 from vaneloop.discrepancy import laws
 
 # Two users' models of the same names, whose helper is too large to be put in place: what is compiled in another process
@@ -56,8 +58,8 @@ print(*(answer(float(loss)) for loss in sys.argv[1:]), len(compiled))
 """
 
 
-def run(folder: Path, *losses: str) -> list[float]:
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(folder)}
+def run(folder: Path, *losses: str, **env: str) -> list[float]:
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(folder), **env}
     words = [sys.executable, "-c", CODE, *losses]
     done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -70,6 +72,31 @@ def test_a_users_functions_are_compiled_once_and_two_of_one_name_are_told_apart(
     *other, compiled = run(tmp_path, "2.0")
     assert other == [4.0] and compiled > 0
     assert run(tmp_path, "0.5", "2.0", "0.5") == [1.0, 4.0, 1.0, 0], "both from files, nothing compiled"
+
+
+def test_what_was_compiled_ahead_is_read_and_left_as_it_is(tmp_path: Path) -> None:
+    run(tmp_path / "ahead", "0.5")
+    before = sorted((tmp_path / "ahead").rglob("*"))
+    assert run(tmp_path / "user", "0.5", VANELOOP_AHEAD=str(tmp_path / "ahead")) == [1.0, 0], "nothing compiled"
+    *_, compiled = run(tmp_path / "user", "2.0", VANELOOP_AHEAD=str(tmp_path / "ahead"))
+    assert compiled > 0 and sorted((tmp_path / "ahead").rglob("*")) == before
+    assert list((tmp_path / "user").rglob("*.nbc"))
+
+
+@pytest.mark.slow
+def test_after_the_set_up_the_first_replay_and_diagnosis_compile_nothing(tmp_path: Path) -> None:
+    env = {**os.environ, "VANELOOP_AHEAD": str(tmp_path / "ahead"), "NUMBA_CACHE_DIR": str(tmp_path / "user")}
+    for words in (
+        ["vaneloop.cli.ahead"],
+        ["vaneloop", "replay", "examples/engine_run.blf"],
+        ["vaneloop", "diagnose", "examples/hidden_effect.parquet"],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", *words], cwd=ROOT, env=env, capture_output=True, text=True, check=False
+        )
+        assert done.returncode in (0, 1), done.stderr
+        assert ("compiling" in done.stdout + done.stderr) == (words == ["vaneloop.cli.ahead"]), done.stdout
+    assert not list((tmp_path / "user").rglob("*.nbc"))
 
 
 def test_a_damaged_file_counts_as_none(tmp_path: Path) -> None:
@@ -140,3 +167,53 @@ def test_what_cannot_be_told_has_no_digest(k: Any) -> None:
     assert digest_of(made("def f(x): return k", k=k)) == ""
     assert digest_of(made("def f(x): return g(x)", g=made("def f(x): return k", k=k))) == ""
     assert digest_of(made("def f(x): return x", k=k)), "it is not referred to"
+
+
+@pytest.fixture
+def a_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "is_command", True)
+    monkeypatch.setattr(terminal, "told_of_compiling", False)
+
+
+def compile_for_long(waiting: Waiting) -> None:
+    waiting.on_start(None)
+    assert waiting.timer is not None
+    waiting.timer.join()
+    waiting.on_start(None)  # a function that it calls
+    waiting.on_end(None)
+    waiting.on_end(None)
+
+
+def test_a_long_compilation_is_told_once(a_command: None, capsys: pytest.CaptureFixture[str]) -> None:
+    waiting = Waiting(after=0.0)
+    compile_for_long(waiting)
+    waiting.on_start(None)
+    waiting.on_end(None)
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("vaneloop: compiling what has not run") and err.count("\n") == 1
+
+
+def test_a_short_compilation_is_not_told(a_command: None, capsys: pytest.CaptureFixture[str]) -> None:
+    waiting = Waiting(after=1e6)
+    waiting.on_start(None)
+    waiting.on_end(None)
+    assert waiting.timer is not None and waiting.timer.finished.is_set()
+    assert capsys.readouterr().err == ""
+
+
+def test_what_the_command_told_itself_hides_only_the_next_one(
+    a_command: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Reading a CAN log tells of its own compilation; what comes after it is another."""
+    args = argparse.Namespace(quiet=False, json=None)
+    terminal.say(args, "compiling the reader of CAN logs for this machine (once, about 3 s) ...")
+    waiting = Waiting(after=0.0)
+    compile_for_long(waiting)
+    assert capsys.readouterr().err == ""
+    compile_for_long(waiting)
+    assert "compiling what has not run" in capsys.readouterr().err
+
+
+def test_a_program_that_calls_a_command_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
+    compile_for_long(Waiting(after=0.0))
+    assert capsys.readouterr().err == ""

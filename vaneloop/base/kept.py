@@ -16,6 +16,7 @@ import itertools
 import os
 import pickle
 import sys
+import threading
 import types
 import uuid
 from collections.abc import Callable
@@ -26,10 +27,12 @@ from typing import Any
 import numba
 import numpy as np
 from numba import njit
-from numba.core import compiler, config, serialize
+from numba.core import compiler, config, event, serialize
 from numba.core.caching import FunctionCache
 
-__all__ = ["AHEAD", "digest_of", "is_kept", "keep", "kept_njit", "sources_digest"]
+from vaneloop.base import terminal
+
+__all__ = ["AHEAD", "Waiting", "digest_of", "is_kept", "keep", "kept_njit", "sources_digest"]
 
 _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
@@ -181,6 +184,41 @@ def _file_digest(file: str) -> str:
         return hashlib.sha256(Path(file).read_bytes()).hexdigest()
     except OSError:
         return uuid.uuid4().hex  # no file: nothing to know the code by
+
+
+class Waiting(event.Listener):
+    """Tells the user (`terminal.compiling`) when a compilation, with all that it calls, has taken ``after`` seconds.
+    Once is enough.
+    """
+
+    def __init__(self, after: float = 1.0):
+        self.after, self.depth, self.told = after, 0, False
+        self.timer: threading.Timer | None = None
+
+    def on_start(self, event: Any) -> None:
+        """A function begins to be compiled: the outermost, or one that it calls."""
+        self.depth += 1
+        if self.depth == 1 and not self.told:
+            self.timer = threading.Timer(self.after, self.tell)
+            self.timer.daemon = True
+            self.timer.start()
+
+    def on_end(self, event: Any) -> None:
+        """It is compiled."""
+        self.depth -= 1
+        if self.depth == 0:
+            terminal.told_of_compiling = False
+            if self.timer is not None:
+                self.timer.cancel()
+
+    def tell(self) -> None:
+        """Tell it, unless the command has told it itself."""
+        self.told = not terminal.told_of_compiling
+        terminal.compiling()
+
+
+_register: Any = event.register
+_register("numba:compile", Waiting())
 
 
 class _Unknown(Exception):

@@ -20,6 +20,7 @@ __all__ = [
     "DEFECT",
     "Parser",
     "add_output_options",
+    "compiling",
     "defect",
     "pairs",
     "print_table",
@@ -29,6 +30,10 @@ __all__ = [
     "start",
     "write_json",
 ]
+
+
+is_command = False  # this process is the command that a user typed, and no program that calls it
+told_of_compiling = False  # of what is compiled next
 
 
 class Parser(argparse.ArgumentParser):
@@ -82,8 +87,16 @@ def pairs(
 
 def say(args: argparse.Namespace, text: str) -> None:
     """Tell the user something, unless quiet; where JSON goes to standard output, text goes to standard error."""
+    global told_of_compiling
+    told_of_compiling = told_of_compiling or text.startswith("compiling")
     if not args.quiet:
         print(text, file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
+
+
+def compiling() -> None:
+    """Tell the user of a command that something is being compiled, where nothing else has told it."""
+    if is_command and not told_of_compiling and "--quiet" not in sys.argv:
+        print("vaneloop: compiling what has not run on this machine before (once, it is kept) ...", file=sys.stderr)
 
 
 def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: list[list[str]]) -> None:

@@ -105,8 +105,22 @@ def main(argv: list[str]) -> int:
     return terminal.start(f"vaneloop {name}", lambda: importlib.import_module(COMMANDS[name][0]), argv[1:])
 
 
+class _CanWithoutMdf:
+    """python-can imports asammdf for a format that is read otherwise here (`hil.logs.mdf`): 0.8 of its 0.9 s. In the
+    process of a command it is told that there is none. Whoever else imports asammdf gets it.
+    """
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        asks = sys.modules.get("can.io.mf4")
+        if name == "asammdf" and getattr(getattr(asks, "__spec__", None), "_initializing", False):
+            raise ImportError("not for python-can")
+
+
 def run() -> None:
     """Entry point of the console script."""
+    terminal.is_command = True
+    if not any(".mf4" in word.lower() for word in sys.argv):
+        sys.meta_path.insert(0, _CanWithoutMdf())
     sys.exit(main(sys.argv[1:]))
 
 
