@@ -63,10 +63,10 @@ def run(
 
 def share(hits: list[bool]) -> dict[str, Any]:
     """A share with its 90 % binomial interval (Wilson)."""
-    from statsmodels.stats.proportion import proportion_confint
+    from scipy.stats import binomtest
 
     n, k = len(hits), sum(hits)
-    low, high = proportion_confint(k, n, 0.10, "wilson") if n else (0.0, 1.0)
+    low, high = binomtest(k, n).proportion_ci(0.90, "wilson") if n else (0.0, 1.0)
     return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}
 
 
