@@ -7,6 +7,7 @@ Screenshots are kept in ``out/web`` (or VANELOOP_SHOTS).
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -101,11 +102,21 @@ def renamed(path: Path) -> None:
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(["t", *columns]), comments="")
 
 
+def faulted(path: Path) -> None:
+    """Thirty seconds in which the controller is in DEGRADED and in FAIL_SAFE, each for a tenth of a second."""
+    t = np.arange(0.0, 30.0, 0.01)
+    state = np.where(t < 10.0, 2.0, np.where(t < 10.1, 3.0, np.where(t < 10.2, 4.0, 2.0)))
+    fault = (t >= 10.0) & (t < 10.2)
+    table = np.column_stack([t, 70.0 + np.sin(t), 20.0 + np.sin(t), state, fault])
+    np.savetxt(path, table, delimiter=",", header="t,n_dem,x_lvdt,state,fault_demand_stale", comments="", fmt="%.6g")
+
+
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("web")
     (folder / "broken.csv").write_text("time_s,n_dem\n0.0,60\n0.1,sixty\n")
     renamed(folder / "renamed.csv")
+    faulted(folder / "faulted.csv")
     s = Server(folder)
     yield s
     s.stop()
@@ -397,6 +408,72 @@ def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path:
             context.close()
 
 
+@needs_browser
+def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Server, page: Any) -> None:
+    page.goto(server.url)
+    choose(page, "faulted.csv")
+    page.get_by_text("All channels").click()
+    curves = page.locator(".curves").first
+    page.locator(".curves-name").first.wait_for(state="detached")
+    # a log laid over stays when the log is read again
+    page.locator(".other").click()
+    page.get_by_role("option", name="renamed.csv").click()
+    legend = page.locator(".curves-legend", has_text="renamed.csv")
+    legend.wait_for()
+    page.get_by_text("Names and units").click()
+    page.get_by_role("button", name="Read again").click()
+    page.get_by_role("alert").first.wait_for()  # this log has too little to compare
+    legend.wait_for()
+
+    # a press on an event shows it; short bands' names do not lie over each other
+    tab_to(page, ".moment")
+    page.locator(".moment", has_text="mode DEGRADED").click()
+    page.wait_for_function("document.querySelector('.curves').dataset.view === '8.0000 12.0000'")
+    page.wait_for_function("document.querySelector('.curves').dataset.labels.includes('FAIL_SAFE')")
+    _, below = json.loads(curves.get_attribute("data-labels"))
+    assert {text for *_, text in below} == {"DEGRADED", "FAIL_SAFE", "demand_stale"}
+    for k, (a, b, row, _) in enumerate(below):
+        assert all(r != row or d < a or c > b for c, d, r, _ in below[k + 1 :]), below
+
+    # channels are chosen from the tree; what is seen is kept under a name, over a reload
+    page.locator(".curves-tree summary").click()
+    page.locator(".curves-tree").get_by_label("speed").uncheck()
+    page.get_by_text("Channels: 2 of 3 shown").wait_for()
+    page.get_by_label("name of a layout").fill("fault")
+    page.keyboard.press("Enter")
+    page.get_by_label("show a layout that was kept").wait_for()
+    page.reload()
+    page.get_by_text("All channels").click()
+    page.get_by_text("Channels: 3 of 3 shown").wait_for()
+    page.get_by_label("show a layout that was kept").select_option("fault")
+    page.get_by_text("Channels: 2 of 3 shown").wait_for()
+    page.wait_for_function("document.querySelector('.curves').dataset.view === '8.0000 12.0000'")
+
+    # what is exported is what is seen: dashes, bands, names
+    with page.expect_download() as download:
+        page.get_by_label("save these curves as SVG").first.click()
+    drawn = Path(download.value.path()).read_text()
+    assert drawn.count("stroke-dasharray") >= 3  # the other log's name and curve, the reference
+    assert all(name in drawn for name in ("renamed.csv", "FAIL_SAFE", "demand_stale")) and "n_dem" not in drawn
+    looks(page, "curves")
+
+
+@needs_browser
+@given(st.lists(st.tuples(st.floats(0, 1000), st.sampled_from(["RUN", "DEGRADED", "a fault with a long name"]))))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30, deadline=None)
+def test_names_in_a_chart_never_lie_over_each_other(page: Any, words: list[tuple[float, str]]) -> None:
+    source = (ROOT / "vaneloop" / "web" / "chart.js").read_text(encoding="utf-8")
+    script = re.sub(r"^import .*$", "", source, flags=re.M).replace("export default", "return")
+    placed = page.evaluate(
+        f"(list) => {{ const chart = (() => {{ {script} }})(); "
+        "return chart.methods.placed(list, 0, 1000, (t) => 6 * t.length, 4).map((m) => [m.from, m.to, m.row]); }",
+        [{"x": x, "text": text} for x, text in words],
+    )
+    assert len(placed) >= min(1, len(words))
+    for k, (a, b, row) in enumerate(placed):
+        assert 0 <= a < b <= 1000 and all(r != row or d < a or c > b for c, d, r in placed[k + 1 :])
+
+
 # ---- page 2: schedule ------------------------------------------------------------------------------------------------
 
 
@@ -510,6 +587,11 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
         "(() => { const l = document.querySelector('.trace').innerText.trim().split('\\n');"
         " return l.length > 3 && l.every((x) => x.includes('VGV_HEALTH')); })()"
     )
+    page.locator(".moment", has_text="injected: demand_stops").wait_for()
+    page.locator(".moment", has_text="mode FAIL_SAFE").first.click()  # its moment is held
+    page.locator(".held", has_text="held at").wait_for()
+    page.get_by_role("button", name="Go on").click()
+    page.locator(".held", has_text="held at").wait_for(state="detached")
     page.reload()  # the loop goes on
     page.locator('[data-lamp="RUN"].good').wait_for()
     page.wait_for_function("parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 15")
@@ -1176,11 +1258,11 @@ def test_a_thinned_view_keeps_every_spike_and_hole() -> None:
 
 
 def test_another_log_is_laid_over_at_the_first_one_s_times() -> None:
-    from vaneloop.web.charts import of_log
+    from vaneloop.web.charts import Over, of_log
 
     t = np.arange(100) * 0.1
     here, there = {"x": ("mm", t, t), "y": ("mm", t, t)}, {"x": ("mm", t[::2], 3.0 * t[::2])}
-    panels = of_log(here, "k", there, later=2.0).panels
+    panels = of_log(here, "k", [Over("other", there, 2.0)]).panels
     assert [len(p.traces) for p in panels] == [2, 1]
     over = panels[0].traces[1].y
     after = panels[0].t >= 2.0

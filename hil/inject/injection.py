@@ -128,6 +128,7 @@ class Disturber:
         self.wire, self.places = wire, places
         self.errors = [(tick_of(a.start), tick_of(a.end), a.probability) for a in actions if isinstance(a, ErrorFrames)]
         self.off = [(tick_of(a.start), tick_of(a.end), places[a.node]) for a in actions if isinstance(a, BusOff)]
+        self.end = max((end for _, end, _ in (*self.errors, *self.off)), default=0.0)
 
     def tick(self, k: int) -> None:
         """Set the wire's state for tick ``k``."""

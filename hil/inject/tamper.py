@@ -67,6 +67,10 @@ class Gateway:
         self.frozen: dict[int, int] = {}
         self.order = 0
 
+    def done(self, k: int) -> bool:
+        """Whether nothing is left to do from tick ``k`` on."""
+        return all(end <= k for _, end in self.span) and not self.late and not any(self.held)
+
     def feed(self, k: int, sent: Iterable[Words]) -> list[Words]:
         """Take the frames that the nodes send at tick ``k``; return those that reach the bus at it."""
         if not self.stages:

@@ -2,9 +2,14 @@
 
 from vaneloop.base.vanes import VANES
 
-__all__ = ["UNITS"]
+__all__ = ["UNITS", "heading"]
 
 UNITS = {
     "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "p_s": "MPa", "t_oil": "degC",
     **dict.fromkeys(VANES, "deg"), "state": "-",
 }  # fmt: skip
+
+
+def heading(name: str, unit: str) -> str:
+    """A quantity as a column or an axis is headed: its unit in brackets, where it has one."""
+    return f"{name} [{unit}]" if unit not in ("", "-") else name

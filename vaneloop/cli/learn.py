@@ -9,6 +9,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.signals import heading
 from vaneloop.cli import options, own_model
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -64,8 +65,7 @@ def command(args: argparse.Namespace) -> int:
         rows = [
             [f"{law.x[k]:.4g}", *(f"{v[k]:.4g}" for v in (law.y, law.low, law.high))] for k in range(0, len(law.x), 32)
         ]
-        unit = "" if law.unit == "-" else f" [{law.unit}]"
-        columns = [f"{law.of} [{law.of_unit}]", f"curve{unit}", "90 % from", "to"]
+        columns = [heading(law.of, law.of_unit), heading("curve", law.unit), "90 % from", "to"]
         terminal.print_table(args, f"{law.name}", columns, rows)
         for f in law.formulas:
             name = f", {f.law} of the library" if f.law else ""

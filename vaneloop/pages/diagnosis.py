@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vaneloop.base.signals import heading
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located, locate
 from vaneloop.discrepancy.models.by_log import ByLog
@@ -251,8 +252,8 @@ def _told(
             page.plot(
                 loop(
                     [Line("what is left", x.x, x.y, "error", 2.0)],
-                    f"{x.feature} [{x.x_unit}]",
-                    f"{x.output} [{x.y_unit}]",
+                    heading(x.feature, x.x_unit),
+                    heading(x.output, x.y_unit),
                 )
             )
     recal = [r for s in d.stages for r in s.recalibrated]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from vaneloop.base.signals import heading
 from vaneloop.discrepancy.locate import Regime
 from vaneloop.pages.figures import Figure, heat
 
@@ -26,7 +27,7 @@ def failure_map(regimes: Sequence[Regime]) -> Figure:
         cells.append([float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty)
         places.append([_range(r, b) for b in range(len(r.ratio))] + [""] * empty)
         moments.append([*(float(v) for v in r.moments), *[None] * empty])
-    names = [f"{r.condition} [{r.condition_unit}]" if r.condition_unit else r.condition for r in regimes]
+    names = [heading(r.condition, r.condition_unit) for r in regimes]
     columns = [f"eighth {i + 1}" for i in range(width)]
     figure = heat(cells, columns, names, "noise floors", "an eighth of the samples each, lowest values to highest", "",
                   places=places, moments=moments)  # fmt: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vaneloop.base.signals import heading
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
 from vaneloop.discrepancy.models.learning import Outcome
@@ -34,9 +35,7 @@ def curve_figure(law: LearnedLaw) -> Figure:
         Line("beyond the logs", below, np.full(2, law.y[0]), "model", 1.4, "dash"),
         Line("beyond the logs, above", above, np.full(2, law.y[-1]), "model", 1.4, "dash"),
     ]  # fmt: skip
-    unit = "" if law.unit == "-" else f" [{law.unit}]"
-    of_unit = "" if law.of_unit == "-" else f" [{law.of_unit}]"
-    return loop(lines, f"{law.of}{of_unit}", f"{law.name}{unit}")
+    return loop(lines, heading(law.of, law.of_unit), heading(law.name, law.unit))
 
 
 def visited_figure(law: LearnedLaw) -> Figure:
@@ -67,7 +66,7 @@ def learned_page(
             "log has been there, and the curve stays as at its end.",
         )
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
-        page.plot(visited_figure(law), f"Where the logs have been, {law.of} in {law.of_unit or '-'}.")
+        page.plot(visited_figure(law), f"Where the logs have been: {heading(law.of, law.of_unit)}.")
         if law.formulas:
             page.table(
                 ["formula", "held-out error, noise floors", "law of the library"],

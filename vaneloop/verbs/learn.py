@@ -81,7 +81,7 @@ class Learned(Answer):
                 out.append(f"{law.name} trades with {', '.join(law.trades)}: without its mean and slope they move")
             if law.rivals:
                 out.append(f"{law.name}: as good: {', '.join(law.rivals)}")
-            reach = f"[{law.x[0]:.4g}, {law.x[-1]:.4g}] {law.of_unit}"
+            reach = f"[{law.x[0]:.4g}, {law.x[-1]:.4g}] {law.of_unit.strip('-')}".strip()
             out.append(f"{law.name}: {law.of} has been in {reach}; beyond, the curve stays as at its end")
         return out
 

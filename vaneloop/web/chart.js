@@ -3,19 +3,27 @@
 import uPlot from "uplot";
 
 const PAD = 0.34;
+const ROWS = 4; // of names of marks and bands
 
 export default {
   template: `<div class="curves"><div v-if="tools" class="curves-tools">
       <input v-if="tree" v-model="word" @input="build" class="curves-find" type="search" placeholder="find a channel" aria-label="find a channel">
       <button v-for="(act, name) in { PNG: png, SVG: svg, CSV: csv }" :key="name" type="button" class="curves-tool" @click="act" :aria-label="'save these curves as ' + name">{{ name }}</button>
-      <button type="button" class="curves-tool" @click="keep" aria-label="keep this layout: view, channels, names hidden">Keep layout</button>
-      <button type="button" class="curves-tool" @click="recall" aria-label="show the layout that was kept">Show kept</button></div>
+      <template v-if="tree"><input v-model="name" class="curves-find" placeholder="name of a layout" aria-label="name of a layout" @keydown.enter="keep">
+      <button type="button" class="curves-tool" @click="keep" aria-label="keep this layout: view, channels, lines hidden, reference">Keep layout</button>
+      <select v-if="Object.keys(kept).length" class="curves-tool" aria-label="show a layout that was kept" @change="recall($event.target.value)">
+        <option value="">layouts kept</option><option v-for="(_, n) in kept" :key="n" :value="n" :selected="n === name">{{ n }}</option></select>
+      <button v-if="kept[name]" type="button" class="curves-tool" @click="forget" :aria-label="'forget the layout ' + name">Forget</button></template></div>
+    <details v-if="tools && tree" class="curves-tree"><summary>Channels: {{ names.filter((c) => wanted(c)).length }} of {{ names.length }} shown</summary>
+      <div class="curves-groups"><fieldset v-for="group in groups()" :key="group.name"><legend><label><input type="checkbox" :checked="group.list.every((c) => !off[c.title])"
+        @change="show(group.list, $event.target.checked)"> {{ group.name }}</label></legend>
+        <label v-for="c in group.list" :key="c.title"><input type="checkbox" :checked="!off[c.title]" @change="show([c], $event.target.checked)"> {{ c.title }}</label></fieldset></div></details>
     <div ref="legend" class="curves-legend"></div>
     <div ref="stack" class="curves-stack" tabindex="0" role="group" :aria-label="'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference'" @keydown="key_"></div>
     <div ref="said" class="away" role="status"></div>
     <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; click: reference for differences &middot; double-click: everything</div></div>`,
   props: { src: String, version: Number, live: Number, unit: String, tree: Boolean },
-  data() { return { tools: false, word: "" }; },
+  data() { return { tools: false, word: "", name: "", names: [], off: {}, kept: {} }; },
   mounted() {
     this.plots = [];
     this.view = null; // [from, to] in s; null: everything
@@ -24,6 +32,7 @@ export default {
     this.again = false;
     this.hidden = {};
     this.at = null; // s: reference cursor
+    this.kept = JSON.parse(localStorage.getItem("layouts " + this.src) || "{}");
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(this.$el);
     this.themes = new MutationObserver(() => this.rebuild());
@@ -78,6 +87,8 @@ export default {
       this.head = head;
       this.data = data;
       this.tools = !this.live && head.panels.length > 0;
+      const names = head.panels.map((p) => ({ title: p.title, group: p.group }));
+      if (JSON.stringify(names) !== JSON.stringify(this.names)) this.names = names;
       const shape = JSON.stringify([head.panels.map((p) => [p.title, p.unit, p.lines, p.height]), head.key]);
       if (shape !== this.shape) {
         if (head.key !== this.key) { this.view = null; this.at = null; }
@@ -122,6 +133,19 @@ export default {
       return (role) => css.getPropertyValue("--" + role).trim() || "#888";
     },
     rebuild() { if (this.head && this.dark !== document.body.classList.contains("body--dark")) this.build(); },
+    wanted(channel) {
+      const word = this.word.trim().toLowerCase();
+      return !this.off[channel.title] && (!word || channel.title.toLowerCase().includes(word));
+    },
+    groups() {
+      const word = this.word.trim().toLowerCase(), out = new Map();
+      this.names.filter((c) => !word || c.title.toLowerCase().includes(word)).forEach((c) => out.set(c.group, [...(out.get(c.group) || []), c]));
+      return [...out].map(([name, list]) => ({ name: name || "other", list }));
+    },
+    show(list, on) {
+      list.forEach((c) => { this.off[c.title] = !on; });
+      this.build();
+    },
     build() {
       this.dark = document.body.classList.contains("body--dark");
       if (this.$refs.hint) this.$refs.hint.style.display = this.head.panels.length ? "" : "none";
@@ -131,11 +155,10 @@ export default {
       const legend = new Map();
       const first = this.head.panels.map((p) => p.lines.map((l) => l.name).join());
       const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own
-      const word = this.word.trim().toLowerCase();
-      const shown = this.head.panels.map((p, i) => i).filter((i) => !word || this.head.panels[i].title.toLowerCase().includes(word));
+      const shown = this.head.panels.map((p, i) => i).filter((i) => this.wanted(this.head.panels[i]));
       this.plots = shown.map((i) => {
         const panel = this.head.panels[i];
-        if (!own) panel.lines.forEach((l) => legend.set(l.name, l.role));
+        if (!own) panel.lines.forEach((l) => legend.set(l.name, l));
         const last = i === shown[shown.length - 1];
         const axis = { stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, font: "12px system-ui, sans-serif" };
         const plot = new uPlot({
@@ -147,7 +170,7 @@ export default {
             { ...axis, show: last, size: last ? 34 : 0, values: (u, v) => v.map((x) => +x.toPrecision(9) + (x === v[v.length - 1] ? " s" : "")) },
             { ...axis, size: 62, label: panel.title, labelSize: 20, labelFont: "12px system-ui, sans-serif", labelGap: 0, values: (u, v) => v.map((x) => +x.toPrecision(6)) },
           ],
-          series: [{}, ...panel.lines.map((l) => ({ label: l.name, stroke: colour(l.role), width: l.width || 1.25, dash: l.dash, points: { show: false }, show: !this.hidden[l.name] }))],
+          series: [{}, ...panel.lines.map((l) => ({ label: l.name, stroke: colour(l.role), width: l.width || 1.25, dash: l.dash && l.dash.length ? l.dash : undefined, points: { show: false }, show: !this.hidden[l.name] }))],
           hooks: {
             drawClear: [(u) => this.band(u, panel, colour), (u) => this.spans(u, colour)],
             draw: [(u) => this.marks(u, colour, i === shown[0])],
@@ -180,13 +203,15 @@ export default {
         }
         return plot;
       });
-      const names = [...legend].map(([name, role]) => {
+      this.legend = legend.size > 1 ? [...legend] : [];
+      const names = [...legend].map(([name, l]) => {
         const b = document.createElement("button");
         b.type = "button";
         b.className = "curves-name" + (this.hidden[name] ? " off" : "");
         b.title = "show or hide";
         const mark = document.createElement("i");
-        mark.style.background = colour(role);
+        mark.style.borderTopColor = colour(l.role);
+        if (l.dash && l.dash.length) mark.style.borderTopStyle = "dashed";
         b.append(mark, document.createTextNode(name));
         b.onclick = () => { this.hidden[name] = !this.hidden[name]; this.build(); };
         return b;
@@ -225,28 +250,50 @@ export default {
       });
     },
     marks(u, colour, named) {
-      const { left, top, width, height } = u.bbox, c = u.ctx, dots = devicePixelRatio || 1;
-      const line = (t, role, text) => {
-        const x = u.valToPos(t, "x", true);
-        if (x < left || x > left + width) return;
-        c.save();
-        c.strokeStyle = c.fillStyle = colour(role);
+      const { left, top, width, height } = u.bbox, c = u.ctx, dots = devicePixelRatio || 1, right = left + width;
+      const inside = (x) => x >= left && x <= right;
+      const line = (x, role) => {
+        c.strokeStyle = colour(role);
         c.setLineDash([4 * dots, 3 * dots]);
         c.lineWidth = dots;
         c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
-        if (text) { c.font = 11 * dots + "px system-ui, sans-serif"; c.textAlign = x > left + 0.8 * width ? "right" : "left"; c.fillText(" " + text + " ", x, top + 11 * dots); }
-        c.restore();
       };
-      (this.head.marks || []).forEach(([t, text]) => line(t, "bad", named ? text : ""));
-      if (named) (this.head.bands || []).forEach(([a, , text, role]) => { const x = u.valToPos(a, "x", true); if (x >= left && x < left + width) { c.save(); c.fillStyle = colour("text"); c.font = 11 * dots + "px system-ui, sans-serif"; c.fillText(text, x + 3 * dots, top + height - 4 * dots); c.restore(); } });
-      if (this.at !== null) line(this.at, "text", "");
+      c.save();
+      const marks = (this.head.marks || []).map(([t, text]) => ({ x: u.valToPos(t, "x", true), text, role: "bad" })).filter((m) => inside(m.x));
+      marks.forEach((m) => line(m.x, m.role));
+      if (this.at !== null && inside(u.valToPos(this.at, "x", true))) line(u.valToPos(this.at, "x", true), "text");
+      if (named) {
+        c.font = 11 * dots + "px system-ui, sans-serif";
+        c.textAlign = "left";
+        c.textBaseline = "alphabetic";
+        const bands = (this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(left, u.valToPos(a, "x", true)), end: u.valToPos(b, "x", true), text, role: "text" })).filter((m) => m.end > left && m.x < right);
+        const words = (list) => this.placed(list, left, right, (t) => c.measureText(t).width, 4 * dots);
+        const above = words(marks), below = words(bands), rows = 12 * dots;
+        above.forEach((m) => { c.fillStyle = colour(m.role); c.fillText(m.text, m.from, top + rows * (m.row + 1)); });
+        below.forEach((m) => { c.fillStyle = colour(m.role); c.fillText(m.text, m.from, top + height - 4 * dots - rows * m.row); });
+        this.$el.dataset.labels = JSON.stringify([above, below].map((l) => l.map((m) => [m.from, m.to, m.row, m.text])));
+      }
+      c.restore();
+    },
+    // Words beside their x, none over another: the next row where the one before is taken, up to ROWS; then left out.
+    placed(list, left, right, wide, gap) {
+      const ends = Array(ROWS).fill(-Infinity), last = Array(ROWS).fill("");
+      return [...list].sort((a, b) => a.x - b.x).flatMap((m) => {
+        const w = wide(m.text), from = Math.max(left + gap, Math.min(m.x + gap, right - w - gap));
+        if (last.some((t, i) => t === m.text && from < ends[i])) return []; // the same word is there already
+        const row = ends.findIndex((end) => end + gap < from);
+        if (row < 0) return [];
+        ends[row] = from + w;
+        last[row] = m.text;
+        return [{ ...m, from, to: from + w, row }];
+      });
     },
     moment(t) {
-      // show a moment of the log: two seconds to each side, with the cursor's reference on it
+      // show a moment: two seconds of a log to each side, with the cursor's reference on it; a live chart is held by the server
       this.at = t;
-      this.look(t - 2, t + 2);
+      if (!this.live) this.look(t - 2, t + 2);
       this.plots.forEach((p) => p.redraw(false));
-      this.$el.scrollIntoView({ behavior: "smooth", block: "center" });
+      if (t !== null) this.$el.scrollIntoView({ behavior: "smooth", block: this.live ? "nearest" : "center" });
     },
     key_(e) {
       if (!this.head || !this.head.panels.length || !this.plots.length) return;
@@ -265,7 +312,7 @@ export default {
       this.plots.forEach((p) => p.redraw(false));
     },
     save(name, href) { const a = document.createElement("a"); a.href = href; a.download = name; a.click(); },
-    name(suffix) { return this.src.split("/").pop() + "." + suffix; },
+    file(suffix) { return this.src.split("/").pop() + "." + suffix; },
     csv() {
       const [a, b] = this.view || this.head.span, rows = ["channel,line,t,value"];
       const q = (v) => (/[",]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v);
@@ -273,49 +320,91 @@ export default {
         const v = p.data[j + 1][k];
         if (t >= a && t <= b && v !== null && v !== undefined) rows.push([q(this.head.panels[p.panel].title), q(l.name), t, v].join(","));
       })));
-      this.save(this.name("csv"), URL.createObjectURL(new Blob([rows.join("\n") + "\n"], { type: "text/csv" })));
+      this.save(this.file("csv"), URL.createObjectURL(new Blob([rows.join("\n") + "\n"], { type: "text/csv" })));
     },
     png() {
-      const all = this.plots.map((p) => p.ctx.canvas), out = document.createElement("canvas");
+      const all = this.plots.map((p) => p.ctx.canvas), out = document.createElement("canvas"), dots = devicePixelRatio || 1;
+      const colour = this.colours(), head = this.legend.length ? 20 * dots : 0;
       out.width = Math.max(...all.map((c) => c.width));
-      out.height = all.reduce((n, c) => n + c.height, 0);
+      out.height = head + all.reduce((n, c) => n + c.height, 0);
       const c = out.getContext("2d");
-      c.fillStyle = this.colours()("panel");
+      c.fillStyle = colour("panel");
       c.fillRect(0, 0, out.width, out.height);
-      let y = 0;
+      c.font = 12 * dots + "px system-ui, sans-serif";
+      let x = 66 * dots, y = head;
+      this.legend.forEach(([name, l]) => {
+        c.strokeStyle = colour(l.role); c.lineWidth = 2 * dots; c.setLineDash((l.dash || []).map((d) => d * dots));
+        c.beginPath(); c.moveTo(x, 11 * dots); c.lineTo(x + 20 * dots, 11 * dots); c.stroke();
+        c.fillStyle = colour("text"); c.fillText(name, x + 25 * dots, 15 * dots);
+        x += 45 * dots + c.measureText(name).width;
+      });
       all.forEach((part) => { c.drawImage(part, 0, y); y += part.height; });
-      this.save(this.name("png"), out.toDataURL("image/png"));
+      this.save(this.file("png"), out.toDataURL("image/png"));
     },
     svg() {
       const colour = this.colours(), w = this.width(), e = (t) => String(t).replace(/[&<>]/g, (x) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[x]);
-      let y = 0;
-      const parts = this.plots.map((p) => {
+      const ruler = document.createElement("canvas").getContext("2d");
+      ruler.font = "11px sans-serif";
+      const wide = (t) => ruler.measureText(t).width;
+      const stroke = (l) => `stroke="${colour(l.role)}"` + (l.dash && l.dash.length ? ` stroke-dasharray="${l.dash.join(" ")}"` : "");
+      let x = 66, y = this.legend.length ? 20 : 0;
+      const legend = this.legend.map(([name, l]) => {
+        const at = x;
+        x += 45 + wide(name);
+        return `<path d="M${at} 11L${at + 20} 11" stroke-width="2" ${stroke(l)}/><text x="${at + 25}" y="15">${e(name)}</text>`;
+      }).join("");
+      const parts = this.plots.map((p, first) => {
         const panel = this.head.panels[p.panel], h = p.height, dots = devicePixelRatio || 1, box = p.bbox, top = y;
         y += h;
-        const X = (t) => (p.valToPos(t, "x", true) / dots).toFixed(1), Y = (v) => (p.valToPos(v, "y", true) / dots + top).toFixed(1);
+        const x = (t) => p.valToPos(t, "x", true) / dots, X = (t) => x(t).toFixed(1), Y = (v) => (p.valToPos(v, "y", true) / dots + top).toFixed(1);
         const lines = panel.lines.map((l, j) => {
+          if (this.hidden[l.name]) return "";
           let path = "", pen = "M";
           p.data[0].forEach((t, k) => { const v = p.data[j + 1][k]; if (v === null || v === undefined) { pen = "M"; return; } path += pen + X(t) + " " + Y(v); pen = "L"; });
-          return `<path d="${path}" fill="none" stroke="${colour(l.role)}" stroke-width="${l.width || 1.25}"/>`;
+          return `<path d="${path}" fill="none" stroke-width="${l.width || 1.25}" ${stroke(l)}/>`;
         }).join("");
         const [L, T, W, H] = [box.left, box.top, box.width, box.height].map((v) => v / dots);
+        const spans = (this.head.bands || []).map(([a, b, , role]) => `<rect x="${X(a)}" y="${top + T}" width="${Math.max(1, x(b) - x(a)).toFixed(1)}" height="${H}" fill="${colour(role)}" fill-opacity="0.16"/>`).join("");
+        const floor = panel.band ? `<rect x="${L}" y="${Y(panel.band)}" width="${W}" height="${(Y(-panel.band) - Y(panel.band)).toFixed(1)}" fill="${colour("noise")}" fill-opacity="0.2"/>` : "";
+        const upright = [...(this.head.marks || []).map(([t]) => [t, "bad"]), ...(this.at === null ? [] : [[this.at, "text"]])]
+          .map(([t, role]) => `<path d="M${X(t)} ${top + T}L${X(t)} ${top + T + H}" stroke="${colour(role)}" stroke-dasharray="4 3"/>`).join("");
+        const named = first ? "" : [[(this.head.marks || []).map(([t, text]) => ({ x: x(t), end: x(t), text, role: "bad" })), (m) => top + T + 12 * (m.row + 2)],
+          [(this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(L, x(a)), end: x(b), text, role: "text" })), (m) => top + T + H - 4 - 12 * m.row]]
+          .map(([list, at]) => this.placed(list.filter((m) => m.end >= L && m.x <= L + W), L, L + W, wide, 4).map((m) => `<text x="${m.from}" y="${at(m)}" fill="${colour(m.role)}">${e(m.text)}</text>`).join("")).join("");
         const { min, max } = p.scales.y;
         const words = [[L - 6, top + T + 10, "end", max.toPrecision(4)], [L - 6, top + T + H, "end", min.toPrecision(4)], [L + 4, top + T + 12, "start", panel.title]]
           .map(([x, at, anchor, text]) => `<text x="${x}" y="${at}" text-anchor="${anchor}">${e(text)}</text>`).join("");
-        return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${lines}</g>${words}`;
+        return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${spans}${floor}${lines}${upright}</g>${named}${words}`;
       }).join("");
       const [a, b] = this.view || this.head.span;
       const foot = `<text x="66" y="${y + 14}">${a.toPrecision(6)} s</text><text x="${w - 14}" y="${y + 14}" text-anchor="end">${b.toPrecision(6)} s</text>`;
-      const text = `<svg xmlns="http://www.w3.org/2000/svg" width="${w}" height="${y + 20}" font-family="sans-serif" font-size="11" fill="${colour("text")}"><rect width="100%" height="100%" fill="${colour("panel")}"/>${parts}${foot}</svg>`;
-      this.save(this.name("svg"), URL.createObjectURL(new Blob([text], { type: "image/svg+xml" })));
+      const text = `<svg xmlns="http://www.w3.org/2000/svg" width="${w}" height="${y + 20}" font-family="sans-serif" font-size="11" fill="${colour("text")}"><rect width="100%" height="100%" fill="${colour("panel")}"/>${legend}${parts}${foot}</svg>`;
+      this.save(this.file("svg"), URL.createObjectURL(new Blob([text], { type: "image/svg+xml" })));
     },
-    keep() { localStorage.setItem("layout " + this.src, JSON.stringify({ view: this.view, word: this.word, hidden: this.hidden })); },
-    recall() {
-      const kept = JSON.parse(localStorage.getItem("layout " + this.src) || "null");
+    store() {
+      localStorage.setItem("layouts " + this.src, JSON.stringify(this.kept));
+      this.kept = { ...this.kept };
+    },
+    keep() {
+      for (let k = 1; !this.name.trim(); k += 1) if (!this.kept["layout " + k]) this.name = "layout " + k;
+      this.name = this.name.trim();
+      this.kept[this.name] = { view: this.view, word: this.word, hidden: { ...this.hidden }, off: { ...this.off }, at: this.at };
+      this.store();
+    },
+    forget() {
+      delete this.kept[this.name];
+      this.name = "";
+      this.store();
+    },
+    recall(name) {
+      const kept = this.kept[name];
       if (!kept) return;
-      this.word = kept.word || "";
-      this.hidden = kept.hidden || {};
+      this.name = name;
+      this.word = kept.word;
+      this.hidden = { ...kept.hidden };
+      this.off = { ...kept.off };
       this.view = kept.view;
+      this.at = kept.at;
       this.build();
       this.fetch();
     },

@@ -19,21 +19,26 @@ from nicegui.elements import plotly as bundled
 from tsdownsample import MinMaxDownsampler
 
 from controller import MODES
+from vaneloop.base.signals import heading
+from vaneloop.base.vanes import VANES
 from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import THEMES
 
 __all__ = [
+    "OVER",
     "Band",
     "Chart",
     "Curves",
     "Figure",
     "Mark",
+    "Over",
     "Panel",
     "Trace",
     "bands",
     "figure",
     "mode_bands",
     "of_log",
+    "of_stage",
     "painted",
     "view",
 ]
@@ -46,18 +51,19 @@ MOST_POINTS = 4000  # a line and view, whatever the browser asks for
 
 @dataclass(frozen=True)
 class Trace:
-    """One line of a panel; its colour by role (`vaneloop.pages.style.THEMES`)."""
+    """One line of a panel; its colour by role (`vaneloop.pages.style.THEMES`). dash: pixels drawn, pixels left out."""
 
     name: str
     y: Array
     role: str = "measured"
     width: float = 1.25
+    dash: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class Panel:
     """Lines over one time axis ``t`` (s, increasing). band: half-width of a grey band about zero. least: smallest
-    height of the y axis.
+    height of the y axis. group: under which the list of channels has it.
     """
 
     title: str
@@ -67,6 +73,7 @@ class Panel:
     band: float | None = None
     height: int = 110
     least: float = 0.0
+    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,7 +135,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
         i = 0 if start is None else max(0, int(np.searchsorted(p.t, start)) - 1)
         j = len(p.t) if end is None else min(len(p.t), int(np.searchsorted(p.t, end)) + 1)
         x, lines = _thin(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
-        names = [{"name": t.name, "role": t.role, "width": t.width} for t in p.traces]
+        names = [{"name": t.name, "role": t.role, "width": t.width, "dash": t.dash} for t in p.traces]
         heads.append(
             {
                 "title": p.title,
@@ -136,6 +143,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
                 "band": p.band,
                 "height": p.height,
                 "least": p.least,
+                "group": p.group,
                 "n": len(x),
                 "lines": names,
             }
@@ -169,28 +177,62 @@ def _whole(y: Array) -> Array:
 
 
 Channels = Mapping[str, tuple[str, Array, Array]]  # name -> unit, s, values
+GROUPS = {
+    "speed": ("n_dem", "n_r"), "actuator": ("x_dem", "x_lvdt", "i_cmd"), "vanes": VANES, "supply": ("p_s", "t_oil"),
+    "controller": ("state",),
+}  # fmt: skip
+GROUP_OF = {signal: group for group, signals in GROUPS.items() for signal in signals}
+# of the logs laid over: colour by role, and dashes, so that they differ without colour, too
+OVER = (("model", (7, 3)), ("target", (2, 3)), ("error", (9, 3, 2, 3)), ("other", (12, 4)))
 
 
-def of_log(channels: Channels, key: str, over: Channels | None = None, later: float = 0.0) -> Curves:
-    """All channels of a log, one below the other, holes open.
+@dataclass(frozen=True)
+class Over:
+    """Channels of another log, laid over this one ``later`` (s)."""
 
-    over   those of another log, laid over them, at the first one's samples
-    later  s, added to the times of the other log
-    """
+    name: str
+    channels: Channels
+    later: float = 0.0
+
+
+def of_log(
+    channels: Channels, key: str, over: Sequence[Over] = (), marks: Sequence[Mark] = (), spans: Sequence[Band] = ()
+) -> Curves:
+    """All channels of a log, one below the other, holes open; those of other logs at the first one's samples."""
     panels = []
     for name, (unit, t, values) in channels.items():
         x, y = break_at_holes(t, values)
         lines = [Trace("this log" if over else name, np.asarray(y), "measured")]
-        if over and name in over:
-            _, t2, v2 = over[name]
-            there = np.interp(np.asarray(x), np.asarray(t2) + later, v2, np.nan, np.nan)
-            lines.append(Trace("the other log", there, "model"))
-        panels.append(Panel(f"{name} [{unit}]", unit, np.asarray(x), lines, height=74))
-    spans = []
+        for other, (role, dash) in zip(over, OVER, strict=False):
+            if name in other.channels:
+                _, t2, v2 = other.channels[name]
+                there = np.interp(np.asarray(x), np.asarray(t2) + other.later, v2, np.nan, np.nan)
+                lines.append(Trace(other.name, there, role, dash=dash))
+        panels.append(Panel(heading(name, unit), unit, np.asarray(x), lines, height=74, group=GROUP_OF.get(name, "")))
     if "state" in channels:
         _, t, values = channels["state"]
-        spans = mode_bands(np.asarray(t), np.asarray(values))
-    return Curves(panels, key, bands=spans)
+        spans = [*mode_bands(np.asarray(t), np.asarray(values)), *spans]
+    return Curves(panels, key, marks, spans)
+
+
+STAGE_ROLES = {"nominal model": "error", "with effects": "model", "by hand": "target"}
+
+
+def of_stage(curves: Mapping[str, Any], by_hand: Mapping[str, Any] | None, key: str) -> Curves:
+    """Outputs of a stage, measured and as models have them, and below each its errors; ``by_hand``: those of a model
+    whose parameters are set by hand.
+    """
+    t, panels = curves["t"], []
+    for output, c in curves["outputs"].items():
+        measured, unit = c["measured"], c["unit"]
+        errors = dict(c["errors"]) | (by_hand["outputs"][output]["errors"] if by_hand is not None else {})
+        over = [Trace(n, measured - e, STAGE_ROLES[n]) for n, e in errors.items()]
+        left = [Trace(n, e, STAGE_ROLES[n]) for n, e in errors.items()]
+        panels.append(
+            Panel(heading(output, unit), unit, t, [Trace("measured", measured, "measured", 1.5), *over], height=150)
+        )
+        panels.append(Panel(heading("error", unit), unit, t, left, band=3.0 * c["floor"], height=150))
+    return Curves(panels, key)
 
 
 class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):

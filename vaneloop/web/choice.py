@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "safe_name"]
+__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
 
 LOG_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
 OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
@@ -14,11 +16,15 @@ OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
 
 @dataclass(frozen=True)
 class LogFile:
-    """A file that may be chosen: where it is, what the user calls it, and how a command would name it."""
+    """A file that may be chosen: where it is, what the user calls it, and how a command would name it.
+
+    marks  of a run recorded here: s from its start, what was injected then
+    """
 
     path: Path
     name: str
     word: str
+    marks: tuple[tuple[float, str], ...] = ()
 
 
 @dataclass
@@ -68,6 +74,15 @@ class Choice:
         if not self.guess:
             out += ["--no-guess"]
         return out
+
+
+@dataclass(eq=False)
+class Overlay:
+    """Another log laid over the one chosen, ``later`` (s); its channels once it is read."""
+
+    file: LogFile
+    later: float = 0.0
+    channels: Mapping[str, tuple[str, Any, Any]] | None = None
 
 
 def safe_name(name: str) -> str:

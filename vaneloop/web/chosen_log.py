@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import html
 from typing import Any
 
 from nicegui import events, ui
 
 from vaneloop.base.signals import UNITS
-from vaneloop.web.charts import Chart
-from vaneloop.web.frame import Live, card, drop, opened, table
+from vaneloop.web.charts import OVER, Chart
+from vaneloop.web.frame import Live, card, drop, list_of_moments, opened, table
 from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
@@ -67,9 +68,15 @@ class ChosenLog:
             self.live.part(self._form, "log", "compare", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
                 self.live.part(
-                    self._other, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
+                    self._other,
+                    "files",
+                    "log",
+                    "over",
+                    shows=lambda: (tuple(f.name for f in s.files), s.choice.file, tuple(map(id, s.overlays))),
                 )
                 self.live.complaint("over")
+                self.live.progress("over")
+                list_of_moments(self.live, lambda: s.moments, lambda t: chart.run_method("moment", t), "log", "over")
                 chart = Chart("log", tree=True)
             all_channels.props("dense")
             self.live.watch(chart.refetch, "log", "over")
@@ -88,20 +95,31 @@ class ChosenLog:
         ).classes("w-full choose")
 
     def _other(self) -> None:
-        """Another log laid over this one."""
+        """Other logs laid over this one."""
         s = self.s
         if s.choice.file is None:
             return
 
-        def lay() -> None:
-            s.lay_over(s.files[other.value] if other.value is not None else None, float(later.value or 0.0))
+        def lay(e: events.ValueChangeEventArguments[Any]) -> None:
+            if e.value is not None:
+                s.lay_over(s.files[e.value])
 
         with ui.element("div").classes("rowc"):
-            options = {i: f.name for i, f in enumerate(s.files) if f != s.choice.file}
-            other = ui.select(options, label="lay another log over it", on_change=lay, clearable=True)
-            other.props("outlined dense options-dense").style("min-width:240px").classes("other")
-            later = ui.number("later by [s]", value=0.0, on_change=lambda: lay() if other.value is not None else None)
-            later.props("outlined dense debounce=500").style("width:120px")
+            for o in s.overlays:
+                with ui.element("div").classes("rowc overlay"):
+                    ui.label(o.file.name).classes("small")
+                    later = ui.number(
+                        "later by [s]", value=o.later, on_change=lambda e, o=o: s.move(o, float(e.value or 0.0))
+                    )
+                    later.props("outlined dense debounce=500").style("width:120px")
+                    ui.button(icon="close", on_click=lambda o=o: s.take_off(o)).props(
+                        f'flat dense round size=sm aria-label="take {html.escape(o.file.name)} away"'
+                    )
+            if len(s.overlays) < len(OVER):
+                on = [o.file for o in s.overlays]
+                options = {i: f.name for i, f in enumerate(s.files) if f != s.choice.file and f not in on}
+                other = ui.select(options, label="lay another log over it", on_change=lay)
+                other.props("outlined dense options-dense").style("min-width:240px").classes("other")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
         file = await receive(self.s, e, "log")

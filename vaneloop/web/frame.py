@@ -18,12 +18,16 @@ from vaneloop.discrepancy.locate import agrees
 from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
 from vaneloop.web.jobs import Job
+from vaneloop.web.moments import Moment
 from vaneloop.web.session import STOPPED, Session
 
-__all__ = ["PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "opened", "table", "tone"]
+__all__ = [
+    "PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "list_of_moments", "opened", "table", "tone",
+]  # fmt: skip
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
 PRIMARY = "#1f6fc4"
+MOMENTS = 200  # that are listed
 OFTEN = 0.05  # s between two looks at what has changed
 
 
@@ -280,6 +284,44 @@ def opened(session: Session, title: str, now: bool = False) -> ui.expansion:
         title, value=now or kept.get(title, False), on_value_change=lambda e: kept.__setitem__(title, bool(e.value))
     )
     return box.classes("w-full").props("dense")
+
+
+def list_of_moments(
+    live: Live,
+    moments: Callable[[], Sequence[Moment]],
+    show: Callable[[float], Any],
+    *sections: str,
+    most: int = MOMENTS,
+) -> None:
+    """The latest ``most`` moments, the latest on top; a press on one shows it. What is listed already stays the same
+    element, so that no press is lost while others come.
+    """
+    count = ui.label().classes("note")
+    box = ui.element("div").classes("events").props('role="log" tabindex="0" aria-label="what happened"')
+    rows: dict[Moment, ui.element] = {}
+
+    def draw() -> None:
+        now = list(moments())[-most:]
+        left_out = len(moments()) - len(now)
+        count.set_text(f"the latest {most} of {len(moments()):,}" if left_out else "")
+        count.set_visibility(bool(left_out))
+        kept = set(now)
+        for gone in [m for m in rows if m not in kept]:
+            rows.pop(gone).delete()
+        for m in now:
+            if m in rows:
+                continue
+            with box:
+                if m.t is None:
+                    rows[m] = ui.label(m.line).classes("small mono moment")
+                else:
+                    rows[m] = ui.button(m.line, on_click=lambda m=m: show(m.t))
+                    rows[m].props("flat dense no-caps align=left padding='0 6px'").classes("small mono moment")
+            rows[m].move(target_index=0)
+        box.set_visibility(bool(now))
+
+    draw()
+    live.watch(draw, *sections, of=box)
 
 
 def tone(ratio: float) -> str:

@@ -149,6 +149,7 @@ class _Injected:
         self.machines: list[Any] = []
         self.disturbers: list[Any] = []
         self.recorded: list[tuple[int, int, int]] = []
+        self.begun: list[tuple[float, str]] = []  # s, name: since the last news
         self.end = 0.0
 
     def add(self, name: str, k: int) -> None:
@@ -160,6 +161,7 @@ class _Injected:
 
         scenario = load_scenario(name)
         first = min((a.start for a in scenario.inject), default=0.0)
+        self.begun.append((k * 1e-3, name))
         moved = [a.model_copy(update={"start": k * 1e-3 + a.start - first}) for a in scenario.inject]
         chance = random.Random(scenario.seed)
         for who in self.gateways:
@@ -176,11 +178,20 @@ class _Injected:
             self.disturbers.append(injection.Disturber(on_bus, self.channel.wire, self.places))
         self.end = max(self.end, *(min(a.end, k * 1e-3 + scenario.duration - first) for a in moved), 0.0)
 
+    def news(self) -> list[tuple[float, str]]:
+        """What began since the last call, and when, s."""
+        out, self.begun = self.begun, []
+        return out
+
     def tidy(self, k: int) -> None:
-        """Leave the wire's places of outsiders that are done."""
+        """Forget what is done before tick ``k``, and leave the wire's places of outsiders."""
         for place, intruder in [x for x in self.intruders if x[1].end <= k]:
             self.channel.leave(place)
             self.intruders.remove((place, intruder))
+        for who, gateways in self.gateways.items():
+            self.gateways[who] = [g for g in gateways if not g.done(k)]
+        self.machines = [m for m in self.machines if m.end >= k]  # at its last tick it undoes what it did
+        self.disturbers = [d for d in self.disturbers if d.end >= k]
 
 
 def _compile() -> None:
@@ -321,17 +332,8 @@ def lockstep(
             took = time.perf_counter() - due + NEWS
             reached += 0.2 * ((k - first_k) / 1000.0 / max(took, 1e-9) - reached)
             injecting = max(0.0, min(injected.end, 1e6) - k * 1e-3)
-            progress(
-                None,
-                {
-                    **heard.news(),
-                    **tool.news(),
-                    "speed": reached,
-                    "n_dem": typed.n_dem,
-                    "load": channel.load,
-                    "injecting": injecting,
-                },
-            )
+            more = {"speed": reached, "n_dem": typed.n_dem, "load": channel.load, "injecting": injecting}
+            progress(None, {**heard.news(), **tool.news(), **more, "injected": injected.news()})
     finally:
         if recorder is not None:
             recorder.close()
@@ -443,13 +445,35 @@ def listen(progress: Progress, bus: str) -> dict[str, Any]:
                     port.write(np.array(commands, np.int64))
                 if n < len(rows):
                     time.sleep(0.005)
-            progress(None, {**heard.news(), **tool.news(), "lost": port.lost})
+            progress(None, {**heard.news(), **tool.news(), "lost": port.lost, "clock": began})
     finally:
         opened.shutdown()
     return {"frames": heard.frames}
 
 
-TASKS = {f.__name__: f for f in (ready, lockstep, node, ecu, listen)}
+def outside(progress: Progress, scenario: str, bus: str) -> bool:
+    """Do a shipped scenario to a bus in real time, as ``vaneloop inject`` does; whether the expectations held.
+
+    Says when its first action began: ``at`` on this machine's clock, which the listener's ``clock`` counts from.
+    """
+    from hil.inject.injection import run
+    from hil.inject.scenario import load_scenario
+
+    made = load_scenario(scenario)
+    first = min((a.start for a in made.inject), default=0.0)
+    told = False
+
+    def share(fraction: float) -> None:
+        nonlocal told
+        if not told and fraction * made.duration >= first:
+            told = True
+            progress(None, {"at": time.perf_counter(), "name": scenario})
+        progress(fraction, f"injecting {scenario}")
+
+    return run(made, bus=bus, name=scenario, progress=share).held
+
+
+TASKS = {f.__name__: f for f in (ready, lockstep, node, ecu, listen, outside)}
 
 if __name__ == "__main__":
     if "--nice" in sys.argv:

@@ -8,6 +8,7 @@ from typing import Any
 from nicegui import events, ui
 
 from plant.effects import EFFECTS
+from vaneloop.base.signals import heading
 from vaneloop.discrepancy.locate import AGREES, Located
 from vaneloop.pages.failures import failure_map
 from vaneloop.pages.figures import Line as PageLine
@@ -370,7 +371,7 @@ class _Page:
         reach = abs(fitted - p.neutral) or abs(p.high - p.neutral) / 4
         low, high = max(p.low, min(p.neutral, fitted) - reach), min(p.high, max(p.neutral, fitted) + reach)
         with ui.element("div").classes("turn"):
-            ui.label(f"{effect}: {name} [{unit}], fitted {number(fitted, 4)}").classes("what soft")
+            ui.label(f"{effect}: {heading(name, unit)}, fitted {number(fitted, 4)}").classes("what soft")
             slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(
                 f'dense aria-label="{effect} {name}"'
             )

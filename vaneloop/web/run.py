@@ -5,6 +5,7 @@ for page 1.
 from __future__ import annotations
 
 import html
+import math
 import shlex
 import time
 from itertools import islice
@@ -19,14 +20,24 @@ from hil.loop.ecu import BUILTIN
 from vaneloop.pages.figures import bars
 from vaneloop.web.calibrate import Calibrate
 from vaneloop.web.charts import Chart
-from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame
-from vaneloop.web.running import Loop
+from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, list_of_moments
+from vaneloop.web.running import ANY, Loop
 from vaneloop.web.session import Session
 
 __all__ = ["build"]
 
 LIT = 1.5  # s that a lamp stays lit once it is shown, so that what passes quickly is seen
 TRACE_LINES = 40
+EVENTS = 60  # listed
+# of the bus, with what is demanded: signal, demand, words, ends of the dial
+GAUGES = (
+    ("n_r", "n_dem", "speed, %", 0.0, 110.0),
+    ("x_lvdt", "x_dem", "stroke, mm", 0.0, 48.0),
+    ("vigv", "", "VIGV, deg", -40.0, 40.0),
+    ("i_cmd", "", "current, mA", -40.0, 40.0),
+    ("p_s", "", "supply, MPa", 0.0, 30.0),
+)
+SWEEP = 240.0  # deg, of a dial
 TONES = {"RUN": "good", "STANDBY": "mid", "INIT": "mid", "DEGRADED": "bad", "FAIL_SAFE": "bad"}
 
 
@@ -192,33 +203,54 @@ class _Page:
                     self.lamps[name] = lamp
             with ui.element("div").classes("tiles").style("margin:8px 0"):
                 self.tiles: dict[str, ui.label] = {}
-                for name, words in (
-                    ("t", "time, s"),
-                    ("n_r", "speed, %"),
-                    ("x_lvdt", "stroke, mm"),
-                    ("vigv", "VIGV, deg"),
-                    ("p_s", "supply, MPa"),
-                    ("pace", "x real time"),
-                ):
-                    with ui.element("div").classes("tile"):
-                        self.tiles[name] = ui.label("-").classes("v")
-                        ui.label(words).classes("l")
+                self.hands: dict[str, ui.element] = {}
+                self._tile("t", "time, s")
+                for name, demand, words, low, high in GAUGES:
+                    self._tile(name, words, (demand, low, high))
+                self._tile("pace", "x real time")
             with ui.element("div").classes("rowc"):
 
                 def arm(e: events.ValueChangeEventArguments[Any]) -> None:
-                    self.loop.trigger, self.loop.held = bool(e.value), None
+                    self.loop.trigger = e.value or ""
 
-                ui.checkbox("hold the charts at the next fault", value=self.loop.trigger, on_change=arm)
+                options = {"": "never", ANY: ANY, **{f: f.replace("_", " ") for f in FAULTS}}
+                ui.select(options, value=self.loop.trigger, label="hold the charts at", on_change=arm).props(
+                    "outlined dense options-dense"
+                ).style("min-width:190px").classes("trigger")
+                self.held = ui.label().classes("small held")
 
                 def again() -> None:
-                    self.loop.held = None
+                    self.loop.go_on()
+                    self.chart.run_method("moment", None)
 
-                ui.button("Go on", icon="play_arrow", on_click=again).props("flat dense padding='2px 10px'")
-            Chart("run", live=8.0)
+                self.again = ui.button("Go on", icon="play_arrow", on_click=again)
+                self.again.props("outline dense padding='2px 10px'").classes("go-on")
+            self.chart = Chart("run", live=8.0)
+            self.again.set_visibility(False)
             ui.timer(0.3, self._shown)
+
+    def _tile(self, name: str, words: str, dial: tuple[str, float, float] | None = None) -> None:
+        """A figure in words, with a dial where it has one: a hand for what is measured, a mark for what is demanded."""
+        with ui.element("div").classes("tile"):
+            if dial is not None:
+                ui.html(_dial(*dial[1:]), sanitize=False)
+                with ui.element("div").classes("hands").props('aria-hidden="true"'):
+                    for signal, what in ((dial[0], "wanted"), (name, "hand")):
+                        if signal:
+                            self.hands[signal] = ui.element("i").classes(what)
+            self.tiles[name] = ui.label("-").classes("v")
+            ui.label(words).classes("l")
 
     def _shown(self) -> None:
         """Lamps, figures and trace together: the browser goes through the page once for all of them."""
+        held = self.loop.held
+        self.held.set_text("" if held is None else f"held at {held:.2f} s")
+        self.again.set_visibility(held is not None)
+        for signal, demand, _, low, high in GAUGES:
+            for name in filter(None, (signal, demand)):
+                v = self.loop.latest(name)
+                turn = f"rotate({SWEEP * (min(max((v - low) / (high - low), 0.0), 1.0) - 0.5):.0f}deg)"
+                self.hands[name].style(f"transform:{turn};visibility:visible" if v == v else "visibility:hidden")
         self._lamps()
         self._trace()
 
@@ -271,8 +303,15 @@ class _Page:
                     box.set_visibility((e.value or "").lower() in text)
 
             find.on_value_change(search)
-            self.live.progress("command")
-            self.live.part(self._events, "events", "loop", shows=lambda: (*self.loop.events, self.loop.bus))
+            self.live.progress("judge")
+            self.live.part(self._scenario, "events", "loop", shows=lambda: (self.loop.asked, self.loop.bus))
+            ui.html("<h3>What happened</h3>", sanitize=False)
+            ui.label("A press shows the moment in the charts; six minutes are kept.").classes("note")
+            list_of_moments(self.live, lambda: self.loop.events, self._look, "events", "loop", most=EVENTS)
+
+    def _look(self, t: float) -> None:
+        self.loop.show(t)
+        self.chart.run_method("moment", t)
 
     def _begin(self, name: str) -> None:
         if self.loop.running:
@@ -280,20 +319,17 @@ class _Page:
         else:
             ui.notify("start the loop first")
 
-    def _events(self) -> None:
-        with ui.element("div").classes("events").props('role="log" tabindex="0" aria-label="events"'):
-            for text in reversed(self.loop.events):
-                ui.label(text).classes("small mono")
-        if self.loop.injected:
-            last = self.loop.injected[-1].text
-            if self.loop.bus == "lockstep":
-                ui.button(f"Judge {last}", icon="rule", on_click=lambda: self.loop.judge(last)).props(
-                    "outline dense padding='2px 12px'"
-                ).classes("judge")
-                ui.label("Here it begins in the loop that runs. By itself, held against what it expects:").classes(
-                    "note"
-                )
-            command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
+    def _scenario(self) -> None:
+        """The scenario asked for last: its verdict by itself, and its command."""
+        last = self.loop.asked
+        if not last:
+            return
+        if self.loop.bus == "lockstep":
+            ui.button(f"Judge {last}", icon="rule", on_click=lambda: self.loop.judge(last)).props(
+                "outline dense padding='2px 12px'"
+            ).classes("judge")
+            ui.label("Here it begins in the loop that runs. By itself, held against what it expects:").classes("note")
+        command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
 
     # ---- trace
 
@@ -360,6 +396,19 @@ class _Page:
                     figure_of(f, dark(self.s), 300)
 
             ui.timer(0.5, show)
+
+
+def _dial(low: float, high: float) -> str:
+    """The face of a dial from ``low`` to ``high``: an arc with eleven ticks, and its ends in words."""
+
+    def at(share: float, radius: float) -> str:
+        turn = math.radians(SWEEP * (share - 0.5))
+        return f"{50 + radius * math.sin(turn):.1f} {50 - radius * math.cos(turn):.1f}"
+
+    ticks = "".join(f'<path d="M{at(k / 10, 44)}L{at(k / 10, 38 if k % 5 else 34)}"/>' for k in range(11))
+    words = f'<text x="16" y="92">{low:g}</text><text x="84" y="92">{high:g}</text>'
+    arc = f'<path d="M{at(0.0, 44)}A44 44 0 1 1 {at(1.0, 44)}"/>'
+    return f'<svg class="dial" viewBox="0 0 100 96" aria-hidden="true">{arc}{ticks}{words}</svg>'
 
 
 def _in_words(t: float, head: int, data: int, values: dict[str, float]) -> str:

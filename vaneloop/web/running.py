@@ -15,16 +15,19 @@ from controller import FAULTS, MODES
 from hil.inject.scenario import load_scenario
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.style import STAGE_ROLES
-from vaneloop.web.charts import Curves, Mark, Panel, Trace, bands, mode_bands
+from vaneloop.web.charts import Curves, Mark, Panel, Trace, mode_bands
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS, COMPILING
+from vaneloop.web.moments import Moment, bit_bands, told
 from vaneloop.web.session import LogFile, Session
 from vaneloop.web.tuning import Tuning
 
-__all__ = ["Loop"]
+__all__ = ["ANY", "Loop"]
 
+MOST = 200  # events and marks kept
+ANY = "any fault"
 KEPT = 36_000  # rows kept for the charts: six minutes at 100 Hz
-AFTER = 3.0  # s that the charts show after the fault that they stop at
+AFTER = 3.0  # s that the charts show after the moment that they stop at
 SHOWN = 30.0  # s in the strip charts
 TRACED = 2000  # frames kept for the trace
 STRIPS: tuple[
@@ -55,12 +58,15 @@ class Loop:
     status: dict[str, Any] = field(default_factory=dict)
     late: dict[str, Any] = field(default_factory=dict)
     recorded: LogFile | None = None
-    events: deque[str] = field(default_factory=lambda: deque(maxlen=40))
-    injected: list[Mark] = field(default_factory=list)  # scenarios begun, with their times
-    changes: list[Mark] = field(default_factory=list)  # values and pages changed, with their times
+    events: deque[Moment] = field(default_factory=lambda: deque(maxlen=MOST))
+    injected: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # scenarios begun, with their times
+    changes: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # values and pages changed, likewise
+    asked: str = ""  # the scenario asked for last
     last: tuple[int, int] = (-1, 0)  # latest mode and faults
-    trigger: bool = False  # the charts stop at the next fault
-    held: float | None = None  # s: the fault that they stop at
+    trigger: str = ""  # the charts stop at the next fault of this name (ANY: whichever)
+    held: float | None = None  # s: the moment that they stop at
+    first: float = 0.0  # s: the first row, where the record begins
+    clock: float = 0.0  # s of this machine's clock at the listener's start
     workers: dict[str, Worker] = field(default_factory=dict)
     runs: int = 0
     boxes: Path | None = None  # folder of the black boxes of a controller of the user's own
@@ -147,7 +153,7 @@ class Loop:
         self.events.clear()
         self.injected.clear()
         self.changes.clear()
-        self.last, self.held = (-1, 0), None
+        self.last, self.held, self.asked = (-1, 0), None, ""
         self.runs += 1
         s.do("run", self._in_lockstep() if self.bus == "lockstep" else self._in_real_time())
         s.touch("loop")
@@ -235,7 +241,8 @@ class Loop:
         self.tuning.ended()
         path = self.session.folder / f"run{self.runs}.log"
         if record is not None and path.is_file() and path.stat().st_size:
-            self.recorded = LogFile(path, f"recorded: {path.name}", path.name)
+            marks = tuple((max(0.0, m.t - self.first), m.text) for m in self.injected)
+            self.recorded = LogFile(path, f"recorded: {path.name}", path.name, marks)
             self.session.files.append(self.recorded)
             self.session.saved[f"run-{path.name}"] = path
             self.session.touch("files")
@@ -264,18 +271,25 @@ class Loop:
     def _changed(self, what: str) -> None:
         """Note that the calibration was changed."""
         self.changes.append(Mark(self.now(), what))
-        self.events.append(f"{self.now():.1f} s  calibration: {what}")
-        self.session.touch("events")
+        self._tell(Moment(self.now(), f"calibration: {what}"))
 
     def inject(self, name: str) -> None:
         """Start a scenario of the library now."""
+        self.asked = name
         if self.bus == "lockstep":
             self.tell(inject=name)
-            self.injected.append(Mark(self.now(), name))
-            self.events.append(f"{self.now():.1f} s  {name}: {load_scenario(name).title}")
-            self.session.touch("events")
         else:
             self.session.do("inject", self._inject_outside(name))
+        self.session.touch("events")
+
+    def _begun(self, t: float, name: str) -> None:
+        """Note a scenario whose first action began at ``t`` (s)."""
+        self.injected.append(Mark(t, name))
+        self._tell(Moment(t, f"injected: {name}: {load_scenario(name).title}"))
+
+    def _tell(self, *moments: Moment) -> None:
+        self.events.extend(moments)
+        self.session.touch("events")
 
     def judge(self, name: str) -> None:
         """Run a scenario by itself, and hold what the machine does against what the scenario expects."""
@@ -283,23 +297,33 @@ class Loop:
 
     async def _judge(self, name: str) -> None:
         words = ["inject", name, *self.tables_words(), *self.controller_words()]
-        answer = await self.session.bench.call("command", f"judging {name}", words=words)
-        self.events.append(f"{name}, by itself: {'pass' if answer['code'] == 0 else 'FAIL'}")
-        self.session.touch("events")
+        answer = await self.session.aside.call("judge", f"judging {name}", words=words)
+        self._judged(None, f"{name}, by itself", answer["code"] == 0)
+
+    def _judged(self, t: float | None, name: str, held: bool) -> None:
+        self._tell(Moment(t, f"{name}: {'pass' if held else 'FAIL'}"))
 
     async def _inject_outside(self, name: str) -> None:
-        bus = self.bus_name
-        self.injected.append(Mark(self.now(), name))
-        w = Worker()
-        self.session.extra.setdefault("closers", []).append(w.stop)
+        w = Worker("vaneloop.web.loop", changed=lambda: self.session.touch("jobs"))
+        w.news = lambda news: self._begun(news["at"] - self.clock, news["name"])
+        closers = self.session.extra.setdefault("closers", [])
+        closers.append(w.stop)
         try:
-            answer = await w.call(
-                "command", f"injecting {name}", words=["inject", name, "--bus", bus, *self.tables_words()]
-            )
-            self.events.append(f"{self.now():.1f} s  {name}: {'pass' if answer['code'] == 0 else 'FAIL'}")
+            held = await w.call("outside", f"injecting {name}", scenario=name, bus=self.bus_name)
+            self._judged(self.now(), name, held)
         finally:
             w.stop()
-            self.session.touch("events")
+            closers.remove(w.stop)
+
+    def show(self, t: float) -> None:
+        """Stop the charts at a moment of this run; where it is no longer kept, at the first one that is."""
+        self.held = max(t, float(self.rows[0, 0])) if self.filled else t
+        self._draw()
+
+    def go_on(self) -> None:
+        """Let the charts move again."""
+        self.held = None
+        self._draw()
 
     def now(self) -> float:
         """Time of the latest row, s."""
@@ -320,6 +344,9 @@ class Loop:
         self.tuning.answered(news.pop("xcp", []))
         first = not self.filled
         rows = news.pop("rows")[-KEPT:]
+        if first and len(rows):
+            self.first = float(rows[0, 0])
+        self.clock = news.pop("clock", self.clock)
         over = self.filled + len(rows) - KEPT
         if over > 0:
             drop = max(over, KEPT // 10)
@@ -329,6 +356,8 @@ class Loop:
         self.filled += len(rows)
         self.trace.extend(news.pop("trace"))
         self._light(rows)
+        for t, name in news.pop("injected", ()):
+            self._begun(t, name)
         self._note(rows)
         if first and self.filled:
             self.session.touch("loop")
@@ -347,23 +376,16 @@ class Loop:
 
     def _note(self, rows: np.ndarray) -> None:
         """Write changes of mode and faults into the list of events."""
-        new: list[str] = []
         columns = [COLUMNS.index(c) for c in ("t", "state", "faults")]
         for t, state, faults in rows[:, columns].tolist():
-            mode, bits = int(state) if state == state else -1, int(faults) if faults == faults else 0
-            if (mode, bits) == self.last:
+            now = int(state) if state == state else -1, int(faults) if faults == faults else 0
+            if now == self.last:
                 continue
-            if mode != self.last[0] and 0 <= mode < len(MODES):
-                new.append(f"{t:.1f} s  mode {MODES[mode]}")
-            for i, fault in enumerate(FAULTS):
-                if (bits ^ self.last[1]) >> i & 1:
-                    new.append(f"{t:.1f} s  {fault} {'set' if bits >> i & 1 else 'cleared'}")
-                    if self.trigger and self.held is None and bits >> i & 1:
-                        self.held = t
-            self.last = mode, bits
-        if new:
-            self.events.extend(new)
-            self.session.touch("events")
+            new = told(t, *now, self.last)
+            self.last = now
+            self._tell(*new)
+            if self.held is None and any(m.fault and self.trigger in (ANY, m.fault) for m in new):
+                self.held = t
 
     def _draw(self) -> None:
         rows = self.rows[: self.filled]
@@ -390,5 +412,5 @@ class Loop:
         ]
         marks = [m for m in (*self.injected, *self.changes) if t[0] <= m.t <= t[-1]]
         state, faults = rows[:, COLUMNS.index("state")], rows[:, COLUMNS.index("faults")]
-        spans = [*mode_bands(t, state), *bands(t, faults > 0.0, {1: ("fault", "noise")})]
+        spans = [*mode_bands(t, state), *bit_bands(t, faults)]
         self.session.curves["run"] = Curves(panels, "run", marks, spans)

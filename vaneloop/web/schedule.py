@@ -15,6 +15,7 @@ from nicegui import events, ui
 from nicegui.element import Element
 
 from plant import Geometry, Schedules, load_geometry, load_schedules
+from vaneloop.base.signals import heading
 from vaneloop.design.links import CRITERIA
 from vaneloop.design.schedule_files import write_geometry, write_schedules
 from vaneloop.design.stroke_tables import STROKE_LIMITS
@@ -149,7 +150,7 @@ class _Page:
             self._edited()
 
         box = (
-            ui.number(f"{label} [{q.unit}]", value=q.value, format="%.6g")
+            ui.number(heading(label, q.unit), value=q.value, format="%.6g")
             .props("outlined dense")
             .on("blur", changed)
             .on("keydown.enter", changed)

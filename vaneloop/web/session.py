@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base.signals import UNITS
-from vaneloop.web.charts import Curves, Panel, Trace, of_log
-from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, safe_name
+from vaneloop.web import moments
+from vaneloop.web.charts import OVER, Curves, Mark, Over, of_log, of_stage
+from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
 from vaneloop.web.jobs import Cancelled, Job, Worker, WorkError
 
 __all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
@@ -54,6 +55,7 @@ class Session:
         self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
         self.search.news = self._news
         self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
+        self.aside = Worker(changed=lambda: self.touch("jobs"))  # what goes on whichever log is chosen
         self.tasks: set[asyncio.Task[None]] = set()
         self.working: Counter[str] = Counter()  # sections whose work has not ended
         self._fitting = asyncio.Lock()
@@ -62,6 +64,7 @@ class Session:
         self.curves: dict[str, Curves] = {}
         self.extra: dict[str, Any] = {}  # what other pages keep
         self.choice = Choice(tables=tables)
+        self.overlays: list[Overlay] = []
         self.offered: list[str] = []
         self.seen: dict[str, Any] | None = None  # what is known of its names and units (worker.look)
         self.draft: dict[str, str] = {}  # what is typed in the form and not yet read
@@ -70,6 +73,7 @@ class Session:
 
     def _clear_log(self) -> None:
         self.preview: dict[str, Any] | None = None
+        self.moments: list[moments.Moment] = []
         self._clear_results()
 
     def _clear_results(self) -> None:
@@ -130,14 +134,14 @@ class Session:
         """End the processes and remove the private folder."""
         for task in list(self.tasks):
             task.cancel()
-        for end in (self.search.stop, self.bench.stop, *self.extra.get("closers", [])):
+        for end in (self.search.stop, self.bench.stop, self.aside.stop, *self.extra.get("closers", [])):
             end()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     @property
     def jobs(self) -> list[Job]:
         """What is being done."""
-        return [*self.search.jobs.values(), *self.bench.jobs.values()]
+        return [j for w in (self.search, self.bench, self.aside) for j in w.jobs.values()]
 
     def busy(self, *names: str) -> Job | None:
         """The first job of one of these names."""
@@ -159,7 +163,7 @@ class Session:
         else:
             dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
             self.choice = Choice(file=file, dbc=dbc, tables=self.tables)
-            self.offered, self.seen, self.draft = [], None, {}
+            self.offered, self.seen, self.draft, self.overlays = [], None, {}, []
         if self.choice.file is not None:
             self.read()
         self.touch("log")
@@ -181,26 +185,58 @@ class Session:
         self.seen = await self.search.call("look", "looking at its names", words=words)
         self.touch("log")
         self.preview = await self.search.call("preview", "reading the log", words=words)
-        self.curves["log"] = of_log(self.preview["channels"], words[0])
+        self._draw_log()
         self.touch("log")
+        if self.overlays:
+            for o in self.overlays:
+                o.channels = None  # names and units may be others now
+            self.do("over", self._lay_over())
         if self.preview["channels"]:
             self.do("compare", self._compare())
         else:
             wanted = ", ".join(UNITS)
             raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
 
-    def lay_over(self, file: LogFile | None, later: float) -> None:
-        """Draw another log over this one, read in the same way, so many seconds later; None: take it away."""
-        self.do("over", self._lay_over(file, later))
+    def _draw_log(self) -> None:
+        """Curves and moments of the log, with what is laid over it."""
+        if self.preview is None or self.choice.file is None:
+            return
+        channels, faults = self.preview["channels"], self.preview["faults"]
+        marks = [Mark(t, text) for t, text in self.choice.file.marks]
+        over = [Over(o.file.name, o.channels, o.later) for o in self.overlays if o.channels is not None]
+        spans = moments.fault_bands(faults)
+        self.curves["log"] = of_log(channels, str(self.choice.file.path), over, marks, spans)
+        self.moments = moments.of_log(channels, faults, marks)
 
-    async def _lay_over(self, file: LogFile | None, later: float) -> None:
-        over = None
-        if file is not None:
-            words = replace(self.choice, file=file).reading(real=True)
-            over = (await self.bench.call("preview", "reading the other log", words=words))["channels"]
-        if self.preview is not None and self.choice.file is not None:
-            self.curves["log"] = of_log(self.preview["channels"], str(self.choice.file.path), over, later)
+    def lay_over(self, file: LogFile) -> None:
+        """Draw another log over this one, read in the same way."""
+        if len(self.overlays) < len(OVER) and all(o.file != file for o in self.overlays):
+            self.overlays = [*self.overlays, Overlay(file)]
+            self.do("over", self._lay_over())
+
+    def take_off(self, overlay: Overlay) -> None:
+        """Take a log laid over this one away."""
+        self.overlays = [o for o in self.overlays if o is not overlay]
+        self.move(overlay, overlay.later)
+
+    def move(self, overlay: Overlay, later: float) -> None:
+        """Move a log laid over this one in time."""
+        overlay.later = later
+        self._draw_log()
         self.touch("over")
+
+    async def _lay_over(self) -> None:
+        for o in self.overlays:
+            if o.channels is None:
+                words = replace(self.choice, file=o.file).reading(real=True)
+                try:
+                    o.channels = (await self.bench.call("over", "reading the other log", words=words))["channels"]
+                except (WorkError, Cancelled):
+                    if o in self.overlays:
+                        self.take_off(o)
+                    raise
+                self._draw_log()
+                self.touch("over")
 
     async def _compare(self) -> None:
         words = self.choice.words(real=True)
@@ -231,7 +267,11 @@ class Session:
         self.sofar = []
         self.touch("sofar")
         self.touch("diagnosis")
-        self.diagnosis = await self.search.call("diagnose", "searching the library of effects", words=words)
+        try:
+            self.diagnosis = await self.search.call("diagnose", "searching the library of effects", words=words)
+        finally:
+            self.sofar = []  # said by the answer, or nothing is kept of it
+            self.touch("sofar")
         self.experiment, self.experiment_done = None, False
         d = self.diagnosis["diagnosis"]
         self.chosen = {s.stage: tuple(f.effect for f in s.effects) for s in d.stages}
@@ -288,10 +328,20 @@ class Session:
     def switch(self, effect: str, on: bool) -> None:
         """Add an effect to the model of the stage shown, or take it away."""
         stage = self.stage
-        now = [e for e in self.chosen.get(stage, ()) if e != effect]
+        before = self.chosen.get(stage, ())
+        now = [e for e in before if e != effect]
         self.chosen[stage] = tuple([*now, effect] if on else now)
         self.hand, self.hand_rms = {}, {}
-        self.do("fit", self._fit(stage))
+        self.do("fit", self._switched(stage, self.chosen[stage], before))
+
+    async def _switched(self, stage: str, now: tuple[str, ...], before: tuple[str, ...]) -> None:
+        """Fit what is switched on ``now``; where that fails or is stopped, the switches go back."""
+        try:
+            await self._fit(stage)
+        except (WorkError, Cancelled):
+            if self.chosen.get(stage) == now:
+                self.chosen[stage] = before
+            raise
 
     async def _fit(self, stage: str) -> None:
         effects = self.chosen.get(stage, ())
@@ -344,15 +394,8 @@ class Session:
             f, stage = self.fitted(), self.stage
             if f is None or not self.hand:
                 return
-            answer = await self.bench.call(
-                "hand",
-                "",
-                words=self.choice.words(real=True),
-                stage=stage,
-                theta=f.theta,
-                floor=f.floor,
-                values=self.values(),
-            )
+            given = {"stage": stage, "theta": f.theta, "floor": f.floor, "values": self.values()}
+            answer = await self.bench.call("hand", "", words=self.choice.words(real=True), **given)
             if self.hand and stage == self.stage and f is self.fitted():
                 self.hand_rms = answer["rms"]
                 self._draw(answer["curves"])
@@ -363,25 +406,8 @@ class Session:
     def _draw(self, by_hand: dict[str, Any] | None = None) -> None:
         f = self.fitted() if self.diagnosis else None
         curves = f.curves if f is not None else (self.compared or {}).get("curves", {}).get(self.stage)
-        if curves is None:
-            self.curves["stage"] = Curves()
-            return
-        t, panels = curves["t"], []
-        for output, c in curves["outputs"].items():
-            measured = c["measured"]
-            over = [Trace("measured", measured, "measured", 1.5)]
-            left = []
-            roles = {"nominal model": "error", "with effects": "model"}
-            for name, e in c["errors"].items():
-                over.append(Trace(name, measured - e, roles[name]))
-                left.append(Trace(name, e, roles[name]))
-            if by_hand is not None:
-                e = by_hand["outputs"][output]["errors"]["by hand"]
-                over.append(Trace("by hand", measured - e, "target"))
-                left.append(Trace("by hand", e, "target"))
-            panels.append(Panel(f"{output} [{c['unit']}]", c["unit"], t, over, height=150))
-            panels.append(Panel(f"error [{c['unit']}]", c["unit"], t, left, band=3.0 * c["floor"], height=150))
-        self.curves["stage"] = Curves(panels, f"{self.choice.file.path if self.choice.file else ''} {self.stage}")
+        key = f"{self.choice.file.path if self.choice.file else ''} {self.stage}"
+        self.curves["stage"] = of_stage(curves, by_hand, key) if curves is not None else Curves()
 
     # ---- what comes next
 
@@ -393,14 +419,17 @@ class Session:
     async def _recommend(self) -> None:
         assert self.diagnosis is not None
         self.touch("experiment")
-        self.experiment = await self.search.call(
-            "experiment",
-            "trying demand profiles",
-            words=self.choice.words(real=True),
-            diagnosis=self.diagnosis["diagnosis"],
-        )
+        given = {"words": self.choice.words(real=True), "diagnosis": self.diagnosis["diagnosis"]}
+        self.experiment = await self.search.call("experiment", "trying demand profiles", **given)
         self.experiment_done = True
         self.touch("experiment")
+
+    def _anew(self, key: str, name: str) -> Path:
+        """Where a file to be downloaded is written; an earlier one is offered no more."""
+        self.saved.pop(key, None)
+        path = self.folder / name
+        path.unlink(missing_ok=True)
+        return path
 
     def save_report(self) -> None:
         """Write the report of the diagnosis."""
@@ -409,7 +438,7 @@ class Session:
 
     async def _save_report(self) -> None:
         assert self.diagnosis is not None
-        path = self.folder / "diagnosis.html"
+        path = self._anew("report", "diagnosis.html")
         self.touch("save")
         await self.search.call(
             "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"],
@@ -425,12 +454,8 @@ class Session:
 
     def extend_words(self) -> list[str]:
         """Options of ``vaneloop extend`` beyond the log's."""
-        return [w for e in self.all_chosen() for w in ("--effect", e)] + [
-            "--out",
-            "extended.toml",
-            "--report",
-            "extended.html",
-        ]
+        effects = [w for e in self.all_chosen() for w in ("--effect", e)]
+        return [*effects, "--out", "extended.toml", "--report", "extended.html"]
 
     def save_model(self) -> None:
         """Run ``vaneloop extend`` with the effects that are switched on."""
@@ -441,10 +466,7 @@ class Session:
         words = ["extend", *self.choice.words(real=True), *self.extend_words()]
         for name in ("extended.toml", "extended.html"):
             words[words.index(name)] = str(self.folder / name)
-        files = {"model": self.folder / "extended.toml", "extended": self.folder / "extended.html"}
-        for key, file in files.items():
-            file.unlink(missing_ok=True)
-            self.saved.pop(key, None)
+        files = {"model": self._anew("model", "extended.toml"), "extended": self._anew("extended", "extended.html")}
         self.touch("save")
         await self.bench.call("command", "extending the model", words=words)
         self.saved |= {
@@ -458,7 +480,8 @@ class Session:
             self.do("mapping", self._save_mapping())
 
     async def _save_mapping(self) -> None:
-        path = self.folder / "mapping.toml"
+        path = self._anew("mapping", "mapping.toml")
+        self.touch("mapping")
         words = ["map", *self.choice.reading(real=True), "--out", str(path)]
         await self.bench.call("command", "writing the mapping file", words=words)
         if path.exists():
@@ -467,7 +490,7 @@ class Session:
 
     def stop(self, *names: str) -> None:
         """End jobs of these names (or of any) and whatever else their processes do."""
-        for w in (self.search, self.bench):
+        for w in (self.search, self.bench, *([self.aside] if names else [])):
             if any(not names or j.name in names for j in w.jobs.values()):
                 w.stop()
         self._hand_wanted = False

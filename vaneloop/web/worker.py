@@ -97,14 +97,25 @@ def look(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 
 def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
-    """Read the log: its channels in our names and units."""
+    """Read the log: its channels in our names and units; and the controller's faults, where it has them."""
+    from controller import FAULTS
+    from hil.logs import read_log
     from hil.logs.columns import warm_up
+    from vaneloop.base.errors import InputError
     from vaneloop.base.signals import UNITS
 
     if words[0].lower().endswith(options.CAN_SUFFIXES):
         warm_up(lambda text: progress(None, text))
-    log = options.read_log_of(parsed("diagnose", words), require=())
-    return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in log.channels.items()}}
+    args = parsed("diagnose", words)
+    named = {f"fault_{f}": f for f in FAULTS}  # as vgv.dbc calls them
+    signals = {**UNITS, **dict.fromkeys(named, "-")}
+    try:
+        log = read_log(args.log, **options.log_options(args), require=(), signals=signals)
+    except InputError:  # said as every command says it
+        log = options.read_log_of(args, require=())
+    own = {n: c for n, c in log.channels.items() if n in UNITS}
+    faults = {fault: (c.t, c.values) for n, fault in named.items() if (c := log.channels.get(n)) is not None}
+    return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in own.items()}, "faults": faults}
 
 
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
@@ -349,6 +360,8 @@ TASKS: dict[str, Callable[..., Any]] = {
         )
     },
     "ahead": refit,  # the same, before the user asks for it
+    "over": preview,  # of a log laid over the one chosen
+    "judge": command,  # of a scenario, whatever else goes on
 }
 
 
