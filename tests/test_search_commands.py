@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from hil.logs import Channel, read_log, write_log
+from tests.browser import open_to_all
 from vaneloop.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -173,6 +174,7 @@ def test_the_extended_model_is_nearer_to_the_log_in_the_whole_loop(
         x = [next(s["rms"] for s in j[where] if s["signal"] == "x_lvdt") for j in (before, after)]
         assert x[1] < 0.6 * x[0], where
     assert page.stat().st_size > 10_000
+    open_to_all(page, "compare")
 
 
 def test_compare_leaves_with_one_where_a_tolerance_is_exceeded() -> None:
@@ -269,6 +271,13 @@ def test_bad_input_gets_one_line_and_exit_code_two(
     line = complaint(code, err)
     assert out == "" and all(word in line for word in says), line
     assert not (bad / "m.toml").exists()
+
+
+def test_a_log_that_is_none_is_complained_of_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "junk.mf4").write_bytes(b"MDF     4.10    " + bytes(range(256)) * 40)
+    code = main(["compare", str(tmp_path / "junk.mf4")])
+    out, err = capsys.readouterr()
+    assert "junk.mf4" in complaint(code, err) and out == ""
 
 
 def test_a_process_with_bad_input_leaves_with_two(bad: Path) -> None:

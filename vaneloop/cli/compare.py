@@ -45,10 +45,11 @@ def command(args: argparse.Namespace) -> int:
     stages: list[dict[str, object]] = []
     floors: dict[str, float] = {}
     said: list[str] = []
+    alone = ""  # why there is only the loop
     try:
         chain = chain_of(args)
     except LogError as e:
-        terminal.say(args, f"note: no stage by stage comparison: {e}")
+        alone = str(e)
         extra["not_observed"] = {"all": str(e)}
     else:
         said = chain.notes
@@ -82,7 +83,10 @@ def command(args: argparse.Namespace) -> int:
             terminal.say(args, f"page: {answer.report(report, words)}")
             report = None
     args.report = report
-    return replay.replayed(args, {"stages": stages, **extra}, floors, said)
+    code = replay.replayed(args, {"stages": stages, **extra}, floors, said)
+    if alone:  # where the loop cannot be compared either, that is said once
+        terminal.say(args, f"note: no stage by stage comparison: {alone}")
+    return code
 
 
 def _own(args: argparse.Namespace) -> int:

@@ -1,0 +1,64 @@
+"""A headless Chromium for the tests: pictures, what axe-core finds, and whether a report is open to everybody."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import ROOT
+
+CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
+SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
+# ms; a slow machine with other work compiles the simulator first
+LONG = 1000.0 * float(os.environ.get("VANELOOP_PATIENCE", "240"))
+WHY_NOT = "no Chromium: apt-get install chromium (make test does, where it may)"
+
+
+def shot(page: Any, name: str) -> None:
+    """Keep a picture of the whole page."""
+    SHOTS.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=str(SHOTS / f"{name}.png"), full_page=True)
+
+
+def violations(page: Any) -> dict[str, str]:
+    """What axe-core finds wrong for somebody who uses a keyboard or a screen reader: rule -> the first place."""
+    axe = pytest.importorskip("axe_playwright_python", reason="no axe-core: pip install -e '.[test]'")
+    page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run(document).then((r) => r.violations.map((v) => [v.id, v.nodes[0].html]))")
+    return dict(found)
+
+
+def look_at(browser: Any, file: Path, name: str) -> None:
+    """Hold a report against axe-core in light and dark, on a laptop and on a phone of 360 px; nothing sticks out."""
+    for width, schemes in ((1280, ("light", "dark")), (360, ("dark", "light"))):
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=schemes[0])
+        page = context.new_page()
+        complaints: list[str] = []
+        page.on("pageerror", lambda e, said=complaints: said.append(str(e)))
+        page.goto(file.as_uri())
+        drawn = "[...document.querySelectorAll('.plot')].every((p) => p.querySelector('.main-svg'))"
+        page.wait_for_function(drawn, timeout=LONG)
+        for scheme in schemes:
+            page.emulate_media(color_scheme=scheme)
+            shot(page, f"report_{name}_{width}_{scheme}")
+            assert not violations(page), f"{name} at {width}, {scheme}"
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= width, f"{name}: {wide} px of {width}"
+        context.close()
+        assert not complaints, complaints
+
+
+def open_to_all(file: Path, name: str) -> None:
+    """`look_at` in a browser of its own. Skips, saying so, where there is no Chromium: stands last in its test."""
+    if CHROMIUM is None:
+        pytest.skip(WHY_NOT)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        look_at(browser, file, name)
+        browser.close()
