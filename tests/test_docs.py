@@ -26,6 +26,7 @@ import pytest
 
 from hil.logs import Channel, read_log, write_log
 from tests.conftest import ROOT
+from tests.quotes import absent, lines_of, tokens
 from vaneloop.base import terminal
 from vaneloop.cli.main import COMMANDS, main
 
@@ -147,6 +148,11 @@ LONG: dict[str, str] = {
     '"""A log of a machine whose play grows': "tests/test_rig.py",
 }
 OURS = ("vaneloop", "python", "make", "candump")
+# page -> the beginning of a block that quotes no output of the step above it -> what it is
+NO_OUTPUT: dict[str, dict[str, str]] = {
+    "docs/diagnosis.md": {"  what  ": "of 200 logs, which take an hour; `vaneloop hidden-effect` is run with one"},
+    "docs/tables.md": {"my.toml: servo: kp (": "complaints of files with one mistake each; tests/test_tables.py"},
+}
 
 
 @dataclass(frozen=True)
@@ -223,6 +229,12 @@ def test_every_exception_is_a_step_of_some_page(table: dict[str, str]) -> None:
     for reason in table.values():
         for file in re.findall(r"tests/\w+\.py", reason):
             assert (ROOT / file).is_file(), file
+
+
+@pytest.mark.parametrize("page", NO_OUTPUT)
+def test_every_block_that_quotes_no_output_is_there(page: str) -> None:
+    lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    assert all(sum(line.startswith(begin) for line in lines) == 1 for begin in NO_OUTPUT[page])
 
 
 @pytest.mark.parametrize("page", REPLACED)
@@ -408,8 +420,27 @@ def run_command(text: str) -> None:
         assert done.returncode == 0, f"{text}\n{done.stderr}"
 
 
+def skipped(page: str, step: Step, long: bool) -> bool:
+    """Whether the step is not run."""
+    run = Step(step.line, step.kind, replaced(page, step.text))
+    named = step.text in NAMES or re.match(r"# \w+\.py\n", step.text) is not None
+    return named or bool(step.listed(NOT_RUN)) or (bool(run.listed(LONG)) and not long)
+
+
+def misquoted(page: str, said: str, long: bool) -> list[str]:
+    """Lines of output that the page quotes and that its steps, where they were run, did not print."""
+    heard, out = tokens(said), []
+    text = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    for block, line, quoted in lines_of(ROOT / page, OURS):
+        above = [s for s in ALL[page] if s.line <= (block if s.line == block else line)]
+        what = next((k for k in NO_OUTPUT.get(page, {}) if text[block].startswith(k)), None)
+        if above and not skipped(page, above[-1], long) and what is None and absent(quoted, heard):
+            out.append(f"{page}:{line}: {quoted}")
+    return out
+
+
 def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool) -> None:
-    """Run a page's steps; ``long``: also those that take long."""
+    """Run a page's steps; ``long``: also those that take long. What it quotes of them must be what they print."""
     (folder / "examples").symlink_to(ROOT / "examples")
     for s in ALL[page]:
         if s.kind == "python" and (name := re.match(r"# (\w+\.py)\n", s.text)):
@@ -417,14 +448,11 @@ def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool
     with pytest.MonkeyPatch.context() as m:
         m.chdir(folder)
         m.syspath_prepend(str(ROOT))
+        m.setenv("COLUMNS", "200")
+        heard = request.getfixturevalue("capfd")
         for s in ALL[page]:
             run = Step(s.line, s.kind, replaced(page, s.text))
-            if (
-                s.text in NAMES
-                or s.listed(NOT_RUN)
-                or (run.listed(LONG) and not long)
-                or re.match(r"# \w+\.py\n", s.text)
-            ):
+            if skipped(page, s, long):
                 continue
             given = before(page, run, folder)
             try:
@@ -438,6 +466,20 @@ def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool
                         f(request.getfixturevalue("sil"))
             except Exception as e:
                 pytest.fail(f"{page}:{s.line}: {run.text.splitlines()[0]}: {type(e).__name__}: {e}")
+        said = "\n".join(heard.readouterr())
+        sys.stdout.write(said)
+    assert misquoted(page, said, long) == []
+
+
+@pytest.mark.parametrize(
+    ("quoted", "said", "there"),
+    [("x_lvdt  0.6616 mm", "│ x_lvdt │ 0.66162 │ mm │", True), ("x_lvdt 0.6616 mm", "x_lvdt 0.6618 mm", False),
+     ("12 of 40", "12 of 40 logs", True), ("vgv1 fits", "vgv2 fits", False), ("fails", "it fails", True),
+     ("nominal 130 -> ... -> floor 1.00", "nominal 130.4 -> a 3 -> floor 1.0", True), ("-0.1 mm", "0.1 mm", False),
+     ("1,234 frames", "1234 frames", True), ("1.2e-07", "1.23e-07", True), ("1.2e-07", "1.4e-07", False)],
+)  # fmt: skip
+def test_a_quote_is_held_word_by_word_and_digit_by_digit(quoted: str, said: str, there: bool) -> None:
+    assert absent(quoted, tokens(said)) is not there
 
 
 @pytest.mark.parametrize("page", REAL)
