@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.browser import open_to_all
 from vaneloop.base.errors import InputError
 from vaneloop.design import trend as tf
 from vaneloop.design.limit_cycles import LimitCycle, Play, limit_cycles, play_describing_function
@@ -290,6 +291,7 @@ def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -
     result, code = evaluate(kp=60.0)
     assert code == 1 and not result.ok
     json.dumps(result.to_dict(), allow_nan=False)
+    open_to_all(tmp_path / "design.html", "design")
 
 
 def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:

@@ -15,6 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.browser import open_to_all
+
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
@@ -201,6 +203,8 @@ def test_the_page_leads_to_the_logs_own_pages(folder: Folder, tmp_path: Path) ->
     links = set(re.findall(r'href="(fleet_logs/[^"]+)"', page))
     assert links and all((tmp_path / x).is_file() for x in links)
     assert "supply_dip" in page and "no limit is given" in page and view.sentence() in page
+    open_to_all(tmp_path / sorted(links)[0], "fleet-log")
+    open_to_all(tmp_path / "fleet.html", "fleet")
 
 
 def test_tables_of_two_reports_are_the_same_bytes(folder: Folder, tmp_path: Path) -> None:

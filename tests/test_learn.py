@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 
 from plant import Model, load_model, write_model
 from plant.model import Learned
+from tests.browser import open_to_all
 from vaneloop import InputError, Record, System, unknown
 from vaneloop.base.curve import on_table
 from vaneloop.base.forms import FORMS
@@ -298,6 +299,7 @@ def test_the_command_learns_the_law_and_another_log_confirms_it(tmp_path: Path) 
     done = vaneloop(tmp_path, "compare", "warm.csv", *own, "--model", "law.toml", "--json", "c.json")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "c.json").read_text())["signals"][0]["rms"] < 0.075  # its noise is 0.05
+    open_to_all(tmp_path / "a.html", "learn")
 
 
 OWN = ("--system", "tank.py")

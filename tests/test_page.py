@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.figures import error_figures
+from tests.browser import open_to_all
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy.locate import Regime
@@ -433,6 +434,7 @@ def test_the_engine_test_stands_beside_the_paper(tmp_path):
     words = " ".join(Elements(file.read_text(encoding="utf-8")).text)
     assert tone == "good" and "0.55" in text
     assert all(figure in words for figure in ("2.17", "0.55", "0.47", "1.6"))
+    open_to_all(file, "engine-test")
 
 
 def test_a_dual_schedule_that_misses_the_paper_is_not_called_good(tmp_path):

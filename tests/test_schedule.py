@@ -16,6 +16,7 @@ from hil.engine_test import engine_test, load_profile
 from hil.logs import Channel, Log, LogError, write_log
 from plant import Geometry, build_plant, load_geometry, load_schedules
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, stage_ring_angle, vane_angle
+from tests.browser import open_to_all
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, Manoeuvre, simulate
 from vaneloop.base.errors import InputError
@@ -231,6 +232,7 @@ def test_log_to_tables_to_engine_test_shows_small_errors(engine, capsys):
     assert own.mean_abs < 0.1
     assert own.mean_abs < 0.2 * nominal.mean_abs
     assert own.mean_abs < 0.2 * single.signals[0].mean_abs
+    open_to_all(report, "schedule")
 
 
 @pytest.mark.parametrize("seed", [5, 11])

@@ -25,6 +25,7 @@ from plant.spatial import (
     plane_joints,
     spatial_angles,
 )
+from tests.browser import open_to_all
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.base.vanes import VANES
@@ -217,6 +218,7 @@ def test_spatial_command_states_the_difference_and_draws_it(tmp_path, capsys):
     assert data["stages"][0]["max_abs"] == pytest.approx(0.0405, abs=1e-3)
     assert page.stat().st_size > 1e5
     assert main(["spatial", "--points", "9", "--limit", "0.01", "--quiet"]) == 1
+    open_to_all(page, "spatial")
 
 
 def test_clearance_command_names_the_millimetres(tmp_path, capsys):
@@ -225,6 +227,7 @@ def test_clearance_command_names_the_millimetres(tmp_path, capsys):
     data = json.loads(capsys.readouterr().out)
     assert data["stages"][0]["clearances"]["ring"] == pytest.approx(0.81, abs=0.01)
     assert page.stat().st_size > 1e5
+    open_to_all(page, "clearance")
 
 
 @pytest.mark.parametrize(

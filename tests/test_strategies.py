@@ -16,6 +16,7 @@ from hil.engine_test import load_profile
 from hil.loop.lockstep import Stimulus, lockstep, snapshot_names
 from plant import build_plant
 from tests import columns as fw
+from tests.browser import open_to_all
 from vaneloop.base.vanes import VANES
 from vaneloop.cli.main import main
 from vaneloop.design import strategies as st
@@ -220,6 +221,7 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     assert row["vigv"]["mean_abs"] == pytest.approx(again.figures["vigv"]["mean_abs"], rel=1e-9)
     text = page.read_text(encoding="utf-8")
     assert "What adaptive learns" in text and "<script src" not in text
+    open_to_all(page, "strategies")
 
 
 @pytest.mark.parametrize(

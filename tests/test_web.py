@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,18 +24,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.browser import CHROMIUM, LONG, SHOTS, WHY_NOT, look_at, shot, violations
 from tests.conftest import ROOT
 from tests.test_realtime import ON_TIME_US
 
-CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
-SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
-LONG = 1000.0 * float(
-    os.environ.get("VANELOOP_PATIENCE", "240")
-)  # ms; a slow machine with other work compiles the simulator first
-
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium: apt-get install chromium (make test does, where it may)"
-)
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
 
 
 class Server:
@@ -149,19 +141,6 @@ def page(browser: Any) -> Iterator[Any]:
     assert not complaints, complaints
 
 
-def shot(page: Any, name: str) -> None:
-    """Keep a picture of the whole page."""
-    page.screenshot(path=str(SHOTS / f"{name}.png"), full_page=True)
-
-
-def violations(page: Any) -> dict[str, str]:
-    """What axe-core finds wrong for somebody who uses a keyboard or a screen reader: rule -> the first place."""
-    axe = pytest.importorskip("axe_playwright_python", reason="no axe-core: pip install -e '.[test]'")
-    page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
-    found = page.evaluate("axe.run(document).then((r) => r.violations.map((v) => [v.id, v.nodes[0].html]))")
-    return dict(found)
-
-
 def tab_to(page: Any, selector: str) -> None:
     """Press Tab until the element that matches has the focus."""
     for _ in range(200):
@@ -172,8 +151,8 @@ def tab_to(page: Any, selector: str) -> None:
 
 
 def looks(page: Any, name: str) -> None:
-    """Pictures: a laptop in light, a wide screen and a phone in dark. Nothing sticks out, axe-core is content."""
-    for width, dark in ((1280, False), (1920, True), (360, True)):
+    """Pictures: a laptop, a wide screen, a phone, in light and dark. Nothing sticks out, axe-core is content."""
+    for width, dark in ((1280, False), (360, False), (360, True), (1920, True)):
         page.set_viewport_size({"width": width, "height": 900})
         if dark != ("body--dark" in (page.locator("body").get_attribute("class") or "")):
             page.get_by_label("light or dark").click()
@@ -370,6 +349,9 @@ def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+IN_ONE_TEST = ("locate", "replay", "extend", "diagnose", "experiment")  # the others where they are made anyway
+
+
 @needs_browser
 def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path: Path) -> None:
     import vaneloop
@@ -387,25 +369,38 @@ def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path:
         "diagnose": diagnosis_page(*parts),
         "experiment": experiment_page(*parts, "Ramp it.", experiment),
     }
+    assert tuple(reports) == IN_ONE_TEST
     for name, made in reports.items():
         file = made.write(tmp_path / f"{name}.html")
-        for width, scheme in ((1280, "light"), (360, "dark")):
-            context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-            page = context.new_page()
+        look_at(browser, file, name)
+        if name == "extend":  # the way from a cell to its moment, by keyboard
+            page = browser.new_page()
             page.goto(file.as_uri())
-            page.wait_for_function("document.querySelectorAll('.main-svg').length > 0", timeout=LONG)
-            shot(page, f"report_{name}_{width}_{scheme}")
-            wide = page.evaluate("document.documentElement.scrollWidth")
-            assert wide <= width, f"{name}: {wide} px of {width}"
-            assert not violations(page), f"{name} at {width}"
-            if name == "extend" and width == 1280:  # the way from a cell to its moment, by keyboard
-                tab_to(page, ".show")
-                page.keyboard.press("Enter")
-                page.wait_for_function(
-                    "[...document.querySelectorAll('.plot')].some((p) => p.layout.xaxis.range && "
-                    "Math.abs(p.layout.xaxis.range[1] - p.layout.xaxis.range[0] - 4) < 1e-6)"
-                )
-            context.close()
+            page.wait_for_function("document.querySelectorAll('.show').length > 0", timeout=LONG)
+            tab_to(page, ".show")
+            page.keyboard.press("Enter")
+            page.wait_for_function(
+                "[...document.querySelectorAll('.plot')].some((p) => p.layout.xaxis.range && "
+                "Math.abs(p.layout.xaxis.range[1] - p.layout.xaxis.range[0] - 4) < 1e-6)"
+            )
+            page.close()
+
+
+def test_every_command_with_a_report_has_it_held_against_axe_core() -> None:
+    import importlib
+
+    from vaneloop.base import terminal
+    from vaneloop.cli.main import COMMANDS
+
+    written = set()
+    for name, (module, *_) in COMMANDS.items():
+        parser = terminal.Parser(prog=name)
+        importlib.import_module(module).add_options(parser)
+        if "--report" in parser.format_help() or name == "fleet":  # fleet has it in a part
+            written.add(name)
+    texts = [f.read_text(encoding="utf-8") for f in (ROOT / "tests").glob("test_*.py")]
+    held = set(re.findall(r'open_to_all\(.*, "([\w-]+)"\)', "\n".join(texts)))
+    assert written - held - set(IN_ONE_TEST) == set() and len(written) >= 14
 
 
 @needs_browser

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.browser import open_to_all
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
 from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
@@ -87,6 +88,7 @@ def test_the_page_s_example_runs_as_it_is_written(page: Path) -> None:
     assert main(["extend", *words, "--effect", "level.square_root", "--out", str(page / "better.toml")]) in (0, 1)
     assert main(["compare", *words, "--model", str(page / "better.toml"), "--json", str(page / "c.json")]) == 0
     assert json.loads((page / "c.json").read_text())["signals"][0]["rms"] < 0.06
+    open_to_all(page / "tank.html", "own-model")
 
 
 def test_diagnosing_a_model_that_has_a_law_already_keeps_the_law() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vaneloop.pages.figures import Figure, Line, Panel, heat, overlay
 from vaneloop.pages.page import Link, Page
+from vaneloop.pages.story import verdict_word
 
 __all__ = ["FleetView", "Series", "fleet_page", "log_page"]
 
@@ -264,13 +265,14 @@ def log_page(key: str, answer: dict[str, Any]) -> Page:
     """The short page of one log, from its answer: tables, no curves."""
     tones = {"none": "good", "missing": "neutral", "unknown": "bad"}
     page = Page(
-        f"Log {key[:8]}", f"Verdict: {answer['verdict']}.", tone=tones.get(answer["verdict"], "neutral"),  # type: ignore[arg-type]
+        f"Log {key[:8]}", f"Verdict: {verdict_word(answer['verdict'])}.", tone=tones.get(answer["verdict"], "neutral"),  # type: ignore[arg-type]
         subtitle="fleet", log=answer["log"], command=f"vaneloop diagnose {answer['log']} --report diagnosis.html",
     )  # fmt: skip
     page.section("Stages", "RMS errors on held-out data. The command below gives the page with all curves.")
     columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     fields = ("stage", "verdict", "signal", "error_before", "error_after", "noise_floor", "unit")
-    page.table(columns, [[s.get(k) for k in fields] for s in answer["stages"]])
+    rows = [{**s, "verdict": verdict_word(s["verdict"])} for s in answer["stages"]]
+    page.table(columns, [[s.get(k) for k in fields] for s in rows])
     if answer["effects"]:
         page.section("Effects")
         page.table(

@@ -76,7 +76,7 @@ class Page:
         e = html.escape
         self._tiles.append(
             f'<div class="tile {e(tone)}"><div class="label">{e(label)}</div><div '
-            f'class="value">{e(number(value))}<span class="unit">{e(unit)}</span></div><div '
+            f'class="value">{e(number(value))} <span class="unit">{e(unit)}</span></div><div '
             f'class="note">{e(note)}</div></div>'
         )
 

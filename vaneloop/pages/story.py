@@ -15,7 +15,7 @@ from vaneloop.pages.style import Tone, capital
 __all__ = [
     "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
     "falling", "floors",
-    "reached", "stage_tone", "word", "word_of_located", "worths",
+    "reached", "stage_tone", "verdict_word", "word", "word_of_located", "worths",
 ]  # fmt: skip
 
 FITS = "fits"  # no error beyond the noise
@@ -33,6 +33,11 @@ def floors(ratio: float) -> str:
 def reached(s: StageDiagnosis) -> bool:
     """Whether every output of a stage stands at its noise floor with the best model."""
     return all(agrees(e, f) for e, f in zip(s.error_after, s.floor, strict=True))
+
+
+def verdict_word(verdict: str) -> str:
+    """A verdict as the JSON has it, as a reader is told it."""
+    return FITS if verdict == "none" else verdict
 
 
 def word(s: StageDiagnosis, extended: bool = False) -> str:
