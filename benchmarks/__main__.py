@@ -1,10 +1,11 @@
-"""``python -m benchmarks``: measure, print a table, write benchmarks/results/latest.json. Never fails for a slow
-figure.
+"""``python -m benchmarks [WORD ...]``: measure (only what has one of the words in its name), print a table, write
+benchmarks/results/latest.json. Never fails for a slow figure.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 import time
 from dataclasses import asdict
 
@@ -19,15 +20,15 @@ MEASUREMENTS = measure.MEASUREMENTS | native.MEASUREMENTS | bus.MEASUREMENTS | t
 
 
 def main() -> None:
-    """Run every measurement; one that cannot run says why in the table."""
-    import sys
-
+    """Run the measurements; one that cannot run says why in the table."""
     console = Console(markup=False, width=None if sys.stdout.isatty() else 160)
     host = machine()
     console.print("  ".join(f"{k} {v}" for k, v in host.items()))
     rows: list[Row] = []
-    for i, (name, rows_of) in enumerate(MEASUREMENTS.items(), 1):
-        console.print(f"[{i}/{len(MEASUREMENTS)}] measuring {name} ...")
+    words = sys.argv[1:]
+    chosen = {name: rows_of for name, rows_of in MEASUREMENTS.items() if not words or any(w in name for w in words)}
+    for i, (name, rows_of) in enumerate(chosen.items(), 1):
+        console.print(f"[{i}/{len(chosen)}] measuring {name} ...")
         started = time.perf_counter()
         try:
             rows += list(rows_of())

@@ -678,3 +678,12 @@ def test_stages_settle_two_places_of_rivals_in_one_stage() -> None:
     assert set(d.final.effects) == {"a_twin", "b_twin"}
     sizes = {f.effect: float(f.parameters["size"]["value"]) for f in d.effects}  # type: ignore[arg-type]
     assert sizes == pytest.approx({"a_twin": 0.4, "b_twin": 0.3}, rel=0.02)
+
+
+def test_what_is_searched_at_once_comes_first_and_then_the_longest() -> None:
+    from vaneloop.discrepancy.workflow import _order
+
+    sizes = {"long": (16, 3), "short": (1, 1), "middle": (19, 1), "quick": (4, 1), "tenth": (5, 1)}
+    stages = [type("S", (), {"effects": [0] * n, "outputs": [0] * m}) for n, m in sizes.values()]
+    names = [list(sizes)[i] for i in _order(stages)]  # type: ignore[arg-type]
+    assert names == ["short", "quick", "long", "middle", "tenth"]

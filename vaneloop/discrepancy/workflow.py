@@ -69,6 +69,7 @@ class News:
 
 
 OFTEN = 0.1  # s between two looks at searches in other processes
+SHORT = 10  # times smaller than the longest search: takes next to nothing
 USUAL = 60.0  # fits after which half of a stage's search is usually done
 
 _WORK: list[Stage] = []
@@ -135,8 +136,7 @@ def diagnose(
     started = time.perf_counter()
     _WORK[:], _JUDGED[:] = list(stages), [judged]
     _FITS[:] = [multiprocessing.RawValue("l", 0) for _ in _WORK]
-    # the longest first
-    order = sorted(range(len(_WORK)), key=lambda i: -len(_WORK[i].effects) * len(_WORK[i].outputs))
+    order = _order(_WORK)
     done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
 
     def tell(found: StageDiagnosis | None = None) -> None:
@@ -169,6 +169,16 @@ def diagnose(
     verdicts = {d.verdict for d in results}
     verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
     return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def _order(stages: Sequence[Stage]) -> list[int]:
+    """Stages in the order in which they are searched: the longest first, but before them those that take next to
+    nothing, so that something is found at once.
+    """
+    size = [len(s.effects) * len(s.outputs) for s in stages]
+    by_size = sorted(range(len(stages)), key=lambda i: size[i])
+    short = [i for i in by_size if SHORT * size[i] < size[by_size[-1]]]
+    return [*short, *(i for i in reversed(by_size) if i not in short)]
 
 
 def _how_far(done: set[int]) -> tuple[float, str]:
