@@ -23,6 +23,8 @@ from vaneloop.web.session import LogFile, Session
 
 __all__ = ["build"]
 
+WARM = 0.5  # s after the page: first it is drawn
+
 
 def build(session: Session, most: int) -> None:
     """Draw the page; ``most`` is the largest upload in bytes."""
@@ -33,6 +35,7 @@ def build(session: Session, most: int) -> None:
         page.where()
         page.what()
         page.next()
+        ui.timer(WARM, session.warm, once=True)
 
 
 class _Page:

@@ -151,6 +151,11 @@ class Session:
         """The equivalent command line."""
         return shlex.join(["vaneloop", verb, *self.choice.words(real=False), *more])
 
+    def warm(self) -> None:
+        """Load what the first log will need, before it is there."""
+        if self.search.process is None and not self.working["warm"]:
+            self.do("warm", self.search.call("ready", ""))
+
     # ---- the log
 
     def choose(self, file: LogFile) -> None:
@@ -469,9 +474,7 @@ class Session:
         files = {"model": self._anew("model", "extended.toml"), "extended": self._anew("extended", "extended.html")}
         self.touch("save")
         await self.bench.call("command", "extending the model", words=words)
-        self.saved |= {
-            key: file for key, file in files.items() if file.exists()
-        }  # nothing is written that is no better
+        self.saved |= {k: f for k, f in files.items() if f.exists()}  # nothing is written that is no better
         self.touch("save")
 
     def save_mapping(self) -> None:
@@ -491,7 +494,7 @@ class Session:
     def stop(self, *names: str) -> None:
         """End jobs of these names (or of any) and whatever else their processes do."""
         for w in (self.search, self.bench, *([self.aside] if names else [])):
-            if any(not names or j.name in names for j in w.jobs.values()):
+            if any(j.name in names or (not names and j.name != "ready") for j in w.jobs.values()):
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")

@@ -75,6 +75,16 @@ def chain_for(words: list[str], progress: Progress) -> Any:
 # ---- tasks -----------------------------------------------------------------------------------------------------------
 
 
+def ready(progress: Progress) -> None:
+    """Load what a log will need, before there is one."""
+    import vaneloop.discrepancy.workflow
+    import vaneloop.pages.diagnosis
+    import vaneloop.verbs.search  # noqa: F401
+    from hil.loop.lockstep import warm_up
+
+    warm_up(lambda text: progress(None, text))
+
+
 def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
     """Names that the log offers, to be mapped."""
     from hil.logs import offered
@@ -345,6 +355,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     **{
         f.__name__: f
         for f in (
+            ready,
             offers,
             look,
             preview,
