@@ -148,7 +148,7 @@ LONG: dict[str, str] = {
     '"""A log of a machine whose play grows': "tests/test_rig.py",
 }
 OURS = ("vaneloop", "python", "make", "candump")
-# page -> the beginning of a block that quotes no output of the step above it -> what it is
+# page -> the beginning of the output of a block that quotes no output of the step above it -> what it is
 NO_OUTPUT: dict[str, dict[str, str]] = {
     "docs/diagnosis.md": {"  what  ": "of 200 logs, which take an hour; `vaneloop hidden-effect` is run with one"},
     "docs/tables.md": {"my.toml: servo: kp (": "complaints of files with one mistake each; tests/test_tables.py"},
@@ -430,10 +430,10 @@ def skipped(page: str, step: Step, long: bool) -> bool:
 def misquoted(page: str, said: str, long: bool) -> list[str]:
     """Lines of output that the page quotes and that its steps, where they were run, did not print."""
     heard, out = tokens(said), []
-    text = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    first: dict[int, str] = {}  # line of output of a block
     for block, line, quoted in lines_of(ROOT / page, OURS):
         above = [s for s in ALL[page] if s.line <= (block if s.line == block else line)]
-        what = next((k for k in NO_OUTPUT.get(page, {}) if text[block].startswith(k)), None)
+        what = next((k for k in NO_OUTPUT.get(page, {}) if first.setdefault(block, quoted).startswith(k)), None)
         if above and not skipped(page, above[-1], long) and what is None and absent(quoted, heard):
             out.append(f"{page}:{line}: {quoted}")
     return out
