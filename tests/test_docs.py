@@ -105,6 +105,7 @@ NOT_RUN: dict[str, str] = {
     "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
     "python -m benchmarks": "measures for minutes; no test judges time",
     "vaneloop fleet": "needs the logs of many engines; tests/test_fleet_run.py, tests/test_fleet_report.py",
+    "vaneloop campaign": "runs for minutes, on workers; tests/test_campaign.py",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
     "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",
     "# vaneloop/base/errors.py": "signatures, not a program",

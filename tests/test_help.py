@@ -100,6 +100,7 @@ NOT_RUN = {
     "extend NEW": "goes on from the example before it: tests/test_learn.py",
     "compare NEW": "goes on from the example before it: tests/test_learn.py",
     "fleet": "logs of many engines, workers of a cluster: tests/test_fleet_run.py",
+    "campaign": "a plan of the reader's own, workers of a cluster: tests/test_campaign.py",
     "a2l --out mine.a2l --controller": "a library of the reader's own: tests/test_xcp.py",
     "export-fmu --part plant --model M.toml": "a model of the reader's own: tests/test_fmu.py",
     "fuzz --tool": "a minute each: tests/test_fuzz.py",

@@ -43,6 +43,10 @@ COMMANDS = {
         "blind benchmark for users' own models: laws hidden in systems of many families (needs a checkout)",
     ),
     "fleet": ("vaneloop.cli.fleet", "many engines, many logs: who lacks what, since when, how fast it grows"),
+    "campaign": (
+        "vaneloop.cli.campaign",
+        "scenarios times tolerances, calibrations, firmwares: failure probability, margins, worst cases",
+    ),
     "schedule": (
         "vaneloop.cli.schedule",
         "links and stroke tables from geometry, schedules and a measured stroke-angle loop",

@@ -161,7 +161,7 @@ def _warm_up(function: Callable[..., object] | None, options: dict[str, Any], ru
 
     cache = Path(config.CACHE_DIR)  # type: ignore[attr-defined]
     cache.mkdir(parents=True, exist_ok=True)
-    warm = cache / f"fleet-{sources_digest()}.warm"
+    warm = cache / f"fleet-{function.__module__}-{sources_digest()}.warm"
     with open(cache / "fleet.lock", "w") as lock:
         waits = time.monotonic() + WARM_UP / 2.0
         while not warm.exists() and time.monotonic() < waits:

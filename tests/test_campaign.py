@@ -1,0 +1,178 @@
+"""Campaigns: margins agree with verdicts; probability, worst case and indices are right where the truth is known."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import pytest
+
+pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
+
+from hil import inject
+from hil.inject.margin import margins
+from tests.conftest import ROOT
+from tests.native_builds import wrong
+from vaneloop.base.errors import InputError
+from vaneloop.cli.main import main
+from vaneloop.fleet import campaign
+from vaneloop.fleet.plan import draw, groups, load_plan
+from vaneloop.fleet.worker import work
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The processes that run trials find the package."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    yield
+
+
+# ---- margins ---------------------------------------------------------------------------------------------------------
+
+T = np.arange(1000) * 1e-3
+X = 10.0 * T  # mm
+MODE = np.where(T < 0.2, 1, np.where(T < 0.8, 2, 3))  # STANDBY, RUN, DEGRADED
+CLAIMS = [  # claim, margin, share; NaN: nothing measures it
+    ({"mode": "RUN", "at": 0.2}, 0.002, 1.0),
+    ({"mode": "RUN", "at": 0.201}, 0.001, 0.5),
+    ({"mode": "RUN", "at": 0.3}, -0.098, -1.0),
+    ({"mode": "RUN", "by": 0.6, "after": 0.1}, 0.4, 0.8),
+    ({"mode": "RUN", "by": 0.15, "after": 0.1}, -0.05, -1.0),
+    ({"mode": "FAIL_SAFE", "by": 0.6}, np.nan, -1.0),
+    ({"mode": "RUN", "during": [0.4, 0.7]}, 0.2, 0.5),
+    ({"mode": "RUN", "during": [0.4, 0.9]}, -0.101, -0.202),
+    ({"mode": "FAIL_SAFE", "never": True}, np.nan, np.nan),
+    ({"mode": "DEGRADED", "never": True}, -0.2, -0.2002),
+    ({"signal": "x_lvdt", "low": 3.0, "high": 8.0, "during": [0.4, 0.7]}, 1.0, 0.4),
+    ({"signal": "x_lvdt", "high": 5.0, "during": [0.4, 0.6]}, -1.0, -0.2),
+    ({"signal": "x_lvdt", "low": 12.0, "high": 14.0, "by": 0.9}, -2.01, -1.0),
+    ({"signal": "x_lvdt", "low": 5.0, "never": True}, -0.5, -0.5005),
+]
+
+
+@pytest.mark.parametrize(("claim", "value", "share"), CLAIMS, ids=[str(c) for c, _, _ in CLAIMS])
+def test_a_margin_is_the_distance_and_has_the_verdicts_sign(claim: dict, value: float, share: float) -> None:
+    from hil.inject.verdict import Outcome, Trace
+
+    scenario = inject.Scenario(title="made", duration=1.0, expect=[inject.Expect(**claim)])
+    signals = {"x_lvdt": X, "x_dem": X, "i_cmd": X}
+    trace = Trace(T, MODE, np.zeros(1000, np.int64), signals)
+    checks = inject.judge(scenario, trace)
+    m = margins(scenario, Outcome("made", "", "lockstep", checks, trace, [], [], {}, [], 1.0, 0.0, None))[0]
+    assert m.held == checks[0].held and (np.isnan(m.share) or (m.share >= 0.0) == m.held)
+    assert m.value == pytest.approx(value, abs=1e-9, nan_ok=True) and m.share == pytest.approx(
+        share, abs=2e-4, nan_ok=True
+    )
+
+
+# ---- the whole, where the truth is known -----------------------------------------------------------------------------
+
+STILL = """title = "Nothing moves"
+duration = 0.4
+[[expect]]
+signal = "vigv"
+high = {high}
+during = [0.3, 0.35]
+"""
+
+
+def write(folder: Path, margin: float = 0.05, more: str = "", keys: str = "") -> Path:
+    """A plan whose scenario holds while the potentiometer's bias is below ``margin`` deg; the rest is idle."""
+    still = inject.Scenario(title="still", duration=0.4)
+    vigv = inject.run(still).trace.signals["vigv"][300:351].max()
+    (folder / "still.toml").write_text(STILL.format(high=float(vigv) + margin))
+    plan = folder / "plan.toml"
+    plan.write_text(
+        f'title = "bias"\nscenarios = ["still.toml"]\nsamples = 16\nsearch = 16\nsensitivity = 8\n{keys}\n'
+        f'[vary]\n"sensors.vigv_bias" = "tolerance"\n"engine.lag" = [1.1, 1.3]\n{more}'
+    )
+    return plan
+
+
+def run(plan: Path, out: Path) -> None:
+    """Do a campaign's work in this process, without Dask."""
+    read, quantities, folder = campaign.begin(plan, out, 3600.0)
+    assert campaign.take_samples(read, quantities, folder)
+    work(folder.path)
+    campaign.take_searches(read, folder)
+    work(folder.path)
+
+
+def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: Path) -> None:
+    plan, out = write(tmp_path), tmp_path / "run"
+    run(plan, out)
+    words = ["campaign", str(plan), "--out", str(out), "--report", str(tmp_path / "c.html")]
+    words += ["--json", str(tmp_path / "c.json"), "--junit", str(tmp_path / "c.xml"), "--quiet"]
+    assert main(words) == 1  # a quarter of the machines fails; all trials are there, none is run again
+    said = json.loads((tmp_path / "c.json").read_text())
+    (g,) = said["groups"]
+    # each sixteenth of a quantity's range has one point of the sequence: bias above 0.05 of -0.1..0.1 deg is four
+    assert (g["trials"], g["failed"], g["lost"]) == (16, 4, 0) and g["low"] < 0.25 < g["high"]
+    assert g["low"] == pytest.approx(0.0727, abs=1e-4) and g["high"] == pytest.approx(0.5238, abs=1e-4)
+    assert g["by_search"] and g["worst"][0] > 0.0999  # the sequence's greatest is below
+    claim = g["requirements"][0]
+    assert claim["broken"] == 4 and claim["searched"] == pytest.approx(0.05 - g["worst"][0], abs=1e-3)
+    assert g["total"][0] > 0.5 and g["total"][1] == pytest.approx(0.0, abs=1e-6)
+    again = g["command"].split()
+    assert main([*again[1:], "--json", str(tmp_path / "again.json"), "--quiet"]) == 1
+    (o,) = json.loads((tmp_path / "again.json").read_text())["scenarios"]
+    assert o["state_hash"] == g["state_hash"] and g["same"]
+    cases = {c.get("name"): c.find("failure") is not None for c in Xml.parse(tmp_path / "c.xml").iter("testcase")}
+    assert cases[claim["expected"]] and not cases["mode changes as documented"] and cases["the combination passes"]
+    assert "worst machine" in (tmp_path / "c.html").read_text()
+
+
+def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path: Path) -> None:
+    gcc = shutil.which("gcc")
+    if gcc is None:
+        pytest.skip("no C compiler")
+    wrong(gcc, tmp_path, "abort();", "")
+    more = '[[firmware]]\nname = "shipped"\n[[firmware]]\nname = "mine"\ncontroller = "wrong.so"\n'
+    plan = write(tmp_path, 1.0, more)
+    text = plan.read_text().replace("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 4\nsearch = 0")
+    plan.write_text(text)
+    (tmp_path / "still.toml").write_text(
+        (tmp_path / "still.toml").read_text().replace("duration = 0.4", "duration = 0.6")
+    )
+    run_out = tmp_path / "run"
+    read, quantities, folder = campaign.begin(plan, run_out, 3600.0)
+    campaign.take_samples(read, quantities, folder)
+    work(folder.path)
+    view = campaign.judge(read, quantities, folder, lambda fraction: None)
+    ours, theirs = view.groups
+    assert (ours.failed, theirs.failed) == (0, 4) and view.passed(ours) and not view.passed(theirs)
+    assert theirs.same and "--controller" in theirs.command and "abort" in theirs.seen[0]
+
+
+# ---- plans -----------------------------------------------------------------------------------------------------------
+
+BAD = [  # what is put in place of what, and what the line names
+    ('"sensors.vigv_bias" = "tolerance"', '"sensors.vigv_bais" = "tolerance"', "did you mean sensors.vigv_bias?"),
+    ('"sensors.vigv_bias" = "tolerance"', '"actuator.stroke" = "tolerance"', "actuator.stroke"),
+    ("[1.1, 1.3]", "[1.3, 1.1]", "must be below high"),
+    ("[1.1, 1.3]", "[0.001, 1.3]", "engine.lag (=0.001 s) must be in"),
+    ("samples = 16", "samples = 17", "power of two"),
+    ("still.toml", "stil.toml", "stil.toml: no such file"),
+    ("search = 16", "serach = 16", "serach"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "named"), BAD, ids=[n for _, n, _ in BAD])
+def test_a_wrong_plan_is_one_line(tmp_path: Path, old: str, new: str, named: str) -> None:
+    plan = write(tmp_path)
+    plan.write_text(plan.read_text().replace(old, new))
+    with pytest.raises(InputError) as e:
+        campaign.begin(plan, tmp_path / "run", 3600.0)
+    assert named in str(e.value) and "\n" not in str(e.value) and not (tmp_path / "run").exists()
+
+
+def test_a_draw_is_the_same_every_time_and_the_groups_are_the_product(tmp_path: Path) -> None:
+    more = '[[calibration]]\nname = "a"\n[[calibration]]\nname = "b"\n[[firmware]]\nname = "x"\n'
+    plan = load_plan(write(tmp_path, more=more))
+    (a, b), (c, d) = draw(plan, 2), draw(plan, 2)
+    assert np.array_equal(a, c) and np.array_equal(b, d) and a.shape == (16, 2) and b.shape == (8, 2)
+    assert [g.name for g in groups(plan)] == ["still.a.x", "still.b.x"]

@@ -1,0 +1,225 @@
+"""A campaign: trials drawn from the tolerances, run on a run folder like the logs of a fleet, then searched and judged.
+
+    trials/GROUP/000012.json      a sample; b..., ab...: points of the sensitivity indices; search.json: the search
+    worst/GROUP/                  scenario, model and tables of the worst machine, and the command that runs it again
+
+A group is one scenario with one calibration and one firmware.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plant import write_model
+from vaneloop.base.errors import InputError
+from vaneloop.fleet import plan as plans
+from vaneloop.fleet.files import digest_of, whole_json
+from vaneloop.fleet.folder import Folder, copies_of
+from vaneloop.fleet.plan import Group, Plan, Varied
+from vaneloop.fleet.sources import Source
+from vaneloop.fleet.tables import answers
+from vaneloop.fleet.trial import model_at, moving, trial_once, worst_share
+from vaneloop.pages.campaign import CampaignView, GroupView, Requirement
+
+__all__ = ["FUNCTION", "begin", "interval", "judge", "take_samples", "take_searches"]
+
+FUNCTION = "vaneloop.fleet.trial:run_trial"
+KNOWN = 64  # worst samples that a search begins with
+
+
+def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[Varied], Folder]:
+    """Read the plan, check it against the machine, and begin the run or open it. Raises InputError."""
+    plan = plans.load_plan(file)
+    files = plans.files_of_plan(plan)
+    quantities: list[Varied] = []
+    for g in plans.groups(plan):
+        machine = plans.group_machine(files, g)
+        quantities = plans.varied(plan, machine.plant, file)
+        for corner in (0.0, 1.0):  # limits that a model file may not have are refused before anything is begun
+            plans.group_machine(files, g, model_at(files, g, quantities, [corner] * len(quantities)))
+    told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed"})
+    for c in (
+        told["calibration"] + told["firmware"]
+    ):  # where the files lay is no part of the campaign; their contents are
+        c.pop("tables"), c.pop("controller")
+    told |= {"scenarios": [Path(s).stem for s in plan.scenarios], "model": bool(plan.model), "plant": bool(plan.plant)}
+    options = {"files": copies_of(files), "limit": limit, "plan": told, **plans.as_options(plan, quantities)}
+    return plan, quantities, Folder.begin(out, FUNCTION, options, files)
+
+
+def take_samples(plan: Plan, quantities: list[Varied], folder: Folder) -> int:
+    """Take up every sample, and every point of the sensitivity indices; return how many are new."""
+    a, b = plans.draw(plan, len(quantities))
+    trials: list[str] = []
+    for g in plans.groups(plan):
+        points = {f"{i:06d}": x for i, x in enumerate(a)} | {f"b{i:06d}": x for i, x in enumerate(b)}
+        for k in range(len(quantities) if len(b) else 0):
+            mixed = a[: len(b)].copy()
+            mixed[:, k] = b[:, k]
+            points |= {f"ab{k:03d}-{i:06d}": x for i, x in enumerate(mixed)}
+        trials += [_trial(folder, g, name, {"point": x.tolist()}) for name, x in points.items()]
+    return folder.add([Source(t, "campaign", 0.0) for t in trials])
+
+
+def take_searches(plan: Plan, folder: Folder) -> int:
+    """Take up one search a group, from its worst samples; return how many are new."""
+    trials = []
+    for g in plans.groups(plan):
+        rows = [row for row in _rows(folder, g).values() if row is not None]
+        among = moving(rows)
+        known = [(row["point"], worst_share(row, among)) for row in rows]
+        if plan.search and len(known) >= 5:
+            known.sort(key=lambda k: (k[1], k[0]))
+            trials.append(_trial(folder, g, "search", {"search": plan.search, "among": among, "known": known[:KNOWN]}))
+    return folder.add([Source(t, "campaign", 0.0) for t in trials], in_chunk=1) if trials else 0
+
+
+def _trial(folder: Folder, g: Group, name: str, asked: dict[str, Any]) -> str:
+    """Write a trial's file, unless it is there as it must be; return its path."""
+    file = (folder.path / "trials" / g.name / f"{name}.json").absolute()
+    content = {"group": [g.scenario, g.calibration, g.firmware], "name": name, **asked}
+    try:
+        if json.loads(file.read_text(encoding="utf-8")) == json.loads(json.dumps(content)):
+            return str(file)
+    except (OSError, ValueError):
+        pass
+    file.parent.mkdir(parents=True, exist_ok=True)
+    whole_json(file, content)
+    return str(file)
+
+
+def _rows(folder: Folder, g: Group, pattern: str = "[0-9]*.json") -> dict[str, dict[str, Any] | None]:
+    """Answers of a group's trials by their names; None: it has none."""
+    names = {f"{digest_of(f)}.json": f.stem for f in sorted((folder.path / "trials" / g.name).glob(pattern))}
+    found = answers(folder, list(names)) if names else {}
+    return {name: found.get(key) for key, name in names.items()}
+
+
+def interval(failed: int, n: int, confidence: float) -> tuple[float, float]:
+    """Clopper-Pearson's interval of a failure probability from ``failed`` of ``n`` trials."""
+    from scipy.stats import binomtest
+
+    found = binomtest(failed, n).proportion_ci(confidence, method="exact")
+    return float(found.low), float(found.high)
+
+
+def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[float], None]) -> CampaignView:
+    """What the campaign says. The worst case of each group is saved, and run again from its saved files."""
+    files = {n: str(folder.path / f) for n, f in folder.job["options"]["files"].items()}
+    shown, all_groups = [], list(plans.groups(plan))
+    for k, g in enumerate(all_groups):
+        rows = _rows(folder, g)
+        done = [r for r in rows.values() if r is not None]
+        if not done:
+            raise InputError(f"{folder.path}: no trial of {g.name} came to an end; vaneloop fleet status says why")
+        among = moving(done)
+        search = _rows(folder, g, "search.json").get("search")
+        worst = min([*done, *([search] if search else [])], key=lambda r: (worst_share(r, among), r["point"]))
+        failed = sum(not r["held"] for r in done)
+        low, high = interval(failed, len(done), plan.confidence)
+        saved, command, same = _save(folder, files, plan, g, quantities, worst)
+        shares, points = [worst_share(r, among) for r in done], [r["point"] for r in done]
+        least, runs = worst_share(worst, among), search["runs"] if search else 0
+        first, total = _indices(plan, quantities, folder, g, rows, among)
+        shown.append(GroupView(
+            g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
+            _requirements(done, search), shares, points, _values(quantities, worst["point"]), least, worst is search,
+            runs, worst["seen"], worst["state_hash"], str(saved), command, same, first, total,
+        ))  # fmt: skip
+        told((k + 1) / len(all_groups))
+    return CampaignView(
+        plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
+        plan.allowed, plan.sampling, plan.seed, shown,
+    )  # fmt: skip
+
+
+def _values(quantities: list[Varied], point: Iterable[float]) -> list[float]:
+    return [q.low + u * (q.high - q.low) for q, u in zip(quantities, point, strict=True)]
+
+
+def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> list[Requirement]:
+    """Every claim over all trials: how often it was broken, its least and its median margin, and the search's."""
+    by: dict[str, list[dict[str, Any]]] = {}
+    for r in done:
+        for m in r["margins"]:
+            by.setdefault(m["expected"], []).append(m)
+    found = {m["expected"]: m for m in (search or {"margins": []})["margins"]}
+    for expected in found.keys() - by.keys():
+        by[expected] = []
+    out = []
+    for expected, rows in by.items():
+        value = [m["value"] for m in rows if m["value"] is not None]
+        share = [m["share"] for m in rows if m["share"] is not None]
+        s = found.get(expected)
+        unit = next((m["unit"] for m in [*rows, *([s] if s else [])] if m["unit"]), "")
+        out.append(Requirement(
+            expected, len(rows), sum(not m["held"] for m in rows), unit, min(value, default=None),
+            float(np.median(value)) if value else None, min(share, default=None),
+            None if s is None else s["value"], None if s is None else bool(s["held"]),
+        ))  # fmt: skip
+    return out
+
+
+def _save(
+    folder: Folder, files: dict[str, str], plan: Plan, g: Group, quantities: list[Varied], worst: dict[str, Any]
+) -> tuple[Path, str, bool]:
+    """Save the worst case with the command that runs it again; True: from these files it is the same, bit for bit."""
+    at = folder.path / "worst" / g.name
+    shutil.rmtree(at, ignore_errors=True)
+    at.mkdir(parents=True)
+    scenario = at / f"{g.scenario}.toml"
+    shutil.copyfile(files[f"scenario.{g.scenario}"], scenario)
+    made = model_at(files, g, quantities, worst["point"])
+    write_model(at / "model.toml", made.noted(f"campaign {folder.path.name}, worst case of {g.name}"))
+    own = {f"scenario.{g.scenario}": str(scenario), "model": str(at / "model.toml")}
+    words = ["vaneloop", "inject", str(scenario), "--model", str(at / "model.toml")]
+    for option, key in (
+        ("tables", f"tables.{g.calibration}"),
+        ("plant", "plant"),
+        ("controller", f"firmware.{g.firmware}"),
+    ):
+        if key in files:
+            copy = at / f"{option}{Path(files[key]).suffix}"
+            (shutil.copytree if Path(files[key]).is_dir() else shutil.copyfile)(files[key], copy)
+            own[key] = str(copy)
+            words += [f"--{option}", str(copy)]
+    again = trial_once(own, g, [], [])
+    (at / "command.txt").write_text(f"{shlex.join(words)}\n", encoding="utf-8")
+    same = (again["state_hash"], again["margins"]) == (worst["state_hash"], worst["margins"])
+    return at, shlex.join(words), same
+
+
+def _indices(
+    plan: Plan,
+    quantities: list[Varied],
+    folder: Folder,
+    g: Group,
+    rows: dict[str, dict[str, Any] | None],
+    among: list[str],
+) -> tuple[list[float], list[float]]:
+    """First-order and total Sobol index of each quantity for the least margin; empty: none was asked for, or the margin
+    does not vary.
+    """
+    from scipy.stats import sobol_indices
+
+    n, d = plan.sensitivity, len(quantities)
+    if not n:
+        return [], []
+    more = {**rows, **_rows(folder, g, "*b*.json")}
+
+    def shares(names: Iterable[str]) -> list[float]:
+        return [np.nan if (r := more.get(name)) is None else worst_share(r, among) for name in names]
+
+    a, b = (np.array([shares(f"{p}{i:06d}" for i in range(n))]) for p in ("", "b"))
+    ab = np.array([[shares(f"ab{k:03d}-{i:06d}" for i in range(n))] for k in range(d)])
+    if not (np.isfinite(a).all() and np.isfinite(b).all() and np.isfinite(ab).all()) or np.ptp([a, b]) == 0.0:
+        return [], []
+    found = sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=n)
+    return np.ravel(found.first_order).tolist(), np.ravel(found.total_order).tolist()

@@ -1,0 +1,159 @@
+"""What a campaign does with one trial: a scenario on one machine, judged; or a search for the worst machine.
+
+A trial is a file of JSON in the campaign's folder, which makes it an entry like a log of a fleet: ``group``, ``point``
+(in the unit cube) and, for a search, ``search`` (runs), ``among`` (claims that guide it) and ``known`` (points and
+their margins).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.inject.any_controller import SHIPPED, expected_of_any, load_reactions
+from hil.inject.injection import run
+from hil.inject.margin import margins
+from hil.inject.scenario import Scenario
+from hil.inject.verdict import Outcome
+from plant import Model
+from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of
+
+__all__ = ["model_at", "moving", "run_trial", "trial_once", "worst_share"]
+
+
+def run_trial(path: str, options: dict[str, Any], run_folder: str) -> dict[str, Any]:
+    """Do what the file asks for; the answer has the point, the margins and the state's digest of the (worst) run."""
+    asked = json.loads(Path(path).read_text(encoding="utf-8"))
+    files = {name: str(Path(run_folder) / f) for name, f in options["files"].items()}
+    g, quantities = Group(*asked["group"]), [Varied(**q) for q in options["vary"]]
+    if "search" not in asked:
+        answer = trial_once(files, g, quantities, asked["point"])
+    else:
+        answer = _search(files, g, quantities, asked, int(options["seed"]))
+    return {"verdict": "held" if answer["held"] else "failed", "answer": answer}
+
+
+def model_at(files: dict[str, str], g: Group, quantities: list[Varied], point: list[float]) -> Model:
+    """The model file of a point of the unit cube."""
+    values = [q.low + u * (q.high - q.low) for q, u in zip(quantities, point, strict=True)]
+    base = base_model(files, group_machine(files, g, Model()).plant) if "model" in files else None
+    return model_of(quantities, values, base)
+
+
+def trial_once(files: dict[str, str], g: Group, quantities: list[Varied], point: list[float]) -> dict[str, Any]:
+    """Run a group's scenario on the machine of a point, as ``vaneloop inject`` would."""
+    made = model_at(files, g, quantities, point)
+    machine, scenario = group_machine(files, g, made), scenario_of(files, g)
+    reactions = load_reactions(SHIPPED) if machine.controller is not None else None
+    outcome = run(scenario, plant=machine.plant, calibration=machine.calibration, name=g.scenario, reactions=reactions)
+    if reactions is not None and g.scenario in reactions.reactions:
+        scenario = expected_of_any(g.scenario, scenario, reactions)
+    return _answer(scenario, outcome, point)
+
+
+def _answer(scenario: Scenario, outcome: Outcome, point: list[float]) -> dict[str, Any]:
+    found = margins(scenario, outcome)
+    rows = [
+        {"expected": m.expected, "held": m.held, "value": None if np.isnan(m.value) else m.value, "unit": m.unit,
+         "share": None if np.isnan(m.share) else m.share} for m in found
+    ]  # fmt: skip
+    return {
+        "point": [float(u) for u in point], "held": outcome.held, "margins": rows, "state_hash": outcome.state_hash,
+        "seen": [c.seen for c in outcome.checks if c.held is False],
+    }  # fmt: skip
+
+
+def moving(answers: Iterable[dict[str, Any]]) -> list[str]:
+    """Claims whose margin differs between trials; all that have one where none does.
+
+    A margin that no tolerance moves would hide those that come nearer and nearer to it.
+    """
+    shares: dict[str, set[float]] = {}
+    for answer in answers:
+        for m in answer["margins"]:
+            if m["share"] is not None:
+                shares.setdefault(m["expected"], set()).add(m["share"])
+    return sorted(c for c, s in shares.items() if len(s) > 1) or sorted(shares)
+
+
+def worst_share(answer: dict[str, Any], among: Sequence[str]) -> float:
+    """Least margin of a trial, as a share, of the claims ``among``, and of any that is broken; 1: none has one."""
+    counts = (
+        m["share"] for m in answer["margins"] if m["share"] is not None and (m["expected"] in among or not m["held"])
+    )
+    return min(counts, default=1.0)
+
+
+class _Spent(Exception):
+    """The runs of a search are used up."""
+
+
+def _search(
+    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    """Look for the least margin: at the corner to which a plane through the known margins falls, by differential
+    evolution from the worst samples, then with a simplex from what that found.
+
+    The first two have half of the runs, the simplex the other half. The same file gives the same runs.
+    """
+    from scipy import optimize
+
+    seen = {tuple(point): float(share) for point, share in asked["known"]}
+    start = sorted(seen, key=lambda point: (seen[point], point))
+    best: list[Any] = [np.inf, None]
+    runs, most = 0, 0
+
+    def least(x: np.ndarray) -> float:
+        nonlocal runs
+        point = tuple(float(u) for u in np.clip(x, 0.0, 1.0))
+        if point not in seen:
+            if runs >= most:
+                raise _Spent
+            runs += 1
+            answer = trial_once(files, g, quantities, list(point))
+            seen[point] = worst_share(answer, asked["among"])
+            if seen[point] < best[0]:
+                best[:] = [seen[point], answer]
+        return seen[point]
+
+    box = [(0.0, 1.0)] * len(quantities)
+    first = np.array(start[: max(5, 2 * len(quantities))])
+    try:
+        most = (asked["search"] + 1) // 2
+        plane = np.column_stack([np.array(list(seen)), np.ones(len(seen))])
+        slope = np.linalg.lstsq(plane, np.array(list(seen.values())), rcond=None)[0][:-1]
+        corner = np.where(slope > 0.0, 0.0, 1.0)
+        if least(corner) < seen[start[-1]]:
+            first[-1] = corner
+        optimize.differential_evolution(
+            least, box, init=first, maxiter=10_000, tol=0.0, atol=-1.0, polish=False, rng=np.random.default_rng(seed)
+        )
+    except _Spent:
+        pass
+    try:
+        most = asked["search"]
+        at = np.array(min(seen, key=lambda point: (seen[point], point)))
+        corners = at + np.where(at < 0.5, 0.15, -0.15) * np.eye(len(at))
+        optimize.minimize(
+            least, at, method="Nelder-Mead", bounds=box,
+            options={"initial_simplex": np.vstack([at, corners]), "maxfev": 100_000, "xatol": 1e-4, "fatol": 1e-6},
+        )  # fmt: skip
+    except _Spent:
+        pass
+    answer = best[1] if best[0] < seen[start[0]] else trial_once(files, g, quantities, list(start[0]))
+    return {**answer, "runs": runs, "from": seen[start[0]]}
+
+
+def _warm_up(options: dict[str, Any], run_folder: str) -> None:
+    """Compile what a scenario needs."""
+    from hil.loop.lockstep import warm_up
+
+    warm_up(lambda text: None)
+    run(Scenario(title="warm-up", duration=0.1))
+
+
+run_trial.warm_up = _warm_up  # type: ignore[attr-defined]

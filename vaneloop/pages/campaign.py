@@ -1,0 +1,182 @@
+"""The page of a campaign: does every machine within tolerance hold every requirement, how surely, how nearly not."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from vaneloop.pages.figures import Line, Panel, overlay, ranking
+from vaneloop.pages.page import Page
+
+__all__ = ["CampaignView", "GroupView", "Requirement", "campaign_page"]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One claim over all trials of a group.
+
+    trials, broken   in how many it was judged, in how many broken
+    least, median    margin in ``unit``; None: nothing measures it
+    share            the least as a share (`hil.inject.margin`)
+    searched, held   margin of the case that the search ended with, and whether it held there; None: no search
+    """
+
+    expected: str
+    trials: int
+    broken: int
+    unit: str
+    least: float | None
+    median: float | None
+    share: float | None
+    searched: float | None
+    held: bool | None
+
+    @property
+    def fails(self) -> bool:
+        """Whether it was broken in any run."""
+        return self.broken > 0 or self.held is False
+
+
+@dataclass(frozen=True)
+class GroupView:
+    """One scenario with one calibration and one firmware.
+
+    trials, lost, failed   samples with an answer, without one, and those in which a claim was broken
+    low, high              interval of the failure probability
+    shares, points         least margin and point (unit cube) of each sample
+    worst                  values of what was varied, in the worst case; its least margin is ``least``
+    by_search, runs        whether the search found it, and the search's runs
+    same                   whether the saved case ran to the same bits
+    first, total           sensitivity indices of the least margin; empty: none
+    """
+
+    name: str
+    scenario: str
+    calibration: str
+    firmware: str
+    trials: int
+    lost: int
+    failed: int
+    low: float
+    high: float
+    requirements: list[Requirement]
+    shares: list[float]
+    points: list[list[float]]
+    worst: list[float]
+    least: float
+    by_search: bool
+    runs: int
+    seen: list[str]
+    state_hash: str | None
+    saved: str
+    command: str
+    same: bool
+    first: list[float]
+    total: list[float]
+
+
+@dataclass(frozen=True)
+class CampaignView:
+    """What a campaign says: its groups, and what was varied (name, unit, low, high)."""
+
+    title: str
+    run: str
+    version: str
+    varied: list[dict[str, Any]]
+    confidence: float
+    allowed: float | None
+    sampling: str
+    seed: int
+    groups: list[GroupView]
+
+    def passed(self, g: GroupView) -> bool:
+        """Whether a group is good: no trial lost and its case reproduced; and either nothing broken, or the interval's
+        upper end within what the plan allows.
+        """
+        if g.lost or not g.same:
+            return False
+        return not any(r.fails for r in g.requirements) if self.allowed is None else g.high <= self.allowed
+
+    def sentence(self) -> str:
+        """The answer in one sentence."""
+        bad = [g for g in self.groups if not self.passed(g)]
+        near = min(self.groups, key=lambda g: g.least)
+        rule = "no claim may break" if self.allowed is None else f"at most {self.allowed:g} of the machines may fail"
+        n = len(self.groups)
+        return (
+            f"{n - len(bad)} of {n} combinations of scenario, calibration and firmware pass ({rule}); "
+            f"{near.name} comes closest to failing, with a least margin of {near.least:.3g} of what is allowed."
+        )
+
+    def json(self) -> dict[str, Any]:
+        """The answer as plain data."""
+        out = {"schema": 1, **asdict(self), "passed": all(self.passed(g) for g in self.groups)}
+        for row, g in zip(out["groups"], self.groups, strict=True):
+            row["passed"] = self.passed(g)
+            row.pop("points"), row.pop("shares")
+        return out
+
+
+def campaign_page(view: CampaignView, command: str = "") -> Page:
+    """The page of a campaign."""
+    good = all(view.passed(g) for g in view.groups)
+    page = Page("Campaign", view.sentence(), tone="good" if good else "bad", subtitle=view.title, command=command,
+                log=view.run)  # fmt: skip
+    page.tile("combinations", len(view.groups), note="scenario, calibration, firmware")
+    page.tile("machines tried", sum(g.trials for g in view.groups), note=f"{view.sampling}, seed {view.seed}")
+    page.tile("failed", sum(g.failed for g in view.groups), tone="good" if good else "bad")
+    page.tile("runs of the search", sum(g.runs for g in view.groups))
+    page.section(
+        "Result",
+        f"Failure probability of a machine drawn uniformly from the tolerances, with its {100.0 * view.confidence:g} % "
+        "interval (Clopper-Pearson, which takes the samples as independent; points of a Sobol sequence are spread more "
+        "evenly than that). The least margin is a share: 1 is as good as can be, 0 is at the limit, below 0 is broken.",
+    )
+    page.table(
+        ["combination", "passes", "machines", "without answer", "failed", "probability", "low", "high", "least margin",
+         "found by"],
+        [[g.name, view.passed(g), g.trials, g.lost, g.failed, g.failed / g.trials, g.low, g.high, g.least,
+          "search" if g.by_search else "sample"] for g in view.groups],
+    )  # fmt: skip
+    page.section("What was varied", "Each uniformly and independently of the others, between these limits.")
+    page.table(["quantity", "low", "high", "unit"], [[q["name"], q["low"], q["high"], q["unit"]] for q in view.varied])
+    for g in view.groups:
+        _group(page, view, g)
+    page.section("Basis")
+    page.text(f"VaneLoop {view.version}. All trials, their answers and the copies of all files are in {view.run}.")
+    return page
+
+
+def _group(page: Page, view: CampaignView, g: GroupView) -> None:
+    page.section(
+        f"{g.scenario}, calibration {g.calibration}, firmware {g.firmware}",
+        "Requirements of the scenario. A margin is the distance from being broken, in the unit of the claim; a claim "
+        "without a margin is only held or broken.",
+    )
+    columns = ["requirement", "holds", "judged in", "broken in", "least margin", "median margin", "unit",
+               "margin after search"]  # fmt: skip
+    page.table(columns, [[r.expected, not r.fails, r.trials, r.broken, r.least, r.median, r.unit or "–", r.searched]
+                         for r in g.requirements])  # fmt: skip
+    names = [q["name"] for q in view.varied]
+    if g.total:
+        page.plot(
+            ranking(names, g.total, "share of the least margin's variance (total Sobol index)",
+                    notes=[f"{t:.2f} (alone {f:.2f})" for f, t in zip(g.first, g.total, strict=True)]),
+            "Which tolerance the least margin depends on.", half=True,
+        )  # fmt: skip
+    order = np.sort(np.array(g.shares))
+    line = Line("machines", order, (np.arange(len(order)) + 1.0) / len(order), "model", 2.2)
+    page.plot(overlay([Panel("share of machines", [line])], "least margin at or below", 320),
+              "How the least margin is spread over the machines.", half=True)  # fmt: skip
+    how = (
+        f"by the search ({g.runs} runs)" if g.by_search else f"among the samples; the search ({g.runs} runs) found none"
+    )
+    page.text(f"Worst machine, found {how}; least margin {g.least:.4g}." + "".join(f" Seen: {s}." for s in g.seen))
+    page.table(
+        ["quantity", "worst machine", "low", "high", "unit"],
+        [[q["name"], v, q["low"], q["high"], q["unit"]] for q, v in zip(view.varied, g.worst, strict=True)],
+    )
+    again = "It ran to the same bits" if g.same else "It did NOT run to the same result"
+    page.text(f"{again} from its saved files (state {g.state_hash}): {g.command}")
