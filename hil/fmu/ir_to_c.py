@@ -17,7 +17,25 @@ from collections.abc import Iterator
 
 __all__ = ["translate"]
 
-_C = {"double": "double", "i64": "int64_t", "i32": "int32_t", "i8": "int8_t", "i1": "int", "ptr": "uintptr_t"}
+
+class _Types(dict[str, str]):
+    """Types in C. An integer of another width, which the optimiser makes to mask one of 64 bits (trunc, then zext), is
+    kept in 64 bits without sign; nothing else is done with it.
+    """
+
+    def __missing__(self, kind: str) -> str:
+        if _bits(kind):
+            return "uint64_t"
+        raise KeyError(kind)
+
+
+def _bits(kind: str) -> int:
+    """Width of an integer that C does not have; 0: it has it, or this is none."""
+    known = kind in ("i1", "i8", "i32", "i64")
+    return int(kind[1:]) if not known and re.fullmatch(r"i[1-9]\d?", kind) and int(kind[1:]) < 64 else 0
+
+
+_C = _Types({"double": "double", "i64": "int64_t", "i32": "int32_t", "i8": "int8_t", "i1": "int", "ptr": "uintptr_t"})
 _SIZE = {"double": 8, "i64": 8, "i32": 4, "i8": 1, "ptr": 8}
 _UNSIGNED = {"i64": "uint64_t", "i32": "uint32_t", "i8": "uint8_t", "i1": "unsigned"}
 _FLOAT = {"fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/"}
@@ -344,6 +362,12 @@ def _compared(op: str, how: str, kind: str, a: str, b: str) -> str:
 
 
 def _converted(op: str, of: str, to: str, value: str, line: str) -> str:
+    if _bits(to) and op == "trunc":
+        return f"(uint64_t){value} & UINT64_C({(1 << _bits(to)) - 1})"
+    if _bits(of) and op == "zext":
+        return f"({_C[to]}){value}"
+    if _bits(of) or _bits(to):
+        raise NotImplementedError(line)
     if op == "zext":
         return f"({_C[to]})({_UNSIGNED[of]}){value}"
     if op == "sext" and of == "i1":
