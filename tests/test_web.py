@@ -605,7 +605,7 @@ def test_the_loop_is_calibrated_while_it_runs(server: Server, page: Any) -> None
     page.locator('[data-lamp="RUN"].good').wait_for()
     stroke = "parseFloat(document.querySelectorAll('.tiles .v')[2].innerText)"
     page.wait_for_function(f"Math.abs({stroke} - 6.9) < 0.2")
-    events = page.get_by_role("log", name="events")
+    events = page.get_by_role("log", name="what happened")
     for name in ("kp", "ki", "kff"):
         tab_to(page, f'[data-name="{name}"] input')
         page.keyboard.press("Control+a")
