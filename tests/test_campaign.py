@@ -15,6 +15,7 @@ pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 
 from hil import inject
 from hil.inject.margin import margins
+from tests.browser import open_to_all
 from tests.conftest import ROOT
 from tests.native_builds import wrong
 from vaneloop.base.errors import InputError
@@ -124,6 +125,7 @@ def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: P
     cases = {c.get("name"): c.find("failure") is not None for c in Xml.parse(tmp_path / "c.xml").iter("testcase")}
     assert cases[claim["expected"]] and not cases["mode changes as documented"] and cases["the combination passes"]
     assert "worst machine" in (tmp_path / "c.html").read_text()
+    open_to_all(tmp_path / "c.html", "campaign")
 
 
 def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path: Path) -> None:

@@ -275,7 +275,7 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
         whole.excerpt = lambda at: SimpleNamespace(t=at)
         diagnose.diagnose_stage(whole, np.ones(1))
     assert seen == [59_999, 40_000, 40_000]
-    at = diagnose._excerpt(judge(whole), nothing)  # type: ignore[arg-type]
+    at = diagnose.excerpt_of(judge(whole), nothing, 4_000, 40_000)  # type: ignore[arg-type]
     assert np.diff(np.flatnonzero(np.diff(at, prepend=-9) > 1)).min() >= 4_000
 
 

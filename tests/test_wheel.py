@@ -88,7 +88,9 @@ def test_the_wheel_holds_every_source_and_table(wheel: Path) -> None:
         for p in (ROOT / name).rglob("*")
         if p.is_file() and "__pycache__" not in p.parts
     ]
-    here = [p.relative_to(ROOT).as_posix() for p in kept if p.suffix not in (".nbi", ".nbc")]
+    # nor what make has compiled ahead for this machine
+    made = ROOT / "vaneloop" / "base" / "ahead"
+    here = [p.relative_to(ROOT).as_posix() for p in kept if p.suffix not in (".nbi", ".nbc") and made not in p.parents]
     wanted = {f"vaneloop/{name}" if name.startswith("tables/") else name for name in here}
     assert wanted <= inside, f"not in the wheel: {sorted(wanted - inside)}"
     assert {"vaneloop/tables/vgv.dbc", "vaneloop/tables/calibration.toml"} <= inside

@@ -59,7 +59,7 @@ def diagnose_stage(
     base = recalibrate(judge)
     left = base
     for _ in range(2):
-        at = excerpt_of(judge, left)
+        at = excerpt_of(judge, left, PIECE, SEARCHED)
         part = stage.excerpt(at)
         said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick, judged)
         found = _confirm(stage, keep, floor, base, said, judged)
@@ -77,7 +77,7 @@ def _unless_coarse(stage: Stage, said: StageDiagnosis) -> StageDiagnosis:
     return said
 
 
-def excerpt_of(judge: Judge, fit: Fit, piece: int = PIECE, searched: int = SEARCHED) -> Array:
+def excerpt_of(judge: Judge, fit: Fit, piece: int, searched: int) -> Array:
     """Samples to search on, about ``searched``: pieces of whole windows, about ``piece`` long, half of them evenly
     spaced, the others where ``fit`` fails most.
     """

@@ -40,7 +40,7 @@ def doubts(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
         limit, of = (low, p.low) if side < 0.0 else (high, p.high)
         if limit == of:
             more = f": the logs would have it go beyond; {ROUND}" if _pulled(fit, judge, k, side) else ""
-            out.append(f"{p.name} stands at its bound, {value:.4g} {p.unit}{more}")
+            out.append(f"{p.name} stands at its bound, {limit:.4g} {p.unit}{more}")
         elif _pulled(fit, judge, k, side):
             out.append(
                 f"{p.name} stands at the end of its tolerance, {value:.4g} {p.unit}: the logs would have it go on"
