@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plant.effect import HYDRAULIC, KINDS, UNITS
-from plant.effects import CURVES, SIGNAL_AT
+from plant.effects import CURVES, N_STATE, SIGNAL_AT
 from plant.layout import (
     C_HIGH,
     C_LOW,
@@ -30,7 +30,7 @@ from plant.layout import (
     VANE_COUNT,
 )
 from plant.places import N_R, POT, SPEED, X
-from vaneloop.base.compiled import in_place, inlined
+from vaneloop.base.compiled import compiled, in_place, inlined
 from vaneloop.base.curve import POINTS, between_points
 from vaneloop.base.vanes import MOST, VANES
 
@@ -38,7 +38,7 @@ __all__ = [
     "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS", "LVDT_ADDS",
     "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
     "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow", "take",
-    "turn",
+    "turn", "turns",
 ]  # fmt: skip
 
 (
@@ -48,7 +48,7 @@ __all__ = [
 # of all stages; of each stage k: the number behind it and k
 RING_ADDS, PLAY_ADDS, POT_ADDS, POT_TIMES = (100 * n for n in range(1, 5))
 LEAST = 0.05  # a factor 1 + c is not less
-TURN = 0.02  # of the full stroke: a smaller way back is no reversal
+TURN = 0.02  # of the full stroke, of any other channel's range: a smaller way back is no reversal
 KNOWN = SIGNALS.index(VANES[0]) + MOST  # signals that a curve may be of; behind them the memory of `turn`
 (
     S_CURRENT, S_X, S_SPEED, S_N_R, S_P_S, S_T_OIL, S_TIME, S_N_DEM, S_X_DEM, S_DIRECTION, S_DISTANCE, S_SINCE, S_VANE,
@@ -124,7 +124,7 @@ PLACES = {
         Place("linkage.ring", "adds", "linkage", "deg", _DEG, RING_ADDS),
         Place("linkage.play", "adds", "linkage", "deg", _DEG, PLAY_ADDS),
         *(
-            Place(f"{at}", how, "linkage", unit, si, base + 1 + k, v)
+            Place(at, how, "linkage", unit, si, base + 1 + k, v)
             for k, v in enumerate(VANES)
             for at, how, unit, si, base in (
                 (f"linkage.{v}_ring", "adds", "deg", _DEG, RING_ADDS),
@@ -195,6 +195,22 @@ def turn(s: np.ndarray, j: int, x: float, t: float, band: float) -> None:
         s[S_FARTHEST + 1, j], s[S_FARTHEST + 3, j] = farthest, s[S_FARTHEST + 2, j]
         s[S_FARTHEST, j], s[S_FARTHEST + 2, j] = x, t
     s[S_DISTANCE, j], s[S_SINCE, j] = abs(x - s[S_FARTHEST + 1, j]), t - s[S_FARTHEST + 3, j]
+
+
+@compiled
+def turns(x: np.ndarray, t: np.ndarray, band: float) -> np.ndarray:
+    """Direction (-1, 1; 0 before it first moves) of a channel ``x`` at times ``t``, and way and time since it last
+    turned, float64[3, samples].
+
+    band  a smaller way back is no reversal
+    """
+    s = np.zeros((N_STATE, 1))
+    s[S_FARTHEST : S_FARTHEST + 2, 0], s[S_FARTHEST + 2 : S_FARTHEST + 4, 0] = x[0], t[0]
+    out = np.empty((3, len(x)))
+    for k in range(len(x)):
+        turn(s, 0, x[k], t[k], band)
+        out[0, k], out[1, k], out[2, k] = s[S_DIRECTION, 0], s[S_DISTANCE, 0], s[S_SINCE, 0]
+    return out
 
 
 @in_place

@@ -11,7 +11,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import StageError, System
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
-from vaneloop.verbs.search import Diagnosed, diagnose
+from vaneloop.verbs.search import Diagnosed, diagnose, with_fits
 from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learned import LearnedLaw
     from vaneloop.discrepancy.models.learning import Outcome
     from vaneloop.discrepancy.models.vanes import Chain
-    from vaneloop.discrepancy.stage_answer import StageDiagnosis
     from vaneloop.pages.page import Page
 
 __all__ = ["Learned", "learn"]
@@ -211,7 +210,7 @@ def learned(
         "none": "the model comes down to the noise of the log's sensors: nothing is missing",
     }.get(verdict, "; ".join(said))
     if laws:
-        model = _with_named(model, stages)
+        model = with_fits(model, [s for s in stages if s.verdict == "missing"])
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
     return Learned(found, outcome, laws, None, model if laws else None, log)
@@ -223,21 +222,6 @@ def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
 
     moved = {str(r["parameter"]): float(str(r["value"])) for r in recalibrated(judge.stage, fit)}
     return model.model_copy(update={"parameters": {**model.parameters, **moved}})
-
-
-def _with_named(model: Model, stages: Sequence[StageDiagnosis]) -> Model:
-    """The model with the effects that the library has for other stages."""
-    from plant.effects import EFFECTS
-
-    effects, parameters = dict(model.effects), dict(model.parameters)
-    for s in stages:
-        if s.verdict != "missing":
-            continue
-        parameters |= {str(r["parameter"]): float(str(r["value"])) for r in s.recalibrated}
-        for f in s.effects:
-            own = {p.name for p in EFFECTS[f.effect].parameters}
-            effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items() if k in own}
-    return model.model_copy(update={"effects": effects, "parameters": parameters})
 
 
 def _learned(diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None]) -> Learned:

@@ -399,14 +399,12 @@ def known(effects: Sequence[str]) -> None:
 
 def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:
     """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
-    from plant import Model
     from plant.curve import PLACES
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.models.vane_stages.ground import SCALE, curve_effect, with_laws
+    from vaneloop.discrepancy.models.vane_stages.ground import curve_effect, with_laws
 
     started = time.perf_counter()
     by_stage: dict[str, list[str]] = {}
-    effects: dict[str, dict[str, float]] = {}
     curves: dict[str, list[Any]] = {}
     laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
     for name in dict.fromkeys([*before.effects, *wanted]):
@@ -426,26 +424,35 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
         elif name in wanted:
             why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in EFFECTS[name].stages)
             raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
-        else:
-            effects[name] = before.effects[name]
     results = []
     for s, names in by_stage.items():
         part = with_laws(chain.stage(s), [n for n in names if n not in laws], curves.get(s, ()), log)
         results.append(as_compared(chain.stage(s), extend_stage(part, tuple(names))))
-    parameters: dict[str, Any] = dict(before.parameters)
+    model = with_fits(before, results)
+    seconds = time.perf_counter() - started
+    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
+    return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
+
+
+def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
+    """The model with effects and nominal parameters as stages of the vane chain were fitted; a curve of a law file is
+    as it was learned, times its scale.
+    """
+    from plant.effects import EFFECTS
+    from vaneloop.discrepancy.models.vane_stages.ground import SCALE
+
+    parameters, effects = dict(model.parameters), dict(model.effects)
     for r in results:
         parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
         for f in r.effects:
             fitted = {k: float(cast(float, v["value"])) for k, v in f.parameters.items()}
-            if law := laws.get(f.effect):
+            if learned := model.curves.get(f.effect):
+                law = learned.now(model.effects.get(f.effect, {}))
                 effects[f.effect] = {n: v * fitted[SCALE] for n, v in zip(law.numbers, law.values, strict=True)}
             else:
                 own = [p.name for p in EFFECTS[f.effect].parameters]
                 effects[f.effect] = {k: v for k, v in fitted.items() if k in own}
-    model = Model(parameters=parameters, effects=effects, meta=before.meta, curves=before.curves)
-    seconds = time.perf_counter() - started
-    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
-    return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
+    return model.model_copy(update={"parameters": parameters, "effects": effects})
 
 
 def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None) -> Experiment:

@@ -45,6 +45,7 @@ class Candidate:
     how, place, unit   as `Curve` has them; ``at``: the place's name; ``unit``: of the curve
     size   how large such a curve is in usual
     mean   whether it may have a mean
+    near   whether the quantity is at the place itself, whatever their names
     """
 
     name: str
@@ -56,6 +57,7 @@ class Candidate:
     mean: bool
     quantity: Quantity
     basis: Basis
+    near: bool = False
 
     @property
     def turn(self) -> Array:

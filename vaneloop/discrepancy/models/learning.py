@@ -34,12 +34,6 @@ SCREENED = 1.0  # of them, where candidates are screened
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
-# quantities that are at a place of the vane chain itself
-PLAIN = {
-    "valve.current": ("i_cmd",), "actuator.load": ("x_lvdt", "speed_of_x_lvdt"), "sensors.lvdt": ("x_lvdt",),
-    "servo.current": ("i_cmd",), "actuator.flow_gain": ("x_lvdt", "t_oil"), "linkage.ring": ("x_lvdt",),
-    "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
-}  # fmt: skip
 Placings = tuple[tuple[Placed, Effect], ...]
 
 
@@ -105,7 +99,7 @@ def _strange(candidate: Candidate) -> int:
     turns, and time from every one that drifts.
     """
     name = candidate.quantity.name
-    if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or name in PLAIN.get(candidate.at, ()):
+    if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or candidate.near:
         return 0
     if name.startswith((WAY, DISTANCE, SINCE)):
         return 3

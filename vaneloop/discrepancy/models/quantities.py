@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from plant.curve import TURN, turns
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.system import Record
 from vaneloop.discrepancy.stage import Array
@@ -14,7 +15,6 @@ __all__ = ["DISTANCE", "SINCE", "TIME", "WAY", "column_of"]
 
 TIME = "time"
 WAY, DISTANCE, SINCE = "direction_of_", "distance_since_reversal_of_", "time_since_reversal_of_"
-TURN = 0.02  # of a channel's range: a smaller way back is no reversal
 
 
 def column_of(record: Record, t: Array, name: str) -> Array:
@@ -34,19 +34,6 @@ def _filled(y: Array) -> Array:
     return np.interp(k, k[good], y[good]) if good.any() else np.zeros(len(y))
 
 
-def _turns(t: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Direction of a channel (-1, 1; 0 before it first moves), distance and time since it last turned."""
+def _turns(t: Array, y: Array) -> Array:
     x = smoothed(t, y) if np.ptp(y) > 0.0 and len(y) > 100 else y
-    band = TURN * float(np.ptp(x))
-    way, far, at = 0.0, x[0], 0  # farthest point of the way that it is on
-    out = np.zeros((3, len(x)))
-    begin, since = x[0], t[0]
-    for k, v in enumerate(x.tolist()):
-        if way * (v - far) >= 0.0 and way != 0.0:
-            far, at = v, k
-        elif abs(v - far) > band:
-            way = 1.0 if v > far else -1.0
-            begin, since = far, t[at]
-            far, at = v, k
-        out[:, k] = way, abs(v - begin), t[k] - since
-    return out[0], out[1], out[2]
+    return np.asarray(turns(np.ascontiguousarray(x), np.ascontiguousarray(t), TURN * float(np.ptp(x))))

@@ -8,7 +8,6 @@ from plant import chain, places
 from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
-from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, SUBSTEPS, WINDOW, lately, rms
@@ -28,7 +27,7 @@ def actuator_stage(driven: Driven) -> Stage:
     """Stroke from the current of every tick, started anew in each window."""
     t, c, machine, _, outputs, run = driven[:6]
     parameters, effects, rows, si = declared("actuator", driven)
-    signals = driven.signals() if driven.curved else NOTHING
+    signals = driven.signals()
     dt = float(t[1] - t[0])
     # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
     substeps = c["ticks"].shape[1] if "ticks" in c else SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))

@@ -4,6 +4,8 @@ plant's parameters behind them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from plant import chain
@@ -160,13 +162,13 @@ def tables_of(driven: Driven, thetas: Array) -> list[tuple[Place, Curve, Array]]
     return out
 
 
-def bends(driven: Driven, thetas: Array, known: Array, site: int) -> Array:
-    """What the curves at a site of the controller give at the signals of a log, float64[sets, samples], border units:
-    those of the machine, and those that are tried.
+def bends(driven: Driven, thetas: Array, known: Array, *sites: int) -> Iterator[Array]:
+    """What the curves at each of some sites of the controller give at the signals of a log, float64[sets, samples],
+    border units: those of the machine, and those that are tried.
     """
-    out = np.zeros((len(thetas), len(driven.t)))
     p = lanes(driven, thetas, np.zeros(0, dtype=int), np.zeros(0))
     s = np.zeros((chain.N_STATE, len(thetas)))
-    si = next(place.si for place in ALL_PLACES if place.site == site)
-    run_bends(known, p, s, site, out)
-    return out / si
+    for site in sites:
+        out = np.zeros((len(thetas), len(driven.t)))
+        run_bends(known, p, s, site, out)
+        yield out / next(place.si for place in ALL_PLACES if place.site == site)

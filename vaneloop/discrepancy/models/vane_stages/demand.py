@@ -115,7 +115,7 @@ def demand_stage(driven: Driven) -> Stage:
     def simulate(thetas: Array) -> Array:
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
-        shift = bends(driven, thetas, signals, DEMAND_ADDS) * 1e-3 if driven.curved else none
+        shift = next(bends(driven, thetas, signals, DEMAND_ADDS)) * 1e-3 if driven.curved else none
         for i, theta in enumerate(thetas):
             k, table = as_scalars(cal.k.copy()), cal.table.copy()
             factor = value(theta, "trend_threshold_error", 1.0)

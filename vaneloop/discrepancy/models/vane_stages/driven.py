@@ -12,6 +12,7 @@ from plant import Plant
 from plant.curve import KNOWN, QUANTITIES
 from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS
+from plant.stages.blocks import NOTHING
 from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.runner import Placed
@@ -58,8 +59,10 @@ class Driven(NamedTuple):
 
     def signals(self) -> Array:
         """What curves are of, as the log has it, float64[KNOWN, samples], SI; NaN: what it has not, and what no curve
-        here is of.
+        here is of. Without curves: no samples.
         """
+        if not self.curved:
+            return NOTHING
         out = np.full((KNOWN, len(self.t)), np.nan)
         have = {int(of) for of in self.machine.p[CURVES + 1 + C_OF :: CURVE_ROWS, 0]}
         tried = {c.curve.quantity for c, _ in self.curves if c.curve is not None}

@@ -6,7 +6,6 @@ import numpy as np
 
 from plant import chain, places
 from plant.stages import engine_run
-from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, pieces_of
@@ -25,7 +24,7 @@ def engine_stage(driven: Driven) -> Stage:
     if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
         inner = int(round(dt / RASTER))
         n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
-    signals = np.repeat(driven.signals(), inner, axis=1) if driven.curved else NOTHING
+    signals = np.repeat(driven.signals(), inner, axis=1)
     pieces = pieces_of(c["stretch"])
     second = max(1, int(round(1.0 / dt)))
 

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from plant.curve import KNOWN, QUANTITIES, Place, turn
-from plant.effects import CURVES, N_STATE, SIGNAL_AT
+from plant.curve import QUANTITIES, TURN, Place, turns
+from plant.effects import CURVES
 from plant.layout import AREA, MOST_CURVES, P_REF
 from plant.model import Learned
-from vaneloop.base.compiled import compiled
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.curves import COUNT, basis_of
@@ -34,18 +33,15 @@ SCALE = "scale"  # of a law from a file
 LOG, REST, TEST = "log", "rest of the log", "test"
 # a quantity that is the place's own output, or nothing but the reading there: it multiplies by the same as it adds
 OWN = {"sensors.lvdt": "x_lvdt", "servo.current": "i_cmd", "controller.demand": "x_dem"}
+# quantities that are at a place itself
+NEAR = {
+    "valve.current": ("i_cmd",), "actuator.load": ("x_lvdt", "speed_of_x_lvdt"), "sensors.lvdt": ("x_lvdt",),
+    "servo.current": ("i_cmd",), "actuator.flow_gain": ("x_lvdt", "t_oil"), "linkage.ring": ("x_lvdt",),
+    "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
+}  # fmt: skip
 OF_STROKE = (  # what `reversals` works out
     "speed_of_x_lvdt", "direction_of_x_lvdt", "distance_since_reversal_of_x_lvdt", "time_since_reversal_of_x_lvdt",
 )  # fmt: skip
-
-
-@compiled
-def _turns(x: Array, t: Array, band: float, s: Array, out: Array) -> None:
-    s[SIGNAL_AT + 9 :, 0] = 0.0
-    s[SIGNAL_AT + KNOWN, 0] = s[SIGNAL_AT + KNOWN + 1, 0] = x[0]
-    for k in range(len(x)):
-        turn(s, 0, x[k], t[k], band)
-        out[0, k], out[1, k], out[2, k] = s[SIGNAL_AT + 9, 0], s[SIGNAL_AT + 10, 0], s[SIGNAL_AT + 11, 0]
 
 
 def reversals(t: Array, stroke: Array, full: float) -> dict[str, Array]:
@@ -53,10 +49,8 @@ def reversals(t: Array, stroke: Array, full: float) -> dict[str, Array]:
 
     full  mm, the machine's stroke
     """
-    out = np.empty((3, len(t)))
     x = smoothed(t, stroke)
-    _turns(np.ascontiguousarray(x * 1e-3), t, 0.02e-3 * full, np.zeros((N_STATE, 1)), out)
-    return dict(zip(OF_STROKE, (np.gradient(x, t), out[0], out[1] * 1e3, out[2]), strict=True))
+    return dict(zip(OF_STROKE, (np.gradient(x, t), *turns(x, t, TURN * full)), strict=True))
 
 
 def room_for(p: Array) -> int:
@@ -181,7 +175,8 @@ class VaneGround:
                 word = "gain" if place.how == "times" else "curve"
                 name = f"{place.at}.{word}_of_{q.name}"
                 size = self._size(place, error)
-                out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis))
+                near = q.name in NEAR.get(place.at, ())
+                out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis, near))
         return out
 
     def _idle(self, place: Place, q: str) -> bool:

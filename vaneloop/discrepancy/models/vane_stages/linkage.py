@@ -10,7 +10,6 @@ import numpy as np
 
 from plant.parameters import derive
 from plant.stages import linkage_run
-from plant.stages.blocks import NOTHING
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
@@ -24,7 +23,7 @@ def linkage_stage(driven: Driven) -> Stage:
     """Vane angles that the log has, from the stroke."""
     t, c, machine, _, outputs, run = driven[:6]
     parameters, effects, rows, si = declared("linkage", driven)
-    signals = driven.signals() if driven.curved else NOTHING
+    signals = driven.signals()
     dt = float(t[1] - t[0])
     x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))

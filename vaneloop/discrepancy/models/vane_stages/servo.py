@@ -21,14 +21,15 @@ def servo_stage(driven: Driven) -> Stage:
     mean, hidden = c["law"].mean(axis=1), c["law_error"].T
     named = len(effects) > len(driven.curves)  # controller_gain_error
     signals = driven.signals()
-    signals[QUANTITIES["i_cmd"].of] = mean * 1e-3  # of the law's own current, which has no noise of the logged one
+    if driven.curved:
+        signals[QUANTITIES["i_cmd"].of] = mean * 1e-3  # of the law's own current, which has no noise of the logged one
 
     def simulate(thetas: Array) -> Array:
         factor = thetas[:, :1] if named else np.ones((len(thetas), 1))
         i = factor * mean[None]
         if driven.curved:
-            i *= 1.0 + bends(driven, thetas, signals, SERVO_TIMES)
-            i += bends(driven, thetas, signals, SERVO_ADDS)
+            times, adds = bends(driven, thetas, signals, SERVO_TIMES, SERVO_ADDS)
+            i = i * (1.0 + times) + adds
         return i[:, None, :]
 
     # at the limit the integral stands still: its constant is another one before and after
