@@ -158,14 +158,14 @@ def test_a_formula_is_found_in_its_own_values(form) -> None:
         q = np.linspace(-10.0, 90.0, 257)
     numbers = np.array(NUMBERS.get(form.name, (0.7,)))
     y = form.value(q, numbers)
-    got = begin(form, q, y, level=False)
+    got = begin(form, q, y, free=())
     assert got is not None
     assert got[1] < (0.05 if form.name == "step" else 1e-3)
     if form.name not in ("step", "sine"):  # anywhere between two points; several phases are one
         assert np.allclose(got[0], numbers, rtol=0.02, atol=0.01)
     assert "a" not in text_of(form, numbers, "Q").replace("tanh", "").replace("max", "")
     if form.name not in ("constant", "straight line"):  # a parameter that is fitted takes a constant off
-        shifted = begin(form, q, y + 5.0, level=True)
+        shifted = begin(form, q, y + 5.0, free=(0,))
         assert shifted is not None
         assert shifted[1] < (0.05 if form.name == "step" else 1e-3)
 

@@ -45,7 +45,7 @@ class Form:
 
 
 def _power(q: Array, n: Array) -> Array:
-    return np.asarray(n[0] * np.sign(q) * np.abs(q) ** n[1])
+    return np.asarray(n[0] * np.sign(q) * np.maximum(np.abs(q), 1e-12) ** np.clip(n[1], -8.0, 8.0))
 
 
 def _exp(q: Array, n: Array) -> Array:

@@ -14,9 +14,10 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 
-__all__ = ["from_checkout", "print_shares", "run", "share"]
+__all__ = ["INSIDE", "as_curve", "from_checkout", "print_shares", "run", "share"]
 
 Row = dict[str, Any]
+INSIDE = 0.90  # of the visited values: there the truth must be in the band of a curve that is the law
 
 
 def from_checkout(names: Iterable[str], needed: str) -> tuple[Any, ...]:
@@ -59,6 +60,30 @@ def run(
             if progress:
                 progress(len(rows) / max(many, len(rows)))
     rows.sort(key=lambda r: r["index"])
+
+
+def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row:
+    """How far a learned law is the true one, where the logs have been.
+
+    value  the true curve; ``forms``: names of the formulas that it is
+
+    inside   share of the visited values at which the truth is in the curve's band. What the answer says that the logs
+             do not tell, a constant or a slope, is taken as the truth has it.
+    formula  whether one of ``forms`` is among those given; None: the truth has no formula
+    """
+    import numpy as np
+
+    weight = np.interp(law.x, 0.5 * (law.edges[1:] + law.edges[:-1]), law.visited)
+    visited = weight > 0.0
+    x, w = law.x[visited], weight[visited]
+    off = law.y[visited] - value(x)
+    if law.untold:  # a slope that a gain takes makes the rest larger by as much
+        lines = np.stack([(np.ones(len(x)), x, value(x))[k] for k in (*law.untold, *([2] if 1 in law.untold else []))])
+        off = off - np.linalg.lstsq((lines * np.sqrt(w)).T, off * np.sqrt(w), rcond=1e-9)[0] @ lines
+    low, high = (law.low - law.y)[visited], (law.high - law.y)[visited]
+    within = (low <= -off) & (-off <= high)
+    given = {f.form for f in law.formulas}
+    return {"inside": float(w[within].sum() / w.sum()), "formula": bool(given & set(forms)) if forms else None}
 
 
 def share(hits: list[bool]) -> dict[str, Any]:

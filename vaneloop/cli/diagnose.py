@@ -32,6 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_machine_options(parser)
     options.add_controller_options(parser)
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
+    options.add_without_option(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
 
@@ -40,15 +41,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.base.errors import InputError
-    from vaneloop.verbs.search import diagnosed
+    from vaneloop.verbs.search import diagnosed, not_given
 
     if not 1 <= args.workers <= 64:
         raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
     if own_model.asked(args):
         with terminal.progress_bar(args, "searching laws at all places") as progress:
-            answer = own_model.ask(args, "diagnose", progress=progress)
+            answer = own_model.ask(args, "diagnose", without=args.without, progress=progress)
     else:
-        chain = chain_of(args)
+        chain = not_given(chain_of(args), args.without)
         with options.search_bar(args) as news:
             answer = diagnosed(chain, args.log, args.workers, news=news)
     show(args, answer)

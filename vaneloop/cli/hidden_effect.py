@@ -19,7 +19,7 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.cli.blind import from_checkout, print_shares, run, share
+from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -32,6 +32,7 @@ examples:
   vaneloop hidden-effect --logs 40 --out out/blind.parquet
   vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
   vaneloop hidden-effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
+  vaneloop hidden-effect --logs 40 --leave-out --out out/left_out.parquet
   vaneloop hidden-effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -41,6 +42,7 @@ SHARES = (0.25, 0.25, 0.20, 0.30)
 GAPS = 0.2  # of the logs lack rows
 MODES = 0.2  # of the logs have seconds in another mode
 MACHINES = {"hydraulic": "plant.toml", "electromechanical": "plant_electromechanical.toml"}  # that the rig has
+LEAVE_OUT = "left out"  # a kind of its own
 LIKELY = 0.5  # a name less probable than this needs a rival
 
 
@@ -66,6 +68,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
     )
     parser.add_argument(
+        "--leave-out",
+        action="store_true",
+        help="hide only effects of the library that are functions of one quantity, each taken out of the library: does "
+        "vaneloop learn find it?",
+    )
+    parser.add_argument(
         "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
         help=f"draw only logs of these kinds: {', '.join(KINDS)} (default: all)",
     )  # fmt: skip
@@ -80,21 +88,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _rig() -> Any:
-    return from_checkout(("tests.rig", "tests.firmware_on_rig"), "hidden-effect needs the independent rig in tests/rig")
+    modules = ("tests.rig", "tests.firmware_on_rig", "tests.rig.left_out")
+    return from_checkout(modules, "hidden-effect needs the independent rig in tests/rig")
 
 
 def draw_case(
-    seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic", kinds: Sequence[str] = KINDS
-) -> dict[str, Any]:
+    seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic", kinds: Sequence[str] = KINDS,
+    leave_out: bool = False,
+) -> dict[str, Any]:  # fmt: skip
     """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing
     simulated yet.
 
     machine  of `MACHINES`: what can be hidden in it
     kinds    of `KINDS`, that are drawn
+    leave_out  hide effects that can be left out of the library instead
     """
     import numpy as np
 
-    rig, _ = _rig()
+    rig, _, left_out = _rig()
     motor = machine == "electromechanical"
     library = list(rig.WITH_MOTOR if motor else rig.EFFECTS)
     outside = [k for k, e in rig.OUTSIDE.items() if not motor or e.stage != "actuator" or e.site == "lvdt"]
@@ -102,7 +113,10 @@ def draw_case(
     shares = np.array([share if kind in kinds else 0.0 for kind, share in zip(KINDS, SHARES, strict=True)])
     kind = str(rng.choice(KINDS, p=shares / shares.sum()))
     hidden = []
-    if kind == "single":
+    if leave_out:
+        names = [name for name in left_out.LEFT_OUT if name in library]
+        kind, hidden = LEAVE_OUT, [rig.draw(str(rng.choice(names)), int(rng.integers(1, 5)), rng)]
+    elif kind == "single":
         hidden = [rig.draw(str(rng.choice(library)), int(rng.integers(0, 5)), rng)]
     elif kind == "outside":
         hidden = [rig.draw(str(rng.choice(outside)), int(rng.integers(1, 5)), rng)]
@@ -137,7 +151,7 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
     """
     from plant.effects import EFFECTS
 
-    rig, _ = _rig()
+    rig, *_ = _rig()
     out = []
     for h in hidden:
         named = next((e for e in answer["effects"] if e["effect"] == h.name), None)
@@ -153,19 +167,25 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
     return out
 
 
-def _learned(chain: Any, d: Any, name: str) -> dict[str, Any]:
-    """What `learn` answers on the diagnosed log: each law with its rivals, formulas and errors."""
+def _learned(chain: Any, d: Any, name: str, names: Sequence[str] = (), truth: Any = None) -> dict[str, Any]:
+    """What `learn` answers on the diagnosed log: each law with its rivals, formulas and errors.
+
+    names, truth  curves that are what is hidden, and the first of them (`tests.rig.left_out`)
+    """
     from plant import Model
     from vaneloop.verbs.learn import learned
     from vaneloop.verbs.search import Diagnosed
 
     started = time.process_time()
     answer = learned(chain, name, Model(), 1, None, Diagnosed(chain, d, name))
-    laws = [
+    laws: list[dict[str, Any]] = [
         {"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas], "before": law.error_before,
-         "after": law.error_after}
+         "after": law.error_after, "found": any(n in names for n in (law.name, *law.rivals))}
         for law in answer.laws
     ]  # fmt: skip
+    for law, row in zip(answer.laws, laws, strict=True):
+        if truth is not None and law.name == names[0]:
+            row |= as_curve(law, *truth)
     return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
             "nearest": answer.outcome.nearest, "processor_s": time.process_time() - started}  # fmt: skip
 
@@ -190,7 +210,17 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     errors = [laws[-1]["after"] for r in right if (laws := json.loads(r["learned"])["laws"])]
     spent = sorted(json.loads(r["learned"])["processor_s"] for r in asked if json.loads(r["learned"])["laws"])
     clean = [not json.loads(r["learned"])["laws"] for r in asked if r["kind"] == "clean"]
+    gone = [json.loads(r["learned"])["laws"] for r in asked if r["kind"] == LEAVE_OUT and r["detectable"][0]]
+    curves = [c for laws in gone for c in [next((law for law in laws if "inside" in law), None)] if c is not None]
+    none = [False] * sum(not any(law["found"] for law in laws) for laws in gone)
     return {
+        "learned: left out of the library, right place and quantity": share(
+            [any(law["found"] for law in laws) for laws in gone]
+        ),
+        "learned: left out, the curve is the law within its band": share(
+            [c["inside"] >= INSIDE for c in curves] + none
+        ),
+        "learned: left out, the right formula among those given": share([bool(c["formula"]) for c in curves] + none),
         "learned: outside the library, right place and quantity": share([r in right for r in outside]),
         "learned: of those that are a curve at all": share([r in right for r in plain]),
         "learned: of these, held-out error within 1.5 noise floors": share([e <= 1.5 for e in errors]),
@@ -231,7 +261,7 @@ def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: 
 
 def judge_case(
     seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic",
-    learn: bool = False, kinds: Sequence[str] = KINDS,
+    learn: bool = False, kinds: Sequence[str] = KINDS, leave_out: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
     import numpy as np
@@ -241,9 +271,10 @@ def judge_case(
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.models.vanes import build_chain
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+    from vaneloop.verbs.search import not_given
 
-    rig, on_rig = _rig()
-    case = draw_case(seed, index, duration, machine, kinds)
+    rig, on_rig, left_out = _rig()
+    case = draw_case(seed, index, duration, machine, kinds, leave_out)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
 
@@ -261,11 +292,18 @@ def judge_case(
             return build_chain(read_log(path, require=()), plant)
 
     chain = stages_of(case["hidden"])
+    if leave_out:
+        chain = not_given(chain, [h.name for h in case["hidden"]])
     started, used = time.perf_counter(), time.process_time()
     d = diagnose(chain.stages, chain.not_observed, workers=1)
     elapsed, used = time.perf_counter() - started, time.process_time() - used
     answer = diagnosis_json(d, f"case {index}")
     said = _learned(chain, d, f"case {index}") if learn else {}
+    if leave_out:
+        (h,) = case["hidden"]
+        truth = left_out.LEFT_OUT[h.name]
+        value = truth.of(h)
+        said = _learned(chain, d, f"case {index}", truth.names(h), value and (value, truth.forms))
     truth = [h.name for h in case["hidden"]]
     # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3
     # spreads of the floor
@@ -547,9 +585,13 @@ def command(args: argparse.Namespace) -> int:
     warm_up(lambda text: terminal.say(args, text))
     if args.learn and any(json.loads(r.get("learned") or "{}") == {} for r in rows):
         raise InputError(f"{path}: has rows without --learn; allowed: no --learn, or another --out")
+    if rows and args.leave_out != any(r["kind"] == LEAVE_OUT for r in rows):
+        raise InputError(
+            f"{path}: has rows {'without' if args.leave_out else 'of'} --leave-out; allowed: another --out"
+        )
     run(
         args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine,
-        args.learn, tuple(k for k in KINDS if k in args.kinds),
+        args.learn, tuple(k for k in KINDS if k in args.kinds), args.leave_out,
     )  # fmt: skip
     s = summary(rows)
     spent = f"{s['median seconds']:.1f} s a diagnosis"

@@ -10,11 +10,12 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.cli.blind import from_checkout, print_shares, run, share
+from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
 
@@ -28,6 +29,7 @@ examples:
   vaneloop hidden-law --systems 32 --seed 1 --out out/hidden_law.parquet
   vaneloop hidden-law --systems 200 --seed 1 --out out/hidden_law.parquet      (continues where it was stopped)
   vaneloop hidden-law --systems 32 --seed 1 --learn --out out/learned.parquet
+  vaneloop hidden-law --systems 32 --seed 1 --leave-out --out out/left_out.parquet
   vaneloop hidden-law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/variants.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -54,6 +56,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
     )
     parser.add_argument(
+        "--leave-out",
+        action="store_true",
+        help="hide only laws of the library that are functions of one quantity, each taken out of the library: does "
+        "vaneloop learn find it?",
+    )
+    parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
     )
     parser.add_argument(
@@ -67,14 +75,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _systems() -> Any:
     """Modules of the families, the nominal models and the variants."""
-    names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants")
+    names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants", "tests.rig_systems.left_out")
     return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
 
 
-def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None) -> dict[str, Any]:
+def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None, truth: Any = None) -> dict[str, Any]:
     """What `diagnose` answers, or the error that it raised; with its processor seconds.
 
     floors  true noise of every output: `learn` is asked, too, and its errors on the test log are held against it
+    truth   a law that is hidden as a curve (`tests.rig_systems.left_out.Truth`): what was learned is held against it
     """
     from vaneloop.verbs import learn, search
 
@@ -85,7 +94,7 @@ def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None) 
             said = search.diagnose(records, system, test=test)
         else:
             asked = learn.learn(records, system, test=test)
-            said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors)
+            said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors, truth)
         answer = terminal.plain(said.to_dict())
         out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
     except Exception as e:  # one system must not end the run; it counts as a miss
@@ -93,31 +102,41 @@ def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None) 
     return {**out, "learned": learned, "seconds": time.process_time() - started}
 
 
-def _as_learned(asked: Any, test: str, floors: Any) -> dict[str, Any]:
+def _as_learned(asked: Any, test: str, floors: Any, truth: Any) -> dict[str, Any]:
     """What `learn` answers: each law with its rivals and formulas, and the error on the test log in noise floors."""
     by = list(asked.by_log.steps.values())[-1] if asked.by_log else {}
     error = float(((by[test] / floors) ** 2).mean() ** 0.5) if test in by else None
     laws = [{"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas]} for law in asked.laws]
+    if truth is not None:
+        for law, row in zip(asked.laws, laws, strict=True):
+            if truth.found(law.name):
+                row |= as_curve(law, truth.value, truth.forms)
     return {"verdict": asked.verdict, "laws": laws, "error": error, "nearest": asked.outcome.nearest}
 
 
 def judge_case(
-    seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False, learn: bool = False
-) -> Row:
-    """Draw, simulate and diagnose one system; a flat record."""
+    seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False, learn: bool = False,
+    leave_out: bool = False,
+) -> Row:  # fmt: skip
+    """Draw, simulate and diagnose one system; a flat record.
+
+    leave_out  hide a law of the library that is a function of one quantity, and take it out of the library
+    """
     import logging
 
     from vaneloop.discrepancy import Record
 
     logging.getLogger("numba").setLevel(logging.ERROR)
-    rig, nominal, changes = _systems()
-    case = rig.draw_case(seed, index, families)
+    rig, nominal, changes, left_out = _systems()
+    case = _left_out_case(seed, index, families) if leave_out else rig.draw_case(seed, index, families)
     left = rig.left_over(case)
     records = [Record(f"log {k + 1}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
-    said = _said(
-        nominal.nominal(case.family, case.values, case.factors), records[:-1], records[-1:],
-        case.floors if learn else None,
-    )  # fmt: skip
+    system, truth = nominal.nominal(case.family, case.values, case.factors), None
+    if leave_out:
+        (h,) = case.hidden
+        system = replace(system, without=sorted(case.family.equivalent(h.name)))
+        truth = left_out.truth_of(case.family, h, case.greatest.get(h.place, 1.0))
+    said = _said(system, records[:-1], records[-1:], case.floors if learn or leave_out else None, truth)
     tried: dict[str, Any] = {}
     if variants and not said["error"]:
         for name, (system, fitted, test) in changes.variants(case, records, nominal.nominal):
@@ -132,7 +151,8 @@ def judge_case(
         for k, v in h.values.items() if k in sizes[h.name] and abs(v) < _far(h, v)
     ]  # fmt: skip
     return {
-        "seed": seed, "index": index, "families": " ".join(families), "family": case.family.name, "kind": case.kind,
+        "seed": seed, "index": index, "families": " ".join(families), "family": case.family.name,
+        "kind": "left out" if leave_out else case.kind,
         "truth": [h.name for h in case.hidden], "sizes": json.dumps([h.values for h in case.hidden]),
         "same": json.dumps({h.name: sorted(case.family.equivalent(h.name)) for h in case.hidden}),
         "amounts": json.dumps(
@@ -147,6 +167,17 @@ def judge_case(
         "answer": json.dumps(said["answer"]), "learned": json.dumps(said["learned"]),
         "curves": json.dumps(sorted({c for h in case.hidden for c in rig.LEARNED.get((case.family.name, h.name), ())})),
     }  # fmt: skip
+
+
+def _left_out_case(seed: int, index: int, families: tuple[str, ...]) -> Any:
+    """A system with a law that can be left out of the library."""
+    import numpy as np
+
+    rig, _, _, left_out = _systems()
+    rng = np.random.default_rng([seed, index, 1])
+    family = str(rng.choice(families or list(rig.FAMILIES)))
+    law = str(rng.choice(left_out.laws_of(rig.FAMILIES[family])))
+    return rig.draw_case(seed, index, (family,), [law])
 
 
 def _far(hidden: Any, value: float) -> float:
@@ -175,6 +206,8 @@ def _right(row: Row) -> bool:
         return False
     if row["kind"] == "clean":
         return not row["named"]
+    if row["kind"] == "left out":
+        return any("inside" in law for law in json.loads(row["learned"]).get("laws", ()))
     if row["kind"] == "outside":
         if sorted(row["named"]) in json.loads(row["amounts"]):
             return True
@@ -229,7 +262,16 @@ def learned_summary(rows: list[Row]) -> dict[str, Any]:
         return {}
     outside = [(r, said) for r, said in asked if r["kind"] == "outside" and _seen(r)]
     right = [(r, said) for r, said in outside if _learned_right(r, said)]
+    gone = [said["laws"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
+    curves: list[Row] = [next((law for law in laws if "inside" in law), {}) for laws in gone]
     return {
+        "learned: left out of the library, right place and quantity": share([bool(c) for c in curves]),
+        "learned: left out, the curve is the law within its band": share(
+            [c.get("inside", 0.0) >= INSIDE for c in curves]
+        ),
+        "learned: left out, the right formula among those given": share(
+            [bool(c.get("formula")) for c in curves if c.get("formula", False) is not None]
+        ),
         "learned: outside the library, right place and quantity": share([_learned_right(r, s) for r, s in outside]),
         "learned: of these, error on the test log within 1.5 noise floors": share(
             [s["error"] is None or s["error"] <= 1.5 for _, s in right]
@@ -309,7 +351,7 @@ def command(args: argparse.Namespace) -> int:
 
     from vaneloop.base.errors import InputError
 
-    rig, _, _ = _systems()
+    rig, *_ = _systems()
     for name in args.family:
         if name not in rig.FAMILIES:
             raise InputError(f"--family {name!r}: not a family; allowed: {', '.join(rig.FAMILIES)}")
@@ -329,12 +371,18 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(f"{path}: has rows without variants; allowed: no --variants, or another --out")
     if args.learn and any((r.get("learned") or "{}") == "{}" and not r["error"] for r in rows):
         raise InputError(f"{path}: has rows without --learn; allowed: no --learn, or another --out")
+    if rows and args.leave_out != any(r["kind"] == "left out" for r in rows):
+        raise InputError(
+            f"{path}: has rows {'without' if args.leave_out else 'of'} --leave-out; allowed: another --out"
+        )
     terminal.say(args, f"seed {seed}; {len(rows)} systems done before")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{path.parent}: cannot be made ({e.strerror})") from None
-    run(args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants, args.learn)
+    run(
+        args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants, args.learn, args.leave_out
+    )
     _print(args, rows)
     tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}
     terminal.write_json(args, {"schema": 1, "seed": seed, "summary": summary(rows), **tables})

@@ -37,6 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_machine_options(parser)
     options.add_controller_options(parser)
     parser.add_argument("--out", metavar="LAW.toml", help="law file to write, a model file with the learned laws in it")
+    options.add_without_option(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
     parser.set_defaults(learns=True)
@@ -46,15 +47,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.verbs.learn import learned, with_path
+    from vaneloop.verbs.search import not_given
 
     if args.out and (Path(args.out).is_dir() or not Path(args.out).parent.is_dir()):
         raise InputError(f"{args.out}: cannot be written")
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     own = own_model.asked(args)
-    chain: Any = None if own else options.chain_of(args)
+    chain: Any = None if own else not_given(options.chain_of(args), args.without)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
         if own:
-            answer = own_model.ask(args, "learn", progress=tell)
+            answer = own_model.ask(args, "learn", without=args.without, progress=tell)
         else:
             answer = learned(chain, args.log, options.machine_of(args).added, progress=tell)
     if answer.model is not None and args.out:

@@ -24,6 +24,7 @@ __all__ = [
     "add_plant_option",
     "add_reading_options",
     "add_tables_option",
+    "add_without_option",
     "chain_of",
     "guarded",
     "log_options",
@@ -143,6 +144,14 @@ def add_tables_option(group: Any) -> None:
         f"--out writes one",
     )
     add_plant_option(group)
+
+
+def add_without_option(parser: Any) -> None:
+    """Declare ``--without``: laws that are not looked for."""
+    parser.add_argument(
+        "--without", metavar="EFFECT", nargs="+", default=[],
+        help="effects that are not looked for, such as those that this machine cannot have",
+    )  # fmt: skip
 
 
 def add_plant_option(group: Any) -> None:

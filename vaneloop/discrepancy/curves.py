@@ -10,6 +10,7 @@ matters, and the mean and the slope can be held at zero, to see what the curve s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,18 +57,19 @@ class Basis:
         """`splines` of its knots at ``x``."""
         return splines(self.knots, x)
 
-    def effect(self, name: str, unit: str, size: float, wiggle: float, mean: bool = True) -> Effect:
+    def effect(self, name: str, unit: str, size: float, wiggle: float, kept: Sequence[int]) -> Effect:
         """The curve as an effect: amplitudes in ``unit``, ``size`` large in usual, bends known to be within ``wiggle``.
 
         wiggle  standard deviation of the amplitude of function 2, in ``size``; others by how much they bend
-        mean    whether it may have a mean: where a parameter that is fitted does the same, it must not
+        kept    of its functions, rising: where a parameter that is fitted does what the mean does, the curve has none
         """
         # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
-        first, wide = ("mean", "slope") if mean else ("slope",), float(np.sqrt(3.0) * LEVEL * size)
-        out = [Parameter(n, 0.0, unit, scale=size, tolerance=wide) for n in first]
-        for k in range(2, len(self.bend)):
-            deviation = wiggle * size / np.sqrt(self.bend[k])
-            out.append(Parameter(f"bend_{k - 1}", 0.0, unit, scale=size, tolerance=float(np.sqrt(3.0) * deviation)))
+        wide = float(np.sqrt(3.0) * LEVEL * size)
+        out = []
+        for k in kept:
+            own = ("mean", "slope")[k] if k < 2 else f"bend_{k - 1}"
+            tolerance = wide if k < 2 else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
+            out.append(Parameter(own, 0.0, unit, scale=size, tolerance=tolerance))
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
                        for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
         return Effect(name, tuple(out), starts)

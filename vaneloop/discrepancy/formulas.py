@@ -6,6 +6,7 @@ The formulas are in `vaneloop.base.forms`.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -16,19 +17,29 @@ from vaneloop.discrepancy.stage import Array
 __all__ = ["begin", "text_of"]
 
 
-def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | None:
+def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array, float] | None:
     """Numbers with which a form comes nearest to a curve, and the share of the curve's variance that it leaves.
 
-    level  a constant may be added: what the model does with a parameter that is fitted
+    free  what may be added, as the model does it with parameters that are fitted: a constant (0), a straight line (1)
     """
     if (form.positive and not q.min() > 0.0) or (form.signed and not q.min() < 0.0 < q.max()):
         return None
     if form.name == "Arrhenius" and not q.min() > -200.0:
         return None
-    if level and form.name in ("constant", "straight line"):
+    straight = {"constant": {0}, "line": {1}, "straight line": {0, 1}}.get(form.name)
+    if straight and (straight <= set(free) or (free and len(straight) == 2)):
         return None
     span, low = float(np.ptp(q)), float(q.min())
-    total = float(np.sum((y - y.mean()) ** 2)) if level else float(np.sum(y**2))
+    lines = [np.ones(len(q)), q - q.mean()]
+    lines = [g / np.sqrt(g @ g) for k, g in enumerate(lines) if k in free and g.any()]
+
+    def told(z: Array) -> Array:
+        for g in lines:
+            z = z - g * (g @ z)
+        return z
+
+    aim = told(y)
+    total = float(aim @ aim)
     if not total > 0.0:
         return None
     units = {"per": 1.0 / span, "share": span, "plain": 1.0, "kelvin": 1e4}
@@ -36,12 +47,10 @@ def begin(form: Form, q: Array, y: Array, level: bool) -> tuple[Array, float] | 
     best: tuple[float, Array] | None = None
 
     def left(inner: Array) -> tuple[float, float, Array]:
-        f = form.value(q, np.concatenate([[1.0], inner]))
-        g = f - f.mean() if level else f
-        z = y - y.mean() if level else y
+        g = told(form.value(q, np.concatenate([[1.0], inner])))
         size = float(g @ g)
-        a = float(g @ z) / size if size > 1e-300 else 0.0
-        return a, float(np.sum((z - a * g) ** 2)), z - a * g
+        a = float(g @ aim) / size if size > 1e-300 else 0.0
+        return a, float(np.sum((aim - a * g) ** 2)), aim - a * g
 
     for start in np.array(np.meshgrid(*grids)).reshape(len(grids), -1).T if grids else [np.zeros(0)]:
         inner = start

@@ -76,8 +76,10 @@ class Learned(Answer):
         """What the user should know."""
         out = list(self.outcome.notes)
         for law in self.laws:
-            if law.trades:
-                out.append(f"{law.name} trades with {', '.join(law.trades)}: without its mean and slope they move")
+            if law.untold:
+                what = " and ".join(("mean", "slope")[k] for k in law.untold)
+                trades = f"; it trades with {', '.join(law.trades)}" if law.trades else ""
+                out.append(f"{law.name}: its {what} cannot be told from these logs{trades}")
             if law.rivals:
                 out.append(f"{law.name}: as good: {', '.join(law.rivals)}")
             reach = f"[{law.x[0]:.4g}, {law.x[-1]:.4g}] {law.of_unit.strip('-')}".strip()
@@ -110,7 +112,7 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
         "formulas": [
             {"form": f.form, "text": f.text, "numbers": f.numbers, "error": f.error, "law": f.law} for f in law.formulas
         ],
-        "trades": law.trades, "rivals": law.rivals,
+        "untold": law.untold, "trades": law.trades, "rivals": law.rivals,
     }  # fmt: skip
 
 
@@ -139,6 +141,7 @@ def learn(
     fit: Any = (),
     test: Any = (),
     added: Model | None = None,
+    without: Sequence[str] = (),
     workers: int = 2,
     progress: Callable[[float], None] | None = None,
 ) -> Learned:
@@ -149,12 +152,12 @@ def learn(
     """
     tell = progress or (lambda _: None)
     if not isinstance(model, System):
-        from vaneloop.verbs.search import chain_for
+        from vaneloop.verbs.search import chain_for, not_given
 
         machine = model or Machine()
         chain, name = chain_for(log, machine, fit, test)
-        return learned(chain, name, machine.added, workers=workers, progress=tell)
-    diagnosed = diagnose(log, model, fit=fit, test=test, added=added, progress=lambda f: tell(0.5 * f))
+        return learned(not_given(chain, without), name, machine.added, workers=workers, progress=tell)
+    diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
         return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f))
     except StageError as e:

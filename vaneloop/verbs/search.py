@@ -297,20 +297,37 @@ def diagnose(
     fit: Any = (),
     test: Any = (),
     added: Model | None = None,
+    without: Sequence[str] = (),
     workers: int = 2,
     progress: Progress | None = None,
 ) -> Diagnosed:
-    """Which physical effects does the model lack? Arguments as of `compare`; ``workers``: stages searched at a time."""
+    """Which physical effects does the model lack? Arguments as of `compare`.
+
+    without  effects that are not looked for
+    workers  stages searched at a time
+    """
     if isinstance(model, System):
         from vaneloop.discrepancy.models.by_log import ByLog
 
+        model = replace(model, without=(*model.without, *without))
         logs, name = _logs(log, model, fit, test, added)
         d = search(logs.fitted.stages, None, progress, 1, logs.judged())
         by_log = ByLog.of(logs, d.stages[0], added)
         d.notes = by_log.notes
         return Diagnosed(logs.fitted, d, name, by_log)
     chain, name = chain_for(log, model or Machine(), fit, test)
-    return diagnosed(chain, name, workers, progress)
+    return diagnosed(not_given(chain, without), name, workers, progress)
+
+
+def not_given(chain: Chain, effects: Sequence[str]) -> Chain:
+    """The chain, of whose stages some effects are not looked for."""
+    if not effects:
+        return chain
+    from vaneloop.discrepancy.models.vane_stages.ground import without_laws
+
+    known(effects, "without")
+    test = replace(chain.test, stages=without_laws(chain.test.stages, effects)) if chain.test else None
+    return replace(chain, stages=without_laws(chain.stages, effects), test=test)
 
 
 def diagnosed(
@@ -384,8 +401,8 @@ def _close(name: str, known: Sequence[str]) -> str:
     return f"close: {', '.join(close)}" if close else f"it can have {', '.join(known)}"
 
 
-def known(effects: Sequence[str]) -> None:
-    """Refuse an effect that is not in the library."""
+def known(effects: Sequence[str], option: str = "effect") -> None:
+    """Refuse an effect that is not in the library; ``option``: by which it was given."""
     import difflib
 
     from plant.effects import EFFECTS
@@ -394,7 +411,7 @@ def known(effects: Sequence[str]) -> None:
         if name not in EFFECTS:
             close = difflib.get_close_matches(name, EFFECTS, 1)
             hint = f"; probably {close[0]!r} is meant" if close else ""
-            raise InputError(f"--effect {name!r} is not in the library{hint}; docs/effects.md lists it")
+            raise InputError(f"--{option} {name!r} is not in the library{hint}; docs/effects.md lists it")
 
 
 def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:

@@ -85,6 +85,17 @@ class Bound:
         self.read_starts = False
         self._make()
 
+    def _leave_out(self) -> None:
+        """Take out the laws that the system is not to be given."""
+        names = [e.name for e in self.effects]
+        for name in self.system.without:
+            if name not in names:
+                raise StageError(
+                    f"without {name!r}: not a law that system {self.system.name!r} can have; it has {', '.join(names)}"
+                )
+        keep = [k for k, name in enumerate(names) if name not in self.system.without]
+        self.placed, self.effects = [self.placed[k] for k in keep], [self.effects[k] for k in keep]
+
     def _make(self) -> None:
         """Fit what is unknown, place the laws, and make the stage."""
         s = self.system
@@ -113,6 +124,7 @@ class Bound:
                 course = nominal_course(self.runner, fitted)
                 self.runner.smalls = course.smalls
             self.placed, self.effects = places(self.data, course, self.runner.dispatch)
+            self._leave_out()
             for name, curve in self.curves.items():
                 one, effect = from_file(name, curve, self.data)
                 self.placed.append(one)

@@ -46,6 +46,7 @@ class Candidate:
     size   how large such a curve is in usual
     mean   whether it may have a mean
     near   whether the quantity is at the place itself, whatever their names
+    untold of its mean (0) and slope (1): what it has not, as the logs do not tell it from fitted parameters
     """
 
     name: str
@@ -58,22 +59,27 @@ class Candidate:
     quantity: Quantity
     basis: Basis
     near: bool = False
+    untold: tuple[int, ...] = ()
+
+    @property
+    def kept(self) -> list[int]:
+        """Its basis' functions that it has."""
+        gone = {*self.untold, *(() if self.mean else (0,))}
+        return [k for k in range(self.basis.turn.shape[1]) if k not in gone]
 
     @property
     def turn(self) -> Array:
-        """B-spline coefficients of each of its functions: those of the basis, without the constant where it has no
-        mean.
-        """
-        return self.basis.turn if self.mean else self.basis.turn[:, 1:]
+        """B-spline coefficients of each of its functions."""
+        return self.basis.turn[:, self.kept]
 
     @property
     def grid(self) -> Array:
         """Where a curve's table has its points."""
         return np.linspace(self.basis.low, self.basis.high, POINTS)
 
-    def placed(self, turn: Array | None = None) -> Placed:
-        """What runs; ``turn``: B-spline coefficients of each function, by default its own."""
-        design = self.basis.design(self.grid) @ (self.turn if turn is None else turn)
+    def placed(self) -> Placed:
+        """What runs."""
+        design = self.basis.design(self.grid) @ self.turn
         return self.placed_as(design.__matmul__, design.shape[1])
 
     def placed_as(self, table: Callable[[Array], Array], parameters: int) -> Placed:
@@ -84,7 +90,7 @@ class Candidate:
 
     def effect(self, wiggle: float) -> Effect:
         """What the search is told."""
-        return self.basis.effect(self.name, self.unit, self.size, wiggle, self.mean)
+        return self.basis.effect(self.name, self.unit, self.size, wiggle, self.kept)
 
 
 def quantities(bound: Bound, values: Array) -> list[Quantity]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.base.forms import FORMS, Form
-from vaneloop.discrepancy.error_share import RIVAL, score
+from vaneloop.discrepancy.error_share import score
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.curved import Candidate
@@ -56,7 +56,8 @@ class LearnedLaw:
     name, how, at, of   of the effect; what it does (`vaneloop.discrepancy.models.curve`), at which place, of what
     x, y, low, high     the curve, at places of its quantity, with its 90 % band
     edges, visited      of a histogram: where the logs have been, as shares
-    trades   nominal parameters that leave their intervals where the curve may have neither mean nor slope
+    untold   of its mean (0) and slope (1): what the logs do not tell from the model's parameters; it has none
+    trades   parameters that left their intervals when it was given none
     rivals   curves at other places or of other quantities that do as well
     """
 
@@ -76,6 +77,7 @@ class LearnedLaw:
     error_after: float
     knots: Array = field(repr=False)
     formulas: list[Formula] = field(default_factory=list)
+    untold: tuple[int, ...] = ()
     trades: list[str] = field(default_factory=list)
     rivals: list[str] = field(default_factory=list)
 
@@ -105,30 +107,34 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list
     assert placed.curve is not None
     grid = c.grid
     y = placed.curve.table(amplitudes)
-    low, high = _band(tried, placed.curve.table)
+    formulas = _formulas(ground, tried, y)
+    low, high = _with_formulas(c, y, *_band(tried, placed.curve.table), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
-        _formulas(ground, tried, y), _trades(ground, tried), rivals,
+        formulas, c.untold, _trades(tried), rivals,
     )  # fmt: skip
 
 
 def _band(tried: Tried, table: object) -> tuple[Array, Array]:
-    """90 % band of a curve: blocks of the log drawn anew, each draw solved by the slopes of the fit."""
+    """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
+    the fit. What the log cannot tell apart is as wide as it was known before.
+    """
     judge, fit, c = tried.judge, tried.fit, tried.candidate
     scale = judge.scale[fit.free]
     prior = fit.prior * scale**2
     n = judge.n_blocks
-    weights = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), DRAWS)
-    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    rng = np.random.default_rng(0)
+    weights = rng.multinomial(n, np.full(n, 1.0 / n), DRAWS)
+    known = rng.standard_normal((DRAWS, len(prior))) * np.sqrt(prior)
     at = judge.stage.index()[c.name]
     mine = np.flatnonzero((fit.free >= at.start) & (fit.free < at.stop))
     curves = []
-    for w in weights:
+    for w, drawn in zip(weights, known, strict=True):
         a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
-        step = np.linalg.solve(a, w @ fit.gradients - prior * deviation)
+        step = np.linalg.solve(a, (w - 1.0) @ fit.gradients + drawn)
         curves.append(table((fit.theta[fit.free] + step * scale)[mine]))  # type: ignore[operator]
     edge = 50.0 * (1.0 - BAND)
     low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
@@ -136,26 +142,29 @@ def _band(tried: Tried, table: object) -> tuple[Array, Array]:
     return np.minimum(low, y), np.maximum(high, y)
 
 
-def _trades(ground: Ground, tried: Tried) -> list[str]:
-    """Nominal parameters that stand elsewhere where the curve may only bend."""
-    c, fit = tried.candidate, tried.fit
-    bending = c.basis.turn[:, 2:]
-    if not bending.shape[1]:
+def _with_formulas(c: Candidate, y: Array, low: Array, high: Array, formulas: list[Formula]) -> tuple[Array, Array]:
+    """The band about a curve, and about each formula that does as well: a smooth curve is no corner."""
+    x, visited = c.grid, np.isin(np.arange(POINTS), np.searchsorted(c.grid, c.quantity.visited).clip(0, POINTS - 1))
+    below, above = y - low, high - y
+    for formula in formulas:
+        f = values_of(formula, x)
+        gone = [k for k in (0, 1) if k not in c.kept]
+        if gone:  # the curve has them as the parameters leave them, and the formula has its own
+            lines = np.stack([(np.ones(POINTS), x, f)[k] for k in (*gone, *([2] if 1 in gone else []))])
+            f = f + np.linalg.lstsq(lines[:, visited].T, (y - f)[visited], rcond=1e-9)[0] @ lines
+        low, high = np.minimum(low, f - below), np.maximum(high, f + above)
+    return low, high
+
+
+def _trades(tried: Tried) -> list[str]:
+    """Parameters of the model that stand elsewhere than where the curve had a mean and a slope."""
+    told, now = tried.told, tried.fit
+    if told is None:
         return []
-    whole = c.effect(tried.wiggle)
-    effect = Effect(c.name, whole.parameters[-bending.shape[1] :], tuple(s[-bending.shape[1] :] for s in whole.starts))
-    judge = Judge(ground.stage((), (*tried.curves[:-1], (c.placed(bending), effect))), ground.floor)
-    names = tuple(e.name for e in judge.stage.effects)
-    theta = np.concatenate([fit.theta[: tried.judge.stage.index()[c.name].start], fit.theta[-bending.shape[1] :]])
-    other = with_held_out(judge, judge.fit(names, theta, 8))
-    if score(judge, other) > score(judge, fit) + RIVAL:
-        return []  # the logs tell its mean and slope
-    out = []
-    for k, column in enumerate(fit.free):
-        if column < len(judge.stage.parameters):
-            value = other.theta[column]
-            if not fit.low[k] <= value <= fit.high[k]:
-                out.append(judge.stage.parameters[column].name)
+    names, out = [p.name for p in tried.judge.stage.parameters], []
+    for k, column in enumerate(told.free):
+        if column < len(names) and not told.low[k] <= now.theta[column] <= told.high[k]:
+            out.append(names[column])
     return out
 
 
@@ -172,7 +181,7 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
     few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line
     warm = c.quantity.unit in DEGREES
     for form in [f for f in FORMS if (not few or f.name == "line") and (warm or f.name != "Arrhenius")]:
-        got = begin(form, visited, at_visited, not c.mean)
+        got = begin(form, visited, at_visited, {k for k in (0, 1) if k not in c.kept})
         if got is not None and got[1] < SHAPED:
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])

@@ -16,7 +16,17 @@ from typing import Protocol
 import numpy as np
 
 from vaneloop.discrepancy.curves import basis_of
-from vaneloop.discrepancy.error_share import HARM, LEAST_USE, MOST_LEFT, RIVAL, UNKNOWN, ErrorShare, score, worth
+from vaneloop.discrepancy.error_share import (
+    BETTER,
+    HARM,
+    LEAST_USE,
+    MOST_LEFT,
+    RIVAL,
+    UNKNOWN,
+    ErrorShare,
+    score,
+    worth,
+)
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.curved import Candidate
@@ -65,6 +75,7 @@ class Tried:
     """A curve fitted beside the model, and curves before it.
 
     curves  each as it runs and as the search has it, the new one last
+    told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
     """
 
     candidate: Candidate
@@ -72,6 +83,7 @@ class Tried:
     judge: Judge
     fit: Fit
     curves: Placings
+    told: Fit | None = None
 
 
 @dataclass
@@ -176,6 +188,7 @@ class Learner:
                 break
             limit = score(self.judge, best.fit) + RIVAL
             out.rivals.append([t.candidate.name for t in good if t is not best and score(self.judge, t.fit) < limit])
+            best = self._settled(current, best)
             out.tried.append(best)
             current, fit = best, best.fit
         return self._concluded(out, named)
@@ -215,6 +228,26 @@ class Learner:
 
     def _earns(self, before: Fit, tried: Tried) -> bool:
         return worth(self.judge, before, tried.fit, self.form.form).good
+
+    def _settled(self, current: Tried, best: Tried) -> Tried:
+        """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
+        parameters.
+
+        Along such a valley a fit ends anywhere; here it ends where the parameters say all that they can.
+        """
+        whole = best.candidate
+        found = dict(zip(whole.kept, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
+        nominal = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]]
+        for untold in ((0, 1), (1,), (0,)):
+            c = replace(whole, untold=untold)
+            if len(c.kept) == len(whole.kept) or not c.kept:
+                continue
+            bends = [found[k] for k in c.kept]
+            fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
+            simpler = min(fits, key=lambda t: score(self.judge, t.fit))
+            if score(self.judge, simpler.fit) <= score(self.judge, best.fit) + BETTER:
+                return replace(simpler, told=best.fit)
+        return best
 
     # ---- candidates --------------------------------------------------------------------------------------------------
 

@@ -88,6 +88,7 @@ class System:
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
     units       of the position of kind force, {"position": "mm"}
     laws        laws of your own beside the library's, `Law`
+    without     laws (``place.law``) that are not looked for
     """
 
     name: str
@@ -114,6 +115,7 @@ class System:
     read: Callable[[str], Mapping[str, Any]] | None = None
     units: dict[str, str] = field(default_factory=dict)
     laws: Sequence[Law] = ()
+    without: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Check what the user wrote; one line says what is wrong and what is allowed."""

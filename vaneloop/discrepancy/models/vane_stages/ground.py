@@ -24,7 +24,17 @@ from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
 from vaneloop.discrepancy.models.vane_stages.driven import Made
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
 
-__all__ = ["OF_STROKE", "SCALE", "VaneGround", "curve_effect", "remade", "reversals", "room_for", "with_laws"]
+__all__ = [
+    "OF_STROKE",
+    "SCALE",
+    "VaneGround",
+    "curve_effect",
+    "remade",
+    "reversals",
+    "room_for",
+    "with_laws",
+    "without_laws",
+]
 
 WHOLE = 12_000  # samples; of a longer log an excerpt is learned on, and the rest tests it
 QUICK = 4_000  # samples of the excerpt that tells which candidates to fit
@@ -92,6 +102,16 @@ def with_laws(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, 
         if stage.made.driven.quantity(placed.curve.quantity) is None:
             raise InputError(f"{log}: {effect.name}: the log has no {placed.curve.quantity}")
     return remade(stage, laws, curves)
+
+
+def without_laws(stages: Sequence[Stage], laws: Sequence[str]) -> list[Stage]:
+    """Stages of the vane chain that are not given some laws of the library."""
+    out = []
+    for stage in stages:
+        have = [e.name for e in stage.effects]
+        rest = [name for name in have if name not in laws]
+        out.append(stage if rest == have else remade(stage, rest, ()))
+    return out
 
 
 class VaneGround:
