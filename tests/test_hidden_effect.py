@@ -9,7 +9,10 @@ import re
 
 import numpy as np
 
-from tests.rig import WITH_MOTOR, load_geometry
+from plant.curve import PLACES, QUANTITIES
+from plant.effects import EFFECTS
+from tests.rig import CATALOGUE, WITH_MOTOR, Hidden, load_geometry
+from tests.rig.left_out import LEFT_OUT
 from vaneloop.base.tables import path
 from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case
 from vaneloop.cli.main import main
@@ -96,3 +99,30 @@ def test_a_name_is_too_easy_when_improbable_without_rival_or_on_a_bound():
     assert _too_easy(named("lvdt_bias", 0.9, [], bias=top))
     # the bound that is also the neutral value is no bound met: the other stages of an effect stand there
     assert not _too_easy(named("linkage_wear", 0.9, [], vigv=0.0, vgv1=5.0, vgv2=0.0))
+
+
+def test_what_is_left_out_is_an_effect_and_a_curve_that_the_plant_can_have():
+    names = {f"{p.at}.{'gain' if p.how == 'times' else 'curve'}_of_{q}" for p in PLACES.values() for q in QUANTITIES}
+    for name, truth in LEFT_OUT.items():
+        stage = {"stage": 1.0} if CATALOGUE[name].stages else {}
+        hidden = Hidden(name, {CATALOGUE[name].main: CATALOGUE[name].ladder[3], **stage})
+        assert name in EFFECTS and set(truth.names(hidden)) <= names, name
+        if value := truth.of(hidden):
+            q = np.linspace(-40.0, 90.0, 9)
+            neutral = Hidden(
+                name, {CATALOGUE[name].main: CATALOGUE[name].parameters[CATALOGUE[name].main].neutral, **stage}
+            )
+            assert np.any(value(q) != 0.0) and np.all(truth.of(neutral)(q) == 0.0), name
+
+
+def test_a_left_out_effect_is_not_looked_for():
+    case = draw_case(4, 0, 60.0, leave_out=True)
+    assert case["kind"] == "left out" and case["hidden"][0].name in LEFT_OUT
+    row = judge_case(4, 0, 60.0, 100, leave_out=True)
+    assert row["truth"][0] not in row["named"] and row["kind"] == "left out"
+    assert "learned" in row and json.loads(row["learned"])["verdict"] in ("learned", "unknown", "named", "none")
+
+
+def test_an_effect_that_is_not_looked_for_must_be_one(capsys):
+    assert main(["diagnose", "examples/hidden_effect.parquet", "--without", "valve_lags", "--quiet"]) == 2
+    assert "--without 'valve_lags' is not in the library; probably 'valve_lag' is meant" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,16 @@ import polars as pl
 import pytest
 
 from tests.nominal_systems import NOMINAL, nominal
-from tests.rig_systems import FAMILIES, LEARNED, Case, Family, draw_case, left_over
+from tests.rig_systems import FAMILIES, LEARNED, Case, Family, Hidden, draw_case, left_out, left_over
 from tests.rig_systems.cases import RATES, hide
-from tests.rig_systems.laws import on_signal
+from tests.rig_systems.laws import Size, draw_values, on_signal
 from tests.rig_systems.simulate import course, simulate
 from tests.system_variants import SCALES, rescaled, variants
 from vaneloop import Record, System
 from vaneloop.cli import hidden_law
+from vaneloop.cli.blind import as_curve
 from vaneloop.cli.main import main
-from vaneloop.discrepancy import Parameter
+from vaneloop.discrepancy import Parameter, laws
 from vaneloop.discrepancy.library import LAWS
 from vaneloop.discrepancy.models import runner
 from vaneloop.discrepancy.models.bound import Bound
@@ -300,8 +302,85 @@ def test_what_is_learned_is_counted_where_it_was_asked() -> None:
     assert not any(k.startswith("learned") for k in hidden_law.summary([row("clean", [], [], {})]))
 
 
+def test_what_is_left_out_is_counted_beside_what_other_laws_say() -> None:
+    def asked(verdict: str, laws: list[dict[str, Any]]) -> Any:
+        said = {"verdict": verdict, "laws": laws, "error": None, "nearest": []}
+        return {**row("left out", ["a.cubic"], [5.0], {}), "learned": json.dumps(said)}
+
+    right = {"names": ["a.curve_of_a"], "formulas": ["a^3"], "inside": 0.95, "formula": True}
+    narrow = {**right, "inside": 0.5, "formula": False}
+    other = {"names": ["b.curve_of_a"], "formulas": []}
+    rows = [asked("learned", [right]), asked("learned", [other, narrow]), asked("learned", [other]), asked("named", [])]
+    s = {k.removeprefix("learned: left out"): (v["hits"], v["of"]) for k, v in hidden_law.summary(rows).items()
+         if k.startswith("learned: left out")}  # fmt: skip
+    assert s == {
+        " of the library, right place and quantity": (2, 4), ", and no other law of the library does as well": (2, 3),
+        ", the curve is the law within its band": (1, 4), ", the right formula among those given": (1, 4),
+    }  # fmt: skip
+
+
 def test_every_law_outside_the_library_has_its_curves_or_is_said_to_have_none() -> None:
     assert set(LEARNED) == {(name, law) for name, f in FAMILIES.items() for law in f.outside}
+
+
+SIGNALS = {"absolute_value": laws.ABSOLUTE}  # where the product's number has another name
+FORCES = ("force_offset", "viscous", "coulomb", "stribeck", "quadratic_drag", "spring", "cubic_spring")
+
+
+def as_product(kind: str, law: str, values: list[float], x: float) -> float:
+    """What the product's own law of that name adds."""
+    p, memory = np.array([*values, 0.0, 0.0, 0.0]), np.zeros(laws.MEMORY)
+    if kind == "force":
+        code = getattr(laws, law.upper())
+        return laws.force_of(code, x, x, True, p, 0.0, 0.0, 0.0, memory)
+    if kind == "state":
+        code = {"leak": laws.LEAK, "offset": laws.STATE_OFFSET}.get(law) or getattr(
+            laws, f"STATE_{law.removesuffix('_drag').upper()}"
+        )
+        return laws.state_rate(code, x, p)
+    code = SIGNALS.get(law) or getattr(laws, law.upper())
+    return laws.transform(code, 0, np.zeros(1), np.array([x]), p, memory) - x
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_law_that_is_left_out_is_the_products_as_a_curve(name: str) -> None:
+    """The rig's own equations of each law against the product's, at the place and of the quantity that are told."""
+    f, rng = FAMILIES[name], np.random.default_rng(1)
+    x = rng.uniform(0.1, 3.0, 20) * rng.choice([-1.0, 1.0], 20)
+    for full in left_out.laws_of(f):
+        place, _, law = full.rpartition(".")
+        kind = f.where(place)[0]
+        hidden = Hidden(full, draw_values(law, kind, Size(-3.0, 3.0, 1.0, 2.0, 1.0, 0.01), rng))
+        values = [*hidden.values.values()]
+        if law == "square_root" and kind != "state":
+            values.append(3.0)
+        truth = left_out.truth_of(f, hidden, 3.0)
+        theirs = [as_product(kind, law, values, float(v)) for v in x]
+        assert truth.value(x) == pytest.approx(theirs, abs=1e-12), full
+        assert truth.found(f"{truth.at}.curve_of_{truth.quantity or 'time'}")
+        assert not truth.found(f"{truth.at}.gain_of_{truth.quantity or 'time'}")
+
+
+def learned_law(y: np.ndarray, width: float, untold: tuple[int, ...] = ()) -> Any:
+    """A learned law on [-1, 1], visited evenly, with a band of a width."""
+    x = np.linspace(-1.0, 1.0, 257)
+    return SimpleNamespace(
+        x=x, y=y, low=y - width, high=y + width, edges=np.linspace(-1.0, 1.0, 25), visited=np.full(24, 1 / 24),
+        untold=untold, formulas=[SimpleNamespace(form="cube")],
+    )  # fmt: skip
+
+
+def test_a_curve_is_the_law_where_its_band_holds_it() -> None:
+    x = np.linspace(-1.0, 1.0, 257)
+    near, off = learned_law(x**3 + 0.01, 0.02), learned_law(x**3 + 0.03, 0.02)
+    assert as_curve(near, lambda q: q**3, ("cube",)) == {"inside": pytest.approx(1.0), "formula": True}
+    assert as_curve(off, lambda q: q**3, ("line",)) == {"inside": 0.0, "formula": False}
+    assert as_curve(near, lambda q: q**3, ())["formula"] is None
+    # a slope that the logs do not tell from a gain makes the rest larger or smaller, and says so
+    scaled = 1.7 * x**3 + 0.7 * x
+    assert as_curve(learned_law(scaled, 1e-6, (1,)), lambda q: q**3, ())["inside"] == pytest.approx(1.0)
+    assert as_curve(learned_law(scaled, 1e-6), lambda q: q**3, ())["inside"] < 0.1
+    assert as_curve(learned_law(scaled + 0.1, 1e-6, (1,)), lambda q: q**3, ())["inside"] < 0.1
 
 
 def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:

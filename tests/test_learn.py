@@ -5,8 +5,11 @@ and the command from logs to a law that another log confirms.
 from __future__ import annotations
 
 import json
+import math
+import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,7 @@ from vaneloop import InputError, Record, System, unknown
 from vaneloop.base.curve import on_table
 from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import read
+from vaneloop.cli.blind import as_curve
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.fit import Judge
@@ -30,6 +34,8 @@ from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import candidates, with_curves
 from vaneloop.discrepancy.models.learning import held_out
 from vaneloop.discrepancy.models.quantities import column_of
+from vaneloop.verbs.learn import learn
+from vaneloop.verbs.search import diagnose
 
 OIL = np.linspace(20.0, 60.0, 5)
 
@@ -163,6 +169,8 @@ def test_a_formula_is_found_in_its_own_values(form) -> None:
     assert got[1] < (0.05 if form.name == "step" else 1e-3)
     if form.name not in ("step", "sine"):  # anywhere between two points; several phases are one
         assert np.allclose(got[0], numbers, rtol=0.02, atol=0.01)
+    code = form.code.format(**{name: repr(float(v)) for name, v in zip(form.numbers, numbers, strict=True)})
+    assert [eval(code, {"math": math, "q": float(v)}) for v in q] == pytest.approx(y.tolist(), abs=1e-9)
     assert "a" not in text_of(form, numbers, "Q").replace("tanh", "").replace("max", "")
     if form.name not in ("constant", "straight line"):  # a parameter that is fitted takes a constant off
         shifted = begin(form, q, y + 5.0, free=(0,))
@@ -329,3 +337,36 @@ def test_a_judge_of_a_curve_counts_its_amplitudes_as_effects(bound) -> None:
     w = with_curves(bound, (), [(c.placed(), c.effect(1.0))])
     judge = Judge(w.thinned, bound.floor)
     assert len(judge.columns((c.name,))) == len(judge.columns(())) + len(c.effect(1.0).parameters)
+
+
+def test_a_slope_that_parameters_take_is_left_to_them_and_the_formula_is_found(tmp_path: Path) -> None:
+    """A limit of a signal whose gain and offset are fitted; the library is not given the limit."""
+    rng = np.random.default_rng(3)
+    records = []
+    for k in range(3):
+        t = np.arange(1200) * 0.1
+        u = 5.0 * np.sin(t / (3.0 + k)) + 1.5 * np.sin(t / 0.9)
+        y = 2.0 * np.minimum(u, 3.0) + 0.7 + 0.02 * rng.standard_normal(len(t))
+        records.append(Record(f"log {k}", t, {"u": u, "y": y}))
+    limited = System(
+        "limited", "static", lambda u, p: p.gain * u.u + p.offset, inputs={"u": "V"}, outputs={"y": "V"},
+        parameters=[unknown("gain", 1.0, "-"), unknown("offset", 0.0, "V")], places=["u"],
+    )  # fmt: skip
+    without = ["u.saturation", "u.smooth_saturation", "u.dead_zone"]  # which is a limit, with a bias
+    said = learn(records[:2], limited, test=records[2:], without=without)
+    law = said.laws[0]
+    assert law.name == "u.curve_of_u" and law.error_after < 1.2
+    assert law.untold == (0, 1)  # the gain takes the slope, the offset the mean
+    right = [f for f in law.formulas if f.form == "above" and f.numbers["b"] == pytest.approx(3.0, abs=0.05)]
+    assert right, [f.text for f in law.formulas]
+    truth = as_curve(law, lambda u: np.minimum(u, 3.0) - u, ("above",))
+    assert truth == {"inside": pytest.approx(1.0, abs=0.1), "formula": True}
+    held_to = said.write_python(tmp_path / "limit.py", limited)
+    space = runpy.run_path(str(held_to))
+    space["test_curve"](), space["test_law"]()
+    assert [space["curve"](u) for u in (-2.0, 2.9, 5.0)] == pytest.approx([0.0, 0.0, -2.0], abs=0.08)
+    with_law = replace(limited, laws=[space["LAW"]])
+    named = diagnose(records[:2], with_law, test=records[2:], without=without)
+    assert named.effects == [law.name]
+    with pytest.raises(InputError, match=r"'u\.satration': not a law that system 'limited' can have"):
+        learn(records[:1], limited, without=["u.satration"])

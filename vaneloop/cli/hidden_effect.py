@@ -210,12 +210,16 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     errors = [laws[-1]["after"] for r in right if (laws := json.loads(r["learned"])["laws"])]
     spent = sorted(json.loads(r["learned"])["processor_s"] for r in asked if json.loads(r["learned"])["laws"])
     clean = [not json.loads(r["learned"])["laws"] for r in asked if r["kind"] == "clean"]
-    gone = [json.loads(r["learned"])["laws"] for r in asked if r["kind"] == LEAVE_OUT and r["detectable"][0]]
+    answers = [json.loads(r["learned"]) for r in asked if r["kind"] == LEAVE_OUT and r["detectable"][0]]
+    gone = [said["laws"] for said in answers]
     curves = [c for laws in gone for c in [next((law for law in laws if "inside" in law), None)] if c is not None]
     none = [False] * sum(not any(law["found"] for law in laws) for laws in gone)
     return {
         "learned: left out of the library, right place and quantity": share(
             [any(law["found"] for law in laws) for laws in gone]
+        ),
+        "learned: left out, and no other effect of the library does as well": share(
+            [any(law["found"] for law in said["laws"]) for said in answers if said["verdict"] != "named"]
         ),
         "learned: left out, the curve is the law within its band": share(
             [c["inside"] >= INSIDE for c in curves] + none

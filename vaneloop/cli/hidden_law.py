@@ -263,9 +263,13 @@ def learned_summary(rows: list[Row]) -> dict[str, Any]:
     outside = [(r, said) for r, said in asked if r["kind"] == "outside" and _seen(r)]
     right = [(r, said) for r, said in outside if _learned_right(r, said)]
     gone = [said["laws"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
+    verdicts = [said["verdict"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
     curves: list[Row] = [next((law for law in laws if "inside" in law), {}) for laws in gone]
     return {
         "learned: left out of the library, right place and quantity": share([bool(c) for c in curves]),
+        "learned: left out, and no other law of the library does as well": share(
+            [bool(c) for c, said in zip(curves, verdicts, strict=True) if said != "named"]
+        ),
         "learned: left out, the curve is the law within its band": share(
             [c.get("inside", 0.0) >= INSIDE for c in curves]
         ),

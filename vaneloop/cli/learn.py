@@ -38,6 +38,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_controller_options(parser)
     parser.add_argument("--out", metavar="LAW.toml", help="law file to write, a model file with the learned laws in it")
     options.add_without_option(parser)
+    parser.add_argument(
+        "--python", metavar="LAW.py", help="write the first law as a Python file, too: of a model of your own as a Law"
+    )
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
     parser.set_defaults(learns=True)
@@ -49,8 +52,9 @@ def command(args: argparse.Namespace) -> int:
     from vaneloop.verbs.learn import learned, with_path
     from vaneloop.verbs.search import not_given
 
-    if args.out and (Path(args.out).is_dir() or not Path(args.out).parent.is_dir()):
-        raise InputError(f"{args.out}: cannot be written")
+    for path in filter(None, (args.out, args.python)):
+        if Path(path).is_dir() or not Path(path).parent.is_dir():
+            raise InputError(f"{path}: cannot be written")
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     own = own_model.asked(args)
     chain: Any = None if own else not_given(options.chain_of(args), args.without)
@@ -82,4 +86,7 @@ def command(args: argparse.Namespace) -> int:
     terminal.write_json(args, answer.to_dict())
     if args.report:
         terminal.say(args, f"page: {answer.report(args.report, words)}")
+    if args.python and answer.laws:
+        answer.write_python(args.python, own_model.system_of(args) if own else None)
+        terminal.say(args, f"law in Python: {args.python}")
     return 1 if answer.verdict in ("learned", "unknown") else 0

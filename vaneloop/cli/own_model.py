@@ -9,7 +9,7 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.cli import options
 
-__all__ = ["add_options", "ask", "asked", "show"]
+__all__ = ["add_options", "ask", "asked", "show", "system_of"]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +57,13 @@ def asked(args: argparse.Namespace) -> bool:
         if getattr(args, name, None) and not model_file:
             raise InputError(f"--{name} does not go with --system")
     return True
+
+
+def system_of(args: argparse.Namespace) -> Any:
+    """The user's model."""
+    from vaneloop.discrepancy import load_system
+
+    return load_system(args.system)
 
 
 def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:

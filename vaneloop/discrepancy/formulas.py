@@ -27,7 +27,7 @@ def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array,
     if form.name == "Arrhenius" and not q.min() > -200.0:
         return None
     straight = {"constant": {0}, "line": {1}, "straight line": {0, 1}}.get(form.name)
-    if straight and (straight <= set(free) or (free and len(straight) == 2)):
+    if straight and straight <= set(free):
         return None
     span, low = float(np.ptp(q)), float(q.min())
     lines = [np.ones(len(q)), q - q.mean()]

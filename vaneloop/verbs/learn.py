@@ -100,6 +100,16 @@ class Learned(Answer):
         write_model(str(path), self.model)
         return Path(path)
 
+    def write_python(self, path: str | Path, system: System | None = None) -> Path:
+        """Write the first law as a Python file; return its path.
+
+        system  the user's own model, to whose ``laws`` it can be added; None: of the vane chain, the function alone
+        """
+        from vaneloop.discrepancy.models.python_law import python_law
+
+        Path(path).write_text(python_law(self.laws[0], system), encoding="utf-8")
+        return Path(path)
+
 
 def law_json(law: LearnedLaw) -> dict[str, Any]:
     """A law as JSON; its curve at 33 places."""

@@ -129,7 +129,8 @@ class Bound:
                 one, effect = from_file(name, curve, self.data)
                 self.placed.append(one)
                 self.effects.append(effect)
-            parameters = [self._fixed(p, v) for p, v in zip([*s.parameters, *starts], fitted, strict=True)]
+            sizes = self._felt([*s.parameters, *starts], fitted)
+            parameters = [self._fixed(*pvs) for pvs in zip([*s.parameters, *starts], fitted, sizes, strict=True)]
             if self._starts_matter(fitted):
                 parameters += self._read_starts()
         else:
@@ -500,11 +501,30 @@ class Bound:
                 self.runner.steps //= 2
                 break
 
-    def _fixed(self, p: Parameter, value: float) -> Parameter:
-        """An unknown parameter, once fitted, may move by a few of its own sizes."""
+    def _felt(self, parameters: Sequence[Parameter], values: Array) -> list[float]:
+        """Of each unknown parameter for which the user gave 0, which says nothing of its size: what moves an output by
+        as much as it varies; 0 for the others.
+        """
+        zero = [i for i, p in enumerate(parameters) if p.value == 0.0 and not np.isfinite(p.tolerance)]
+        out = [0.0] * len(parameters)
+        if not zero:
+            return out
+        thetas = np.repeat(values[None], 1 + len(zero), axis=0)
+        for row, i in enumerate(zero, 1):
+            thetas[row, i] += 1e-3 * max(abs(values[i]), 1e-3 * self._unit_size(parameters[i]))
+        y = self.run(thetas)
+        spread = np.nanstd(self.measured, axis=1)
+        for row, i in enumerate(zero, 1):
+            moved = np.sqrt(np.mean((y[row] - y[0]) ** 2, axis=1)) / np.where(spread > 0.0, spread, 1.0)
+            felt = float(np.nanmax(moved)) / float(thetas[row, i] - values[i])
+            out[i] = 1.0 / felt if np.isfinite(felt) and felt > 0.0 else 0.0
+        return out
+
+    def _fixed(self, p: Parameter, value: float, felt: float) -> Parameter:
+        """An unknown parameter, once fitted, may move by a few of its own sizes, or by what is ``felt`` (`_felt`)."""
         if np.isfinite(p.tolerance):
             return p
-        size = max(abs(value), abs(p.value), 1e-3 * self._unit_size(p))
+        size = max(abs(value), abs(p.value), 1e-3 * self._unit_size(p), felt)
         if p.name.startswith("start_"):
             size = max(size, self._unit_size(p))
         wide = max(WIDE * size, GIVEN * abs(p.value))

@@ -24,6 +24,7 @@ DRAWS = 400
 BAND = 0.90
 REFITTED = 5  # formulas that are fitted in the simulation
 NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
+POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
 SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
 DEGREES = ("degC", "°C", "C")
 SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
@@ -39,6 +40,7 @@ class Formula:
     text     with its numbers
     numbers  name -> value; ``error``: held-out RMS, in noise floors, with it in the curve's place
     law      name of the law of the library that it is; "": none
+    level    added to it: less its mean, where a parameter of the model has that
     """
 
     form: str
@@ -47,6 +49,7 @@ class Formula:
     error: float
     complexity: int
     law: str = ""
+    level: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -180,12 +183,18 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
     shaped = []
     few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line
     warm = c.quantity.unit in DEGREES
-    for form in [f for f in FORMS if (not few or f.name == "line") and (warm or f.name != "Arrhenius")]:
+    for form in FORMS:
+        if (few and form.name != "line") or (not warm and form.name == "Arrhenius"):
+            continue
+        if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
+            continue
         got = begin(form, visited, at_visited, {k for k in (0, 1) if k not in c.kept})
         if got is not None and got[1] < SHAPED:
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
+    own = max(rms_of(tried.judge, tried.fit), 1.0)
+    fitted = [f for f in fitted if f.error <= POOR * own]
     if not fitted:
         return []
     fitted.sort(key=lambda f: np.log(f.error) + PER_NUMBER * len(f.numbers))
@@ -226,7 +235,9 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
-    fit = with_held_out(judge, judge.fit(tuple(e.name for e in judge.stage.effects), theta, 12))
+    names = tuple(e.name for e in judge.stage.effects)
+    theta = judge.fit(names[:-1], theta, 8).theta  # first the rest of the model with the formula as it stands
+    fit = with_held_out(judge, judge.fit(names, theta, 12))
     if not np.isfinite(score(judge, fit)):
         return None
     values = form.plain(fit.theta[-len(numbers) :])
@@ -239,6 +250,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         rms_of(judge, fit),
         form.complexity,
         law,
+        -mean(values),
     )
 
 

@@ -181,7 +181,7 @@ class Learner:
             if not good:
                 break
             near = [t for t in good if score(self.judge, t.fit) < score(self.judge, good[0].fit) + RIVAL]
-            best = min(near, key=lambda t: _strange(t.candidate))
+            best = min(near, key=lambda t: (_strange(t.candidate), t.candidate.how.endswith("times")))
             why = self._harmful(current, best)
             if why:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")

@@ -1,0 +1,147 @@
+"""A learned law as a Python file: its formula, or its curve as a table, with units, range, and a test of its own.
+
+On a user's own model it is a `vaneloop.Law`, for the ``laws`` of the `System`; there a law may be a function of the
+signal or state that it acts on, of a displacement, or of time. Of the vane chain it is the function alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vaneloop.base.errors import InputError
+from vaneloop.base.forms import FORMS
+
+if TYPE_CHECKING:
+    from vaneloop.discrepancy.models.learned import LearnedLaw
+    from vaneloop.discrepancy.models.system import System
+
+__all__ = ["python_law"]
+
+POINTS = 33  # of a table
+HELD = 9  # values that the file's test holds
+
+FILE = '''"""{sentence}
+
+Equation::
+
+    curve = {equation}
+
+Symbols: q is {of} ({of_unit}); the curve is in {unit}.
+Range: learned for q in [{low:.6g}, {high:.6g}]; beyond, it stays as at the ends.
+Error on held-out data: {before:.3g} noise floors without it, {after:.3g} with it.
+"""
+
+import math
+{imports}
+{constants}
+
+def curve(q):
+    """The curve at ``q``."""
+    q = min(max(q, {low!r}), {high!r})
+    return {code}
+
+{law}
+def test_curve():
+    """The curve is what was learned."""
+    for q, y in {held}:
+        assert math.isclose(curve(q), y, rel_tol=1e-6, abs_tol=1e-9)
+{test}'''
+
+OWN_LAW = '''
+def {function}({arguments}):
+    """What the law gives, ``p.scale`` times as much as was learned."""
+    return {gives}
+
+
+LAW = Law(
+    "{name}",
+    "{on}",
+    {function},
+    parameters=[Parameter("scale", 0.0, "-", low=-3.0, high=3.0)],
+    starts=[1.0],
+    places=["{place}"],
+)
+
+'''
+
+OWN_TEST = '''
+
+def test_law():
+    """At its neutral value it changes nothing."""
+    p = type("P", (), {{"scale": 0.0}})
+    assert {function}({some}) == {nothing}
+'''
+
+
+def python_law(law: LearnedLaw, system: System | None = None) -> str:
+    """The text of the file; ``system``: the user's own model, else the vane chain.
+
+    Raises InputError where a `Law` cannot say it: where it is a function of another channel, or multiplies a parameter.
+    """
+    low, high = float(law.x[0]), float(law.x[-1])
+    code, constants, equation = _code(law)
+    curve: dict[str, object] = {}
+    exec(f"import math\n{constants}\ndef curve(q):\n    return {code}", curve)  # our own text
+    held = [(float(q), float(curve["curve"](q))) for q in np.linspace(low, high, HELD)]  # type: ignore[operator]
+    parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
+    sentence = law.sentence().rstrip(".")
+    return FILE.format(
+        sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=law.of, of_unit=law.of_unit or "-",
+        unit=law.unit or "-", low=low, high=high, before=law.error_before, after=law.error_after, code=code,
+        constants=constants, held=held, **parts,
+    )  # fmt: skip
+
+
+def _code(law: LearnedLaw) -> tuple[str, str, str]:
+    """The curve as an expression of q, its constants, and the equation in words."""
+    if law.formulas:
+        f = law.formulas[0]
+        form = next(g for g in FORMS if g.name == f.form)
+        constants = "".join(f"{k.upper()} = {v!r}\n" for k, v in f.numbers.items())
+        code, level = form.code, f.level
+        for k in f.numbers:
+            code = code.replace(f"{{{k}}}", k.upper())
+        if level:
+            constants += f"LEVEL = {level!r}  # the model's own parameter has the mean\n"
+            code = f"{code} + LEVEL"
+        return code, constants, f.text.replace(law.of, "q")
+    places = np.linspace(0, len(law.x) - 1, POINTS).astype(int)
+    x, y = (tuple(float(f"{v:.9g}") for v in a[places]) for a in (law.x, law.y))
+    step = (x[-1] - x[0]) / (POINTS - 1)
+    constants = f"Y = {y!r}\n"
+    at = f"min(int((q - {x[0]!r}) / {step!r}), {POINTS - 2})"
+    code = f"Y[{at}] + (Y[{at} + 1] - Y[{at}]) * ((q - {x[0]!r}) / {step!r} - {at})"
+    return code, constants, f"a table of {POINTS} points, straight between them (no formula fits it)"
+
+
+def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
+    """The parts of the file that make it a `Law`."""
+    own = law.at.removesuffix("_sensor")
+    name = law.name.rpartition(".")[2]
+    on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
+    if on == "state" and law.at in system.rates:
+        on = "force"
+    way = "position" if law.how == "force adds" else system.rates.get(law.at, "")
+    speed = "velocity" if law.how == "force adds" else law.at
+    of = {
+        "signal": {own: "u"}, "state": {own: "x"}, "force": {speed: "v", **({way: "x"} if way else {})},
+    }.get(on or "", {}).get(law.of)  # fmt: skip
+    if on is None or of is None:
+        raise InputError(
+            f"--python: {law.name} is a function of {law.of} at {law.at}; a Law of your own can be one of the signal, "
+            f"state or motion that it acts on. --out writes this one"
+        )
+    arguments = {"signal": "u, t, p", "state": "x, t, p", "force": "v, x, t, p"}[on]
+    does = f"p.scale * curve({of})"
+    some = {"signal": "1.5, 0.0, p", "state": "1.5, 0.0, p", "force": "1.5, 0.5, 0.0, p"}[on]
+    parts = {
+        "function": "acts", "arguments": arguments, "gives": f"u + {does}" if on == "signal" else does, "name": name,
+        "on": on, "place": law.at, "some": some, "nothing": "1.5" if on == "signal" else "0.0",
+    }  # fmt: skip
+    return {
+        "imports": "\nfrom vaneloop import Law, Parameter\n", "law": OWN_LAW.format(**parts),
+        "test": OWN_TEST.format(**parts),
+    }  # fmt: skip
