@@ -16,6 +16,7 @@ from vaneloop.fleet.leases import BEATS, Me
 __all__ = ["PLACES", "needs", "rent"]
 
 PLACES = "local, slurm, tcp://HOST:PORT (a Dask scheduler)"
+ANSWERS = 30.0  # s within which a Dask scheduler answers
 _NEEDED = {"distributed": "dask", "duckdb": "duckdb", "psutil": "psutil"}
 
 
@@ -49,7 +50,7 @@ def rent(
     try:
         cluster = _cluster(on, workers, queue)
         try:
-            client = Client(cluster if cluster is not None else on, timeout=30)
+            client = Client(cluster if cluster is not None else on, timeout=ANSWERS)
         except (OSError, ValueError) as e:
             raise InputError(f"--on {on}: no Dask scheduler answers ({type(e).__name__})") from None
         run = str(folder.path.resolve())
