@@ -13,8 +13,8 @@ from tests.conftest import ROOT
 
 CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
 SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
-# axe describes every element that a rule passes, unless it is told that nobody asks. All rules are held all the same; of
-# 29 s on the page of a replay, 4 s are left.
+# axe describes every element that a rule passes, unless it is told that nobody asks. All rules are held all the same;
+# of 29 s on the page of a replay 4 s are left.
 AXE = "axe.run(document, {resultTypes: ['violations']})"
 # ms; a slow machine with other work compiles the simulator first
 LONG = 1000.0 * float(os.environ.get("VANELOOP_PATIENCE", "240"))

@@ -28,3 +28,21 @@ def read(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
     if "pause" in text:
         time.sleep(0.05)
     return {"verdict": "none", "answer": {"letters": len(text), "first": text[:12]}}
+
+
+def read_cold(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
+    """As `read`, once compiled; its ``options`` say what compiling comes to."""
+    return read(path, options, run)
+
+
+def _warm_up(options: dict[str, Any], run: str) -> None:
+    if options["compiling"] == "hangs":
+        time.sleep(3600.0)
+    begun = Path(run) / "begun"
+    with open(begun, "a", encoding="utf-8") as f:
+        f.write("x")
+    if len(begun.read_text(encoding="utf-8")) <= options["compiling"]:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+read_cold.warm_up = _warm_up  # type: ignore[attr-defined]

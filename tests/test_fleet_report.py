@@ -22,6 +22,7 @@ pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
+from vaneloop.cli.main import main
 from vaneloop.fleet import state
 from vaneloop.fleet.folder import Folder, _schema
 from vaneloop.fleet.report import YEAR, limits_of, view_of, write_pages
@@ -252,11 +253,31 @@ def test_the_command_reports_and_says_how_far_a_run_is(folder: Folder, tmp_path:
         (("run", "nowhere", "--out", "x"), "neither a log nor a folder"),
         (("run", "examples", "--out", "x", "--workers", "0"), "must be in"),
         (("work", "x", "--patience", "0"), "must be in"),
+        (("run", "examples", "--out", "x", "--patience", "0"), "must be in"),
+        (("run", "examples", "--out", "x", "--on", "slrum"), "did you mean slurm"),
+        (("run", "examples", "--out", "x", "--queue", "night"), "must look like NAME=value"),
     ],
 )
-def test_bad_input_is_one_line(words: tuple[str, ...], says: str) -> None:
-    done = command(*words)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr, done.stderr
+def test_bad_input_is_one_line_before_anything_is_begun(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    says: str,
+) -> None:
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples" / "a.csv").write_text("t,n_dem\n0,60\n")
+    monkeypatch.chdir(tmp_path)
+    assert main(["fleet", *words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and says in err, err
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_folder_of_a_campaign_is_told_from_a_fleet_s(tmp_path: Path) -> None:
+    run = Folder.begin(tmp_path / "run", "vaneloop.fleet.trial:run_trial", {"plan": {}}, {})
+    with pytest.raises(InputError, match=r"is a campaign's run, not a fleet's; vaneloop campaign PLAN\.toml --out"):
+        roll_up(run)
 
 
 @pytest.mark.slow

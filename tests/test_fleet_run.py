@@ -178,6 +178,37 @@ def test_a_run_of_another_machine_or_version_is_not_gone_on_with(tmp_path: Path)
         work(folder.path)
 
 
+def test_a_run_is_of_the_sources_that_its_results_follow_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every module that a diagnosis or a trial loads is in the digest, and the tables; each changes it."""
+    from vaneloop.base import tables
+    from vaneloop.fleet import folder
+
+    script = (
+        "import sys, vaneloop.fleet.diagnosis, vaneloop.fleet.trial, vaneloop.fleet.worker, vaneloop.verbs.search\n"
+        "for m in list(sys.modules.values()): print(getattr(m, '__file__', ''))"
+    )
+    said = subprocess.run([sys.executable, "-c", script], env=ENV, cwd=ROOT, capture_output=True, text=True, check=True)
+    ours = [Path(f).relative_to(ROOT) for f in said.stdout.split() if f.startswith(str(ROOT / "")) and ".venv" not in f]
+    loaded = [f for f in ours if f != Path("vaneloop/__init__.py")]  # names only
+    assert len(loaded) > 50
+    assert [f for f in loaded if not str(f).startswith(tuple(f"{p}/" for p in folder._SOURCES))] == []
+
+    files = [tmp_path / p / "part.py" for p in folder._SOURCES] + [tmp_path / "tables" / "plant.toml"]
+    for f in files:
+        f.parent.mkdir(parents=True)
+        f.write_text("a = 1\n")
+    monkeypatch.setattr(folder, "_ROOT", tmp_path)
+    monkeypatch.setattr(tables, "path", lambda name: tmp_path / "tables" / name)
+    seen = {folder.sources_version.__wrapped__()}
+    (tmp_path / "vaneloop/base/__pycache__").mkdir()
+    (tmp_path / "vaneloop/base/__pycache__/made.c").write_text("what is made of sources is none")
+    assert folder.sources_version.__wrapped__() in seen
+    for f in files:
+        f.write_text("a = 2\n")
+        seen.add(folder.sources_version.__wrapped__())
+    assert len(seen) == len(files) + 1
+
+
 def test_a_copy_of_a_folder_with_a_dot_in_its_name_is_where_the_job_says(tmp_path: Path) -> None:
     (tmp_path / "bench.v2").mkdir()
     (tmp_path / "bench.v2" / "plant.toml").write_text("a = 1\n")
@@ -306,6 +337,48 @@ def test_sigterm_ends_a_worker_in_order(tmp_path: Path) -> None:
     assert (
         p.wait() == 0 and not list((folder.path / "leases").iterdir()) and not list((folder.path / "workers").iterdir())
     )
+
+
+def test_an_answer_that_comes_while_a_worker_is_told_to_stop_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vaneloop.fleet import reader
+
+    folder, ask = fleet(tmp_path, many(3), in_chunk=3), reader.Reader.ask
+    with monkeypatch.context() as m:
+
+        def told(self: Any, *words: Any) -> Any:
+            row = ask(self, *words)
+            self.stopped.set()
+            return row
+
+        m.setattr(reader.Reader, "ask", told)
+        assert work(folder.path) == {"done": 1}
+    assert [n for _, n in folder.begun()] == [1]
+    assert work(folder.path) == {"done": 2} and len(rows(folder)) == 3
+
+
+@pytest.mark.parametrize(
+    ("compiling", "says"), [("hangs", "is not ready after 2 s of compiling"), (3, "ended 3 times before it read any")]
+)
+def test_a_machine_that_cannot_compile_is_one_line_and_no_log_s_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiling: str | int, says: str
+) -> None:
+    from vaneloop.fleet import reader
+
+    if compiling == "hangs":
+        monkeypatch.setattr(reader, "WARM_UP", 2.0)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "a.csv").write_text("log 1")
+    folder = Folder.begin(tmp_path / "run", "tests.fleet_jobs:read_cold", {"compiling": compiling}, {})
+    folder.add(sources.find([str(tmp_path / "a.csv")]))
+    with pytest.raises(InputError, match=says):
+        work(folder.path)
+    assert not folder.finished() and not list((folder.path / "leases").iterdir())
+    (key,) = (e.key for e in folder.entries())
+    assert not (folder.results(folder.entries()[0].chunk) / f"{key}.json").exists(), "the log has no row"
+    if compiling == 3:  # the fourth start succeeds
+        assert work(folder.path) == {"done": 1}
 
 
 def test_a_worker_that_stands_still_is_replaced_and_does_no_harm(

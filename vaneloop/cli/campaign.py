@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.fleet.rent import needs
+    from vaneloop.fleet.rent import known, needs
 
     needs("psutil", "duckdb", "distributed")
     from vaneloop.fleet import campaign
@@ -61,6 +61,8 @@ def command(args: argparse.Namespace) -> int:
     for option, low, high in (("limit", 1e-3, 1e6), ("patience", 0.5, 1e5)):
         if not low <= getattr(args, option) <= high:
             raise InputError(f"--{option} (={getattr(args, option):g} s) must be in [{low:g}, {high:g}]")
+    known(args.on)
+    terminal.pairs(args.queue, "queue")
     plan, quantities, folder = campaign.begin(args.plan, args.out, args.limit)
     new = campaign.take_samples(plan, quantities, folder)
     terminal.say(args, f"{new} trials to take up")

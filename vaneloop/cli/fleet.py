@@ -96,12 +96,14 @@ def _run(args: argparse.Namespace) -> int:
     from vaneloop.fleet import sources, state
     from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.leases import BEATS
-    from vaneloop.fleet.rent import rent
+    from vaneloop.fleet.rent import known, rent
 
     if not 1 <= args.workers <= 10_000:
         raise InputError(f"--workers (={args.workers}) must be in [1, 10000]")
     if not 0.0 < args.limit <= 1e6:
         raise InputError(f"--limit (={args.limit:g} s) must be in (0, 1e6]")
+    patience, queue = _patience(args), terminal.pairs(args.queue, "queue")
+    known(args.on)
     logs = sources.find(args.logs, args.engines)
     folder = Folder.begin(args.out, "vaneloop.fleet.diagnosis:diagnose_log", *_job(args))
     state.tidy(folder)
@@ -112,8 +114,7 @@ def _run(args: argparse.Namespace) -> int:
     terminal.say(args, f"{len(logs)} logs, {new} of them new or changed; {left} chunks to do")
     if left:
         with terminal.progress_bar(args, "diagnosing the fleet") as progress:
-            queue = terminal.pairs(args.queue, "queue")
-            rent(folder, args.on, args.workers, queue, _patience(args) / BEATS,
+            rent(folder, args.on, args.workers, queue, patience / BEATS,
                  lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
     return _show(args, folder)
 

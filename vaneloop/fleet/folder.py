@@ -22,11 +22,11 @@ import stat
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from vaneloop.base.compiled import sources_digest
+from vaneloop.base import tables
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, digest_of, passed, read_json, whole
 from vaneloop.fleet.sources import Source
@@ -34,6 +34,11 @@ from vaneloop.fleet.sources import Source
 __all__ = ["Entry", "Folder", "copies_of", "key_of", "sources_version"]
 
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
+_ROOT = Path(__file__).parents[2]
+# what a result follows from: how it is found and written, and the tables of a machine that nobody gave
+_SOURCES = (
+    "controller", "plant", "hil", "vaneloop/base", "vaneloop/discrepancy", "vaneloop/verbs", "vaneloop/fleet"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,15 +71,24 @@ def copies_of(files: dict[str, str]) -> dict[str, str]:
     return {name: f"machine/{name}{Path(f).suffix}" for name, f in files.items()}
 
 
+@cache
 def sources_version() -> str:
-    """VaneLoop's version and a digest of its sources: results of other code do not belong beside these."""
+    """VaneLoop's version and a digest of the sources, tables and numba's version from which a result follows: results
+    of other code do not belong beside these.
+    """
+    import hashlib
     from importlib.metadata import PackageNotFoundError, version
 
     try:
         number = version("vaneloop")
     except PackageNotFoundError:
         number = "0"
-    return f"{number}+{sources_digest()}"
+    h = hashlib.sha256(version("numba").encode())
+    kinds = (".py", ".toml", ".dbc", ".c", ".h")
+    for place in (*(_ROOT / p for p in _SOURCES), tables.path("plant.toml").parent):
+        for f in sorted(f for f in place.rglob("*.*") if f.suffix in kinds and "__pycache__" not in f.parts):
+            h.update(f"{f.relative_to(place).as_posix()}:{digest_of(f)}\n".encode())
+    return f"{number}+{h.hexdigest()[:16]}"
 
 
 class Folder:
@@ -125,6 +139,11 @@ class Folder:
                     f"give another --out"
                 )
         return folder
+
+    @property
+    def of_campaign(self) -> bool:
+        """Whether trials of a campaign are run here, not logs diagnosed."""
+        return "plan" in self.job["options"]
 
     # ---- the logs ----------------------------------------------------------------------------------------------------
 

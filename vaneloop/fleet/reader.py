@@ -23,10 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.base.compiled import cache_folder, sources_digest
 from vaneloop.base.errors import InputError
 
-__all__ = ["Died", "Reader", "Stopped", "TimedOut", "serve"]
+__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "serve"]
 
 # one thread a process: several processes that each use all cores are slower than one
 ONE_THREAD = dict.fromkeys(
@@ -34,6 +33,7 @@ ONE_THREAD = dict.fromkeys(
 )
 
 WARM_UP = 1200.0  # s for compiling on the slowest of machines
+STARTS = 3  # of a process that ends before it has read anything
 
 
 class Died(Exception):
@@ -48,6 +48,10 @@ class Stopped(Exception):
     """The worker is to stop, and has ended the process."""
 
 
+class NotReady(InputError):
+    """The process cannot compile what it needs: no log's fault, and so for every log."""
+
+
 class Reader:
     """A worker's process for logs, begun when it is first needed and after it has died."""
 
@@ -57,21 +61,41 @@ class Reader:
         self.process: subprocess.Popen[bytes] | None = None
 
     def ask(self, path: str, options: dict[str, Any], limit: float) -> dict[str, Any]:
-        """What the function says of a log. Raises Died, TimedOut (after ``limit`` s), Stopped, or OSError."""
+        """What the function says of a log. Raises Died, TimedOut (after ``limit`` s), Stopped, NotReady, or OSError."""
         try:
             if self.process is None:
-                self._begin(options)
+                self._ready(options)
             return self._answer({"path": path, "options": options}, limit)
         except BrokenPipeError:
-            assert self.process is not None
-            code = self.process.wait()
-            why = self._last_words()
-            self.stop()
-            how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            raise Died(f"the process that read it ended with {how}{why}") from None
+            raise Died(f"the process that read it ended with {self._ended()}") from None
         except (Stopped, TimedOut):
             self.stop()
             raise
+
+    def _ready(self, options: dict[str, Any]) -> None:
+        """Have a process that has compiled what it needs."""
+        for tried in range(1, STARTS + 1):
+            try:
+                return self._begin(options)
+            except BrokenPipeError:
+                how = self._ended()
+                if tried == STARTS:
+                    why = f"the process that reads logs ended {tried} times before it read any, with {how}"
+                    raise NotReady(why) from None
+            except TimedOut:
+                self.stop()
+                raise NotReady(
+                    f"the process that reads logs is not ready after {WARM_UP:g} s of compiling; a machine with less "
+                    f"to do is needed"
+                ) from None
+
+    def _ended(self) -> str:
+        """How the process ended, in words."""
+        assert self.process is not None
+        code = self.process.wait()
+        why = self._last_words()
+        self.stop()
+        return f"signal {-code}{why}" if code < 0 else f"exit code {code}{why}"
 
     def _begin(self, options: dict[str, Any]) -> None:
         """Start the process, and have it compile what it needs; other processes of this host wait meanwhile."""
@@ -120,6 +144,8 @@ class Reader:
 
 def _environment() -> dict[str, str]:
     """Environment of the process: one thread, and a cache of compiled code that no other host or version shares."""
+    from vaneloop.base.compiled import cache_folder
+
     own = {"NUMBA_CACHE_DIR": f"{cache_folder()}-{socket.gethostname()}"}
     return {**own, **os.environ, **ONE_THREAD}
 
@@ -158,6 +184,8 @@ def _warm_up(function: Callable[..., object] | None, options: dict[str, Any], ru
     if function is None:
         return
     from numba import config
+
+    from vaneloop.base.compiled import sources_digest
 
     cache = Path(config.CACHE_DIR)  # type: ignore[attr-defined]
     cache.mkdir(parents=True, exist_ok=True)

@@ -13,9 +13,10 @@ from vaneloop.base.errors import InputError, meant
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import BEATS, Me
 
-__all__ = ["PLACES", "needs", "rent"]
+__all__ = ["PLACES", "known", "needs", "rent"]
 
 PLACES = "local, slurm, tcp://HOST:PORT (a Dask scheduler)"
+SCHEDULERS = ("tcp://", "tls://", "ws://")
 ANSWERS = 30.0  # s within which a Dask scheduler answers
 _NEEDED = {"distributed": "dask", "duckdb": "duckdb", "psutil": "psutil"}
 
@@ -26,6 +27,12 @@ def needs(*modules: str) -> None:
         if importlib.util.find_spec(module) is None:
             name = _NEEDED.get(module, module)
             raise InputError(f"vaneloop fleet needs {name}, which is not installed: pip install 'vaneloop[fleet]'")
+
+
+def known(on: str) -> None:
+    """Raise InputError where ``on`` is none of the `PLACES`."""
+    if on not in ("local", "slurm") and not on.startswith(SCHEDULERS):
+        raise InputError(f"--on {on!r} is not known{meant(on, ['local', 'slurm'])}; allowed: {PLACES}")
 
 
 def rent(
@@ -86,7 +93,8 @@ def _result(task: Any) -> dict[str, int]:
 
 def _cluster(on: str, workers: int, queue: dict[str, str]) -> Any:
     """A cluster of our own; None: ``on`` names one that is there."""
-    if on.startswith(("tcp://", "tls://", "ws://")):
+    known(on)
+    if on.startswith(SCHEDULERS):
         return None
     if on == "local":
         from dask.distributed import LocalCluster
@@ -96,13 +104,11 @@ def _cluster(on: str, workers: int, queue: dict[str, str]) -> Any:
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0,
             silence_logs=logging.CRITICAL,
         )  # fmt: skip
-    if on == "slurm":
-        needs("dask_jobqueue")
-        options = {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "08:00:00", **queue}
-        cluster = importlib.import_module("dask_jobqueue").SLURMCluster(**options)
-        cluster.scale(jobs=workers)
-        return cluster
-    raise InputError(f"--on {on!r} is not known{meant(on, ['local', 'slurm'])}; allowed: {PLACES}")
+    needs("dask_jobqueue")
+    options = {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "08:00:00", **queue}
+    cluster = importlib.import_module("dask_jobqueue").SLURMCluster(**options)
+    cluster.scale(jobs=workers)
+    return cluster
 
 
 def _work(run: str, starter: str, every: float) -> dict[str, int]:

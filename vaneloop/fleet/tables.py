@@ -36,7 +36,14 @@ _UNSEEN = """[{"stage": "VARCHAR", "verdict": "VARCHAR", "reason": "VARCHAR"}]""
 
 
 def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
-    """The tables of a run, in a database in memory. Raises InputError where nothing is finished yet."""
+    """The tables of a run, in a database in memory. Raises InputError where nothing is finished yet, and for the folder
+    of a campaign, which has no logs.
+    """
+    if folder.of_campaign:
+        raise InputError(
+            f"{folder.path}: is a campaign's run, not a fleet's; vaneloop campaign PLAN.toml --out {folder.path} "
+            f"--report campaign.html shows it"
+        )
     if not folder.finished():
         raise InputError(f"{folder.path}: no part of the run is finished yet; vaneloop fleet status says how far it is")
     db = _database()

@@ -116,7 +116,7 @@ class _Worker:
                 self.journal.note("begin", key=e.key, path=e.path)
                 passed("begin")
                 row = self._read(e, tried, before)
-            if self.me.stopped.is_set():
+            if row is None and self.me.stopped.is_set():  # an answer that has come is kept all the same
                 return
         whole_json(self.folder.results(chunk) / f"{e.key}.json", {"key": e.key, **row})
         passed("result")
