@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,16 +53,38 @@ def calibrate(page: Any) -> None:
     page.locator(".vcard", has_text="Calibrate").evaluate("(e) => window.scrollTo(0, e.offsetTop - 480)")
 
 
+def fleet(page: Any) -> None:
+    """A run of a fleet."""
+    page.locator(".run-folder").click()
+    page.get_by_role("option").first.click()
+    page.get_by_text("What the logs say together").wait_for()
+    page.wait_for_timeout(6000)
+    page.locator(".vcard", has_text="What the logs say together").evaluate("(e) => window.scrollTo(0, e.offsetTop - 8)")
+
+
+WORK = (
+    ("", "missing", missing),
+    ("schedule", "schedule", schedule),
+    ("run", "run", run),
+    ("run", "calibrate", calibrate),
+)
+FLEET = ROOT / "out" / "fleet"  # a run of `vaneloop fleet`, for its picture
+
+
 def take(folder: Path) -> list[Path]:
     """Take every picture; return the files."""
+    out = _take(folder, ROOT / "examples", WORK)
+    if not (FLEET / "run.json").is_file():
+        print(f"no picture of a fleet: {FLEET} is no run; docs/fleet.md says how one is made")
+        return out
+    return out + _take(folder, FLEET.parent, (("fleet", "fleet", fleet),))
+
+
+def _take(folder: Path, served: Path, scenes: Sequence[tuple[str, str, Callable[[Any], None]]]) -> list[Path]:
+    """Take pictures of pages of one workbench: its address, the picture's name, what is done before."""
     out = []
-    with workbench(ROOT / "examples") as (browser, url, _):
-        for path, name, scene in (
-            ("", "missing", missing),
-            ("schedule", "schedule", schedule),
-            ("run", "run", run),
-            ("run", "calibrate", calibrate),
-        ):
+    with workbench(served) as (browser, url, _):
+        for path, name, scene in scenes:
             page = browser.new_context(viewport=WIDE, color_scheme="light").new_page()
             page.set_default_timeout(PATIENCE)
             page.goto(url.replace("/?", f"/{path}?"))

@@ -563,6 +563,46 @@ RECORD_IS_THERE = "!!document.querySelector('.open-record')"
 
 
 @needs_browser
+def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: Any, tmp_path: Path) -> None:
+    """The page says what `fleet report` says, of what is done and then of all; a click leads to a log's own page."""
+    from tests.test_fleet_report import synthetic
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.report import view_of
+    from vaneloop.fleet.tables import roll_up
+
+    folder = synthetic(server.folder / "engines", 6, 30)
+    *_, last = sorted((folder.path / "parts").iterdir())
+    last.rename(tmp_path / last.name)  # the last chunk is not done
+    so_far = view_of(roll_up(folder), {})
+    Folder.begin(server.folder / "trials", "vaneloop.fleet.trial:run_trial", {"plan": {}}, {})
+    page.goto(server.at("fleet"))
+    page.locator(".run-folder").click()
+    page.get_by_role("option", name="engines/run").click()
+    page.get_by_text("128 of 180 different contents done (180 logs)").wait_for()
+    page.get_by_text(so_far.sentence()).wait_for()
+    page.get_by_text("vaneloop fleet work engines/run").wait_for()
+    (tmp_path / last.name).rename(last)
+    page.get_by_text("180 of 180 different contents done (180 logs)").wait_for()  # by itself
+    view = view_of(roll_up(folder), {})
+    page.get_by_text(view.sentence()).wait_for()
+    for title in ("Engines and effects", "What changes", "Unlike their sisters", "What the logs could not show"):
+        page.get_by_role("heading", name=title).wait_for()
+    page.wait_for_function(f"document.querySelectorAll('.main-svg').length >= {len(view.changed) + 1}")
+    looks(page, "fleet")
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.locator('a[href^="fleet_logs/"]').first.click()
+    key = view.lacking[0]["key"]
+    page.get_by_role("heading", name=f"Log {key[:8]}").wait_for()
+    assert page.url.endswith(f"/fleet_logs/{key}.html") and not violations(page)
+    assert page.goto(page.url.replace(key[:8], "deadbeef")).status == 404
+    page.complaints.clear()  # of the 404
+    page.goto(server.at("fleet"))
+    page.locator(".run-folder").click()
+    page.get_by_role("option", name="trials").click()
+    page.get_by_text("This is a campaign's run").wait_for()
+
+
+@needs_browser
 def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: Any) -> None:
     page.add_init_script(WATCH_LAMPS)
     page.goto(server.at("run"))

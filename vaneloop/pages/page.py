@@ -30,7 +30,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.pages.figures import Figure
 from vaneloop.pages.style import THEMES, Tone, capital, number
 
-__all__ = ["Link", "Page", "write_atomically"]
+__all__ = ["Link", "Page", "Plot", "Section", "Tile", "write_atomically"]
 
 _POLICY = (  # no network at all, whatever a page may hold
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
@@ -48,8 +48,36 @@ class Link(NamedTuple):
     href: str
 
 
+class Tile(NamedTuple):
+    """A key figure, ready to be shown."""
+
+    label: str
+    value: str
+    unit: str
+    note: str
+    tone: Tone
+
+
+class Section(NamedTuple):
+    """The beginning of a section: its heading."""
+
+    title: str
+
+
+class Plot(NamedTuple):
+    """A plot: its place among the figures, what stands below it, and whether it takes half of a wide screen."""
+
+    number: int
+    caption: str
+    half: bool
+
+
 class Page:
-    """A report under construction: verdict, key figures, sections, footer."""
+    """A report under construction: verdict, key figures, sections, footer.
+
+    tiles, parts  what it holds, in its order, for whoever shows it elsewhere (the workbench); a part that is a string
+                  is HTML: paragraphs, or a table
+    """
 
     def __init__(
         self,
@@ -65,34 +93,24 @@ class Page:
     ):
         self.title, self.verdict, self.tone, self.subtitle = title, verdict, tone, subtitle
         self.facts = {"version": version or _version(), "command": command, "log": log, "state hash": state_hash}
-        self._tiles: list[str] = []
-        self._body: list[str] = []
-        self._sections: list[str] = []
+        self.tiles: list[Tile] = []
+        self.parts: list[str | Section | Plot] = []
         self.figures: list[Figure] = []
-        self._grid = False
 
     def tile(self, label: str, value: object, unit: str = "", note: str = "", tone: Tone = "neutral") -> None:
         """Add a key figure; ``note`` says in a few words what it means."""
-        e = html.escape
-        self._tiles.append(
-            f'<div class="tile {e(tone)}"><div class="label">{e(label)}</div><div '
-            f'class="value">{e(number(value))} <span class="unit">{e(unit)}</span></div><div '
-            f'class="note">{e(note)}</div></div>'
-        )
+        self.tiles.append(Tile(label, number(value), unit, note, tone))
 
     def section(self, title: str, text: str = "") -> None:
         """Begin a section: a heading and what its plots say in plain words; an empty line in ``text`` begins a new
         paragraph.
         """
-        self._end_grid()
-        self._sections.append(title)
-        self._body.append(f'<h2 id="s{len(self._sections)}">{html.escape(title)}</h2>')
+        self.parts.append(Section(title))
         self.text(text)
 
     def text(self, text: str) -> None:
         """Add paragraphs."""
-        self._end_grid()
-        self._body += [f"<p>{html.escape(p.strip())}</p>" for p in text.split("\n\n") if p.strip()]
+        self.parts += [f"<p>{html.escape(p.strip())}</p>" for p in text.split("\n\n") if p.strip()]
 
     def notes(self, notes: Sequence[str]) -> None:
         """Add what the reader should know, a sentence each, in a section of its own; nothing where there is none."""
@@ -105,22 +123,11 @@ class Page:
         """Add a plot; two ``half`` ones in a row stand side by side where the screen is wide enough."""
         if hasattr(figure, "to_plotly_json"):
             figure = json.loads(figure.to_json())
-        if half and not self._grid:
-            self._body.append('<div class="pair">')
-            self._grid = True
-        elif not half:
-            self._end_grid()
-        height = int(figure.get("layout", {}).get("height") or 400)
-        note = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-        self._body.append(
-            f'<figure><div class="box"{_REGION.format("plot")}><div class="plot" id="p{len(self.figures)}" '
-            f'style="height:{height}px"></div></div>{note}</figure>'
-        )
+        self.parts.append(Plot(len(self.figures), caption, half))
         self.figures.append(figure)
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "") -> None:
         """Add a table; numbers are rounded to three digits and set flush right."""
-        self._end_grid()
         e = html.escape
         head = ""
         for i, c in enumerate(columns):
@@ -128,16 +135,16 @@ class Page:
             head += f"<{tag}{_right(bool(rows) and all(_is_number(r[i]) for r in rows))}>{e(str(c))}</{tag}>"
         body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{_cell(v)}</td>" for v in row) + "</tr>\n" for row in rows)
         note = f"<caption>{e(caption)}</caption>" if caption else ""
-        self._body.append(
+        self.parts.append(
             f'<div class="scroll"{_REGION.format("table")}>'
             f"<table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
         )
 
     def html(self) -> str:
         """Return the whole page."""
-        self._end_grid()
         e = html.escape
-        toc = "".join(f'<a href="#s{i}">{e(s)}</a>' for i, s in enumerate(self._sections, start=1))
+        sections = [p.title for p in self.parts if isinstance(p, Section)]
+        toc = "".join(f'<a href="#s{i}">{e(s)}</a>' for i, s in enumerate(sections, start=1))
         facts = "".join(f"<div><dt>{e(k)}</dt><dd>{e(v)}</dd></div>" for k, v in self.facts.items() if v)
         parts = [
             "<!doctype html>",
@@ -151,9 +158,9 @@ class Page:
             f"<header><p "
             f'class="kicker">VaneLoop{" · " + e(self.subtitle) if self.subtitle else ""}</p><h1>{e(self.title)}</h1>'
             f'<p class="verdict {e(self.tone)}">{e(self.verdict)}</p></header>',
-            f'<div class="tiles">{"".join(self._tiles)}</div>' if self._tiles else "",
-            f'<nav aria-label="contents">{toc}</nav>' if len(self._sections) > 1 else "",
-            *self._body,
+            f'<div class="tiles">{"".join(map(_tile, self.tiles))}</div>' if self.tiles else "",
+            f'<nav aria-label="contents">{toc}</nav>' if len(sections) > 1 else "",
+            *self._body(),
             f"<footer><dl>{facts}</dl></footer>",
             "</main>",
             *(self._scripts() if self.figures else []),
@@ -176,10 +183,36 @@ class Page:
         """Write the page in one go: a reader never sees half of it. Raises InputError when it cannot be written."""
         return write_atomically(path, self.html())
 
-    def _end_grid(self) -> None:
-        if self._grid:
-            self._body.append("</div>")
-            self._grid = False
+    def _body(self) -> list[str]:
+        """The parts as HTML; half plots that follow each other stand in one grid."""
+        out, grid, sections = [], False, 0
+        for part in self.parts:
+            half = isinstance(part, Plot) and part.half
+            if half != grid:
+                out.append('<div class="pair">' if half else "</div>")
+                grid = half
+            if isinstance(part, Section):
+                sections += 1
+                out.append(f'<h2 id="s{sections}">{html.escape(part.title)}</h2>')
+            elif isinstance(part, Plot):
+                height = int(self.figures[part.number].get("layout", {}).get("height") or 400)
+                note = f"<figcaption>{html.escape(part.caption)}</figcaption>" if part.caption else ""
+                out.append(
+                    f'<figure><div class="box"{_REGION.format("plot")}><div class="plot" id="p{part.number}" '
+                    f'style="height:{height}px"></div></div>{note}</figure>'
+                )
+            else:
+                out.append(part)
+        return [*out, "</div>"] if grid else out
+
+
+def _tile(t: Tile) -> str:
+    e = html.escape
+    return (
+        f'<div class="tile {e(t.tone)}"><div class="label">{e(t.label)}</div><div '
+        f'class="value">{e(t.value)} <span class="unit">{e(t.unit)}</span></div><div '
+        f'class="note">{e(t.note)}</div></div>'
+    )
 
 
 def write_atomically(path: str | Path, text: str) -> Path:

@@ -25,7 +25,7 @@ __all__ = [
     "PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "list_of_moments", "opened", "table", "tone",
 ]  # fmt: skip
 
-PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"))
+PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"), ("/fleet", "Fleet"))
 PRIMARY = "#1f6fc4"
 MOMENTS = 200  # that are listed
 OFTEN = 0.05  # s between two looks at what has changed

@@ -1,4 +1,4 @@
-"""The server: one session a browser, the three pages, curves, saved files, behind the guard."""
+"""The server: one session a browser, the four pages, curves, saved files, behind the guard."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI, Request, Response
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from nicegui import Client, ui
 from nicegui import app as pages
 
-from vaneloop.web import missing, run, schedule
+from vaneloop.web import fleet, missing, run, schedule
 from vaneloop.web.charts import Curves, view
 from vaneloop.web.guard import Guard
 from vaneloop.web.private import private_folder
@@ -30,7 +30,7 @@ __all__ = ["serve"]
 
 MOST_SESSIONS = 6  # one without an open tab gives way
 RECONNECT = 60.0  # s that a tab may be out of reach and still counts as open: a browser on a busy machine answers late
-PAGES = ("/", "/schedule", "/run")
+PAGES = ("/", "/schedule", "/run", "/fleet")
 FULL = f"""{MOST_SESSIONS} browsers are at work here, each with an open tab, and that is the limit.
 
 Close a tab of one of them; after {RECONNECT:.0f} s its place is free.
@@ -124,6 +124,7 @@ def _serve(
 
     def new(key: str) -> Session:
         session = Session(key, private / secrets.token_hex(8), list(files), tables, controller)
+        session.extra["served"] = folder
         session.search.start()  # ready by the time that a log is chosen
         session.bench.start()
         return session
@@ -145,7 +146,7 @@ def _serve(
             return None
 
     for path, title, module in zip(
-        PAGES, ("missing physics", "schedule", "run"), (missing, schedule, run), strict=True
+        PAGES, ("missing physics", "schedule", "run", "fleet"), (missing, schedule, run, fleet), strict=True
     ):
         page(path, title, module.build)
 
@@ -178,6 +179,15 @@ def _serve(
         if path is None or not path.is_file():
             return PlainTextResponse("nothing saved", 404)
         return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+
+    @pages.get(f"/{fleet.LOGS}/{{name}}")
+    async def _fleet_log(name: str, request: Request) -> Response:
+        session = mine(request)
+        found = session.extra.get("fleet") if session is not None else None
+        text = None if found is None else await found.log(name)
+        if text is None:
+            return PlainTextResponse("no such log in the run that is looked at", 404)
+        return HTMLResponse(text, headers={"Cache-Control": "no-store"})
 
     pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
     pages.on_shutdown(sessions.close)

@@ -351,6 +351,42 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
     return {"result": result, "files": [*files, str(schedule_page(result, Path(out) / "schedule.html", command))]}
 
 
+def fleet_state(progress: Progress, run: str) -> dict[str, Any]:
+    """How far a fleet's run is, as ``vaneloop fleet status`` says it, and whether it is a campaign's."""
+    from vaneloop.fleet.rent import needs
+
+    needs("psutil", "duckdb")
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.state import state_of
+
+    folder = Folder(run)
+    return {**state_of(folder).json(), "campaign": folder.of_campaign}
+
+
+def fleet_report(progress: Progress, run: str, logs: str) -> Any:
+    """The page that ``vaneloop fleet report`` writes; None for a campaign's run."""
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.report import view_of
+    from vaneloop.fleet.tables import roll_up
+    from vaneloop.pages.fleet import fleet_page
+
+    folder = Folder(run)
+    return None if folder.of_campaign else fleet_page(view_of(roll_up(folder), {}, run), logs=logs)
+
+
+def fleet_log(progress: Progress, run: str, key: str) -> str:
+    """The page of one log of a run, as HTML."""
+    from vaneloop.base.errors import InputError
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.tables import answers
+    from vaneloop.pages.fleet import log_page
+
+    found = answers(Folder(run), [key])
+    if key not in found:
+        raise InputError(f"{run}: has no answer to {key}")
+    return log_page(key, found[key]).html()
+
+
 TASKS: dict[str, Callable[..., Any]] = {
     **{
         f.__name__: f
@@ -368,6 +404,9 @@ TASKS: dict[str, Callable[..., Any]] = {
             command,
             engine_part,
             schedule_step,
+            fleet_state,
+            fleet_report,
+            fleet_log,
         )
     },
     "ahead": refit,  # the same, before the user asks for it
