@@ -13,10 +13,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bus, measure, native, tools, web
+from benchmarks import bus, fleet, measure, native, tools, web
 from benchmarks.measure import ROOT, Row, machine
 
-MEASUREMENTS = measure.MEASUREMENTS | native.MEASUREMENTS | bus.MEASUREMENTS | tools.MEASUREMENTS | web.MEASUREMENTS
+MEASUREMENTS = {
+    **measure.MEASUREMENTS, **native.MEASUREMENTS, **bus.MEASUREMENTS, **tools.MEASUREMENTS, **web.MEASUREMENTS,
+    **fleet.MEASUREMENTS,
+}  # fmt: skip
 
 
 def main() -> None:

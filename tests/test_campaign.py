@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -23,6 +27,7 @@ from vaneloop.cli.main import main
 from vaneloop.fleet import campaign
 from vaneloop.fleet.plan import draw, groups, load_plan
 from vaneloop.fleet.worker import work
+from vaneloop.pages.campaign import campaign_page
 
 
 @pytest.fixture(autouse=True)
@@ -150,6 +155,43 @@ def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path:
     assert theirs.same and "--controller" in theirs.command and "abort" in theirs.seen[0]
 
 
+def test_calibrations_and_firmwares_of_one_s_own_and_a_kill_within_a_trial(tmp_path: Path) -> None:
+    """A second calibration acts, a controller that works passes, and what a kill leaves is gone on with."""
+    if shutil.which("gcc") is None or shutil.which("make") is None:
+        pytest.skip("no C compiler, or no make")
+    assert main(["new-controller", str(tmp_path / "mine"), "--quiet"]) == 0
+    subprocess.run(["make", "-s"], cwd=tmp_path / "mine", check=True)
+    shutil.copytree(ROOT / "tables", tmp_path / "soft")
+    calibration = tmp_path / "soft" / "calibration.toml"
+    text = calibration.read_text()
+    calibration.write_text(text.replace("kp = { value = 16.0,", "kp = { value = 8.0,"))
+    assert calibration.read_text() != text
+    more = '[[calibration]]\nname = "soft"\ntables = "soft"\n'
+    more += '[[firmware]]\nname = "shipped"\n[[firmware]]\nname = "mine"\ncontroller = "mine/my_controller.so"\n'
+    plan = write(tmp_path, 60.0, more)  # wide: what is held here is which files act
+    plan.write_text(plan.read_text().replace("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 4\nsearch = 0"))
+    read, quantities, folder = campaign.begin(plan, tmp_path / "run", 3600.0)
+    assert campaign.take_samples(read, quantities, folder) == 8
+    script = "import sys; from vaneloop.fleet.worker import work; work(sys.argv[1])"
+    env = {**os.environ, "VANELOOP_FLEET_KILL": "begin:3"}
+    killed = subprocess.run([sys.executable, "-c", script, str(folder.path)], env=env, cwd=ROOT, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert work(folder.path) == {"done": 6}, "two were done, the third is done again"
+    view = campaign.judge(read, quantities, folder, lambda fraction: None)
+    assert [g.name for g in view.groups] == ["still.soft.shipped", "still.soft.mine"]
+    for g in view.groups:
+        assert (g.trials, g.failed, g.lost) == (4, 0, 0) and g.same and view.passed(g), (g.name, g.seen)
+        assert "--tables" in g.command and ("--controller" in g.command) == (g.firmware == "mine")
+    words = view.groups[0].command.split()
+    for without, same in (([], True), (words[words.index("--tables") :][:2], False)):  # the calibration acts
+        again = [w for w in words[1:] if w not in without]
+        assert main([*again, "--json", str(tmp_path / "again.json"), "--quiet"]) == 0
+        (o,) = json.loads((tmp_path / "again.json").read_text())["scenarios"]
+        assert (o["state_hash"] == view.groups[0].state_hash) == same
+    page = campaign_page(view, "").html()
+    assert "no search was made" in page
+
+
 # ---- plans -----------------------------------------------------------------------------------------------------------
 
 BAD = [  # what is put in place of what, and what the line names
@@ -158,6 +200,7 @@ BAD = [  # what is put in place of what, and what the line names
     ("[1.1, 1.3]", "[1.3, 1.1]", "must be below high"),
     ("[1.1, 1.3]", "[0.001, 1.3]", "engine.lag (=0.001 s) must be in"),
     ("samples = 16", "samples = 17", "power of two"),
+    ("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 4", "must be at least 5 where a search"),
     ("still.toml", "stil.toml", "stil.toml: no such file"),
     ("search = 16", "serach = 16", "serach"),
 ]

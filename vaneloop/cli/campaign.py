@@ -73,7 +73,7 @@ def command(args: argparse.Namespace) -> int:
     _work(args, folder, "searching for the worst case")
     with terminal.progress_bar(args, "running the worst cases again") as progress:
         view = campaign.judge(plan, quantities, folder, progress or (lambda fraction: None))
-    _show(args, view)
+    _show(args, view, plan.search)
     terminal.write_json(args, view.json())
     if args.report:
         words = " ".join(["vaneloop campaign", *sys.argv[2:]])
@@ -99,7 +99,7 @@ def _work(args: argparse.Namespace, folder: object, what: str) -> None:
              lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
 
 
-def _show(args: argparse.Namespace, view: CampaignView) -> None:
+def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
     rows = [
         [g.name, "passes" if view.passed(g) else "FAILS", f"{g.failed} of {g.trials}", f"{g.low:.2g} to {g.high:.2g}",
          f"{g.least:.3g}", "search" if g.by_search else "sample", "yes" if g.same else "NO"] for g in view.groups
@@ -114,6 +114,8 @@ def _show(args: argparse.Namespace, view: CampaignView) -> None:
                 terminal.say(args, f"broken {where}: {g.name}: {r.expected}")
         if g.lost:
             terminal.say(args, f"without an answer: {g.lost} trials of {g.name}; vaneloop fleet status says what came")
+        if search and not g.runs:
+            terminal.say(args, f"no search in {g.name}: too few of its trials have an answer")
         terminal.say(args, f"worst case: {g.command}")
     terminal.say(args, view.sentence())
 

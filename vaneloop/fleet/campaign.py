@@ -75,7 +75,7 @@ def take_searches(plan: Plan, folder: Folder) -> int:
         rows = [row for row in _rows(folder, g).values() if row is not None]
         among = moving(rows)
         known = [(row["point"], worst_share(row, among)) for row in rows]
-        if plan.search and len(known) >= 5:
+        if plan.search and len(known) >= plans.LEAST:
             known.sort(key=lambda k: (k[1], k[0]))
             trials.append(_trial(folder, g, "search", {"search": plan.search, "among": among, "known": known[:KNOWN]}))
     return folder.add([Source(t, "campaign", 0.0) for t in trials], in_chunk=1) if trials else 0

@@ -42,7 +42,7 @@ from vaneloop.base.tables import Finite, Table, read
 from vaneloop.verbs.machine import Machine
 
 __all__ = [
-    "Group", "Plan", "Varied", "as_options", "base_model", "draw", "files_of_plan", "group_machine", "groups",
+    "LEAST", "Group", "Plan", "Varied", "as_options", "base_model", "draw", "files_of_plan", "group_machine", "groups",
     "load_plan", "model_of", "scenario_of", "varied",
 ]  # fmt: skip
 
@@ -63,6 +63,9 @@ class Choice(Table):
         if not _NAME.fullmatch(name):
             raise ValueError(f"name (={name!r}) must be letters, digits, - and _")
         return name
+
+
+LEAST = 5  # samples that a search begins with
 
 
 class Plan(Table):
@@ -110,6 +113,8 @@ class Plan(Table):
         for stem in stems:
             if not _NAME.fullmatch(stem):
                 raise ValueError(f"scenarios: a file's name (={stem!r}) must be letters, digits, - and _")
+        if self.search and self.samples < LEAST:
+            raise ValueError(f"samples (={self.samples}) must be at least {LEAST} where a search begins with them")
         if self.sensitivity > self.samples:
             raise ValueError(f"sensitivity (={self.sensitivity}) must not be above samples (={self.samples})")
         for key in ("samples", "sensitivity"):

@@ -101,8 +101,8 @@ def _cluster(on: str, workers: int, queue: dict[str, str]) -> Any:
 
         # each worker's logs are read in a process of its own, whose memory is not Dask's to count
         return LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0,
-            silence_logs=logging.CRITICAL,
+            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=logging.CRITICAL,
+            dashboard_address="127.0.0.1:0",  # any port: without one Dask takes 8787, and warns where that is taken
         )  # fmt: skip
     needs("dask_jobqueue")
     options = {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "08:00:00", **queue}

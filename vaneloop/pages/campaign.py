@@ -170,9 +170,9 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     line = Line("machines", order, (np.arange(len(order)) + 1.0) / len(order), "model", 2.2)
     page.plot(overlay([Panel("share of machines", [line])], "least margin at or below", 320),
               "How the least margin is spread over the machines.", half=True)  # fmt: skip
-    how = (
-        f"by the search ({g.runs} runs)" if g.by_search else f"among the samples; the search ({g.runs} runs) found none"
-    )
+    how = f"by the search ({g.runs} runs)"
+    if not g.by_search:
+        how = f"among the samples; {f'the search ({g.runs} runs) found none' if g.runs else 'no search was made'}"
     page.text(f"Worst machine, found {how}; least margin {g.least:.4g}." + "".join(f" Seen: {s}." for s in g.seen))
     page.table(
         ["quantity", "worst machine", "low", "high", "unit"],

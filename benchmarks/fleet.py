@@ -1,0 +1,195 @@
+"""Fleets: a run folder of 100,000 logs, two workers against one, and a report held against what is true.
+
+python -m benchmarks fleet                          # the folder of 100,000 logs, and the workers; free cores
+python -m benchmarks.fleet judge RUN TRUTH.json     # a run over the logs of `vaneloop fleet demo`
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import ROOT, Row
+
+__all__ = ["MEASUREMENTS", "judged"]
+
+LOGS, ENGINES = 100_000, 200
+RIGHT = 0.1  # of the time axis, by which an onset may be off
+
+
+# ---- a folder of many logs -------------------------------------------------------------------------------------------
+
+
+def _measured(*words: str) -> tuple[float, float, float, str]:
+    """Run a command of ours: wall time and processor time (s), greatest memory (GiB), and what it said."""
+    began = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as said:
+        p = subprocess.Popen(
+            [sys.executable, "-m", "vaneloop", *words], cwd=ROOT, stdout=said, stderr=subprocess.STDOUT
+        )
+        _, status, used = os.wait4(p.pid, 0)
+        wall = time.perf_counter() - began
+        said.seek(0)
+        text = said.read()
+    p.returncode = os.waitstatus_to_exitcode(status)
+    if p.returncode not in (0, 1):
+        raise RuntimeError(f"{' '.join(words)}: {text[-300:]}")
+    return wall, used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20, text
+
+
+def _many(folder: Path) -> None:
+    """A run of 100,000 logs with answers drawn by chance; the logs are there, and hold nothing."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from tests.test_fleet_report import synthetic
+    from vaneloop.cli import fleet
+    from vaneloop.fleet.folder import Folder
+
+    made = synthetic(folder / "made", ENGINES, LOGS // ENGINES)
+    logs = folder / "logs"
+    parser = argparse.ArgumentParser()
+    fleet.add_options(parser)
+    options, files = fleet._job(parser.parse_args(["run", str(logs), "--out", "x"]))
+    run = Folder.begin(folder / "run", "vaneloop.fleet.diagnosis:diagnose_log", options, files)
+    (batch,) = (made.path / "logs").iterdir()
+    rows = pq.read_table(batch).to_pylist()
+    for row in rows:
+        path = logs / str(row["path"]).removeprefix("/logs/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        row |= {"path": str(path), "size": 0, "mtime_ns": path.stat().st_mtime_ns}
+    (run.path / "logs").mkdir()
+    pq.write_table(pa.Table.from_pylist(rows, schema=pq.read_schema(batch)), run.path / "logs" / batch.name)
+    (made.path / "parts").rename(run.path / "parts")
+
+
+def hundred_thousand() -> Iterator[Row]:
+    """List, go on with, and report a run of 100,000 logs."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        _many(folder)
+        run, logs = str(folder / "run"), str(folder / "logs")
+        for what, limit, words in (
+            ("list (fleet status)", 10.0, ("fleet", "status", run)),
+            ("go on (fleet run, nothing new)", 10.0, ("fleet", "run", logs, "--out", run)),
+            ("report", 60.0, ("fleet", "report", run, "--report", str(folder / "fleet.html"))),
+        ):
+            wall, cpu, memory, text = _measured(*words)
+            assert "100,000" in text or what == "report", text
+            yield Row(
+                f"100,000 logs: {what}", f"{wall:.1f} s, {memory:.2f} GiB", f"{limit:.0f} s, 2 GiB", wall / limit,
+                "at most 1", wall <= limit and memory <= 2.0, f"{cpu:.1f} s of a core; load {os.getloadavg()[0]:.0f}",
+            )  # fmt: skip
+
+
+# ---- workers ---------------------------------------------------------------------------------------------------------
+
+
+def workers() -> Iterator[Row]:
+    """Forty logs by one worker and by two; both cores must be free."""
+    with tempfile.TemporaryDirectory() as place:
+        logs = f"{place}/logs"
+        _measured("fleet", "demo", "--engines", "4", "--logs", "40", "--out", logs)
+        seconds = []
+        for n in (1, 1, 2):  # the first run compiles
+            seconds.append(
+                _measured("fleet", "run", logs, "--out", f"{place}/run{len(seconds)}", "--workers", str(n))[0]
+            )
+        share = seconds[1] / (2.0 * seconds[2])
+        yield Row(
+            "a fleet of 40 logs, one worker and two", f"{seconds[2]:.0f} s", f"{seconds[1]:.0f} s", share,
+            "efficiency at least 0.9", share >= 0.9, f"load {os.getloadavg()[0]:.1f}",
+        )  # fmt: skip
+
+
+MEASUREMENTS = {"a fleet's run of 100,000 logs": hundred_thousand, "a fleet's workers": workers}
+
+
+# ---- a report against the truth --------------------------------------------------------------------------------------
+
+
+def judged(run: str, truth_file: str) -> dict[str, Any]:
+    """Hold the report of a run against ``truth.json`` of `vaneloop fleet demo`.
+
+    A growth is found where the engine's own quantity is said to change: the effect's parameter, or the nominal one that
+    it moves. Its onset is right within a tenth of the time axis.
+    """
+    from plant.effects import EFFECTS
+    from vaneloop.base.vanes import VANES
+    from vaneloop.cli.fleet_demo import YEAR, YEARS
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.report import view_of
+    from vaneloop.fleet.sources import moment
+    from vaneloop.fleet.tables import roll_up
+
+    truth = json.loads(Path(truth_file).read_text(encoding="utf-8"))
+    begin, year = moment(truth["begin"]), YEAR.total_seconds()
+    view = view_of(roll_up(Folder(run)), {})
+    growths, healthy, others = [], [], []
+    for t in truth["engines"]:
+        engine, kind = t["engine"], t["fate"]
+        found = [s for s in view.changed if s.engine == engine]
+        lacks = [r["effect"] for r in view.lacking if r["engine"] == engine]
+        odd = [r["quantity"] for r in view.outliers if r["engine"] == engine]
+        if kind == "healthy":
+            healthy.append({"engine": engine, "lacks": lacks, "changes": [s.quantity for s in found], "odd": odd})
+            continue
+        declared = EFFECTS[t["effect"]].parameters
+        vane = next((p for p in declared if p.name == VANES[t["stage"]]), None)
+        parameter = vane or declared[0]
+        nominal = {"linkage_backlash": f"linkage.{parameter.name}_play", "pot_bias": f"sensors.{parameter.name}_bias"}
+        names = (f"{t['effect']}.{parameter.name}", nominal.get(t["effect"], ""))
+        own = sorted((s for s in found if s.quantity in names), key=lambda s: names.index(s.quantity))
+        row = {
+            "engine": engine,
+            "fate": kind,
+            "lacks": t["effect"] in lacks,
+            "quantity": own[0].quantity if own else "",
+        }
+        if t["comes"] != "always":
+            size = t["size"] / parameter.si
+            true = size / (YEARS - t["onset_years"]) if t["comes"] == "growth" else size
+            row |= {"true_onset": t["onset_years"], "true_rate": true}
+        if own:
+            x = own[0].trend
+            row |= {"kind": x["kind"], "onset": (x["onset"] - begin) / year, "rate": x["rate"]}
+            row |= {"low": x["rate_low"], "high": x["rate_high"], "unit": own[0].unit}
+        (growths if t["comes"] == "growth" else others).append(row)
+    known = [g for g in growths if g["quantity"]]
+    right = [g for g in known if abs(g["onset"] - g["true_onset"]) <= RIGHT * YEARS]
+    covered = [g for g in known if g["low"] <= g["true_rate"] <= g["high"]]
+    accused = [h for h in healthy if h["lacks"] or h["changes"] or h["odd"]]
+    return {
+        "logs": view.statuses, "growths": growths, "others": others, "accused": accused, "healthy": len(healthy),
+        "found": len(known), "right": len(right), "covered": len(covered),
+    }  # fmt: skip
+
+
+def _show(said: dict[str, Any]) -> None:
+    for g in [*said["growths"], *said["others"]]:
+        text = " ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in g.items())
+        print(text)
+    for h in said["accused"]:
+        print("healthy and accused:", h)
+    n, found = len(said["growths"]), said["found"]
+    print(f"logs: {said['logs']}")
+    print(f"growths found: {found} of {n}")
+    print(f"onset within a tenth of the time axis: {said['right']} of {found} found")
+    print(f"true growth within the 90 % interval: {said['covered']} of {found} found")
+    print(f"healthy engines accused: {len(said['accused'])} of {said['healthy']}")
+
+
+if __name__ == "__main__":
+    words = sys.argv[1:]
+    if len(words) != 3 or words[0] != "judge":
+        raise SystemExit(__doc__)
+    _show(judged(words[1], words[2]))
