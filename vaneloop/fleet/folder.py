@@ -184,8 +184,9 @@ class Folder:
             before = list(_rows(batches))
             known = {e.path: e for e in before}
             keys = {e.key for e in before if e.chunk} - again
+            other = [s for s in logs if not _same(s, known.get(s.path), again)]
             with ThreadPoolExecutor(8) as pool:
-                looked = pool.map(lambda s, known=known: _look(s, known.get(s.path), again), logs)
+                looked = pool.map(lambda s, known=known: _look(s, known.get(s.path), again), other)
                 new = [e for e in looked if e is not None]
             if not new:
                 return 0
@@ -271,6 +272,17 @@ def _schema() -> Any:
         ("path", text), ("key", text), ("size", number), ("mtime_ns", number), ("chunk", text), ("engine", text),
         ("time", pa.float64()), ("reason", text),
     ])  # fmt: skip
+
+
+def _same(s: Source, known: Entry | None, again: Set[str]) -> bool:
+    """Whether a log is as it is ``known``, and not to be done once more: nothing has to be read for that."""
+    if known is None or known.key in again or s.engine not in ("", known.engine) or s.time not in (None, known.time):
+        return False
+    try:
+        there = os.stat(s.path)
+    except OSError:
+        return False
+    return stat.S_ISREG(there.st_mode) and (known.size, known.mtime_ns) == (there.st_size, there.st_mtime_ns)
 
 
 def _look(s: Source, known: Entry | None, again: Set[str]) -> Entry | None:

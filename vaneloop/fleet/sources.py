@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
@@ -76,9 +77,11 @@ def _files(places: Sequence[str]) -> Iterator[str]:
     for place in places:
         p = Path(place)
         if p.is_dir():
-            for f in p.rglob("*"):
-                if f.suffix.lower() in SUFFIXES and f.name[0] != "." and (f.is_symlink() or _is_file(f)):
-                    yield str(f.absolute())
+            for folder, _, names in os.walk(p.absolute()):
+                for name in names:
+                    f = os.path.join(folder, name)
+                    if name[0] != "." and f.lower().endswith(SUFFIXES) and (os.path.islink(f) or os.path.isfile(f)):
+                        yield f
         elif _is_file(p):
             yield str(p.absolute())
         else:

@@ -11,6 +11,7 @@ from typing import Any
 from vaneloop.fleet.files import read_json
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import Leases, gone
+from vaneloop.fleet.tables import database
 
 __all__ = ["State", "came_to", "state_of", "tidy"]
 
@@ -42,13 +43,10 @@ class State:
 
 def came_to(folder: Folder) -> dict[str, str]:
     """Status of every content in a finished chunk; of one that was done again, the later."""
-    import pyarrow.parquet as pq
-
-    out: dict[str, str] = {}
-    for chunk in sorted(folder.finished()):
-        table = pq.read_table(folder.path / "parts" / f"{chunk}.parquet", columns=["key", "status"])
-        out.update(zip(table["key"].to_pylist(), table["status"].to_pylist(), strict=True))
-    return out
+    if not folder.finished():
+        return {}
+    query = "SELECT key, status FROM read_parquet($1, filename = true) ORDER BY filename"
+    return dict(database().execute(query, [str(folder.path / "parts" / "*.parquet")]).fetchall())
 
 
 def state_of(folder: Folder) -> State:

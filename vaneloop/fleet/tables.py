@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from vaneloop.fleet.folder import Folder
 
-__all__ = ["TABLES", "answers", "roll_up", "write_tables"]
+__all__ = ["TABLES", "answers", "database", "roll_up", "write_tables"]
 
 TABLES = ("logs", "effects", "nominal", "coverage")
 MEMORY = "700MB"
@@ -46,7 +46,7 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
         )
     if not folder.finished():
         raise InputError(f"{folder.path}: no part of the run is finished yet; vaneloop fleet status says how far it is")
-    db = _database()
+    db = database()
     entries, parts = str(folder.path / "logs" / "*.parquet"), str(folder.path / "parts" / "*.parquet")
     db.execute(  # of a path and of a content the latest counts
         "CREATE TEMP TABLE entries AS SELECT path, key, engine, time, reason FROM read_parquet($1, filename = true) "
@@ -82,7 +82,7 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
     return db
 
 
-def _database() -> duckdb.DuckDBPyConnection:
+def database() -> duckdb.DuckDBPyConnection:
     """A database in memory; what does not fit goes to the system's folder for temporary files, not to where the user
     stands.
     """
@@ -98,7 +98,7 @@ def answers(folder: Folder, keys: list[str]) -> dict[str, dict[str, Any]]:
     """The answers to some logs by their keys, as ``vaneloop diagnose --json`` gives them."""
     import json
 
-    rows = _database().execute(
+    rows = database().execute(
         "SELECT key, answer FROM read_parquet($1, filename = true) WHERE list_contains($2, key) AND answer IS NOT NULL "
         "ORDER BY filename", [str(folder.path / "parts" / "*.parquet"), keys],
     ).fetchall()  # fmt: skip
