@@ -104,6 +104,7 @@ NOT_RUN: dict[str, str] = {
     "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
     "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
     "python -m benchmarks": "measures for minutes; no test judges time",
+    "python -m benchmarks.fleet": "holds a run of hundreds of logs against its truth",
     "vaneloop fleet": "needs the logs of many engines; tests/test_fleet_run.py, tests/test_fleet_report.py",
     "vaneloop campaign": "runs for minutes, on workers; tests/test_campaign.py",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",

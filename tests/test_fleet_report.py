@@ -174,6 +174,70 @@ def test_an_odd_engine_is_seen_also_beside_other_odd_ones() -> None:
     assert np.mean(hits) >= 0.9
 
 
+def test_an_interval_is_no_narrower_than_what_all_logs_have_wrong_together() -> None:
+    """Logs that agree better than they claim: a gauge that reads 0.4 % too much leaves no scatter."""
+    t = np.linspace(0.0, 2.0, 12)
+    found = trend(t, 1.004 * 0.5 * np.maximum(t - 0.7, 0.0), np.full(12, 0.03))
+    assert found.kind == "growth" and found.rate_low <= 0.5 <= found.rate_high
+    assert found.rate_high - found.rate_low > 0.02
+
+
+def made(**tables: list[dict[str, Any]]) -> Any:
+    """A database as `roll_up` gives it, of these rows."""
+    import duckdb
+    import polars as pl
+
+    db = duckdb.connect()
+    for name, rows in tables.items():
+        db.register("rows", pl.DataFrame(rows).to_arrow())
+        db.execute(f"CREATE TABLE {name} AS SELECT * FROM rows")
+    return db
+
+
+def logs_of(engine: str, years: list[float]) -> list[dict[str, Any]]:
+    done = {"status": "done", "reason": "", "verdict": "none", "duration_s": 60.0}
+    at = [(f"{engine}/{k:03d}", BEGIN + y * YEAR) for k, y in enumerate(years)]
+    return [{"path": p, "engine": engine, "time": t, "key": p} | done for p, t in at]
+
+
+NO_COVERAGE = [{"path": "", "engine": "", "time": 0.0, "key": "", "effect": "", "stage": "", "needs": ""}]
+OF = ("path", "engine", "time", "key")
+
+
+def test_what_a_log_did_not_tell_is_no_change() -> None:
+    """Six logs leave a parameter where the table has it, three tell it: it has not changed."""
+    logs = logs_of("e", np.linspace(0.0, 1.9, 9).tolist())
+    row = {"stage": "engine", "parameter": "engine.deceleration", "unit": "%/s", "table": 10.0, "tolerance": 0.5}
+    nominal = []
+    for k, log in enumerate(logs):
+        value, half = (10.0, 0.4749) if k < 6 else (10.1978 + 1e-4 * (k - 7), 0.008)
+        nominal.append({n: log[n] for n in OF} | row | {"value": value, "low": value - half, "high": value + half})
+    sizes = {"effect": "none", "stage": "", "parameter": "", "unit": "", "value": 0.0, "low": 0.0, "high": 0.0}
+    effects = [{n: logs[0][n] for n in OF} | sizes | {"neutral": 0.0, "probability": 0.0}]
+    view = view_of(made(logs=logs, effects=effects, nominal=nominal, coverage=NO_COVERAGE), {})
+    (series,) = (s for s in view.series if s.kind == "nominal")
+    assert len(series.t) == 3 and series.trend["kind"] == "too few" and not view.changed
+
+
+def test_a_size_that_no_log_tells_from_nothing_makes_silent_logs_no_surer() -> None:
+    """An engine whose wear is named late; of another, the same stage has a size of 0.0003 +- 0.04 deg."""
+    years, onset, rate = np.linspace(0.1, 1.9, 9), 0.42, 0.41
+    logs, effects = [*logs_of("worn", years.tolist()), *logs_of("other", years.tolist())], []
+    row = {"effect": "linkage_backlash", "stage": "linkage", "parameter": "vgv2", "unit": "deg", "neutral": 0.0}
+    for k, log in enumerate(logs):
+        size = rate * max(float(years[k % 9]) - onset, 0.0) if k < 9 else 0.0003
+        if k < 9 and size < 0.19 or k >= 9 and k % 9 < 6:
+            continue  # not named
+        here = {n: log[n] for n in OF} | row | {"value": size, "low": size - 0.04, "high": size + 0.04}
+        effects.append(here | {"probability": 0.9})
+    idle = {"stage": "", "parameter": "", "unit": "", "value": 0.0, "low": 0.0, "high": 0.0, "table": 0.0}
+    nominal = [{n: logs[0][n] for n in OF} | idle | {"tolerance": 0.0}]
+    view = view_of(made(logs=logs, effects=effects, nominal=nominal, coverage=NO_COVERAGE), {})
+    (wear,) = (s for s in view.changed if s.engine == "worn")
+    assert wear.trend["rate_low"] <= rate <= wear.trend["rate_high"]
+    assert abs(wear.trend["onset"] - BEGIN - onset * YEAR) < 0.2 * YEAR
+
+
 # ---- tables and page -------------------------------------------------------------------------------------------------
 
 

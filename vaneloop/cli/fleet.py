@@ -64,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     demo.add_argument("--out", required=True, metavar="DIR", help="folder of the logs; what is there stays")
     demo.add_argument("--engines", type=int, default=40, metavar="N", help="number of engines (default 40)")
     demo.add_argument("--logs", type=int, default=2000, metavar="N", help="logs of all together (default 2000)")
-    demo.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of a log (default 300 s)")
+    demo.add_argument("--duration", type=float, default=60.0, metavar="S", help="length of a log (default 60 s)")
     demo.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")
     demo.add_argument("--workers", type=int, default=2, metavar="N", help="logs simulated side by side (default 2)")
     for part in (work, status, report):

@@ -27,6 +27,9 @@ FALSE = (
 CHANCE = 1e-3  # that an engine with no more than that is said to lack the effect
 MINIMUM = 2  # logs that name an effect, before an engine is said to lack it
 SPREAD = 2.0 * 1.6449  # a 90 % interval over a standard deviation
+# of the interval that the tolerance alone gives (a uniform draw's deviation is tolerance / sqrt 3), from which on a log
+# has told nothing of a nominal parameter: it stands where the table has it
+UNTOLD = 0.9 * SPREAD / 3.0**0.5
 
 
 def limits_of(file: str | None) -> dict[str, float]:
@@ -101,16 +104,20 @@ def _lacks(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
 
 
 def _effects(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> list[Series]:
-    """Sizes over time of every effect that an engine lacks; logs that could show it and did not say it is small."""
+    """Sizes over time of every effect that an engine lacks; logs that could show it and did not say it is small.
+
+    How small: as the smallest size that any log of the fleet tells from nothing.
+    """
     rows = db.execute(
         "SELECT engine, effect, stage, parameter, unit, neutral, list(time ORDER BY path), list(value ORDER BY path), "
         "list(high - low ORDER BY path), list(key ORDER BY path) FROM effects WHERE time IS NOT NULL GROUP BY ALL "
         "ORDER BY ALL"
     ).fetchall()
-    smallest: dict[tuple[str, str], float] = {}
-    for _, effect, _, parameter, _, neutral, _, values, _, _ in rows:
-        sizes = [abs(v - neutral) for v in values if v is not None and v != neutral]
-        smallest[effect, parameter] = min([smallest.get((effect, parameter), np.inf), *sizes])
+    told = db.execute(
+        "SELECT effect, parameter, min(abs(value - neutral)) FROM effects WHERE low > neutral OR high < neutral "
+        "GROUP BY ALL"
+    ).fetchall()
+    smallest = {(effect, parameter): float(size) for effect, parameter, size in told}
     real = {(r["engine"], r["effect"]) for r in lacks if r["lacks"]}
     out = []
     for engine, effect, _, parameter, unit, neutral, times, values, widths, keys in rows:
@@ -121,7 +128,8 @@ def _effects(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> 
             "EXISTS (SELECT 1 FROM effects e WHERE e.path = l.path AND e.effect = $2) AND NOT EXISTS (SELECT 1 FROM "
             "coverage c WHERE c.path = l.path AND c.effect = $2) ORDER BY l.path", [engine, effect],
         ).fetchall()  # fmt: skip
-        least = smallest[effect, parameter]
+        if (least := smallest.get((effect, parameter))) is None:
+            continue  # no log tells it from nothing
         out.append(_series(
             engine, f"{effect}.{parameter}", unit, [*times, *(s[0] for s in silent)],
             [*values, *[neutral] * len(silent)], [*widths, *[least * SPREAD] * len(silent)],
@@ -131,12 +139,13 @@ def _effects(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> 
 
 
 def _nominal(db: duckdb.DuckDBPyConnection) -> list[Series]:
-    """Every nominal parameter of every engine over time, as recalibrated."""
+    """Every nominal parameter of every engine over time, as recalibrated by the logs that tell something of it."""
     rows = db.execute(
         'SELECT engine, parameter, unit, any_value("table"), any_value(tolerance), list(time ORDER BY path), '
         "list(value ORDER BY path), list(high - low ORDER BY path), list(key ORDER BY path) FROM nominal "
-        "WHERE time IS NOT NULL GROUP BY engine, parameter, unit ORDER BY ALL"
-    ).fetchall()
+        "WHERE time IS NOT NULL AND (tolerance <= 0 OR high - low < $1 * tolerance) GROUP BY engine, parameter, unit "
+        "ORDER BY ALL", [UNTOLD],
+    ).fetchall()  # fmt: skip
     return [
         _series(engine, parameter, unit, times, values, widths, keys, table, tolerance, "nominal")
         for engine, parameter, unit, table, tolerance, times, values, widths, keys in rows
@@ -148,7 +157,7 @@ def _series(
     widths: Sequence[float | None], keys: Sequence[str], neutral: float, tolerance: float | None, kind: str,
 ) -> Series:  # fmt: skip
     t, y = np.array(times, dtype=float), np.array(values, dtype=float)
-    s = np.array([np.nan if v is None else v for v in widths], dtype=float) / SPREAD
+    s = np.array([v if v else np.nan for v in widths], dtype=float) / SPREAD  # of no width: not known
     good = np.isfinite(t) & np.isfinite(y)
     s = np.where(np.isfinite(s), s, np.nanmax(s) if np.isfinite(s).any() else 0.0)
     order = np.argsort(t[good], kind="stable")

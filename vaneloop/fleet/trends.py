@@ -110,8 +110,9 @@ def _changed(kind: str, p: float, b: float, t: Array, y: Array, w: Array, fits: 
         near = fits[fits[:, 3] <= fits[:, 3].min() * (1.0 + 12.0 / (n - 3)), 0]
         fits = np.concatenate([fits, _fitted(kind, t, y, w, np.linspace(near.min(), near.max(), 120))])
     T, a, g, left = fits[np.argmin(fits[:, 3]), :4]
-    # the noise follows from what is left, so the intervals do not rest on what logs say of themselves
-    sigma2 = left / (n - 3)
+    # the noise follows from what is left, but is no less than what logs say of themselves: errors that they have in
+    # common leave nothing
+    sigma2 = max(left / (n - 3), 1.0)
     room = float(stats.f.ppf(LEVEL, 1, n - 3)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
     kept, q = fits[room >= 0.0], np.sqrt(room[room >= 0.0])
     lines = np.column_stack([kept[:, :3], kept[:, 4:] * sigma2, q])
