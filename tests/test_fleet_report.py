@@ -29,7 +29,7 @@ from vaneloop.fleet.report import YEAR, limits_of, view_of, write_pages
 from vaneloop.fleet.sources import moment
 from vaneloop.fleet.tables import TABLES, answers, roll_up, write_tables
 from vaneloop.fleet.trends import Trend, limit_of, odd, trend
-from vaneloop.pages.fleet import fleet_page
+from vaneloop.pages.fleet import FleetView, fleet_page
 
 BEGIN = moment("2026-01-01") or 0.0
 NOMINAL = [f"linkage.vgv{k}_{what}" for k in range(5) for what in ("play", "lc", "l", "bias")]
@@ -88,6 +88,12 @@ def synthetic(tmp: Path, engines: int, each: int, seed: int = 1) -> Folder:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     return synthetic(tmp_path_factory.mktemp("fleet"), 30, 50)
+
+
+@pytest.fixture(scope="module")
+def view(folder: Folder) -> FleetView:
+    """What its logs say, worked out once."""
+    return view_of(roll_up(folder), {})
 
 
 def series(rng: np.random.Generator, n: int, size: float, kind: str) -> tuple[Any, Any, Any, float, float]:
@@ -260,8 +266,7 @@ def test_the_report_finds_what_is_in_the_fleet(folder: Folder) -> None:
     assert blind == ("coil_heating", "an oil temperature that changes by 20 K")
 
 
-def test_the_page_leads_to_the_logs_own_pages(folder: Folder, tmp_path: Path) -> None:
-    view = view_of(roll_up(folder), {})
+def test_the_page_leads_to_the_logs_own_pages(folder: Folder, view: FleetView, tmp_path: Path) -> None:
     said = answers(folder, view.keys())
     write_pages(tmp_path / "fleet_logs", said)
     page = fleet_page(view, "vaneloop fleet report", "fleet_logs").write(tmp_path / "fleet.html").read_text()
