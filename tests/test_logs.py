@@ -7,6 +7,8 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -641,6 +643,13 @@ def test_time_may_be_in_another_unit_or_count_from_1970(tmp_path: Path) -> None:
     assert read_log(csv(tmp_path, "t,n_dem\n0,1\n10,2\n"), units={"t": "min"}).channels["n_dem"].t.tolist() == [0, 600]
     log = read_log(csv(tmp_path, "t,n_dem,x_dem\n1700000000.5,,1\n1700000001.5,1,\n1700000002,2,\n"))
     assert log.channels["n_dem"].t.tolist() == [1.0, 1.5] and log.channels["x_dem"].t.tolist() == [0]
+
+
+def test_parquet_is_read_without_importing_pandas(tmp_path: Path) -> None:
+    """Which takes longer than all else of a command that reads a log."""
+    write_log(tmp_path / "a.parquet", {"n_dem": Channel(np.arange(9.0), np.arange(9.0))})
+    code = "import sys; from hil.logs import read_log; read_log(sys.argv[1]); sys.exit('pandas' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.parquet")], check=False).returncode == 0
 
 
 def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:

@@ -336,6 +336,40 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     shot(page, "mapped_1280_light")
 
 
+def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_told(tmp_path: Path) -> None:
+    import asyncio
+
+    from vaneloop.web.jobs import LOADING, Spare, Worker
+
+    async def go() -> None:
+        spare = Spare()
+        spare.refill()
+        assert spare._ready is not None
+        loaded = spare._ready[0].pid
+        w = Worker(spare=spare)
+        try:
+            asked = asyncio.ensure_future(w.call("offers", "opening the file", path=str(file), dbc=None))
+            await asyncio.sleep(0)
+            assert w.process is not None and w.process.pid == loaded
+            w._progress(LOADING, None, "compiling ...")
+            assert [j.text for j in w.jobs.values()] == [w.loading] == ["compiling ..."]
+            w._progress(LOADING, None, "")
+            assert [j.text for j in w.jobs.values()] == ["opening the file"] and not w.loading
+            assert await asked == ["t", "n_dem"]
+            w.stop()
+            assert not Path(f"/proc/{loaded}").exists()
+            spare.refill()
+            other = spare._ready[0]
+        finally:
+            w.stop()
+            spare.close()
+        assert other.poll() is not None
+
+    file = tmp_path / "a.csv"
+    file.write_text("t,n_dem\n0,60\n0.1,61\n0.2,62\n")
+    asyncio.run(go())
+
+
 def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
     from vaneloop.web.session import Choice, LogFile
 

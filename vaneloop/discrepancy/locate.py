@@ -185,7 +185,8 @@ def locate(judge: Judge, fit: Fit | None = None) -> Located:
 
 def _edges(values: Array) -> Array:
     """Edges of bins of equal population; a categorical condition gets a bin per value."""
-    distinct = np.unique(values)
+    some = np.unique(values[: 8 * BINS])  # where these are many, nobody needs to sort all
+    distinct = np.unique(values) if len(some) <= BINS else some
     if len(distinct) <= BINS:
         middle = 0.5 * (distinct[1:] + distinct[:-1])
         return np.concatenate([[distinct[0] - 0.5], middle, [distinct[-1] + 0.5]])
@@ -265,9 +266,10 @@ def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:
 
 def _greatest(bin_of: Array, size: Array, t: Array, bins: int) -> Array:
     """Time of the greatest ``size`` in each bin."""
-    out = np.full(bins, np.nan)
-    order = np.argsort(size, kind="stable")
-    out[bin_of[order]] = t[order]  # the last of a bin to be written is its greatest
+    out, most = np.full(bins, np.nan), np.full(bins, -1.0)
+    np.maximum.at(most, bin_of, size)
+    at = np.flatnonzero(size == most[bin_of])
+    out[bin_of[at]] = t[at]
     return out
 
 

@@ -62,6 +62,7 @@ class ChosenLog:
                     )
                     self.live.complaint("log")
                     self.live.progress("offers", "look", "preview")
+                    self.live.part(self._loading, "jobs", shows=lambda: (s.search.loading if not s.jobs else "",))
                     self.live.part(self._about, "log", shows=lambda: (s.preview,))
                 with ui.element("div").classes("stackc"):
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
@@ -80,6 +81,12 @@ class ChosenLog:
                 chart = Chart("log", tree=True)
             all_channels.props("dense")
             self.live.watch(chart.refetch, "log", "over")
+
+    def _loading(self) -> None:
+        """What goes on before a log can be read at once."""
+        if self.s.search.loading and not self.s.jobs:
+            text = f"{self.s.search.loading} Choose a log meanwhile; it is read as soon as this is done."
+            ui.label(text).classes("note").props('role="status"')
 
     def _choose(self) -> None:
         s = self.s

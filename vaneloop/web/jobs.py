@@ -16,10 +16,13 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
-__all__ = ["Cancelled", "Job", "WorkError", "Worker"]
+__all__ = ["Cancelled", "Job", "Spare", "WorkError", "Worker"]
 
 
+# A search has its own two processes: threads of linear algebra would only wait for each other (10 % of a search).
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 SHOWN = 0.3  # s between two steps of a bar
+AGAIN = 10.0  # s after which there is another spare process: the one that was taken has work, and comes first
 
 
 class WorkError(Exception):
@@ -38,6 +41,7 @@ class Job:
     name: str
     text: str
     future: asyncio.Future[Any]
+    asked: str = ""  # the text before its process has said anything
     fraction: float | None = None
     started: float = field(default_factory=time.monotonic)
     told: float = 0.0  # when the page was last told of its progress
@@ -48,11 +52,69 @@ class Job:
         return time.monotonic() - self.started
 
 
+LOADING = 0  # in place of a question's number: said before any is answered
+Started = tuple[subprocess.Popen[bytes], Connection]
+
+
+def _launch(module: str, *more: str) -> Started:
+    """Start a process of ours that answers over a socket."""
+    ours, theirs = socket.socketpair()
+    # -P: nothing is imported from the folder in which the server happens to run
+    words = [sys.executable, "-P", "-m", module, str(theirs.fileno()), *more]
+    process = subprocess.Popen(
+        words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
+        env={**os.environ, **ONE_THREAD},
+    )  # fmt: skip
+    theirs.close()
+    return process, Connection(ours.detach())
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End a process and everything that it started."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+class Spare:
+    """A process that has loaded all that a log needs, for the next `Worker` that starts: loading takes seconds. One for
+    all sessions.
+    """
+
+    def __init__(self, module: str = "vaneloop.web.worker"):
+        self.module = module
+        self._ready: Started | None = None
+        self._closed = False
+
+    def refill(self) -> None:
+        """Start one where there is none."""
+        if self._ready is None and not self._closed:
+            self._ready = _launch(self.module, "--load")
+
+    def take(self) -> Started:
+        """Return the one that is there, and let another start later; a new one where none is there, or it has ended."""
+        ready, self._ready = self._ready, None
+        asyncio.get_running_loop().call_later(AGAIN, self.refill)
+        if ready is not None and ready[0].poll() is None:
+            return ready
+        return _launch(self.module, "--load")
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        if self._ready is not None:
+            _kill(self._ready[0])
+            self._ready = None
+
+
 class Worker:
     """One process with its own group. It starts with the first question, and again after it was stopped."""
 
-    def __init__(self, module: str = "vaneloop.web.worker", changed: Callable[[], None] | None = None):
-        self.module = module
+    def __init__(
+        self, module: str = "vaneloop.web.worker", changed: Callable[[], None] | None = None, spare: Spare | None = None
+    ):
+        self.module, self.spare = module, spare
+        self.loading = ""  # what the process does before it answers: it compiles, perhaps
         self.changed = changed or (lambda: None)
         self.news: Callable[[Any], None] | None = None  # takes what a task that runs on sends
         self.jobs: dict[int, Job] = {}
@@ -64,14 +126,8 @@ class Worker:
         """Start the process where it is not running: importing what it needs takes a second or two."""
         if self.process is not None and self.process.poll() is None:
             return
-        ours, theirs = socket.socketpair()
-        # -P: nothing is imported from the folder in which the server happens to run
-        words = [sys.executable, "-P", "-m", self.module, str(theirs.fileno())]
-        self.process = subprocess.Popen(
-            words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        theirs.close()
-        self._connection = Connection(ours.detach())
+        self.process, self._connection = self.spare.take() if self.spare is not None else _launch(self.module)
+        self.loading = ""
         loop = asyncio.get_running_loop()
         threading.Thread(target=self._listen, args=(self._connection, loop), daemon=True).start()
         threading.Thread(target=self._watch, args=(self.process, loop), daemon=True).start()
@@ -81,7 +137,7 @@ class Worker:
         self.start()
         assert self._connection is not None
         self._next += 1
-        job = Job(self._next, name, text, asyncio.get_running_loop().create_future())
+        job = Job(self._next, name, self.loading or text, asyncio.get_running_loop().create_future(), text)
         self.jobs[job.number] = job
         self.changed()
         try:
@@ -100,9 +156,8 @@ class Worker:
         """End the process and everything that it started; whoever waits for an answer gets Cancelled."""
         process, self.process = self.process, None
         if process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            _kill(process)
+        self.loading = ""
         self._connection = None  # the listening thread closes it
         for number in list(self.jobs):
             self._end(number, Cancelled("stopped"))
@@ -127,6 +182,12 @@ class Worker:
             loop.call_soon_threadsafe(self._lost, process)
 
     def _progress(self, number: int, fraction: float | None, text: Any) -> None:
+        if number == LOADING:
+            self.loading = text
+            for waiting in self.jobs.values():
+                waiting.text = text or waiting.asked
+            self.changed()
+            return
         job = self.jobs.get(number)
         if job is not None and not isinstance(text, str):
             if self.news is not None:

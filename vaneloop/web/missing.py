@@ -113,17 +113,26 @@ class _Page:
         ]
         as_given = f" With the parameters as given, in noise floors: {', '.join(given)}." if given else ""
         ui.label(f"Nominal parameters are refitted within their tolerances.{as_given}").classes("note")
-        if c["loop"]:
+        self.live.part(self._whole_loop, "compare", "loop", shows=lambda: (s.loop,))
+        command_line(s.command("compare"))
+        command_line(s.command("locate"))
+
+    def _whole_loop(self) -> None:
+        """The errors of the whole loop, once they are there."""
+        s = self.s
+        self.live.complaint("loop")
+        if s.loop is None:
+            return
+        figures, why = s.loop
+        if figures:
             with opened(s, "The whole loop"):
                 table(
                     ["signal", "against", "RMS", "max", "unit"],
-                    [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in c["loop"]],
+                    [[g.signal, g.reference, number(g.rms), number(g.max_abs), g.unit] for g in figures],
                     numbers=(2, 3),
                 )
-        elif c["loop_missing"]:
-            ui.label(f"no whole loop: {s.clean(c['loop_missing'])}").classes("note")
-        command_line(s.command("compare"))
-        command_line(s.command("locate"))
+        else:
+            ui.label(f"no whole loop: {s.clean(why)}").classes("note")
 
     def _map(self) -> None:
         c = self.s.compared

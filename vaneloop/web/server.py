@@ -23,6 +23,7 @@ from nicegui import app as pages
 from vaneloop.web import fleet, missing, run, schedule
 from vaneloop.web.charts import Curves, view
 from vaneloop.web.guard import Guard
+from vaneloop.web.jobs import Spare
 from vaneloop.web.private import private_folder
 from vaneloop.web.session import LOG_SUFFIXES, LogFile, Session
 
@@ -120,13 +121,12 @@ def _serve(
     sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None],
     private: Path, tables: str | None, controller: str | None,
 ) -> None:  # fmt: skip
-    files = logs_in(folder)
+    files, spare = logs_in(folder), Spare()
+    spare.refill()  # ready by the time that a log is chosen
 
     def new(key: str) -> Session:
-        session = Session(key, private / secrets.token_hex(8), list(files), tables, controller)
+        session = Session(key, private / secrets.token_hex(8), list(files), tables, controller, spare)
         session.extra["served"] = folder
-        session.search.start()  # ready by the time that a log is chosen
-        session.bench.start()
         return session
 
     sessions = Sessions(new)
@@ -218,4 +218,5 @@ def _serve(
     finally:
         signal.signal(signal.SIGTERM, previous)
         sessions.close()
+        spare.close()
     sys.stderr.flush()

@@ -20,7 +20,7 @@ from vaneloop.base.signals import UNITS
 from vaneloop.web import moments
 from vaneloop.web.charts import OVER, Curves, Mark, Over, of_log, of_stage
 from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
-from vaneloop.web.jobs import Cancelled, Job, Worker, WorkError
+from vaneloop.web.jobs import Cancelled, Job, Spare, Worker, WorkError
 
 __all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
 
@@ -42,8 +42,9 @@ class Session:
     """State of the pages of one browser. ``versions`` count what has changed, section by section."""
 
     def __init__(
-        self, number: str, folder: Path, files: list[LogFile], tables: str | None = None, controller: str | None = None
-    ):
+        self, number: str, folder: Path, files: list[LogFile], tables: str | None = None, controller: str | None = None,
+        spare: Spare | None = None,
+    ):  # fmt: skip
         self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
         self.tables = tables  # folder of the machine's tables; None: the shipped ones
         self.controller = controller and str(
@@ -52,7 +53,7 @@ class Session:
         folder.mkdir(mode=0o700, parents=True)
         self.versions: dict[str, int] = {}
         self.lookers: list[Callable[[], None]] = []  # pages that want to know
-        self.search = Worker(changed=lambda: self.touch("jobs"))  # the long searches
+        self.search = Worker(changed=lambda: self.touch("jobs"), spare=spare)  # the long searches
         self.search.news = self._news
         self.bench = Worker(changed=lambda: self.touch("jobs"))  # refits and sliders, answering meanwhile
         self.aside = Worker(changed=lambda: self.touch("jobs"))  # what goes on whichever log is chosen
@@ -78,6 +79,7 @@ class Session:
 
     def _clear_results(self) -> None:
         self.compared: dict[str, Any] | None = None
+        self.loop: tuple[list[Any], str] | None = None  # the whole loop's errors, or why there are none
         self.diagnosis: dict[str, Any] | None = None
         self.stage: str = ""
         self.chosen: dict[str, tuple[str, ...]] = {}
@@ -153,8 +155,8 @@ class Session:
 
     def warm(self) -> None:
         """Load what the first log will need, before it is there."""
-        if self.search.process is None and not self.working["warm"]:
-            self.do("warm", self.search.call("ready", ""))
+        self.search.start()
+        self.bench.start()
 
     # ---- the log
 
@@ -178,7 +180,9 @@ class Session:
         self.stop()
         self._clear_log()
         self.errors = {
-            k: v for k, v in self.errors.items() if k not in ("log", "compare", "diagnose", "fit", "experiment", "save")
+            k: v
+            for k, v in self.errors.items()
+            if k not in ("log", "compare", "loop", "diagnose", "fit", "experiment", "save")
         }
         self.touch("log", "compare", "diagnosis", "fit", "experiment")
         self.do("log", self._read())
@@ -249,6 +253,14 @@ class Session:
         worst = max(self.compared["figures"], key=lambda f: f.rms / f.noise_floor)
         self.show(worst.stage)
         self.touch("compare", "diagnosis")
+        self.do("loop", self._whole_loop(self.compared))
+
+    async def _whole_loop(self, compared: dict[str, Any]) -> None:
+        floors = {f.signal: f.noise_floor for f in compared["figures"]}
+        loop = await self.bench.call("whole_loop", "", words=self.choice.words(real=True), floors=floors)
+        if self.compared is compared:
+            self.loop = loop
+        self.touch("loop")
 
     def show(self, stage: str) -> None:
         """Show this stage's curves."""
@@ -494,7 +506,7 @@ class Session:
     def stop(self, *names: str) -> None:
         """End jobs of these names (or of any) and whatever else their processes do."""
         for w in (self.search, self.bench, *([self.aside] if names else [])):
-            if any(j.name in names or (not names and j.name != "ready") for j in w.jobs.values()):
+            if any(j.name in names or not names for j in w.jobs.values()):
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from vaneloop.cli import options
+from vaneloop.web.jobs import LOADING
 
 __all__ = ["STEPS", "TASKS"]
 
@@ -75,14 +76,28 @@ def chain_for(words: list[str], progress: Progress) -> Any:
 # ---- tasks -----------------------------------------------------------------------------------------------------------
 
 
+SECONDS = 20  # of the run that is compared to load what a comparison needs
+
+
 def ready(progress: Progress) -> None:
-    """Load what a log will need, before there is one."""
-    import vaneloop.discrepancy.workflow
+    """Load what a log will need, before there is one: modules, and compiled code by a comparison of a short run."""
+    import numpy as np
+    import pyarrow.parquet  # noqa: F401
+
+    import hil.logs.survey  # noqa: F401
     import vaneloop.pages.diagnosis
     import vaneloop.verbs.search  # noqa: F401
-    from hil.loop.lockstep import warm_up
+    from hil.logs import Channel, Log
+    from hil.loop.lockstep import Stimulus, lockstep, warm_up
+    from vaneloop.base.signals import UNITS
+    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.verbs.machine import Machine
 
     warm_up(lambda text: progress(None, text))
+    run = lockstep(Stimulus.of(np.repeat([60.0, 90.0, 70.0, 95.0], 25 * SECONDS)), seed=1)
+    log = Log("ready", {k: Channel(run.t, v) for k, v in run.columns.items() if k in UNITS})
+    options.tell_search(lambda text: progress(None, text))
+    locate_stages(Machine().bind(log).stages)
 
 
 def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
@@ -129,39 +144,36 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
-    """Compare and locate: errors stage by stage and in the whole loop, failure maps, curves."""
-    from hil.replay import replay
-    from vaneloop.base.errors import InputError
+    """Compare and locate: errors stage by stage, failure maps, curves."""
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.workflow import locate_stages
     from vaneloop.pages.diagnosis import located_sentence, located_tone
 
     chain = chain_for(words, progress)
     progress(0.1, "comparing")
-    located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.6 * share, f"locating: {name}"))
+    located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.9 * share, f"locating: {name}"))
     figures = [f for x in located for f in x.signals]
     curves = {x.stage: curves_of(Judge(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta}) for x in located}
-    progress(0.7, "the whole loop")
-    args = parsed("diagnose", words)
-    loop: list[Any] = []
-    why = ""
-    try:
-        machine = options.machine_of(args)
-        loop = replay(
-            options.read_log_of(args),
-            plant=machine.plant,
-            calibration=machine.calibration,
-            floors={f.signal: f.noise_floor for f in figures},
-        ).signals
-    except InputError as e:
-        why = str(e)
     progress(1.0, "")
     return {
         "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located),
         "tone": located_tone(located),
-        "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes, "loop": loop, "loop_missing": why,
-        "span": float(chain.t[-1]), "samples": len(chain.t),
+        "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
     }  # fmt: skip
+
+
+def whole_loop(progress: Progress, words: list[str], floors: dict[str, float]) -> tuple[list[Any], str]:
+    """The whole loop's errors, and why there are none."""
+    from hil.replay import replay
+    from vaneloop.base.errors import InputError
+
+    args = parsed("diagnose", words)
+    try:
+        machine = options.machine_of(args)
+        log = options.read_log_of(args)
+        return replay(log, plant=machine.plant, calibration=machine.calibration, floors=floors).signals, ""
+    except InputError as e:
+        return [], str(e)
 
 
 def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
@@ -396,6 +408,7 @@ TASKS: dict[str, Callable[..., Any]] = {
             look,
             preview,
             compare,
+            whole_loop,
             diagnose,
             refit,
             hand,
@@ -428,8 +441,8 @@ def _limit_memory() -> None:
 INBOX: queue.Queue[dict[str, Any]] = queue.Queue()  # what the server tells a task that is running
 
 
-def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> NoReturn:
-    """Answer questions with ``tasks`` until the server is gone."""
+def main(fd: int, tasks: dict[str, Callable[..., Any]], load: Callable[[Progress], None] | None = None) -> NoReturn:
+    """Answer questions with ``tasks`` until the server is gone; ``load`` what they need before the first one."""
     connection = Connection(fd)
     _limit_memory()
     questions: queue.Queue[Any] = queue.Queue()
@@ -447,6 +460,10 @@ def main(fd: int, tasks: dict[str, Callable[..., Any]]) -> NoReturn:
 
     threading.Thread(target=listen, daemon=True).start()
     sending = threading.Lock()
+    if load is not None:
+        with contextlib.suppress(Exception):  # what fails here fails again when it is asked for, and is told then
+            load(lambda _, text: connection.send(("progress", LOADING, (None, text))))
+        connection.send(("progress", LOADING, (None, "")))
     while True:
         number, name, arguments = questions.get()
         last = 0.0
@@ -483,4 +500,4 @@ if __name__ == "__main__":
     from vaneloop.base import terminal
 
     os.nice(10)  # the page answers first
-    sys.exit(terminal.run(lambda: main(int(sys.argv[1]), TASKS)))
+    sys.exit(terminal.run(lambda: main(int(sys.argv[1]), TASKS, ready if "--load" in sys.argv else None)))
