@@ -225,6 +225,25 @@ def test_the_law_of_one_log_lets_the_error_of_another_fall(logs, capsys) -> None
     assert line == {"a": pytest.approx(0.012, rel=0.1), "b": pytest.approx(70.0, abs=6.0)}
     assert "engine.lag" in (logs / "law.html").read_text()
     capsys.readouterr()
+    page, parts = str(logs / "better.html"), ("--fit", ":60", "--test", "60:")
+    main(
+        [
+            "extend",
+            two,
+            "--effect",
+            file,
+            *parts,
+            "--out",
+            better,
+            "--report",
+            page,
+            "--json",
+            str(logs / "tested.json"),
+        ]
+    )
+    (tested,) = json.loads((logs / "tested.json").read_text())["tested"]
+    assert tested["error_after"] < 0.4 * tested["error_before"]
+    assert "engine.lag.gain_of_n_r" in (logs / "better.html").read_text()
     main(["extend", two, "--effect", file, "--out", better, "--json", str(logs / "better.json")])
     stage = json.loads((logs / "better.json").read_text())["waterfall"]["engine"]
     assert stage[-1]["noise_floors"] < 1.3 < 2.0 < stage[0]["noise_floors"]

@@ -265,6 +265,45 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
 
 
 @needs_browser
+def test_where_the_library_knows_nothing_a_law_is_learned_saved_and_added(
+    server: Server, page: Any, tmp_path: Path
+) -> None:
+    """The engine of tests/test_learn_vanes.py: its lag grows with its speed."""
+    from hil.logs import Channel, write_log
+    from tests import rig
+    from tests.firmware_on_rig import firmware
+
+    hidden = rig.Hidden("speed_dependent_lag", {"slope": 0.012})
+    run = rig.simulate(rig.manoeuvre(31, 100.0), firmware(), [hidden], seed=7, rate=100)
+    channels = {k: Channel(run.log["t"], v) for k, v in run.log.items() if k in ("n_dem", "n_r")}
+    write_log(tmp_path / "lag.parquet", channels)
+    page.goto(server.url)
+    page.locator("input[type=file]").first.set_input_files(tmp_path / "lag.parquet")
+    page.get_by_role("button", name="Find the missing physics").click()
+    learn = page.get_by_role("button", name="Learn the law")
+    learn.click()
+    page.locator(".rowc", has_text="trying every quantity at every place").locator(".cancel").click()
+    page.get_by_text("stopped").wait_for()
+    learn.click()
+    page.get_by_text("Engine.lag is multiplied by 1 + a function of n_r").first.wait_for()
+    before, after = (float(x) for x in re.findall(r"[\d.]+", page.locator(".law-error").inner_text()))
+    assert after < 1.2 < before
+    assert page.locator(".vtable", has_text="0.01").count()  # the formulas
+    page.wait_for_function("document.querySelectorAll('.half .main-svg').length >= 2")
+    looks(page, "learned")
+    with page.expect_download() as download:
+        page.get_by_text("download law.toml").click()
+    law = tomllib.loads(Path(download.value.path()).read_text())
+    assert list(law["curves"]) == ["engine.lag.gain_of_n_r"]
+    page.locator(".add-law").click()
+    with page.expect_download() as download:
+        page.get_by_text("download extended.toml").click()
+    assert "engine.lag.gain_of_n_r" in tomllib.loads(Path(download.value.path()).read_text())["curves"]
+    page.get_by_role("button", name="Go on with this model").click()
+    page.locator(".verdict.good", has_text="fits").wait_for()
+
+
+@needs_browser
 def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, tmp_path: Path) -> None:
     page.goto(server.url)
     choose(page, "broken.csv")

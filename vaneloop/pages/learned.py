@@ -16,7 +16,7 @@ from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import Tone, capital, number
 
-__all__ = ["curve_figure", "learned_page", "visited_figure"]
+__all__ = ["ABOUT", "COLUMNS", "HOW", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
 
 TONES: dict[str, Tone] = {
     "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
@@ -44,6 +44,19 @@ def visited_figure(law: LearnedLaw) -> Figure:
     return bars([f"{v:.3g}" for v in middle], {"share of samples": (100.0 * law.visited).tolist()}, "%")
 
 
+COLUMNS = ["formula", "held-out error, noise floors", "law of the library"]
+HOW = "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first."
+ABOUT = (
+    "The band holds the curve in 90 % of draws of the log's blocks. Dashed: no log has been there, and the curve "
+    "stays as at its end."
+)
+
+
+def formula_rows(law: LearnedLaw) -> list[list[str]]:
+    """The formulas, a row each."""
+    return [[f.text, number(f.error), f.law or "-"] for f in law.formulas]
+
+
 def learned_page(
     laws: Sequence[LearnedLaw],
     outcome: Outcome,
@@ -60,19 +73,11 @@ def learned_page(
         figures = f"{number(law.error_before)} to {number(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
     for law in laws:
-        page.section(
-            law.name,
-            f"{capital(law.sentence())}. The band holds the curve in 90 % of draws of the log's blocks. Dashed: no "
-            "log has been there, and the curve stays as at its end.",
-        )
+        page.section(law.name, f"{capital(law.sentence())}. {ABOUT}")
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
         page.plot(visited_figure(law), f"Where the logs have been: {heading(law.of, law.of_unit)}.")
         if law.formulas:
-            page.table(
-                ["formula", "held-out error, noise floors", "law of the library"],
-                [[f.text, f.error, f.law or "-"] for f in law.formulas],
-                "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first.",
-            )
+            page.table(COLUMNS, formula_rows(law), HOW)
     if outcome.nearest and not laws:
         page.section("What came nearest")
         page.text(", ".join(outcome.nearest) + ".")

@@ -192,6 +192,7 @@ def learned(
     from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
 
     tell = progress or (lambda _: None)
+    begun = 0.0 if found else 0.4
     found = found or of_chain(chain, log, workers, lambda f: tell(0.4 * f))
     stages = found.diagnosis.stages
     open_ones = [s for s in stages if s.verdict == "unknown" and chain.stage(s.stage).made is not None]
@@ -204,7 +205,7 @@ def learned(
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
         ground = VaneGround(stage, d.floor, test)
-        learner = Learner(ground, d, lambda f, i=i: tell(0.4 + 0.6 * (i + f) / len(open_ones)))  # type: ignore[misc]
+        learner = Learner(ground, d, lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones)))  # type: ignore[misc]
         one = learner.learned()
         out = out or one
         said += [f"{d.stage}: {note}" for note in one.notes]

@@ -441,14 +441,20 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
         elif name in wanted:
             why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in EFFECTS[name].stages)
             raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
-    results = []
-    for s, names in by_stage.items():
-        part = with_laws(chain.stage(s), [n for n in names if n not in laws], curves.get(s, ()), log)
-        results.append(as_compared(chain.stage(s), extend_stage(part, tuple(names))))
+
+    def with_curves(stages: Chain) -> Chain:
+        """The stages as they are fitted: those with a learned law have its curve."""
+        parts = {s: [n for n in names if n not in laws] for s, names in by_stage.items()}
+        return replace(
+            stages, stages=[with_laws(x, parts.get(x.name, ()), curves.get(x.name, ()), log) for x in stages.stages]
+        )
+
+    bound = replace(with_curves(chain), test=chain.test and with_curves(chain.test))
+    results = [as_compared(chain.stage(s), extend_stage(bound.stage(s), tuple(names))) for s, names in by_stage.items()]
     model = with_fits(before, results)
     seconds = time.perf_counter() - started
     d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
-    return Extended(chain, d, log, None, model, next(filter(None, map(no_better, results)), ""))
+    return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""))
 
 
 def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:

@@ -19,6 +19,7 @@ from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
+from vaneloop.web.learning import LearnedPart
 from vaneloop.web.session import LogFile, Session
 
 __all__ = ["build"]
@@ -185,6 +186,7 @@ class _Page:
             live.part(self._sofar, "sofar", "diagnose", "diagnosis", shows=lambda: (len(s.sofar), s.diagnosis))
             live.complaint("diagnose")
             live.part(self._verdict, "diagnosis", "compare", "log", shows=lambda: (s.compared, s.diagnosis))
+            LearnedPart(s, live).build()
             with ui.element("div").classes("two"):
                 with ui.element("div").classes("stackc"):
                     live.part(self._stages, "diagnosis", shows=lambda: (s.diagnosis,))

@@ -89,6 +89,7 @@ class Session:
         self.hand_rms: dict[str, float] = {}
         self.experiment: dict[str, Any] | None = None
         self.experiment_done = False
+        self.learned: dict[str, Any] | None = None  # a law, where the library has none
         self._hand_wanted = False
         self.sofar: list[str] = []  # what the stages said that are searched already
         self.saved = {k: v for k, v in self.saved.items() if k.startswith(("schedule-", "entered-", "run-"))}
@@ -182,9 +183,9 @@ class Session:
         self.errors = {
             k: v
             for k, v in self.errors.items()
-            if k not in ("log", "compare", "loop", "diagnose", "fit", "experiment", "save")
+            if k not in ("log", "compare", "loop", "diagnose", "learn", "fit", "experiment", "save")
         }
-        self.touch("log", "compare", "diagnosis", "fit", "experiment")
+        self.touch("log", "compare", "diagnosis", "learn", "fit", "experiment")
         self.do("log", self._read())
 
     async def _read(self) -> None:
@@ -289,7 +290,7 @@ class Session:
         finally:
             self.sofar = []  # said by the answer, or nothing is kept of it
             self.touch("sofar")
-        self.experiment, self.experiment_done = None, False
+        self.experiment, self.experiment_done, self.learned = None, False, None
         d = self.diagnosis["diagnosis"]
         self.chosen = {s.stage: tuple(f.effect for f in s.effects) for s in d.stages}
         bad = [s for s in d.stages if s.verdict != "none"]
@@ -441,7 +442,7 @@ class Session:
         self.experiment_done = True
         self.touch("experiment")
 
-    def _anew(self, key: str, name: str) -> Path:
+    def anew(self, key: str, name: str) -> Path:
         """Where a file to be downloaded is written; an earlier one is offered no more."""
         self.saved.pop(key, None)
         path = self.folder / name
@@ -455,7 +456,7 @@ class Session:
 
     async def _save_report(self) -> None:
         assert self.diagnosis is not None
-        path = self._anew("report", "diagnosis.html")
+        path = self.anew("report", "diagnosis.html")
         self.touch("save")
         await self.search.call(
             "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"],
@@ -474,16 +475,16 @@ class Session:
         effects = [w for e in self.all_chosen() for w in ("--effect", e)]
         return [*effects, "--out", "extended.toml", "--report", "extended.html"]
 
-    def save_model(self) -> None:
-        """Run ``vaneloop extend`` with the effects that are switched on."""
-        if self.all_chosen():
-            self.do("save", self._save_model())
+    def save_model(self, law: Path | None = None) -> None:
+        """Run ``vaneloop extend`` with the effects that are switched on, and with a law that was learned."""
+        if self.all_chosen() or law:
+            self.do("save", self._save_model(["--effect", str(law)] if law else []))
 
-    async def _save_model(self) -> None:
-        words = ["extend", *self.choice.words(real=True), *self.extend_words()]
+    async def _save_model(self, law: list[str]) -> None:
+        words = ["extend", *self.choice.words(real=True), *law, *self.extend_words()]
         for name in ("extended.toml", "extended.html"):
             words[words.index(name)] = str(self.folder / name)
-        files = {"model": self._anew("model", "extended.toml"), "extended": self._anew("extended", "extended.html")}
+        files = {"model": self.anew("model", "extended.toml"), "extended": self.anew("extended", "extended.html")}
         self.touch("save")
         await self.bench.call("command", "extending the model", words=words)
         self.saved |= {k: f for k, f in files.items() if f.exists()}  # nothing is written that is no better
@@ -495,7 +496,7 @@ class Session:
             self.do("mapping", self._save_mapping())
 
     async def _save_mapping(self) -> None:
-        path = self._anew("mapping", "mapping.toml")
+        path = self.anew("mapping", "mapping.toml")
         self.touch("mapping")
         words = ["map", *self.choice.reading(real=True), "--out", str(path)]
         await self.bench.call("command", "writing the mapping file", words=words)

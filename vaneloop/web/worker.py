@@ -283,6 +283,25 @@ def report(
     return str(diagnosis_page(diagnosis, chain, command, words[0], next_experiment).write(path))
 
 
+def learn(progress: Progress, words: list[str], diagnosis: Any, law: str, page: str, command: str) -> dict[str, Any]:
+    """Learn a law from a log that has been diagnosed, as ``vaneloop learn`` does; write its file and its page."""
+    from vaneloop.verbs.learn import learned, with_path
+    from vaneloop.verbs.search import Diagnosed
+
+    chain = chain_for(words, progress)
+    found = Diagnosed(chain, diagnosis, words[0])
+    before = options.machine_of(parsed("diagnose", words)).added
+    text = "trying every quantity at every place"
+    answer = learned(chain, words[0], before, progress=lambda f: progress(f, text), found=found)
+    if answer.model is not None:
+        answer = with_path(answer, law, command)
+    answer.report(page, command)
+    return {
+        "laws": answer.laws, "verdict": answer.verdict, "sentence": answer.sentence(), "notes": answer.notes,
+        "nearest": answer.outcome.nearest,
+    }  # fmt: skip
+
+
 def command(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a
     defect of ours.
@@ -414,6 +433,7 @@ TASKS: dict[str, Callable[..., Any]] = {
             hand,
             experiment,
             report,
+            learn,
             command,
             engine_part,
             schedule_step,
