@@ -440,3 +440,20 @@ def test_the_engine_test_stands_beside_the_paper(tmp_path):
 def test_a_dual_schedule_that_misses_the_paper_is_not_called_good(tmp_path):
     worse = result(rate=10.0, dual=False, channels=())
     assert verdict(engine_test_report(worse, worse, None, tmp_path / "e.html"))[0] == "bad"
+
+
+def test_a_stage_that_fails_under_one_condition_only_is_not_said_to_fail_by_what_is_noise() -> None:
+    """1.03 noise floors over the whole log are none; the condition is what is told."""
+    from vaneloop.discrepancy.locate import Located, Regime, StageFigures
+    from vaneloop.pages.diagnosis import located_sentence
+
+    whole = StageFigures("engine", "n_r", "%", 1.03, 1.03, 1.0, 8000)
+    bins = [np.array(v) for v in ([1.0, 1.3], [1.0, 1.3], [4000, 4000], [False, True])]
+    edges, moments = np.array([60.0, 70.0, 80.0]), np.array([1.0, 2.0])
+    regime = Regime("n_r", "%", "rotor speed", "%", edges, *bins, 0.1, moments)
+    x = Located("engine", None, np.ones(1), (whole,), (regime,), None)  # type: ignore[arg-type]
+    said = located_sentence([x])
+    assert "fails most" not in said and "1.03" not in said + x.verdict()
+    assert "the engine stage fails at n_r: 1.3 %" in said and "rotor speed 70 to 80 %" in said
+    clean = Located("engine", None, np.ones(1), (whole,), (), None)  # type: ignore[arg-type]
+    assert located_sentence([clean]) == "Every stage fits its measurements to within the noise."

@@ -34,11 +34,11 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
 class Server:
     """``vaneloop web`` as a user starts it."""
 
-    def __init__(self, folder: Path, *options: str, **environment: str):
+    def __init__(self, folder: Path, *options: str, module: str = "vaneloop.cli.main", **environment: str):
         words = [
             sys.executable,
             "-m",
-            "vaneloop.cli.main",
+            module,
             "web",
             "--port",
             "0",
@@ -48,9 +48,14 @@ class Server:
             str(folder),
             *options,
         ]
-        path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+        more = environment.pop("PYTHONPATH", "")
+        path = os.pathsep.join([str(ROOT), more, os.environ.get("PYTHONPATH", "")])
         self.folder, self.environment = folder, {**os.environ, "PYTHONPATH": path, **environment}
-        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=folder, env=self.environment)
+        self.said = folder / "said.txt"  # on standard error
+        with self.said.open("w") as said:
+            self.process = subprocess.Popen(
+                words, stdout=subprocess.PIPE, stderr=said, text=True, cwd=folder, env=self.environment
+            )
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
         link = re.fullmatch(r"(http://[^/]+:(\d+)/)\?token=([\w-]{16,})", self.url)
@@ -332,6 +337,33 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
     page.locator("input[type=file]").first.set_input_files(junk)
     page.get_by_role("alert").filter(has_text="junk.mf4").wait_for()
     assert page.get_by_text("Names and units").count() == 0
+
+
+@needs_browser
+def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path: Path) -> None:
+    """In the browser what to do next, in the terminal the line of the defect; no traceback anywhere."""
+    (tmp_path / "broken_pages.py").write_text(
+        "import sys\nfrom vaneloop.cli.main import main\nimport vaneloop.web.schedule as s\n"
+        "import vaneloop.web.chosen_log as c\n"
+        "s.build = lambda *_: 1 / 0\nc.ChosenLog._channels = lambda self: self.s.choice.file and {}['gone']\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    server = Server(tmp_path, module="broken_pages", PYTHONPATH=str(tmp_path))
+    try:
+        page = browser.new_page()
+        page.set_default_timeout(LONG)
+        assert page.goto(server.at("schedule")).status == 500
+        assert page.get_by_text("This page could not be made").count()
+        page.goto(server.at(""))
+        choose(page, "hidden_effect.parquet")
+        page.get_by_role("alert").filter(has_text="a part of this page failed").wait_for()
+        page.get_by_text("fails most in the actuator stage").wait_for()  # the other parts go on
+        page.context.close()
+    finally:
+        server.stop()
+    lines = server.said.read_text().strip().splitlines()
+    assert lines and all(line.startswith("vaneloop: internal error: ") for line in lines)
+    assert any("ZeroDivisionError" in line for line in lines) and any("KeyError: 'gone'" in line for line in lines)
 
 
 @needs_browser

@@ -152,6 +152,8 @@ class Located:
             if self.hot
             else "no single condition more than in others"
         )
+        if self.worst.agrees:
+            return f"fits over the whole log, fails in {where}: {self.hot[0].worst()}"
         return f"fails in {where}: {self.worst.signal} at {self.worst.ratio:.3g} noise floors"
 
     def json(self) -> dict[str, Any]:

@@ -70,6 +70,9 @@ def located_sentence(located: Sequence[Located]) -> str:
         return "Every stage fits its measurements to within the noise."
     worst = max(failing, key=lambda x: x.worst.ratio)
     s = worst.worst
+    if s.agrees:  # no more than noise over the whole log
+        where = "; ".join(f"the {x.stage} stage fails at {x.hot[0].worst()}" for x in failing)
+        return f"Over the whole log every stage fits its measurements, but {where}."
     others = [x.stage for x in failing if x is not worst]
     also = f" {' and '.join(others)} {'fail' if len(others) > 1 else 'fails'} too." if others else ""
     off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {floors(s.ratio)} times its noise floor"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,8 +27,13 @@ __all__ = [
 ]  # fmt: skip
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"), ("/fleet", "Fleet"))
+LOG = logging.getLogger("nicegui")  # whose lines the server prints in plain words
 PRIMARY = "#1f6fc4"
 MOMENTS = 200  # that are listed
+FAILED = (
+    "a part of this page failed, which is a defect of VaneLoop; where the workbench was started a line says which. "
+    "Reload the page: what was read and found is still there"
+)
 OFTEN = 0.05  # s between two looks at what has changed
 
 
@@ -97,6 +103,8 @@ class Live:
         self.client = ui.context.client
         ui.timer(0.5, self.look)
         session.lookers.append(self.wake)
+        ui.on_exception(self.failed)
+        self.complaint("page")
         self.client.on_delete(lambda: session.lookers.remove(self.wake))
 
     def wake(self) -> None:
@@ -196,7 +204,16 @@ class Live:
             self.parts = [p for p in self.parts if p[2] is None or not p[2].is_deleted]
             for draw, sections, of in list(self.parts):
                 if changed.intersection(sections) and (of is None or not of.is_deleted):
-                    draw()
+                    try:
+                        draw()
+                    except Exception as e:  # the other parts go on
+                        LOG.error("a part of the page", exc_info=e)
+                        self.failed()
+
+    def failed(self) -> None:
+        """Say on the page that a part of it failed; the terminal has the line of the defect."""
+        self.session.errors["page"] = FAILED
+        self.session.touch("page")
 
 
 def _left(job: Job) -> str:

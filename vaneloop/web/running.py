@@ -121,6 +121,7 @@ class Loop:
         from hil.native.isolation import PATIENCE, told
 
         task = asyncio.ensure_future(call)
+        task.add_done_callback(lambda t: t.cancelled() or t.exception())  # the page may be gone: nobody asks for it
         seen: tuple[float, ...] = ()
         since, hung = time.monotonic(), False
         while not (await asyncio.wait([task], timeout=0.5))[0]:

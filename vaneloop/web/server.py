@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import os
 import secrets
@@ -20,10 +21,11 @@ from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from nicegui import Client, ui
 from nicegui import app as pages
 
+from vaneloop.base import terminal
 from vaneloop.web import fleet, missing, run, schedule
 from vaneloop.web.charts import Curves, view
 from vaneloop.web.guard import Guard
-from vaneloop.web.jobs import Spare
+from vaneloop.web.jobs import Cancelled, Spare
 from vaneloop.web.private import private_folder
 from vaneloop.web.session import LOG_SUFFIXES, LogFile, Session
 
@@ -36,7 +38,25 @@ FULL = f"""{MOST_SESSIONS} browsers are at work here, each with an open tab, and
 
 Close a tab of one of them; after {RECONNECT:.0f} s its place is free.
 """
+NO_PAGE = """This page could not be made, which is a defect of VaneLoop.
+
+Where the workbench was started a line says which, and where its traceback is. Reload the page; if it fails again, end
+the program (Ctrl-C) and start it anew.
+"""
+LOG = logging.getLogger("nicegui")
 HERE = Path(__file__).resolve().parent
+
+
+class Plain(logging.Handler):
+    """What libraries log, as lines for the terminal: the traceback of a defect goes into a file."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one line."""
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, asyncio.CancelledError | Cancelled):
+            return  # somebody wanted that
+        text = terminal.defect(error) if error is not None else " ".join(record.getMessage().split())
+        print(f"vaneloop: {text}", file=sys.stderr, flush=True)
 
 
 class Sessions:
@@ -142,7 +162,12 @@ def _serve(
             session = sessions.get(pages.storage.browser["id"], ui.context.client)
             if session is None:
                 return PlainTextResponse(FULL, 429)
-            build(session, most)
+            session.errors.pop("page", None)
+            try:
+                build(session, most)
+            except Exception as e:
+                LOG.error("the page", exc_info=e)
+                return PlainTextResponse(NO_PAGE, 500)
             return None
 
     for path, title, module in zip(
@@ -199,9 +224,13 @@ def _serve(
         reconnect_timeout=RECONNECT,
         session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},
     )  # fmt: skip
+    for name in ("nicegui", "asyncio", "uvicorn.error"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [Plain(logging.WARNING)], False
     guard = Guard(api, token, port, most, loopback=loopback, pages=PAGES)
     config = uvicorn.Config(  # h11 bounds the headers of a request
-        guard, http="h11", log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2, lifespan="on"
+        guard, http="h11", log_config=None, log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2,
+        lifespan="on",
     )  # fmt: skip
 
     class Told(uvicorn.Server):
