@@ -30,12 +30,17 @@ def curve_figure(law: LearnedLaw) -> Figure:
     below = np.array([law.x[0] - BEYOND * span, law.x[0]])
     above = np.array([law.x[-1], law.x[-1] + BEYOND * span])
     lines = [
-        Line("90 % band, from", law.x, law.low, "other", 1.0), Line("to", law.x, law.high, "other", 1.0),
+        Line("from", law.x, law.low, "other", 1.0), Line("90 % band", law.x, law.high, "other", 1.0),
         Line("learned", law.x, law.y, "model", 2.0),
         Line("beyond the logs", below, np.full(2, law.y[0]), "model", 1.4, "dash"),
-        Line("beyond the logs, above", above, np.full(2, law.y[-1]), "model", 1.4, "dash"),
+        Line("beyond the logs", above, np.full(2, law.y[-1]), "model", 1.4, "dash"),
     ]  # fmt: skip
-    return loop(lines, heading(law.of, law.of_unit), heading(law.name, law.unit))
+    out = loop(lines, heading(law.of, law.of_unit), heading(law.name, law.unit))
+    low, high, *_, above_all = out["data"]
+    high |= {"fill": "tonexty", "fillcolor": "@noise"}
+    for line in (low, above_all):  # named by the other of their pair
+        line["showlegend"] = False
+    return out
 
 
 def visited_figure(law: LearnedLaw) -> Figure:

@@ -12,13 +12,18 @@ export default {
   </svg>`,
   props: { x: Array, y: Array, xtitle: String, ytitle: String },
   data() { return { now: [...this.y], held: null, W: 760, H: 300, L: 48, B: 34 }; },
+  mounted() { // on a phone fewer units across, so that the words keep their size
+    this.sized = new ResizeObserver(() => { this.W = this.$refs.svg.clientWidth < 560 ? 340 : 760; });
+    this.sized.observe(this.$refs.svg);
+  },
+  unmounted() { this.sized.disconnect(); },
   watch: { y(v) { if (this.held === null) this.now = [...v]; } },
   computed: {
     range() { const a = Math.min(...this.y), b = Math.max(...this.y), m = 0.12 * (b - a) || 1; return [a - m, b + m]; },
     ticks() {
       const make = (a, b, n) => { const raw = (b - a) / n, s = Math.pow(10, Math.floor(Math.log10(raw))), d = [1, 2, 5, 10].map((k) => k * s).find((k) => k >= raw);
         const out = []; for (let v = Math.ceil(a / d) * d; v <= b + 1e-9; v += d) out.push(+v.toFixed(6)); return out; };
-      return { x: make(this.x[0], this.x[this.x.length - 1], 8), y: make(...this.range, 6) };
+      return { x: make(this.x[0], this.x[this.x.length - 1], this.W < 560 ? 4 : 8), y: make(...this.range, 6) };
     },
   },
   methods: {
