@@ -187,7 +187,7 @@ class _Page:
             live.complaint("diagnose")
             live.part(self._verdict, "diagnosis", "compare", "log", shows=lambda: (s.compared, s.diagnosis))
             LearnedPart(s, live).build()
-            with ui.element("div").classes("two"):
+            with ui.element("div").classes("two").style("margin-top:10px"):
                 with ui.element("div").classes("stackc"):
                     live.part(self._stages, "diagnosis", shows=lambda: (s.diagnosis,))
                     live.part(self._effects, "diagnosis", "compare", "fit", shows=lambda: (s.diagnosis, s.stage))
@@ -312,7 +312,7 @@ class _Page:
             self.s.switch(name, on)
 
     def _about_effect(self, name: str, found: dict[str, Any], named: dict[str, str], c: Any) -> str:
-        summary = EFFECTS[name].summary if name in EFFECTS else ""
+        summary = capital(EFFECTS[name].summary) if name in EFFECTS else ""
         if name in found:
             f = found[name]
             parts = [
