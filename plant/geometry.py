@@ -12,7 +12,6 @@ from typing import Annotated, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
-from scipy.optimize import brentq
 
 from plant.linkage import (
     G_AX,
@@ -259,6 +258,8 @@ def stroke_for_vigv(
 
     Raises InputError for an angle that no stroke from -2 to 50 mm gives.
     """
+    from scipy.optimize import brentq
+
     g = _flat(geometry)
     low, high = stage_vane_angle(STROKE_LOW, g, 0), stage_vane_angle(STROKE_HIGH, g, 0)
     a = np.atleast_1d(np.asarray(angle, dtype=float))

@@ -30,7 +30,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from plant.geometry import DEG, MM, Geometry
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, stage_ring_angle
@@ -328,6 +327,8 @@ def clearance_for(
 
     Raises InputError where the others alone are wider, or 5 mm are not enough.
     """
+
+    from scipy.optimize import brentq
 
     def miss(value: float) -> float:
         return clearance_width(geometry, stage, replace(clearances, **{joint: value}), vane, offset) - width

@@ -25,6 +25,16 @@ def _chunks(group: Any) -> Iterable[Any]:
     return (group.column(k) for k in range(group.num_columns))
 
 
+def _numbers(column: Any, scale: float) -> np.ndarray:
+    """An array of Arrow's float64 times ``scale``, null as `ABSENT`; from its buffers: ``to_numpy`` imports pandas."""
+    known, numbers = column.buffers()
+    part = slice(column.offset, column.offset + len(column))
+    values = np.zeros(len(column)) if numbers is None else np.frombuffer(numbers, np.float64, part.stop)[part] * scale
+    if column.null_count:
+        values[np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")[part] == 0] = ABSENT
+    return values
+
+
 def open_parquet(path: Path, options: Options) -> Source:
     """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a
     damaged page.
@@ -94,15 +104,7 @@ def open_parquet(path: Path, options: Options) -> Source:
                 column = column.cast(pa.int64())
             if pa.types.is_boolean(kind):
                 column = column.cast(pa.int8())
-            # by its buffers: to_numpy and fill_null would import pandas, which takes half a second
-            number = column.cast(pa.float64(), safe=False)
-            held = number.buffers()[1]
-            raw = np.frombuffer(held, np.float64) if held is not None and held.size else np.zeros(0)
-            values = raw[number.offset : number.offset + len(number)].copy()
-            if scale != 1.0:
-                values *= scale
-            values[np.from_dlpack(column.is_null().cast(pa.int8())) != 0] = ABSENT
-            return values
+            return _numbers(column.cast(pa.float64(), safe=False), scale)
         except LogError:
             raise
         except damage as e:

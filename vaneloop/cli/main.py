@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from vaneloop.base import terminal
@@ -123,6 +124,8 @@ class _CanWithoutMdf:
 def run() -> None:
     """Entry point of the console script."""
     terminal.is_command = True
+    # the matrices here are tall and narrow: a second thread of linear algebra spins more than it computes
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not any(".mf4" in word.lower() for word in sys.argv):
         sys.meta_path.insert(0, _CanWithoutMdf())
     sys.exit(main(sys.argv[1:]))

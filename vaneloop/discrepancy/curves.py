@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import eigh
 
 from vaneloop.base.curve import DEGREE, splines
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
@@ -81,6 +79,9 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     Knots stand at their quantiles: a curve is as fine as the log tells.
     """
     x = np.sort(np.asarray(visited, dtype=float)[np.isfinite(visited)])
+    from scipy.interpolate import BSpline
+    from scipy.linalg import eigh
+
     if len(x) < 4 * LEAST:
         return None
     if len(few := np.unique(x)) in (2, 3):

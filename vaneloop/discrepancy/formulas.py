@@ -9,7 +9,6 @@ import re
 from collections.abc import Collection
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vaneloop.base.forms import Form
 from vaneloop.discrepancy.stage import Array
@@ -22,6 +21,8 @@ def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array,
 
     free  what may be added, as the model does it with parameters that are fitted: a constant (0), a straight line (1)
     """
+    from scipy.optimize import least_squares
+
     if (form.positive and not q.min() > 0.0) or (form.signed and not q.min() < 0.0 < q.max()):
         return None
     if form.name == "Arrhenius" and not q.min() > -200.0:

@@ -203,7 +203,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
     A bin is significant where what is left of it without its worst block of the log is too: one slam that the equations
     do not hold to a micrometre is no condition.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
@@ -240,7 +240,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
                 )
             )
     out = []
-    z_limit = norm.isf(LEVEL / max(looks, 1))
+    z_limit = -ndtri(LEVEL / max(looks, 1))
     for k, output, name, edges, n, ms, other, rest, moments in raw:
         z, confirmed = (
             (x / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, x in ((n, ms), (other, rest))
@@ -253,7 +253,7 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
         out.append(
             Regime(
                 output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * floor, ratio, n,
-                (z > z_limit) & (confirmed > norm.isf(LEVEL)) & (n > 20) & (ratio > 1.05), contrast,
+                (z > z_limit) & (confirmed > -ndtri(LEVEL)) & (n > 20) & (ratio > 1.05), contrast,
                 moments,
             )
         )  # fmt: skip

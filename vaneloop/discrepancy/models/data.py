@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import welch
 
 from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass, motion, smoothed, uses
 from vaneloop.discrepancy.models.quantities import column_of
@@ -277,6 +276,8 @@ def noise_of_channel(y: Array) -> float:
 
 def _quiet(y: Array) -> tuple[float, float]:
     """Third differences where they are small, and the spectrum where it is."""
+    from scipy.signal import welch
+
     d = np.diff(y, 3)
     width = max(10, len(d) // 60)
     parts = d[: len(d) // width * width].reshape(-1, width)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.ndimage import binary_propagation
@@ -171,8 +172,10 @@ def build_chain(
                 between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    turns: Callable[[], dict[str, Array]] = dict
     if "x_lvdt" in columns:
-        have |= reversals(t, have.get("stroke", columns["x_lvdt"]), machine.table.actuator.stroke.value)
+        stroke = have.get("stroke", columns["x_lvdt"])
+        turns = lru_cache(partial(reversals, t, stroke, machine.table.actuator.stroke.value))
     regimes, units = regimes_of(t, columns)
     bits = _lost_bits(log, machine)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
@@ -201,7 +204,7 @@ def build_chain(
             absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
             continue
         rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
-        driven = Driven(t, have, machine, cal, outputs, rows, present)
+        driven = Driven(t, have, machine, cal, outputs, rows, present, turns=turns)
         stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
@@ -210,7 +213,7 @@ def build_chain(
         if dt > 1.5 * RASTER:
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
             # besides
-            coarse = make(driven._replace(t=t[::2], columns=every_other(have), run=rows[::2]))
+            coarse = make(driven.at(slice(None, None, 2), every_other(have), rows[::2]))
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]

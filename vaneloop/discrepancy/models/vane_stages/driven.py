@@ -31,6 +31,7 @@ class Driven(NamedTuple):
     present              effects that the model already has: not tried again
     laws                 effects of the library that may be tried; None: all that the stage can have
     curves               what may be tried besides: curves as they run, and as the search has them
+    turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
     """
 
     t: Array
@@ -42,6 +43,14 @@ class Driven(NamedTuple):
     present: tuple[str, ...]
     laws: tuple[str, ...] | None = None
     curves: tuple[tuple[Placed, Effect], ...] = ()
+    turns: Callable[[], dict[str, Array]] = dict
+
+    def at(self, rows: Array | slice, columns: dict[str, Array], run: Array) -> Driven:
+        """Some of the rows, with their ``columns``, and which of them count."""
+        turns = self.turns
+        return self._replace(
+            t=self.t[rows], columns=columns, run=run, turns=lambda: {k: v[rows] for k, v in turns().items()}
+        )
 
     @property
     def curved(self) -> bool:
@@ -55,6 +64,8 @@ class Driven(NamedTuple):
         if name == "x_lvdt":  # with less noise, where it can be had
             return self.columns.get("stroke", self.columns.get(name))
         values = self.columns.get(name)
+        if values is None:
+            values = self.turns().get(name)
         return values if values is None or name not in VANES else smoothed(self.t, values)
 
     def signals(self) -> Array:
@@ -91,7 +102,7 @@ def excerpts(
 
     def excerpt(at: Array) -> Stage:
         columns = {k: v[at] for k, v in driven.columns.items()}
-        part = make(driven._replace(t=driven.t[at], columns=columns, run=keep(at)))
+        part = make(driven.at(at, columns, keep(at)))
         part.floor, part.quiet, part.noise = stage.floor, stage.quiet, stage.noise
         part.raster_error, part.memory = stage.raster_error, stage.memory
         return part

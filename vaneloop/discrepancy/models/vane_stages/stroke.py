@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter, savgol_coeffs, savgol_filter
+from scipy.linalg import lstsq
+from scipy.ndimage import convolve1d, uniform_filter1d
 
 from hil.figures import noise_floor
 from plant import Plant, chain, places
 from plant.parameters import NAMES, derive
 from plant.stages import actuator_run, step_currents
+from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.models.vane_stages.raster import SUBSTEPS
 from vaneloop.discrepancy.stage import Array
 
@@ -42,7 +43,7 @@ class Smooth(NamedTuple):
         """Error (mm) such as noise and model leave in the stroke at the rows: one draw."""
         noise = self.noise * draw.standard_normal(len(self.off))
         uneven = self.uneven * draw.standard_normal(len(self.off))
-        return np.asarray(savgol_filter(noise, self.rows, SMOOTH_ORDER) + uneven)
+        return np.asarray(_smoothed(noise, self.rows) + uneven)
 
 
 def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
@@ -66,25 +67,26 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
     bends = [0.0, *np.quantile(np.abs(step), BENDS)]
     sides = [np.maximum(side * step - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
     shares = [1.0 - np.exp(-dt / lag) for lag in LAGS]
-    late = [lfilter([share], [1.0, share - 1.0], step) for share in shares]
+    late = [_lagged(step, share) for share in shares]
     parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [*late, np.ones(len(t))])
     logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
     whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
-    calibrated = parts @ np.linalg.lstsq(parts[whole], logged[whole], rcond=None)[0]
+    q, r = np.linalg.qr(parts[whole])  # the singular values of r are those of the parts
+    calibrated = parts @ np.linalg.lstsq(r, q.T @ logged[whole], rcond=None)[0]
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
     off = c["x_lvdt"] - model
     tried = []
     for rows in SMOOTH:
-        smooth, own = savgol_filter(off, rows, SMOOTH_ORDER), savgol_coeffs(rows, SMOOTH_ORDER)[rows // 2]
+        smooth, own = _smoothed(off, rows), _weights(rows)[rows // 2]
         left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
     _, rows, size, smooth = min(tried, key=lambda x: x[0])
     noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
     half = rows // 4 * 2 + 1
-    differs = smooth - savgol_filter(off, half, SMOOTH_ORDER)
+    differs = smooth - _smoothed(off, half)
     fast = np.abs(differs) > 2.0 * noise  # rather noisy than wrong
-    wide, narrow, as_is = savgol_coeffs(rows, SMOOTH_ORDER), np.zeros(rows), np.zeros(rows)
-    narrow[(rows - half) // 2 : (rows + half) // 2] = savgol_coeffs(half, SMOOTH_ORDER)
+    wide, narrow, as_is = _weights(rows), np.zeros(rows), np.zeros(rows)
+    narrow[(rows - half) // 2 : (rows + half) // 2] = _weights(half)
     as_is[rows // 2] = 1.0
     around = int(round(AROUND / dt))
     bent = np.maximum(
@@ -100,6 +102,33 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
     uneven = np.sqrt(share * jerky)
     stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
     return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+# The filters of Savitzky and Golay are `scipy.signal`'s, whose import takes half a second of processor time.
+
+
+def _weights(rows: int) -> Array:
+    """Weights over ``rows`` of a cubic fitted to them, for its value in their middle."""
+    x = np.arange(rows // 2, -(rows // 2) - 1, -1.0)
+    return np.asarray(lstsq(x ** np.arange(SMOOTH_ORDER + 1)[:, None], np.eye(SMOOTH_ORDER + 1)[0])[0])
+
+
+def _smoothed(x: Array, rows: int) -> Array:
+    """A cubic fitted over ``rows`` around each row; the first and the last half of them lie on one cubic."""
+    out, half, at = np.asarray(convolve1d(x, _weights(rows), mode="constant")), rows // 2, np.arange(rows)
+    out[:half] = np.polyval(np.polyfit(at, x[:rows], SMOOTH_ORDER), at[:half])
+    out[-half:] = np.polyval(np.polyfit(at, x[-rows:], SMOOTH_ORDER), at[-half:])
+    return out
+
+
+@compiled
+def _lagged(x: Array, share: float) -> Array:
+    """A lag that goes ``share`` of the way in each row, from 0."""
+    out, y = np.empty(len(x)), 0.0
+    for k in range(len(x)):
+        y = share * x[k] - (share - 1.0) * y
+        out[k] = y
+    return out
 
 
 def _above_noise(values: Array, weights: Array, noise: float, around: int) -> Array:
