@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from plant import chain, curve, electromechanical
@@ -30,7 +27,7 @@ from plant.places import (
     X,
 )
 from plant.stages import hydraulic_blocks, motor_blocks
-from plant.stages.blocks import NOTHING, W, between, elsewhere, in_blocks
+from plant.stages.blocks import NOTHING, W, between, elsewhere, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["actuator_run"]
@@ -77,9 +74,10 @@ def actuator_run(
     motor = p[KIND, 0] != 0.0  # all lanes are of one machine
     alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED) | (p[CURVES] != 0.0)
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
+    # hysteresis costs much beside a load and little without one: it stands at either end
     order = np.lexsort(
         (
-            p[VALVE_HYSTERESIS] != 0.0,
+            (p[VALVE_HYSTERESIS] != 0.0) == (p[DRIVE_LOADED] != 0.0),
             p[PISTON_STICTION] != 0.0,
             lossy,
             p[DRIVE_LOADED] != 0.0,
@@ -88,9 +86,6 @@ def actuator_run(
         )
     )
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
-    work = [range(j, min(j + W, wide)) for j in range(0, wide, W)]
-    each = max(1, -(-(p.shape[1] - wide) // (os.cpu_count() or 1)))
-    work += [range(j, min(j + each, p.shape[1])) for j in range(wide, p.shape[1], each)]
 
     def run(part: range) -> None:
         some = order[part.start : part.stop]
@@ -102,11 +97,7 @@ def actuator_run(
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)
 
-    if len(work) == 1:
-        run(work[0])
-    else:  # compiled code needs no interpreter; the costly ones, which come last, begin first
-        with ThreadPoolExecutor(min(len(work), os.cpu_count() or 1)) as threads:
-            list(threads.map(run, work[::-1]))
+    on_all_cores(run, parts_of(p.shape[1], wide, W))
 
 
 @compiled_free

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import os
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from plant.effects import EFFECTS, NEUTRAL, ROW
 from plant.layout import N_NOMINAL
 from vaneloop.base.compiled import inlined
 
-__all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "put_where_seen"]
+__all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
 
 NOTHING = np.empty((0, 0))  # where no lane has a curve
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
@@ -24,6 +26,24 @@ def in_blocks(lanes: int, width: int, few: int) -> int:
     """How many of the lanes run in blocks; the rest of at most ``few`` one by one."""
     rest = lanes % width
     return lanes - rest if rest <= few else lanes
+
+
+def parts_of(lanes: int, wide: int, width: int) -> list[range]:
+    """Lanes, ``wide`` of them in blocks of ``width``, the rest shared out to the cores: what one thread does at a
+    time.
+    """
+    each = max(1, -(-(lanes - wide) // (os.cpu_count() or 1)))
+    work = [range(j, min(j + width, wide)) for j in range(0, wide, width)]
+    return work + [range(j, min(j + each, lanes)) for j in range(wide, lanes, each)]
+
+
+def on_all_cores(run: Callable[[range], None], work: list[range]) -> None:
+    """``run`` all parts: compiled code needs no interpreter. The costly ones, which come last, begin first."""
+    if len(work) == 1:
+        run(work[0])
+        return
+    with ThreadPoolExecutor(min(len(work), os.cpu_count() or 1)) as threads:
+        list(threads.map(run, work[::-1]))
 
 
 def elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:

@@ -9,13 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from plant import chain, curve, lanes, stem
-from plant.chain import straightened, true_stroke
+from plant.chain import straight_reading, straightened, true_stroke
 from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
-from plant.places import LVDT_LAG_ERROR, POT, POT_LAG_ERROR, X
+from plant.places import (
+    LVDT_BIAS,
+    LVDT_GAIN,
+    LVDT_LAG_ERROR,
+    LVDT_NONLINEARITY,
+    LVDT_THERMAL_DRIFT,
+    POT,
+    POT_LAG_ERROR,
+    X,
+)
 from plant.series import arctangent, tangent
-from plant.stages.blocks import NOTHING, elsewhere, in_blocks
+from plant.stages.blocks import NOTHING, elsewhere, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = ["linkage_run"]
@@ -46,6 +55,7 @@ def linkage_run(
     x_lvdt   measured stroke (m): the LVDT's effects and lags are taken off it lane by lane, so that a wrong reading
              moves all stages
     n_r, t_oil, t   %, degC, s from the start of the log
+    out      quickest where a lane's samples lie side by side in memory
     known    signals of curves (`plant.curve.take`)
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
@@ -60,10 +70,20 @@ def linkage_run(
     alone = elsewhere(p, ("linkage", "pot"), CALLED) | (p[CURVES] != 0.0)
     order = np.argsort(alone, kind="stable")
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
-    if wide:
-        _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[:wide], np.empty(1, _linkage(out.shape[1])))
-    if wide < p.shape[1]:
-        _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, out, order[wide:], known)
+    to = out.transpose(2, 1, 0)
+    to = to if to.flags.c_contiguous else np.empty(to.shape)
+
+    def run(part: range) -> None:
+        some = order[part.start : part.stop]
+        if part.start < wide:
+            block = np.empty(1, _linkage(out.shape[1]))
+            _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, block)
+        else:
+            _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, known)
+
+    on_all_cores(run, parts_of(p.shape[1], wide, WIDE))
+    if not np.may_share_memory(to, out):
+        out[...] = to.transpose(2, 1, 0)
 
 
 @inlined
@@ -91,7 +111,7 @@ def _linkage_lanes(
     lanes: np.ndarray,
     known: np.ndarray,
 ) -> None:
-    """These ``lanes``, one after the other."""
+    """These ``lanes``, one after the other; out[lane, stage, m]."""
     g, stages = GEOMETRY, out.shape[1]
     before = np.empty(stages)
     for j in lanes:
@@ -110,17 +130,20 @@ def _linkage_lanes(
                     e, b = _ramp_lag(pot_lag.step(p[POT_LAG, j], p[POT_LAG_ERROR + k, j]), dt)
                     s[POT + k, j] = e * s[POT + k, j] + ((b - e) * before[k] + (1.0 - b) * vane)
                 before[k] = vane
-                out[m, k, j] = s[POT + k, j]
+                out[j, k, m] = s[POT + k, j]
 
 
 class _Crank(NamedTuple):
-    """What a block of lanes needs of each crank; by how much (s) the LVDT trails the stroke."""
+    """What a block of lanes needs of each crank; by how much (s) the LVDT trails the stroke; its straight line."""
 
     lx0: float
     x1: float
     y1: float
     le: float
     late: float
+    lvdt_gain: float
+    lvdt_drift: float
+    lvdt_bias: float
 
 
 _OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever"))
@@ -150,16 +173,18 @@ def _linkage_blocks(
     order: np.ndarray,
     block: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, `WIDE` at a time. ``block``: memory for one record `_linkage`."""
+    """The lanes of ``order``, `WIDE` at a time; out[lane, stage, m]. ``block``: memory for one record `_linkage`."""
     g = GEOMETRY
     b = block[0]
     for j0 in range(0, len(order), WIDE):
         last = min(WIDE, len(order) - j0)
-        rubbed = eccentric = False
+        rubbed = eccentric = bent = False
         for j in range(WIDE):
             q = order[j0 + min(j, last - 1)]
             b.lx0[j], b.x1[j], b.y1[j], b.le[j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
             b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
+            b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
+            bent |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
             for k in range(b.pot.shape[0]):
                 d = stem.prepare(p, q, k)
                 _put_stem(b, k, j, d)
@@ -169,9 +194,14 @@ def _linkage_blocks(
                 rubbed |= d.friction != 0.0
                 eccentric |= d.amplitude != 0.0
         for m in range(len(x_lvdt)):
-            for j in range(WIDE):
-                q = order[j0 + min(j, last - 1)]
-                b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
+            if bent:
+                for j in range(WIDE):
+                    q = order[j0 + min(j, last - 1)]
+                    b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
+            else:
+                for j in range(WIDE):
+                    off = straight_reading(0.0, b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[m])
+                    b.stroke[j] = (x_lvdt[m] + b.late[j] * speed[m] - off) / b.lvdt_gain[j]
             for j in range(WIDE):
                 b.c[j], b.d[j] = _crank(b.stroke[j], b.lx0[j], b.x1[j], b.y1[j], b.le[j])
             for k in range(b.pot.shape[0]):
@@ -202,7 +232,7 @@ def _linkage_blocks(
                     b.pot[k, j] = b.pot[k, j] if m == 0 else slow
                     b.before[k, j] = vane
                 for j in range(last):
-                    out[m, k, order[j0 + j]] = b.pot[k, j]
+                    out[order[j0 + j], k, m] = b.pot[k, j]
         for j in range(last):
             q = order[j0 + j]
             s[X, q] = b.stroke[j]

@@ -47,7 +47,7 @@ def command(args: argparse.Namespace) -> int:
     said: list[str] = []
     alone = ""  # why there is only the loop
     try:
-        chain = chain_of(args)
+        chain = chain_of(args, loop=True)
     except LogError as e:
         alone = str(e)
         extra["not_observed"] = {"all": str(e)}

@@ -36,7 +36,7 @@ def command(args: argparse.Namespace) -> int:
     from vaneloop.verbs.search import diagnosed
     from vaneloop.verbs.search import experiment as recommend
 
-    chain = chain_of(args)
+    chain = chain_of(args, loop=True)
     with options.search_bar(args) as news:
         found = diagnosed(chain, args.log, news=news)
     with terminal.progress_bar(args, "trying profiles") as progress:

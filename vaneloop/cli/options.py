@@ -59,17 +59,21 @@ def tell_search(say: Callable[[str], None]) -> None:
         say("compiling the stages of the search for this machine (once, about 30 s) ...")
 
 
-def chain_of(args: argparse.Namespace, model: Any = None) -> Any:
+def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) -> Any:
     """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``)
     describes.
+
+    loop  the command simulates the whole loop, too: compiled first, where it is not
     """
-    from hil.loop.lockstep import warm_up
     from vaneloop.verbs.parts import bind_parts, split
 
     machine = machine_of(args, model)
     own_parts = split([x for group in getattr(args, "fit", ()) for x in group], parts_to_test(args))[:2]
     log = read_log_of(args, require=())
-    warm_up(lambda text: terminal.say(args, text))
+    if loop:
+        from hil.loop.lockstep import warm_up
+
+        warm_up(lambda text: terminal.say(args, text))
     tell_search(lambda text: terminal.say(args, text))
     chain = bind_parts(machine, log, *own_parts)
     for note in chain.notes:

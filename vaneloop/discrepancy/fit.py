@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from vaneloop.discrepancy.latest import Latest
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = ["Fit", "Judge", "Task", "bounded_step", "finished", "recalibrate"]
@@ -73,7 +74,7 @@ class Judge:
         """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured
         ones).
         """
-        self.stage, self.floor = stage, np.asarray(floor, dtype=float)
+        self.stage, self.floor, self._latest = stage, np.asarray(floor, dtype=float), Latest()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
@@ -122,7 +123,9 @@ class Judge:
 
     def errors(self, thetas: Array) -> Array:
         """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""
-        thetas = np.atleast_2d(thetas)
+        return self._latest.errors(np.atleast_2d(thetas), self._simulated)
+
+    def _simulated(self, thetas: Array) -> Array:
         out = np.empty((len(thetas), *self.measured.shape))
         for i in range(0, len(thetas), MAX_SETS):
             self._whiten(self.stage.run(thetas[i : i + MAX_SETS]), out[i : i + MAX_SETS])

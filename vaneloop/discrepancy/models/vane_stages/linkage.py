@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-
 import numpy as np
 
 from plant.parameters import derive
@@ -37,9 +33,10 @@ def linkage_stage(driven: Driven) -> Stage:
         start = machine.start(stroke=x[0], n_r=n_r[0])
         machine.place_rings(start, tuple(first))
         s = np.repeat(start, len(thetas), axis=1)
-        out = np.empty((len(t), len(first), len(thetas)))
-        linkage_run(x, n_r, t_oil, t, dt, p, s, out, signals)
-        return np.rad2deg(out[:, which].transpose(2, 1, 0))
+        out = np.empty((len(thetas), len(first), len(t)))
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), signals)
+        out = out if which == list(range(len(first))) else out[:, which]
+        return np.asarray(np.rad2deg(out, out=out))
 
     # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
     # left at full speed by a controller that had to catch up, which turns between two rows
@@ -51,8 +48,7 @@ def linkage_stage(driven: Driven) -> Stage:
     if known.any():
         run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
-    both = partial(_on_two_cores, simulate, least=32)  # a block of lanes
-    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, both, t, measured)
+    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
     stage.alike = {"pot_gain": _cross_talk}
     ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)
     stage.twins = {
@@ -88,16 +84,3 @@ def _cross_talk(named: Named) -> str:
     gains = changed["pot_gain"]
     one = len(gains) == 1 and gains <= changed.get("pot_bias", set())
     return "a share of another stage's reading" if one else ""
-
-
-def _on_two_cores(simulate: Callable[[Array], Array], thetas: Array, least: int) -> Array:
-    """simulate(thetas), half of it in a second thread where there are more than ``least`` sets: compiled code needs no
-    interpreter.
-    """
-    if len(thetas) <= least:
-        return simulate(thetas)
-    half = -(-len(thetas) // 2 // least) * least
-    with ThreadPoolExecutor(1) as other:
-        second = other.submit(simulate, thetas[half:])
-        first = simulate(thetas[:half])
-        return np.concatenate([first, second.result()])
