@@ -635,18 +635,18 @@ def test_fits_made_together_are_those_made_one_by_one() -> None:
         np.testing.assert_array_equal(fit.held_out, alone.held_out)
 
 
-def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_simulating_there_again() -> None:
+def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_asking_for_errors_there_again() -> None:
     stage = integrator(7, null_bias=0.3)
     judge, name, calls = Judge(stage, FLOOR), LIBRARY[0].name, []
     begin = stage.neutral()
     begin[stage.index()[name]] = LIBRARY[0].starts[0]
-    quick, run = judge.fit((name,), begin, 1), stage.run
-    stage.run = lambda thetas: calls.append(len(thetas)) or run(thetas)
+    quick, errors = judge.fit((name,), begin, 1), judge.errors
+    judge.errors = lambda thetas: calls.append(len(thetas)) or errors(thetas)
     again = judge.fit((name,), quick.theta, 8)
-    simulated = sum(calls)
+    asked = sum(calls)
     calls.clear()
     on = judge.fit((name,), quick, 8)
-    assert sum(calls) == simulated - len(quick.free) - 1
+    assert sum(calls) == asked - len(quick.free) - 1
     np.testing.assert_allclose(on.theta, again.theta, rtol=1e-9)
     np.testing.assert_allclose(on.held_out, again.held_out, rtol=1e-9)
     calls.clear()
