@@ -105,7 +105,8 @@ NOT_RUN = {
     "export-fmu --part plant --model M.toml": "a model of the reader's own: tests/test_fmu.py",
     "fuzz --tool": "a minute each: tests/test_fuzz.py",
 }
-SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60"}
+SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60",
+           "--logs 60": "--logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
 LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables"}

@@ -86,7 +86,7 @@ def test_a_curve_does_what_its_place_says(bound, how: str, at: str, q: str) -> N
     curve = bent(how, at, q)
     table = curve(c.grid)
     placed = c.placed_as(lambda n: n[0] * table, 1)
-    effect = c.basis.effect(c.name, "", 1.0, 1.0)
+    effect = c.effect(1.0)
     one = type(effect)(c.name, effect.parameters[:1], ((1.0,),))
     w = with_curves(bound, (), [(placed, one)])
     w.runner.steps = 8
@@ -222,7 +222,7 @@ def test_a_law_file_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_law_from_a_file_does_what_the_curve_does(bound) -> None:
     c = next(c for c in candidates(bound, bound.stage.neutral()[:2]) if c.name == NAME)
     placed, effect = from_file(NAME, LAW, bound.data)
-    theirs = with_curves(bound, (), [(c.placed(np.eye(len(LAW.values))), effect)])
+    theirs = with_curves(bound, (), [(c.placed_as(c.basis.design(c.grid).__matmul__, len(LAW.values)), effect)])
     theta = np.concatenate([[0.2, 0.05], LAW.values])
     ours = with_curves(bound, (), [(placed, effect)]).run(theta[None])[0, 0]
     assert np.allclose(ours, theirs.run(theta[None])[0, 0], rtol=1e-9)
