@@ -178,7 +178,8 @@ def test_the_chain_s_stages_show_the_same_error_before_where_the_floor_was_too_h
 def test_the_vane_chain_s_compare_and_diagnose_show_the_same_error_before() -> None:
     log = vaneloop.read_log(ROOT / "examples" / "hidden_effect.parquet")
     compared = vaneloop.compare(log, fit=(0, 60))
-    assert before(compared) == before(vaneloop.diagnose(log, fit=(0, 60)))
+    # one simulation among others side by side and one alone differ in the last bit
+    assert before(compared) == pytest.approx(before(vaneloop.diagnose(log, fit=(0, 60))), rel=1e-12)
 
 
 def test_a_stage_begins_where_its_fit_may_begin_whoever_asks() -> None:

@@ -409,6 +409,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
 
 def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_told(tmp_path: Path) -> None:
     import asyncio
+    from concurrent.futures import ThreadPoolExecutor
 
     from vaneloop.web.jobs import LOADING, Spare, Worker
 
@@ -438,7 +439,8 @@ def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_t
 
     file = tmp_path / "a.csv"
     file.write_text("t,n_dem\n0,60\n0.1,61\n0.2,62\n")
-    asyncio.run(go())
+    with ThreadPoolExecutor(1) as thread:  # where no browser's loop runs
+        thread.submit(asyncio.run, go()).result()
 
 
 def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:

@@ -29,7 +29,9 @@ def _numbers(column: Any, scale: float) -> np.ndarray:
     """An array of Arrow's float64 times ``scale``, null as `ABSENT`; from its buffers: ``to_numpy`` imports pandas."""
     known, numbers = column.buffers()
     part = slice(column.offset, column.offset + len(column))
-    values = np.zeros(len(column)) if numbers is None else np.frombuffer(numbers, np.float64, part.stop)[part] * scale
+    values = np.zeros(len(column)) if numbers is None else np.frombuffer(numbers, np.float64, part.stop)[part]
+    with np.errstate(invalid="ignore", over="ignore"):  # of a damaged file any bits; what they say is judged later
+        values = values * scale
     if column.null_count:
         values[np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")[part] == 0] = ABSENT
     return values
