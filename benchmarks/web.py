@@ -22,6 +22,7 @@ __all__ = ["MEASUREMENTS"]
 
 REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
 PATIENCE = 240_000  # ms
+QUIET = 12.0  # s after which what a page has begun to load for its first log is loaded
 
 # One step on the chart of all channels: ms until the browser has drawn the moved view, and until the points of that
 # view are there.
@@ -127,6 +128,7 @@ def web() -> Iterator[Row]:
                     first.append(time.perf_counter() - began)
                 if k < 5:
                     context.close()
+                    time.sleep(QUIET)
             yield row("web: first page, until the list of logs is open", first, 1.0, "empty browser cache each time")
 
             page.get_by_role("option", name="long.parquet").click()
