@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.base.curve import POINTS
+from vaneloop.discrepancy.models.memory import STOPS, of_stops
 from vaneloop.discrepancy.stage import Array
 
 if TYPE_CHECKING:
@@ -55,7 +56,9 @@ class Curve:
     table: Callable[[Array], Array]
 
     def at(self, q: Array, table: Array) -> Array:
-        """The curve at values of its quantity."""
+        """The curve at values of its quantity; of stops, at a course of what they follow."""
+        if self.quantity.startswith(STOPS):
+            return of_stops(q, self.low, self.high, table)
         return np.interp(q, np.linspace(self.low, self.high, POINTS), table)
 
     def values(self, data: Data, log: int, u: Array, y: Array | None = None) -> Array:
@@ -88,12 +91,22 @@ def bent(curves: Active, data: Data, log: int, u: Array, p: Array) -> tuple[Arra
 
 def curves_for_kernel(curves: Active, data: Data, log: int, n: int) -> tuple[Array, ...]:
     """The last arguments of a compiled simulation with curves."""
-    names = [c.quantity for c, _ in curves if c.of >= COLUMN]
-    of = [COLUMN + names.index(c.quantity) if c.of >= COLUMN else c.of for c, _ in curves]
-    columns = np.array([data.column(log, name)[:n] for name in names]).reshape(len(names), n)
+    of, low, high, tables, columns = [], [], [], [], []
+    for c, table in curves:
+        a, b = c.low, c.high
+        if c.of >= COLUMN:
+            column = data.column(log, c.quantity)[:n]
+            if c.quantity.startswith(STOPS):  # what they make of it, as it is
+                column = c.at(column, table)
+                b = max(float(np.abs(column).max()), 1e-300)
+                a, table = -b, np.linspace(-b, b, POINTS)
+            columns.append(column)
+        of.append(COLUMN + len(columns) - 1 if c.of >= COLUMN else c.of)
+        low.append(a)
+        high.append(b)
+        tables.append(table)
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
         np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64),
-        np.array([c.low for c, _ in curves]), np.array([c.high for c, _ in curves]),
-        np.ascontiguousarray([table for _, table in curves]), columns,
+        np.array(low), np.array(high), np.ascontiguousarray(tables), np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

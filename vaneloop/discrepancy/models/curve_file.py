@@ -10,6 +10,7 @@ from vaneloop.discrepancy.curves import LEVEL
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.data import Data
+from vaneloop.discrepancy.models.memory import STOPS, named_lag
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Effect, Parameter, StageError
@@ -43,9 +44,10 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     known |= {u: INPUT + i for i, u in enumerate(signals)}
     known |= {x: i for i, x in enumerate(s.states)} if moves else {}
     columns = set.intersection(*(set(r.columns) for r in data.records))
-    shaped = {prefix + c for c in columns for prefix in (WAY, DISTANCE, SINCE)}
+    shaped = {prefix + c for c in columns for prefix in (WAY, DISTANCE, SINCE, STOPS)}
+    lag = named_lag(law.of)
     of = known.get(law.of, COLUMN)
-    if of == COLUMN and law.of not in (TIME, *columns, *shaped):
+    if of == COLUMN and law.of not in (TIME, *columns, *shaped) and not (lag and lag[0] in columns):
         raise wrong("of", law.of, ", ".join([*known, TIME, *sorted(columns - set(known))]))
     try:
         law.check(f"curves.{name}")

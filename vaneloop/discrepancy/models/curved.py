@@ -16,25 +16,46 @@ from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
+from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["Candidate", "OwnGround", "Quantity", "candidates", "on_logs", "quantities", "with_curves"]
+__all__ = ["Candidate", "OwnGround", "Quantity", "basis_for", "candidates", "on_logs", "quantities", "with_curves"]
 
 
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
+LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the shortest lag tried to the longest
+SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had."""
+    """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had; of stops,
+    the radii.
+
+    course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag so many
+            times as long
+    """
 
     name: str
     unit: str
     of: int
     visited: Array
+    course: tuple[Array, ...] = ()
+    slower: Callable[[float], Quantity] | None = None
+
+    @property
+    def stops(self) -> bool:
+        """Whether a curve of it is a hysteresis (`vaneloop.discrepancy.models.memory`)."""
+        return self.name.startswith(STOPS)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it is a lag or stops."""
+        return is_memory(self.name)
 
 
 @dataclass(frozen=True)
@@ -85,6 +106,9 @@ class Candidate:
     def placed_as(self, table: Callable[[Array], Array], parameters: int) -> Placed:
         """The same with another function from so many parameters to its table."""
         q = self.quantity
+        if q.stops:  # where they have not moved they make nothing
+            rising = table
+            table = lambda values: rising(values) - rising(values)[0]  # noqa: E731
         curve = Curve(self.how, self.place, q.of, q.name, self.basis.low, self.basis.high, table)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
@@ -131,28 +155,76 @@ def quantities(bound: Bound, values: Array) -> list[Quantity]:
             column(WAY + name, "-")
             column(DISTANCE + name, unit)
             column(SINCE + name, "s")
+    return [*out, *_remembering(bound, shared)]
+
+
+def _remembering(bound: Bound, shared: set[str]) -> list[Quantity]:
+    """Lags of what drives the model, and stops that it moves. What the model gives is none of them: its measured course
+    would tell the model what it has to say.
+    """
+    s, data = bound.system, bound.data
+    unit = s.units.get("position", "m")
+    motion = ((s.position, unit), (s.velocity, f"{unit}/s")) if s.kind == "force" else ()
+    driving = [(n, u) for n, u in (*motion, *s.inputs.items()) if n in shared]
+
+    def course(name: str) -> tuple[Array, ...]:
+        return tuple(data.column(k, name) for k in range(len(data.records)))
+
+    def slow(name: str, unit: str, tau: float) -> Quantity:
+        lag = lagged_name(name, tau)
+        again = lambda times: slow(name, unit, tau * times)  # noqa: E731
+        return Quantity(lag, unit, COLUMN, np.concatenate(course(lag)), course(name), again)
+
+    out = []
+    step = max(float(np.median(np.diff(r.t))) for r in data.records)
+    longest = LONGEST * min(float(r.t[-1] - r.t[0]) for r in data.records)
+    for name, unit in driving:
+        if not any(np.ptp(c) > 0.0 for c in course(name)):
+            continue
+        if longest > 4.0 * SHORTEST * step:
+            out += [slow(name, unit, SHORTEST * step * (longest / (SHORTEST * step)) ** z) for z in LAGS]
+        if name != s.velocity:
+            radii = 0.5 * np.concatenate(course(DISTANCE + name))
+            out.append(Quantity(STOPS + name, unit, COLUMN, radii, course(name)))
     return out
+
+
+def basis_for(q: Quantity, count: int = 0) -> Basis | None:
+    """Splines of a curve of a quantity, ``count`` of them (0: as many as usual); None where it has been at too few
+    values.
+    """
+    count = count or (IN_TIME if q.name == TIME else COUNT)
+    if q.stops:  # from a radius of 0 to where every way there and back is within it
+        return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)
+    return basis_of(q.visited, count)
+
+
+def _slips(how: str, at: str, q: Quantity, s: System) -> bool:
+    """Whether stops of a quantity may be at a place: the force on what moves, a reading of what is driven, the input
+    itself.
+    """
+    if s.kind == "force":
+        return how == "force adds" and q.name == f"{STOPS}{s.position}"
+    return how == "output adds" if s.kind == "static" else how == "input adds" and q.name == STOPS + at
 
 
 def candidates(bound: Bound, values: Array) -> list[Candidate]:
     """Every curve that may be missing: each place with each quantity."""
     s = bound.system
     moves = s.kind in ("simulate", "closed_loop")
-    known = [
-        (q, b)
-        for q in quantities(bound, values)
-        if (b := basis_of(q.visited, IN_TIME if q.name == TIME else COUNT)) is not None
-    ]
+    known = [(q, b) for q in quantities(bound, values) if (b := basis_for(q)) is not None]
     out: list[Candidate] = []
 
     def put(how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True) -> None:
         for q, basis in known:
             if q.name == but or (not moves and q.of // 100 * 100 == OUTPUT and not how.startswith("output")):
                 continue
-            name = f"{at}.{'gain' if how.endswith('times') else 'curve'}_of_{q.name}"
             if not mean and len(basis.bend) < 2:
                 continue
-            out.append(Candidate(name, how, place, at, unit, size, mean, q, basis))
+            if q.stops and not _slips(how, at, q, s):
+                continue
+            name = f"{at}.{'gain' if how.endswith('times') else 'curve'}_of_{q.name}"
+            out.append(Candidate(name, how, place, at, unit, size, mean and not q.stops, q, basis))
 
     def half(rows: Array) -> float:
         good = rows[np.isfinite(rows)]

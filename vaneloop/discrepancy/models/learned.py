@@ -225,6 +225,8 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
     been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
 
     def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
+        if c.quantity.stops:
+            return float(form.value(grid[:1], n)[0])
         return 0.0 if c.mean else float(np.mean(form.value(been, n)))
 
     def table(n: Array) -> Array:

@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 
-from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.error_share import (
     BETTER,
     HARM,
@@ -29,7 +28,8 @@ from vaneloop.discrepancy.error_share import (
 )
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
-from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.curved import Candidate, basis_for
+from vaneloop.discrepancy.models.memory import dissipates, named_lag
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
@@ -42,7 +42,10 @@ MOST_CURVES = 2
 WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
 SCREENED = 1.0  # of them, where candidates are screened
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
+OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
+OTHER = 1.5  # times as large: another amplitude
+TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which the change must help
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
 Placings = tuple[tuple[Placed, Effect], ...]
 
@@ -108,11 +111,13 @@ def _strange(candidate: Candidate) -> int:
     """Which of several candidates that do as well is meant: the lower, the plainer.
 
     What is at a place itself is plainer than what another signal says of it. Reversals follow from every quantity that
-    turns, and time from every one that drifts.
+    turns, and time from every one that drifts. What remembers imitates most.
     """
     name = candidate.quantity.name
     if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or candidate.near:
         return 0
+    if candidate.quantity.remembers:
+        return 4
     if name.startswith((WAY, DISTANCE, SINCE)):
         return 3
     return 2 if name == TIME else 1
@@ -140,6 +145,35 @@ def with_held_out(judge: Judge, fit: Fit) -> Fit:
     deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
     held = held_out(fit.cost, fit.gradients, fit.normals, mine, fit.prior * scale**2, deviation)
     return replace(fit, held_out=held)
+
+
+def _drawn(tried: Tried) -> Array:
+    """The curve of what was tried last."""
+    placed = tried.curves[-1][0]
+    assert placed.curve is not None
+    return placed.curve.table(tried.fit.theta[tried.judge.stage.index()[tried.candidate.name]])
+
+
+def _moves(tried: Tried) -> tuple[Array, Array]:
+    """How far the channel that a curve remembers goes in each block, and the number of the log that the block is of."""
+    courses, judge = tried.candidate.quantity.course, tried.judge
+    log = np.repeat(np.arange(len(courses)), [len(c) for c in courses])
+    course = np.concatenate(courses)
+    n, start = judge.measured.shape[1], judge.block_start
+    some = slice(None, None, max(1, round(len(course) / n)))
+    course, log = course[some][:n], log[some][:n]
+    return np.maximum.reduceat(course, start) - np.minimum.reduceat(course, start), log[start]
+
+
+def _step_without(tried: Tried, held: Array) -> Array:
+    """Where a fit's parameters move, in their scales, when these blocks are left out."""
+    fit, judge = tried.fit, tried.judge
+    scale = judge.scale[fit.free]
+    prior = fit.prior * scale**2
+    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    a = fit.normals[~held].sum(axis=0)
+    a = a + np.diag(prior + 1e-9 * np.maximum(np.diag(a), 1e-12))
+    return np.asarray(np.linalg.solve(a, fit.gradients[~held].sum(axis=0) - prior * deviation))
 
 
 class Learner:
@@ -180,18 +214,41 @@ class Learner:
             good = [t for t in finalists if self._earns(fit, t)]
             if not good:
                 break
-            near = [t for t in good if score(self.judge, t.fit) < score(self.judge, good[0].fit) + RIVAL]
-            best = min(near, key=lambda t: (_strange(t.candidate), t.candidate.how.endswith("times")))
+            left = {t.candidate.name: self._left(current, t) for t in good}
+            good.sort(key=lambda t: left[t.candidate.name])
+            near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
+            near.sort(key=lambda t: (_strange(t.candidate), t.candidate.how.endswith("times")))
+            best = next((t for t in near if self._confirmed(current, t)), None)
+            if best is None:
+                out.notes.append(
+                    f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
+                    f"another amplitude confirms it"
+                )
+                break
+            limit = left[best.candidate.name] + RIVAL
+            out.rivals.append([t.candidate.name for t in good if t is not best and left[t.candidate.name] < limit])
+            best = self._with_its_lag(current, best, TIMES[1:])
             why = self._harmful(current, best)
             if why:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
                 break
-            limit = score(self.judge, best.fit) + RIVAL
-            out.rivals.append([t.candidate.name for t in good if t is not best and score(self.judge, t.fit) < limit])
             best = self._settled(current, best)
             out.tried.append(best)
             current, fit = best, best.fit
+        if len(out.tried) > 1:
+            self._spare_first(out)
         return self._concluded(out, named)
+
+    def _spare_first(self, out: Outcome) -> None:
+        """Take out a first curve that only stood for what the second one is."""
+        first, second = out.tried
+        own = second.judge.stage.index()
+        gone = {*range(own[first.candidate.name].start, own[first.candidate.name].stop)}
+        theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
+        nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
+        alone = self._fitted(nothing, second.candidate, second.wiggle, theta, 16)
+        if score(self.judge, alone.fit) <= score(self.judge, second.fit) + BETTER:
+            out.tried, out.rivals = [replace(alone, told=second.told)], out.rivals[1:]
 
     def _named(self) -> tuple[Judge, Fit] | None:
         """The best laws of the library, fitted with their held-out errors, where there are any."""
@@ -227,7 +284,59 @@ class Learner:
         return out
 
     def _earns(self, before: Fit, tried: Tried) -> bool:
+        c = tried.candidate
+        if c.quantity.stops and not dissipates(c.basis.low, c.basis.high, _drawn(tried)):
+            return False
         return worth(self.judge, before, tried.fit, self.form.form).good
+
+    def _left(self, before: Tried, tried: Tried) -> float:
+        """Log of the held-out error that a curve leaves, and of what it makes of the test logs' error."""
+        tests = [v for log, v in self._change(before, tried).items() if log in self.ground.tests]
+        return score(self.judge, tried.fit) + (float(np.mean(tests)) if tests else 0.0)
+
+    def _confirmed(self, before: Tried, tried: Tried) -> bool:
+        """Whether another log, or another amplitude, says the same of a curve that remembers.
+
+        Manoeuvres of one size do not hold out a hysteresis: what imitates one of them imitates all. So each log is left
+        out in turn; of one log, the half of its blocks in which the channel moves most, then the other half.
+        """
+        if not tried.candidate.quantity.remembers:
+            return True
+        change = self._change(before, tried)
+        if change and self.ground.tests & set(change):
+            return min(change[log] for log in self.ground.tests & set(change)) < -LEAST_USE
+        moves, log = _moves(tried)
+        large = moves > np.median(moves)
+        parts = [log == k for k in range(log.max() + 1)] if log.any() else [large, ~large]
+        if not log.any() and not np.median(moves[large]) > OTHER * np.median(moves[~large]) > 0.0:
+            return False
+        fit, now = tried.fit, before.fit.cost
+        for held in parts:
+            step = _step_without(tried, held)
+            left = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
+            if not (fit.cost[held] + left).sum() < (1.0 - LEAST_USE) ** 2 * now[held].sum():
+                return False
+        return True
+
+    def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
+        """The curve with the lag that suits it best, by such ``steps`` up and down."""
+        for times in steps if best.candidate.quantity.slower is not None else ():
+            for factor in (times, 1.0 / times):
+                while (more := self._slower(current, best, factor)) is not None:
+                    best = more
+        return best
+
+    def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
+        """The curve with a lag so many times as long; None where that is no better."""
+        c = best.candidate
+        assert c.quantity.slower is not None
+        q = c.quantity.slower(times)
+        basis = basis_for(q)
+        if basis is None or basis.turn.shape != c.basis.turn.shape:
+            return None
+        name = c.name.replace(c.quantity.name, q.name)
+        more = self._fitted(current, replace(c, name=name, quantity=q, basis=basis), best.wiggle, best.fit.theta, 12)
+        return more if score(self.judge, more.fit) < score(self.judge, best.fit) - STEP else None
 
     def _settled(self, current: Tried, best: Tried) -> Tried:
         """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
@@ -259,9 +368,11 @@ class Learner:
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
         done = []
+        over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
+        quick = [t for t in quick if t not in over_time]
         for k, t in enumerate(quick[:FINISHED]):
             options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
-            done.append(min(options, key=lambda o: score(self.judge, o.fit)))
+            done.append(self._with_its_lag(current, min(options, key=lambda o: score(self.judge, o.fit)), TIMES[:1]))
             self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
         done.sort(key=lambda t: score(self.judge, t.fit))
         if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
@@ -274,7 +385,7 @@ class Learner:
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
         c = coarse.candidate
-        basis = basis_of(c.quantity.visited, SPLINES)
+        basis = basis_for(c.quantity, SPLINES)
         if basis is None or len(basis.bend) <= len(c.basis.bend):
             return None
         fine = replace(c, basis=basis)
@@ -297,8 +408,14 @@ class Learner:
         quick = self._judge((), current.curves, True)
         slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
         have = {q.effect for q, _ in current.curves}
-        out = [self._promise(current, c, slopes) for c in self.candidates if c.name not in have]
-        return sorted(out, key=lambda o: o[0])
+        out = sorted(
+            (self._promise(current, c, slopes) for c in self.candidates if c.name not in have), key=lambda o: o[0]
+        )
+        best: dict[tuple[str, str, str], tuple[float, Candidate, Array]] = {}
+        for one in out:  # of several lags of a channel, one
+            lag = named_lag(one[1].quantity.name)
+            best.setdefault((one[1].how, one[1].at, f"lag of {lag[0]}" if lag else one[1].quantity.name), one)
+        return list(best.values())
 
     def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, Array]:
         """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best.
@@ -332,6 +449,16 @@ class Learner:
 
     def _harmful(self, before: Tried, tried: Tried) -> str:
         """Why the logs speak against a curve; "": they do not."""
+        change = self._change(before, tried)
+        worst = max((log for log in change if log in self.ground.tests), key=lambda log: change[log], default=None)
+        if worst is not None and change[worst] > HARM:
+            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
+        if change and min(change.values()) > -LEAST_USE:
+            return f"no log is better by {LEAST_USE:.0%} for it"
+        return ""
+
+    def _change(self, before: Tried, tried: Tried) -> dict[str, float]:
+        """Log of the error with a curve over that without, log by log."""
         floor = self.ground.floor
 
         def levels(of: Tried) -> dict[str, float]:
@@ -340,11 +467,4 @@ class Learner:
             return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in good.items()}
 
         was, now = levels(before), levels(tried)
-        tests = self.ground.tests
-        change = {log: now[log] - was[log] for log in was if log in now}
-        worst = max((log for log in change if log in tests), key=lambda log: change[log], default=None)
-        if worst is not None and change[worst] > HARM:
-            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
-        if change and min(change.values()) > -LEAST_USE:
-            return f"no log is better by {LEAST_USE:.0%} for it"
-        return ""
+        return {log: now[log] - was[log] for log in was if log in now}

@@ -1,5 +1,6 @@
 """Quantities of which a law may be a function and which are known before a model runs: other columns of the log, time,
-and what follows from how a channel turns.
+what follows from how a channel turns, and what it was before
+(`vaneloop.discrepancy.models.memory`).
 """
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from plant.curve import TURN, turns
+from vaneloop.discrepancy.models.memory import STOPS, lagged, named_lag
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.system import Record
 from vaneloop.discrepancy.stage import Array
@@ -24,6 +26,10 @@ def column_of(record: Record, t: Array, name: str) -> Array:
     for prefix, which in ((WAY, 0), (DISTANCE, 1), (SINCE, 2)):
         if name.startswith(prefix) and name not in record.columns:
             return _turns(t, _filled(record.columns[name.removeprefix(prefix)]))[which]
+    if name.startswith(STOPS) and name not in record.columns:  # how they slip is a matter of the curve
+        return _filled(record.columns[name.removeprefix(STOPS)])
+    if name not in record.columns and (lag := named_lag(name)):
+        return np.asarray(lagged(np.ascontiguousarray(t, dtype=float), _filled(record.columns[lag[0]]), lag[1]))
     return _filled(record.columns[name])
 
 

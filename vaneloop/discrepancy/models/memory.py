@@ -1,0 +1,91 @@
+"""Quantities that remember: what a channel was a while ago, and how far it has gone since each of its turns.
+
+A lag is one of first order. A hysteresis is a sum of stops (elastic-plastic elements; Prandtl 1928, Ishlinskii 1944):
+each follows its channel up to its radius and then slips. Radii are fixed, so that the sum is known by its virgin curve
+alone: what it makes of a channel that first leaves rest. A curve that bends down has stops of positive
+weight. It can then be learned, drawn, stored and put into a formula as every other curve.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from vaneloop.base.compiled import compiled
+from vaneloop.discrepancy.stage import Array
+
+__all__ = ["STOPS", "dissipates", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
+
+STOPS = "stops_of_"
+RADII = 64  # of the stops of a hysteresis, closer the smaller: most of it slips early
+COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
+NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
+_LAGGED = re.compile(r"(.+)_lagged_by_([1-9]\d*)_(s|ms|us|ns)")
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+def is_memory(name: str) -> bool:
+    """Whether a quantity's name is that of a lag, or of stops."""
+    return name.startswith(STOPS) or named_lag(name) is not None
+
+
+def named_lag(name: str) -> tuple[str, float] | None:
+    """Channel and time constant (s) of a lagged quantity; None: it is none."""
+    found = _LAGGED.fullmatch(name)
+    return (found[1], int(found[2]) * _UNITS[found[3]]) if found else None
+
+
+def lagged_name(channel: str, tau: float) -> str:
+    """Name of a channel lagged by ``tau`` (s), to three digits."""
+    tau = float(f"{tau:.3g}")
+    unit = next((u for u, size in _UNITS.items() if tau / size >= 1.0 - 1e-9 and _whole(tau / size)), "ns")
+    return f"{channel}_lagged_by_{max(round(tau / _UNITS[unit]), 1)}_{unit}"
+
+
+def _whole(x: float) -> bool:
+    return abs(x - round(x)) < 1e-6 * x
+
+
+@compiled
+def lagged(t: np.ndarray, q: np.ndarray, tau: float) -> np.ndarray:
+    """A channel ``q`` at times ``t`` (s) through a first-order lag that starts settled; straight between samples."""
+    out = np.empty(len(q))
+    y = out[0] = q[0]
+    for k in range(1, len(q)):
+        z = (t[k] - t[k - 1]) / tau
+        keep = np.exp(-z)
+        slope = (q[k] - q[k - 1]) / z if z > 0.0 else 0.0
+        y = out[k] = q[k] - slope + (y - q[k - 1] + slope) * keep
+    return out
+
+
+@compiled
+def _slipped(q: np.ndarray, radii: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    out, at = np.zeros(len(q)), np.zeros(len(radii))
+    for k in range(1, len(q)):
+        move, total = q[k] - q[k - 1], 0.0
+        for i in range(len(radii)):
+            at[i] = min(max(at[i] + move, -radii[i]), radii[i])
+            total += weights[i] * at[i]
+        out[k] = total
+    return out
+
+
+def _stops(low: float, high: float, table: Array, count: int = RADII) -> tuple[Array, Array]:
+    """Radii and weights of the stops that a virgin curve, even points from ``low`` to ``high``, is made of."""
+    radii = high * np.linspace(0.0, 1.0, count + 1) ** 2
+    slopes = np.diff(np.interp(radii, np.linspace(low, high, len(table)), table)) / np.diff(radii)
+    return radii[1:], slopes - np.append(slopes[1:], 0.0)
+
+
+def of_stops(q: Array, low: float, high: float, table: Array) -> Array:
+    """What the hysteresis with this virgin curve makes of a channel ``q``, which starts at rest; float64[samples]."""
+    return np.asarray(_slipped(np.ascontiguousarray(q, dtype=float), *_stops(low, high, table)))
+
+
+def dissipates(low: float, high: float, table: Array) -> bool:
+    """Whether the stops of a virgin curve, seen coarsely, have weights of one sign, as all has that only takes energy."""
+    weights = _stops(low, high, table, COARSE)[1][:-1]  # the last one stands for all that is wider
+    size = float(np.abs(weights).sum())
+    return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE * size
