@@ -22,7 +22,7 @@ from plant import Model, load_model, write_model
 from plant.model import Learned
 from tests.browser import open_to_all
 from vaneloop import InputError, Record, System, unknown
-from vaneloop.base.curve import on_table
+from vaneloop.base.curve import POINTS, on_table
 from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import read
 from vaneloop.cli.blind import as_curve
@@ -33,6 +33,7 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import candidates, with_curves
 from vaneloop.discrepancy.models.learning import held_out
+from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
 from vaneloop.verbs.learn import learn
 from vaneloop.verbs.search import diagnose
@@ -370,3 +371,103 @@ def test_a_slope_that_parameters_take_is_left_to_them_and_the_formula_is_found(t
     assert named.effects == [law.name]
     with pytest.raises(InputError, match=r"'u\.satration': not a law that system 'limited' can have"):
         learn(records[:1], limited, without=["u.satration"])
+
+
+# ---- what remembers --------------------------------------------------------------------------------------------------
+
+
+def stops_written_out(q: np.ndarray, radii: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """A sum of elastic-plastic elements, each by its own rule."""
+    out, at = np.zeros(len(q)), np.zeros(len(radii))
+    for k in range(1, len(q)):
+        at = np.clip(at + q[k] - q[k - 1], -radii, radii)
+        out[k] = weights @ at
+    return out
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hysteresis_is_known_by_its_virgin_curve(seed: int) -> None:
+    """A sum of stops from the curve alone, against the stops themselves; Masing's rule: a turn doubles the curve."""
+    rng = np.random.default_rng(seed)
+    reach = 10.0 ** rng.uniform(-6, 6)
+    radii, weights = reach * rng.uniform(0.05, 1.0, 5), rng.uniform(0.1, 3.0, 5) / reach
+    grid = np.linspace(0.0, reach, POINTS)
+    virgin = (weights * np.minimum(grid[:, None], radii)).sum(axis=1)
+    q = reach * np.interp(np.arange(800), np.arange(0, 800, 40), np.append(0.0, rng.uniform(-1.0, 1.0, 19)))
+    ours, theirs = of_stops(q, 0.0, reach, virgin), stops_written_out(q, radii, weights)
+    assert np.max(np.abs(ours - theirs)) < 0.02 * np.ptp(theirs)
+    assert dissipates(0.0, reach, virgin) and dissipates(0.0, reach, -virgin)
+    assert not dissipates(0.0, reach, reach * np.sin(9.0 * grid / reach))
+    way = np.linspace(0.0, reach, 101)
+    back = of_stops(np.concatenate([way, way[::-1]]), 0.0, reach, virgin)
+    fall = back[100] - back[101:]
+    assert fall == pytest.approx(2.0 * np.interp(0.5 * (way[100] - way[::-1]), grid, virgin), abs=0.02 * virgin[-1])
+
+
+@pytest.mark.parametrize("tau", [0.02, 0.7, 40.0])
+def test_a_lag_is_one_of_first_order(tau: float) -> None:
+    """Against scipy's integrator, at uneven samples."""
+    rng = np.random.default_rng(5)
+    t = np.cumsum(rng.uniform(0.01, 0.3, 200))
+    q = rng.standard_normal(200).cumsum()
+    theirs = [q[0]]
+    for k in range(1, len(t)):
+        step = solve_ivp(
+            lambda at, y: (np.interp(at, t, q) - y) / tau, t[k - 1 : k + 1], theirs[-1:], method="LSODA", rtol=1e-9,
+            atol=1e-9,
+        )  # fmt: skip
+        theirs.append(float(step.y[0, -1]))
+    assert lagged(t, q, tau) == pytest.approx(np.array(theirs), abs=1e-5 * np.ptp(q))
+
+
+@given(st.floats(1e-6, 1e6))
+def test_the_name_of_a_lag_says_how_long(tau: float) -> None:
+    name, said = named_lag(lagged_name("pump_lagged", tau)) or ("", 0.0)
+    assert name == "pump_lagged"
+    assert said == pytest.approx(max(tau, 1e-9), rel=6e-3)
+
+
+VALVE = System(
+    name="sticky_valve", kind="static", model=lambda u, p: p.gain * u.current, inputs={"current": "mA"},
+    outputs={"flow": "l/min"}, parameters=[unknown("gain", 1.0, "l/(min mA)")],
+)  # fmt: skip
+STOPS_OF_VALVE = np.array([0.5, 1.0, 2.0, 4.0]), np.array([-0.4, -0.3, -0.3, -0.2])
+
+
+def run_of_a_valve(seed: int, name: str, ways: np.ndarray | None = None) -> Record:
+    """A valve that follows its current late, going there and back by ``ways`` (default: of all sizes)."""
+    rng = np.random.default_rng(seed)
+    ways = np.append(0.0, rng.uniform(-10.0, 10.0, 41)) if ways is None else ways
+    t = np.arange(0.0, 200.0, 0.05)
+    current = np.interp(t, np.linspace(0.0, 200.0, len(ways)), ways)
+    flow = 3.0 * current + stops_written_out(current, *STOPS_OF_VALVE)
+    return Record(name, t, {"current": current, "flow": flow + 0.05 * rng.standard_normal(len(t))})
+
+
+def test_a_hysteresis_is_learned_and_helps_another_log(tmp_path: Path) -> None:
+    answer = learn([run_of_a_valve(1, "one")], VALVE)
+    (law,) = answer.laws
+    assert (law.at, law.of) == ("flow", "stops_of_current")
+    radii, weights = STOPS_OF_VALVE
+    truth = (weights * np.minimum(law.x[:, None], radii)).sum(axis=1)
+    line = law.x * float(law.x @ (truth - law.y) / (law.x @ law.x)) if 1 in law.untold else 0.0
+    assert law.y + line == pytest.approx(truth, abs=0.15)
+    assert "hysteresis of current" in law.sentence()
+    answer.write(tmp_path / "law.toml")
+    model = read(tmp_path / "law.toml", Model)
+    other = run_of_a_valve(2, "other")
+
+    def left(m: Model) -> float:
+        bound = VALVE.bind([other], values=m.parameters, present=m.effects, curves=m.curves)
+        return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
+
+    before, after = left(Model(parameters=model.parameters)), left(model)
+    assert before > 0.5 and after < 0.06
+
+
+def test_a_hysteresis_that_one_amplitude_shows_is_not_learned() -> None:
+    """Every way there and back is as long as the others: what imitates one imitates all."""
+    answer = learn([run_of_a_valve(1, "one", np.append(0.0, np.tile([6.0, -6.0], 20)))], VALVE)
+    assert not any(law.of.startswith("stops_of") for law in answer.laws)
+    if answer.outcome.verdict != "learned":
+        assert any("neither another log nor another amplitude" in n for n in answer.outcome.notes)

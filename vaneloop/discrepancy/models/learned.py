@@ -15,6 +15,7 @@ from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.learning import Ground, Tried, with_held_out
+from vaneloop.discrepancy.models.memory import STOPS, named_lag
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
@@ -86,19 +87,24 @@ class LearnedLaw:
 
     def sentence(self) -> str:
         """What it is, in words."""
+        stops, lag = self.of.startswith(STOPS), named_lag(self.of)
+        what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of}"
+        if lag:
+            what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
         does = {
-            "parameter times": f"{self.at} is multiplied by 1 + a function of {self.of}",
-            "input adds": f"a function of {self.of} is added to {self.at}",
-            "input times": f"{self.at} is multiplied by 1 + a function of {self.of}",
-            "state adds": f"a function of {self.of} is taken off the derivative of {self.at}",
-            "force adds": f"a function of {self.of} is added to the force",
-            "output adds": f"a function of {self.of} is added to the reading {self.at}",
-            "output times": f"the reading {self.at} is multiplied by 1 + a function of {self.of}",
-            "adds": f"a function of {self.of} is added to {self.at}",
-            "times": f"{self.at} is multiplied by 1 + a function of {self.of}",
+            "parameter times": f"{self.at} is multiplied by 1 + {what}",
+            "input adds": f"{what} is added to {self.at}",
+            "input times": f"{self.at} is multiplied by 1 + {what}",
+            "state adds": f"{what} is taken off the derivative of {self.at}",
+            "force adds": f"{what} is added to the force",
+            "output adds": f"{what} is added to the reading {self.at}",
+            "output times": f"the reading {self.at} is multiplied by 1 + {what}",
+            "adds": f"{what} is added to {self.at}",
+            "times": f"{self.at} is multiplied by 1 + {what}",
         }[self.how]
         best = self.formulas[0] if self.formulas else None
-        said = f", {best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
+        said = f"{best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
+        said = f", {'with the virgin curve ' if stops else ''}{said}" if said else ""
         return f"{does}{said}"
 
 

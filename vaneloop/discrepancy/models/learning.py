@@ -308,7 +308,7 @@ class Learner:
         moves, log = _moves(tried)
         large = moves > np.median(moves)
         parts = [log == k for k in range(log.max() + 1)] if log.any() else [large, ~large]
-        if not log.any() and not np.median(moves[large]) > OTHER * np.median(moves[~large]) > 0.0:
+        if not large.any() or not log.any() and not np.median(moves[large]) > OTHER * np.median(moves[~large]) > 0.0:
             return False
         fit, now = tried.fit, before.fit.cost
         for held in parts:

@@ -85,7 +85,7 @@ def of_stops(q: Array, low: float, high: float, table: Array) -> Array:
 
 
 def dissipates(low: float, high: float, table: Array) -> bool:
-    """Whether the stops of a virgin curve, seen coarsely, have weights of one sign, as all has that only takes energy."""
+    """Whether the stops of a virgin curve, seen coarsely, have weights of one sign: then they only take energy."""
     weights = _stops(low, high, table, COARSE)[1][:-1]  # the last one stands for all that is wider
     size = float(np.abs(weights).sum())
     return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE * size
