@@ -471,3 +471,49 @@ def test_a_hysteresis_that_one_amplitude_shows_is_not_learned() -> None:
     assert not any(law.of.startswith("stops_of") for law in answer.laws)
     if answer.outcome.verdict != "learned":
         assert any("neither another log nor another amplitude" in n for n in answer.outcome.notes)
+
+
+def bent_valve() -> Record:
+    """A valve whose flow is 3 i + 4 tanh(i / 2)."""
+    r = run_of_a_valve(1, "bent")
+    t, i = r.t[::4], r.columns["current"][::4]
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(i))
+    return Record("bent", t, {"current": i, "flow": 3.0 * i + 4.0 * np.tanh(i / 2.0) + noise})
+
+
+@pytest.mark.parametrize("shape", [("odd",), ("zero",), ("rising", "zero"), ("rising",), ("falling",)])
+def test_a_curve_has_the_shape_that_is_known(shape: tuple[str, ...]) -> None:
+    """Whatever its amplitudes, within their bounds; and a time that begins at 0 has no odd curve."""
+    bound = VALVE.bind([bent_valve()])
+    shaped = [s for c in candidates(bound, bound.stage.neutral()[:1]) if (s := c.shaped(shape)) is not None]
+    shaped = [c for c in shaped if not c.quantity.stops]
+    assert any(c.quantity.name == "current" for c in shaped)
+    assert any(c.quantity.name == "time" for c in shaped) == ("odd" not in shape)
+    rng = np.random.default_rng(3)
+    for c in shaped:
+        low = np.array([p.low for p in c.effect(1.0).parameters])
+        placed = c.placed()
+        assert placed.curve is not None
+        x, y = c.grid, placed.curve.table(np.maximum(rng.standard_normal(len(low)), low))
+        size = float(np.max(np.abs(y)))
+        assert size > 0.0
+        if "zero" in shape:
+            assert np.interp(0.0, x, y) == pytest.approx(0.0, abs=0.01 * size)
+        if "odd" in shape:
+            assert x[0] == pytest.approx(-x[-1])
+            assert y == pytest.approx(-y[::-1], abs=1e-9 * size)
+        if up := ("rising" in shape) - ("falling" in shape):
+            assert np.min(up * np.diff(y)) >= -1e-9 * size
+
+
+def test_a_curve_that_is_known_to_rise_from_zero_is_learned_so() -> None:
+    (law,) = learn([bent_valve()], VALVE, shape=("rising", "zero")).laws
+    assert law.error_after < 1.5
+    assert np.min(np.diff(law.y)) >= -1e-9
+    assert law.formulas[0].form == "tanh"
+
+
+@pytest.mark.parametrize("shape", [["round"], ["rising", "falling"], ["odd", "rising"]])
+def test_a_shape_that_no_curve_has_is_refused(shape: list[str]) -> None:
+    with pytest.raises(InputError, match=r"^shape \(="):
+        learn([bent_valve()], VALVE, shape=shape)

@@ -41,6 +41,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--python", metavar="LAW.py", help="write the first law as a Python file, too: of a model of your own as a Law"
     )
+    parser.add_argument(
+        "--shape", nargs="+", default=[], metavar="SHAPE",
+        help="what you know of every curve: zero (nothing where its quantity is 0), odd (same with the other sign), "
+        "rising, falling; zero may stand beside another",
+    )  # fmt: skip
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
     parser.set_defaults(learns=True)
@@ -49,20 +54,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.verbs.learn import learned, with_path
+    from vaneloop.verbs.learn import checked_shape, learned, with_path
     from vaneloop.verbs.search import not_given
 
     for path in filter(None, (args.out, args.python)):
         if Path(path).is_dir() or not Path(path).parent.is_dir():
             raise InputError(f"{path}: cannot be written")
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
+    checked_shape(args.shape)
     own = own_model.asked(args)
     chain: Any = None if own else not_given(options.chain_of(args), args.without)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
         if own:
-            answer = own_model.ask(args, "learn", without=args.without, progress=tell)
+            answer = own_model.ask(args, "learn", without=args.without, shape=args.shape, progress=tell)
         else:
-            answer = learned(chain, args.log, options.machine_of(args).added, progress=tell)
+            answer = learned(chain, args.log, options.machine_of(args).added, progress=tell, shape=args.shape)
     if answer.model is not None and args.out:
         answer = with_path(answer, args.out, words)
     if answer.by_log is not None:

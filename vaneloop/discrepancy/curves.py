@@ -11,7 +11,7 @@ matters, and the mean and the slope can be held at zero, to see what the curve s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,11 +35,14 @@ class Basis:
     turn    float64[splines, functions]: B-spline coefficients of each function; function 0 is a constant, 1 a straight
             line, both and all others with mean square 1 over the visited values
     bend    float64[functions]: mean square of the second derivative over the range, as a share of that of function 2
+    rises   functions but the constant are steps up (1) or down (-1) from one spline to the next, of amplitudes that are
+            not below 0; 0: none of this
     """
 
     knots: Array
     turn: Array
     bend: Array
+    rises: int = 0
 
     @property
     def low(self) -> float:
@@ -50,6 +53,16 @@ class Basis:
     def high(self) -> float:
         """Where it ends; above, curves stay as here."""
         return float(self.knots[-1])
+
+    def zeroed(self) -> Basis:
+        """The same functions less what they are at 0."""
+        return replace(self, turn=self.turn - self.design(np.zeros(1)) @ self.turn)
+
+    def rising(self, sign: int) -> Basis:
+        """The same splines, of curves that only rise (1) or fall (-1)."""
+        n = len(self.turn)
+        steps = sign * np.tril(np.ones((n, n)))[:, 1:]
+        return replace(self, turn=np.column_stack([np.ones(n), steps]), bend=np.ones(n), rises=sign)
 
     def design(self, x: Array) -> Array:
         """`splines` of its knots at ``x``."""
@@ -65,11 +78,13 @@ class Basis:
         wide = float(np.sqrt(3.0) * LEVEL * size)
         out = []
         for k in kept:
-            own = ("mean", "slope")[k] if k < 2 else f"bend_{k - 1}"
-            tolerance = wide if k < 2 else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
-            out.append(Parameter(own, 0.0, unit, scale=size, tolerance=tolerance))
+            step = self.rises and k > 0
+            own = f"step_{k}" if step else ("mean", "slope")[k] if k < 2 else f"bend_{k - 1}"
+            tolerance = wide if k < 2 and not step else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
+            out.append(Parameter(own, 0.0, unit, 0.0 if step else -np.inf, scale=size, tolerance=tolerance))
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
-                       for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3))  # fmt: skip
+                       for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3)
+                       if sign * size > out[k].low)  # fmt: skip
         return Effect(name, tuple(out), starts)
 
 

@@ -152,10 +152,13 @@ def learn(
     test: Any = (),
     added: Model | None = None,
     without: Sequence[str] = (),
+    shape: Sequence[str] = (),
     workers: int = 2,
     progress: Callable[[float], None] | None = None,
 ) -> Learned:
     """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`.
+
+    shape  what is known of every curve: "zero" where its quantity is 0, "odd", "rising", "falling"
 
     The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
     InputError for logs that the system cannot be held against.
@@ -166,10 +169,10 @@ def learn(
 
         machine = model or Machine()
         chain, name = chain_for(log, machine, fit, test)
-        return learned(not_given(chain, without), name, machine.added, workers=workers, progress=tell)
+        return learned(not_given(chain, without), name, machine.added, workers, tell, shape=shape)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
-        return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f))
+        return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f), checked_shape(shape))
     except StageError as e:
         raise InputError(str(e)) from None
 
@@ -181,6 +184,7 @@ def learned(
     workers: int = 2,
     progress: Callable[[float], None] | None = None,
     found: Diagnosed | None = None,
+    shape: Sequence[str] = (),
 ) -> Learned:
     """`learn` of a log that has been put into the stages of the vane chain.
 
@@ -192,6 +196,7 @@ def learned(
     from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
 
     tell = progress or (lambda _: None)
+    shape = checked_shape(shape)
     begun = 0.0 if found else 0.4
     found = found or of_chain(chain, log, workers, lambda f: tell(0.4 * f))
     stages = found.diagnosis.stages
@@ -205,7 +210,7 @@ def learned(
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
         ground = VaneGround(stage, d.floor, test)
-        learner = Learner(ground, d, lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones)))  # type: ignore[misc]
+        learner = Learner(ground, d, lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones)), shape)  # type: ignore[misc]
         one = learner.learned()
         out = out or one
         said += [f"{d.stage}: {note}" for note in one.notes]
@@ -238,7 +243,22 @@ def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
     return model.model_copy(update={"parameters": {**model.parameters, **moved}})
 
 
-def _learned(diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None]) -> Learned:
+def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
+    """What is known of curves; InputError where that is no shape, or no curve has it all."""
+    from vaneloop.discrepancy.models.curved import SHAPES
+
+    for name in shape:
+        if name not in SHAPES:
+            raise InputError(f"shape (={name!r}): allowed: {', '.join(SHAPES)}")
+    one_of = [n for n in ("odd", "rising", "falling") if n in shape]
+    if len(one_of) > 1:
+        raise InputError(f"shape (={', '.join(shape)}): of {' and '.join(one_of)} one is allowed")
+    return tuple(dict.fromkeys(shape))
+
+
+def _learned(
+    diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str]
+) -> Learned:
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.curved import OwnGround, on_logs
     from vaneloop.discrepancy.models.learned import law_of
@@ -248,7 +268,7 @@ def _learned(diagnosed: Diagnosed, added: Model | None, progress: Callable[[floa
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
     ground = OwnGround(logs)
-    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress)
+    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress, shape)
     outcome = learner.learned()
     if outcome.verdict != "learned":
         return Learned(diagnosed, outcome, [], log=diagnosed.log)

@@ -31,6 +31,14 @@ LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the 
 SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
 
 
+SHAPES = {
+    "zero": "nothing where its quantity is 0",
+    "odd": "the same with the other sign where its quantity has the other sign",
+    "rising": "never falls",
+    "falling": "never rises",
+}  # what may be known of a curve
+
+
 @dataclass(frozen=True)
 class Quantity:
     """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had; of stops,
@@ -45,7 +53,7 @@ class Quantity:
     of: int
     visited: Array
     course: tuple[Array, ...] = ()
-    slower: Callable[[float], Quantity] | None = None
+    slower: Callable[[float], Quantity | None] | None = None
 
     @property
     def stops(self) -> bool:
@@ -68,6 +76,7 @@ class Candidate:
     mean   whether it may have a mean
     near   whether the quantity is at the place itself, whatever their names
     untold of its mean (0) and slope (1): what it has not, as the logs do not tell it from fitted parameters
+    shape  what is known of it beforehand (`SHAPES`)
     """
 
     name: str
@@ -81,12 +90,42 @@ class Candidate:
     basis: Basis
     near: bool = False
     untold: tuple[int, ...] = ()
+    shape: tuple[str, ...] = ()
+
+    @property
+    def lent(self) -> set[int]:
+        """Of its mean (0) and slope (1), what parameters of the model have."""
+        return {*self.untold, *(() if self.mean else (0,))}
 
     @property
     def kept(self) -> list[int]:
         """Its basis' functions that it has."""
-        gone = {*self.untold, *(() if self.mean else (0,))}
-        return [k for k in range(self.basis.turn.shape[1]) if k not in gone]
+        gone = self.lent | ({0} if "zero" in self.shape else set())
+        step = 2 if "odd" in self.shape else 1  # of a basis over as much below 0 as above, every other one
+        return [k for k in range(step - 1, self.basis.turn.shape[1], step) if k not in gone]
+
+    def shaped(self, shape: Sequence[str]) -> Candidate | None:
+        """The same with what is known of its shape; None where its quantity cannot have that."""
+        if not shape or self.quantity.stops:
+            return self
+        c = replace(self, shape=tuple(shape))
+        basis = c.basis_of(IN_TIME if c.quantity.name == TIME else COUNT)
+        if basis is None or len(basis.bend) < 3:
+            return None
+        return replace(c, basis=basis)
+
+    def basis_of(self, count: int) -> Basis | None:
+        """So many splines for it."""
+        q, shape = self.quantity, self.shape
+        if not shape or q.stops:
+            return basis_for(q, count)
+        x = q.visited[np.isfinite(q.visited)]
+        if not shape_fits(shape, x):
+            return None
+        basis = basis_of(np.concatenate([x, -x]) if "odd" in shape else x, count)
+        if basis is not None and (rises := ("rising" in shape) - ("falling" in shape)):
+            basis = basis.rising(rises)
+        return basis.zeroed() if basis is not None and "zero" in shape else basis
 
     @property
     def turn(self) -> Array:
@@ -170,19 +209,22 @@ def _remembering(bound: Bound, shared: set[str]) -> list[Quantity]:
     def course(name: str) -> tuple[Array, ...]:
         return tuple(data.column(k, name) for k in range(len(data.records)))
 
-    def slow(name: str, unit: str, tau: float) -> Quantity:
+    step = max(float(np.median(np.diff(r.t))) for r in data.records)
+    shortest, longest = SHORTEST * step, LONGEST * min(float(r.t[-1] - r.t[0]) for r in data.records)
+
+    def slow(name: str, unit: str, tau: float) -> Quantity | None:
+        if not 0.5 * shortest < tau < 2.0 * longest:
+            return None
         lag = lagged_name(name, tau)
         again = lambda times: slow(name, unit, tau * times)  # noqa: E731
         return Quantity(lag, unit, COLUMN, np.concatenate(course(lag)), course(name), again)
 
     out = []
-    step = max(float(np.median(np.diff(r.t))) for r in data.records)
-    longest = LONGEST * min(float(r.t[-1] - r.t[0]) for r in data.records)
     for name, unit in driving:
         if not any(np.ptp(c) > 0.0 for c in course(name)):
             continue
-        if longest > 4.0 * SHORTEST * step:
-            out += [slow(name, unit, SHORTEST * step * (longest / (SHORTEST * step)) ** z) for z in LAGS]
+        if longest > 4.0 * shortest:
+            out += [q for z in LAGS if (q := slow(name, unit, shortest * (longest / shortest) ** z)) is not None]
         if name != s.velocity:
             radii = 0.5 * np.concatenate(course(DISTANCE + name))
             out.append(Quantity(STOPS + name, unit, COLUMN, radii, course(name)))
@@ -197,6 +239,12 @@ def basis_for(q: Quantity, count: int = 0) -> Basis | None:
     if q.stops:  # from a radius of 0 to where every way there and back is within it
         return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)
     return basis_of(q.visited, count)
+
+
+def shape_fits(shape: Sequence[str], x: Array) -> bool:
+    """Whether a quantity that has been at ``x`` can have curves of a shape: what speaks of 0 needs values there."""
+    low, high = (float(x.min()), float(x.max())) if len(x) else (1.0, 0.0)
+    return ("zero" not in shape or low <= 0.0 <= high) and ("odd" not in shape or low < 0.0 < high)
 
 
 def _slips(how: str, at: str, q: Quantity, s: System) -> bool:

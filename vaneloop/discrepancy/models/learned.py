@@ -139,12 +139,13 @@ def _band(tried: Tried, table: object) -> tuple[Array, Array]:
     weights = rng.multinomial(n, np.full(n, 1.0 / n), DRAWS)
     known = rng.standard_normal((DRAWS, len(prior))) * np.sqrt(prior)
     at = judge.stage.index()[c.name]
+    bounds = tuple(b[fit.free] for b in judge.bounds())
     mine = np.flatnonzero((fit.free >= at.start) & (fit.free < at.stop))
     curves = []
     for w, drawn in zip(weights, known, strict=True):
         a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
         step = np.linalg.solve(a, (w - 1.0) @ fit.gradients + drawn)
-        curves.append(table((fit.theta[fit.free] + step * scale)[mine]))  # type: ignore[operator]
+        curves.append(table(np.clip(fit.theta[fit.free] + step * scale, *bounds)[mine]))  # type: ignore[operator]
     edge = 50.0 * (1.0 - BAND)
     low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
     y = table(fit.theta[at])  # type: ignore[operator]
@@ -157,7 +158,7 @@ def _with_formulas(c: Candidate, y: Array, low: Array, high: Array, formulas: li
     below, above = y - low, high - y
     for formula in formulas:
         f = values_of(formula, x)
-        gone = [k for k in (0, 1) if k not in c.kept]
+        gone = sorted(c.lent)
         if gone:  # the curve has them as the parameters leave them, and the formula has its own
             lines = np.stack([(np.ones(POINTS), x, f)[k] for k in (*gone, *([2] if 1 in gone else []))])
             f = f + np.linalg.lstsq(lines[:, visited].T, (y - f)[visited], rcond=1e-9)[0] @ lines
@@ -194,8 +195,8 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
             continue
         if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
             continue
-        got = begin(form, visited, at_visited, {k for k in (0, 1) if k not in c.kept})
-        if got is not None and got[1] < SHAPED:
+        got = begin(form, visited, at_visited, c.lent)
+        if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
@@ -212,6 +213,19 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
         if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):
             out.append(f)
     return out
+
+
+def _is_shaped(form: Form, numbers: Array, c: Candidate) -> bool:
+    """Whether a formula has the shape that its curve is known to have."""
+    x = c.grid
+    y, other, none = (np.broadcast_to(form.value(q, numbers), q.shape) for q in (x, -x, np.zeros(1)))
+    little = 1e-6 * float(np.max(np.abs(y)))
+    steps = np.diff(y) * (("rising" in c.shape) - ("falling" in c.shape))
+    return bool(
+        ("zero" not in c.shape or abs(none[0]) <= little)
+        and ("odd" not in c.shape or np.max(np.abs(y + other)) <= little)
+        and steps.min() >= -little
+    )
 
 
 def values_of(formula: Formula, q: Array) -> Array:

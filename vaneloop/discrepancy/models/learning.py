@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from vaneloop.discrepancy.curves import COUNT
 from vaneloop.discrepancy.error_share import (
     BETTER,
     HARM,
@@ -26,9 +27,9 @@ from vaneloop.discrepancy.error_share import (
     score,
     worth,
 )
-from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.locate import agrees
-from vaneloop.discrepancy.models.curved import Candidate, basis_for
+from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.memory import dissipates, named_lag
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
@@ -143,6 +144,13 @@ def with_held_out(judge: Judge, fit: Fit) -> Fit:
     if not mine.any():
         return fit
     deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    # what a bound holds stays there, whatever block is left out
+    low, high = (b[fit.free] for b in judge.bounds())
+    pull = fit.gradients.sum(axis=0) - fit.prior * scale**2 * deviation
+    at = fit.theta[fit.free]
+    mine &= ~((at <= low) & (pull < 0.0) | (at >= high) & (pull > 0.0))
+    if not mine.any():
+        return fit
     held = held_out(fit.cost, fit.gradients, fit.normals, mine, fit.prior * scale**2, deviation)
     return replace(fit, held_out=held)
 
@@ -182,15 +190,19 @@ class Learner:
     ground    the stage on its logs
     d         what `diagnose` says of it
     progress  called with the share that is done
+    shape     what is known of every curve (`vaneloop.discrepancy.models.curved.SHAPES`)
     """
 
-    def __init__(self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None):
+    def __init__(
+        self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
+        shape: Sequence[str] = (),
+    ):  # fmt: skip
         self.ground, self.d, self.progress = ground, d, progress or (lambda _: None)
         self.judge = self._judge((), ())
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
         self.form = ErrorShare(self.judge)
         self.form.begin(self.base)
-        self.candidates = ground.candidates(self.base.theta)
+        self.candidates = [s for c in ground.candidates(self.base.theta) if (s := c.shaped(shape)) is not None]
 
     def _judge(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Judge:
         return Judge(self.ground.stage(laws, curves, quick), self.ground.floor)
@@ -331,8 +343,8 @@ class Learner:
         c = best.candidate
         assert c.quantity.slower is not None
         q = c.quantity.slower(times)
-        basis = basis_for(q)
-        if basis is None or basis.turn.shape != c.basis.turn.shape:
+        basis = replace(c, quantity=q).basis_of(COUNT) if q is not None else None
+        if q is None or basis is None or basis.turn.shape != c.basis.turn.shape:
             return None
         name = c.name.replace(c.quantity.name, q.name)
         more = self._fitted(current, replace(c, name=name, quantity=q, basis=basis), best.wiggle, best.fit.theta, 12)
@@ -347,7 +359,7 @@ class Learner:
         whole = best.candidate
         found = dict(zip(whole.kept, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
         nominal = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]]
-        for untold in ((0, 1), (1,), (0,)):
+        for untold in ((0, 1), (1,), (0,)) if not whole.basis.rises else ((0,),):
             c = replace(whole, untold=untold)
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
@@ -385,12 +397,13 @@ class Learner:
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
         c = coarse.candidate
-        basis = basis_for(c.quantity, SPLINES)
+        basis = c.basis_of(SPLINES)
         if basis is None or len(basis.bend) <= len(c.basis.bend):
             return None
         fine = replace(c, basis=basis)
         curve = c.basis.design(fine.grid) @ (c.turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
         amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ fine.turn, curve, rcond=None)[0]
+        amplitudes = np.maximum(amplitudes, [p.low for p in fine.effect(1.0).parameters])
         theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
         return self._fitted(current, fine, WIGGLES[-1], theta, 12)
 
@@ -439,7 +452,11 @@ class Learner:
         trials = np.repeat(theta[None], len(DAMPED), axis=0)
         low, high = judge.bounds()
         for row, damping in zip(trials, DAMPED, strict=True):
-            step = np.linalg.solve(a + damping * np.diag(np.diag(a)), g)
+            stiff = a + damping * np.diag(np.diag(a))
+            if candidate.basis.rises:  # half of what a plain step asks for is beyond bounds
+                step = bounded_step(stiff, g, (low - theta)[free] / scale, (high - theta)[free] / scale)
+            else:
+                step = np.linalg.solve(stiff, g)
             row[free] = np.clip(row[free] + step * scale, low[free], high[free])
         left = judge.totals(judge.errors(trials), trials)
         k = int(np.argmin(left))
