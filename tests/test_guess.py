@@ -345,6 +345,21 @@ def test_what_contradicts_the_other_signals_is_withdrawn(tmp_path: Path, run: di
     np.testing.assert_allclose(log.channels["vgv1"].values, run["vgv1"], rtol=1e-8)
 
 
+@pytest.mark.parametrize("signal", ["n_r", "x_lvdt"])
+def test_a_measurement_that_counts_the_other_way_is_told_with_what_mends_it(
+    tmp_path: Path, run: dict[str, np.ndarray], signal: str
+) -> None:
+    demand = {"n_r": "n_dem", "x_lvdt": "x_dem"}[signal]
+    name = {"n_r": "Drehzahl_Ist", "x_lvdt": "Kolbenweg_Ist"}[signal]
+    file = table(tmp_path / "a.csv", {"t": run["t"], "n_dem": run["n_dem"], demand: run[demand], name: -run[signal]})
+    log = read_log(file)
+    assert signal not in log.channels
+    option = f"{signal}=-{UNITS[signal]}"
+    assert f"it is {demand} with the other sign; --unit {option} turns it" in " ".join(log.notes)
+    mended = read_log(file, units=dict([option.split("=", 1)]))
+    np.testing.assert_allclose(mended.channels[signal].values, run[signal], rtol=1e-8)
+
+
 def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:
     assert contradictions({s: (run["t"], run[s]) for s in SIGNALS}, set(SIGNALS)) == {}
 

@@ -689,6 +689,25 @@ def test_of_samples_at_one_time_the_last_is_kept(tmp_path: Path) -> None:
     assert log.notes == ["n_dem (n_dem): 1 of 4 samples have the time of the next: left out"]
 
 
+@pytest.mark.parametrize("stamp", ["whole seconds", "dates", "too few digits"])
+def test_times_too_coarse_for_their_samples_are_refused(tmp_path: Path, stamp: str) -> None:
+    """As a spreadsheet writes them: of a hundred samples a second ninety-nine would be left out without a word."""
+    t = np.arange(0.0, 20.0, 0.01)
+    said = {
+        "whole seconds": [f"{x:.0f}" for x in t],
+        "dates": [f"2026-11-22 18:45:{int(x):02d}" for x in t],
+        "too few digits": [f"{x + 1.7e9:.9g}" for x in t],
+    }[stamp]
+    rows = "".join(f"{a},{60 + 10 * np.sin(b):.6f}\n" for a, b in zip(said, t, strict=True))
+    line = refused(csv(tmp_path, f"time,n_dem\n{rows}"))
+    assert "n_dem" in line and "of 2,000 samples have the time of the next" in line and "--map NAME=t" in line
+
+
+def test_a_row_written_twice_is_read_once(tmp_path: Path) -> None:
+    rows = "".join(f"{i / 100},{60 + i / 10}\n" * 4 for i in range(200))
+    assert read_log(csv(tmp_path, f"t,n_dem\n{rows}")).channels["n_dem"].t.size == 200
+
+
 def test_nan_is_left_out_with_a_note_and_empty_cells_without(tmp_path: Path) -> None:
     log = read_log(csv(tmp_path, "t,n_dem,x_dem,n_r\n0,1,,nan\n1,NaN,5,nan\n2,inf,,nan\n3,4,6,nan\n,9,9,nan\n"))
     assert log.channels["n_dem"].t.tolist() == [0, 3] and log.channels["x_dem"].t.tolist() == [1, 3]

@@ -215,7 +215,12 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
             out[one] = why.format(other=other, own=f"{one}=-{UNITS[one]}")
 
     for a, b, most in (("n_r", "n_dem", 15.0), ("x_lvdt", "x_dem", 15.0)):
-        if (p := pair(a, b)) is not None and (far := float(np.median(np.abs(p[0] - p[1])))) > most:
+        if (p := pair(a, b)) is None:
+            continue
+        far, turned = (float(np.median(np.abs(p[0] - way * p[1]))) for way in (1.0, -1.0))
+        if turned < most / 3.0 and _together(*p, 8.0, 8.0) < -0.7:
+            blame(a, b, "it is {other} with the other sign; --unit {own} turns it")
+        elif far > most:
             blame(a, b, f"it is {far:.3g} {UNITS[a]} away from {{other}} half of the time")
     for stroke in ("x_lvdt", "x_dem"):
         for speed in ("n_r", "n_dem"):

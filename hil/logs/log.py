@@ -139,6 +139,12 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
             )
     if t.size:
         last = np.append(np.diff(t) > 0, True)
+        changed = np.count_nonzero(np.diff(values)[~last[:-1]])
+        if 2 * changed > t.size:  # not a few samples: the clock does not tell them apart
+            raise LogError(
+                f"{path}: {signal} ({key}): {int(np.count_nonzero(~last)):,} of {t.size:,} samples have the time of "
+                f"the next: the times need more digits, or --map NAME=t names another time"
+            )
         if not last.all():
             notes.append(
                 f"{signal} ({key}): {int(np.count_nonzero(~last))} of {t.size} samples have the time of the next: "

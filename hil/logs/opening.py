@@ -160,7 +160,9 @@ def _sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tu
         good = np.isfinite(t) & np.isfinite(v)
         if np.count_nonzero(good) > 1:
             order = np.argsort(t[good], kind="stable")
-            sketch[signal] = t[good][order], v[good][order]
+            t, v = t[good][order], v[good][order]
+            last = np.append(np.diff(t) > 0, True)
+            sketch[signal] = t[last], v[last]
     return sketch
 
 

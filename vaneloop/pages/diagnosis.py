@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from vaneloop.pages.story import (
     floors,
     reached,
     stage_tone,
+    untold,
     word,
     word_of_located,
     worths,
@@ -58,31 +59,37 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
             what = f": {first[0].text}" if first else ""
             parts.append(f"the {s.stage} stage lacks something that the library does not have{what}")
     if not parts:
-        return "Nothing is missing: every observed stage fits its measurements down to the noise floor."
+        silent = untold(d.not_observed)
+        which = "that the log tells of " if silent else ""
+        return f"Nothing is missing: every stage {which}fits its measurements down to the noise floor.{silent}"
     text = "; ".join([*parts, by_log.sentence()] if by_log is not None else parts)
-    return f"{capital(text)}."
+    return f"{capital(text)}.{untold(d.not_observed)}"
 
 
-def located_sentence(located: Sequence[Located]) -> str:
-    """What all stages say together, in one sentence."""
+def located_sentence(located: Sequence[Located], not_observed: Iterable[str] = ()) -> str:
+    """What all stages say together, in one sentence; in a second one those of which the log says nothing."""
     failing = [x for x in located if x.fails]
+    silent = untold(not_observed)
     if not failing:
-        return "Every stage fits its measurements to within the noise."
+        which = "that the log tells of " if silent else ""
+        return f"Every stage {which}fits its measurements to within the noise.{silent}"
     worst = max(failing, key=lambda x: x.worst.ratio)
     s = worst.worst
     if s.agrees:  # no more than noise over the whole log
         where = "; ".join(f"the {x.stage} stage fails at {x.hot[0].worst()}" for x in failing)
-        return f"Over the whole log every stage fits its measurements, but {where}."
+        return f"Over the whole log every stage fits its measurements, but {where}.{silent}"
     others = [x.stage for x in failing if x is not worst]
     also = f" {' and '.join(others)} {'fail' if len(others) > 1 else 'fails'} too." if others else ""
     off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {floors(s.ratio)} times its noise floor"
-    return f"The model fails most in the {worst.stage} stage: {off}.{also}"
+    return f"The model fails most in the {worst.stage} stage: {off}.{also}{silent}"
 
 
-def located_tone(located: Sequence[Located]) -> Tone:
-    """Whether that is good news."""
+def located_tone(located: Sequence[Located], not_observed: Iterable[str] = ()) -> Tone:
+    """Whether that is good news; that nothing fails is none where the log says nothing of a stage."""
     failing = [x.worst.ratio for x in located if x.fails]
-    return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
+    if not failing:
+        return "neutral" if any(True for _ in not_observed) else "good"
+    return "bad" if max(failing) > 2.0 else "neutral"
 
 
 def _stage(bound: Bound, name: str) -> Stage:
@@ -100,7 +107,11 @@ def compare_page(
 ) -> Page:
     """The page of ``vaneloop compare`` or ``locate``: error by stage, curves, and where it fails."""
     page = Page(
-        f"{title}: {Path(log).name}", located_sentence(located), tone=located_tone(located), command=command, log=log
+        f"{title}: {Path(log).name}",
+        located_sentence(located, bound.not_observed),
+        tone=located_tone(located, bound.not_observed),
+        command=command,
+        log=log,
     )
     for x in located:
         w = x.worst
@@ -186,7 +197,8 @@ def diagnosis_page(
 ) -> Page:
     """The page of ``vaneloop diagnose``."""
     title = f"What is missing: {Path(log).name}"
-    page = Page(title, verdict_sentence(d, by_log), tone=TONE_OF[d.verdict], command=command, log=log)
+    tone = "neutral" if d.verdict == "none" and d.not_observed else TONE_OF[d.verdict]
+    page = Page(title, verdict_sentence(d, by_log), tone=tone, command=command, log=log)
     return _told(page, d, bound, experiment, by_log, tested)
 
 

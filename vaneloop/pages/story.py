@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from vaneloop.pages.style import Tone, capital
 __all__ = [
     "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
     "falling", "floors",
-    "reached", "stage_tone", "verdict_word", "word", "word_of_located", "worths",
+    "reached", "stage_tone", "untold", "verdict_word", "word", "word_of_located", "worths",
 ]  # fmt: skip
 
 FITS = "fits"  # no error beyond the noise
@@ -28,6 +29,12 @@ CANNOT = "cannot tell from this log"
 def floors(ratio: float) -> str:
     """An error in noise floors, for a reader."""
     return f"{ratio:.2f}" if ratio < 9.995 else f"{ratio:.3g}" if ratio < 1e5 else f"{ratio:.1e}"
+
+
+def untold(not_observed: Iterable[str]) -> str:
+    """What the log says nothing about, as a sentence to follow the answer; "": it tells of every stage."""
+    names = list(not_observed)
+    return f" {capital(CANNOT)}: {', '.join(names)}." if names else ""
 
 
 def reached(s: StageDiagnosis) -> bool:

@@ -76,7 +76,7 @@ class Stages(Answer):
         """The answer in one sentence."""
         from vaneloop.pages.diagnosis import located_sentence
 
-        return located_sentence(self.located)
+        return located_sentence(self.located, self.bound.not_observed)
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop locate``."""

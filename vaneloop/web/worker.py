@@ -156,8 +156,9 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     curves = {x.stage: curves_of(Judge(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta}) for x in located}
     progress(1.0, "")
     return {
-        "figures": figures, "located": {x.stage: x for x in located}, "verdict": located_sentence(located),
-        "tone": located_tone(located),
+        "figures": figures, "located": {x.stage: x for x in located},
+        "verdict": located_sentence(located, chain.not_observed),
+        "tone": located_tone(located, chain.not_observed),
         "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
     }  # fmt: skip
 

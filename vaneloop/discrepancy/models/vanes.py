@@ -31,6 +31,7 @@ from plant import Plant, build_plant
 from plant.curve import QUANTITIES
 from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
+from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.discrepancy.models.vane_stages.actuator import actuator_stage
 from vaneloop.discrepancy.models.vane_stages.current import SAMPLED, between_rows, other_current, servo_law
@@ -149,7 +150,10 @@ def build_chain(
             have[name] = np.full(len(t), value)
             if name == "p_s" and machine.kind != "hydraulic":
                 continue  # a motor needs no oil
-            notes.append(f"{name}: not logged; {value:g} assumed, and effects that need it to change cannot be seen")
+            notes.append(
+                f"{name}: not logged; {value:g} {UNITS[name]} assumed, and effects that need it to change cannot be "
+                f"seen"
+            )
     if {"x_lvdt", "i_cmd"} <= columns.keys():
         smooth = without_noise(t, have, machine)
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
