@@ -477,3 +477,50 @@ def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
     for verdict in ("none", "missing"):
         assert verdict_sentence(Diagnosis(verdict, [], {}, silent, 1.0)).endswith(end)
     assert "every stage fits" not in verdict_sentence(Diagnosis("none", [], {}, silent, 1.0))
+
+
+@given(st.floats(0.0, 1.0))
+def test_words_on_a_cell_of_a_map_are_read_in_light_and_dark(level: float) -> None:
+    """The contrast that WCAG 2 asks of small words, computed here anew from its definition."""
+    from vaneloop.pages.style import THEMES, cell_role, heat_colour
+
+    def light(colour: str) -> float:
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        r, g, b = (p / 12.92 if p <= 0.03928 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+    for theme, colours in THEMES.items():
+        low, high = sorted((light(heat_colour(theme, level)), light(colours[cell_role(level)])))
+        assert (high + 0.05) / (low + 0.05) > 4.5, (theme, level)
+
+
+def test_every_cell_of_a_map_has_its_words_and_an_empty_one_none() -> None:
+    cells, words = heat([[1.0, None], [0.0, 0.3]], ["a", "b"], ["c", "d"], "deg")["data"]
+    assert cells["z"] == [[1.0, None], [0.0, 0.3]]
+    assert list(zip(words["x"], words["y"], words["text"], strict=True)) == [
+        ("a", "c", "1"), ("a", "d", "0"), ("b", "d", "0.3"),
+    ]  # fmt: skip
+
+
+def test_what_is_called_worst_is_the_worst_cell_of_the_map() -> None:
+    """The most telling condition is not always the one with the greatest error."""
+    from vaneloop.discrepancy.locate import Regime
+    from vaneloop.pages.failures import failure_map, worst_cell
+
+    def regime(name: str, ratio: list[float], samples: list[int]) -> Regime:
+        n = len(ratio)
+        edges, r = np.arange(n + 1.0), np.array(ratio)
+        return Regime("x_lvdt", "mm", name, "s", edges, r, r, np.array(samples), r > 1.0, 0.5, 10.0 * r)
+
+    mine = [regime("direction s", [2.0, 3.0], [99, 99]), regime("time", [1.0, 5.0, 9.0], [99, 99, 3])]
+    assert worst_cell(mine) == (1, 1)
+    assert failure_map(mine)["layout"]["meta"]["worst"] == 50.0
+    assert "5 mm" in mine[1].told(1) and "time 1 to 2 s" in mine[1].told(1)
+
+
+def test_a_name_at_the_beginning_of_a_sentence_stays_as_it_is_written() -> None:
+    from vaneloop.pages.style import capital
+
+    assert capital("x_lvdt is off") == "x_lvdt is off"
+    assert capital("outflow.gain_of_oil: oil has been there") == "outflow.gain_of_oil: oil has been there"
+    assert capital("the actuator stage fails at x_lvdt.") == "The actuator stage fails at x_lvdt." and capital("") == ""

@@ -95,7 +95,10 @@ class Regime:
 
     def worst(self) -> str:
         """The bin with the greatest error, in words."""
-        b = int(np.nanargmax(np.where(self.samples > 0, self.rms, np.nan)))
+        return self.told(int(np.nanargmax(np.where(self.samples > 0, self.rms, np.nan))))
+
+    def told(self, b: int) -> str:
+        """The error of a bin, in words."""
         return f"{self.output}: {self.rms[b]:.3g} {self.unit} ({self.ratio[b]:.3g} noise floors) at {self.place(b)}"
 
     def json(self) -> dict[str, Any]:

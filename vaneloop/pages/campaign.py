@@ -163,7 +163,7 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     if g.total:
         page.plot(
             ranking(names, g.total, "share of the least margin's variance (total Sobol index)",
-                    notes=[f"{t:.2f} (alone {f:.2f})" for f, t in zip(g.first, g.total, strict=True)]),
+                    notes=[f"({f:.2f} alone)" for f in g.first]),
             "Which tolerance the least margin depends on.", half=True,
         )  # fmt: skip
     order = np.sort(np.array(g.shares))

@@ -16,7 +16,7 @@ from vaneloop.discrepancy.stage import Bound, Stage
 from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
-from vaneloop.pages.failures import failure_map
+from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line, Panel, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import (
@@ -374,11 +374,11 @@ def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> No
         page.text(f"The error of the {located.stage} stage begins at t = {located.onset:.0f} s.")
     for output in dict.fromkeys(r.output for r in located.hot):
         mine = [r for r in located.hot if r.output == output]
-        figure = failure_map(mine)
+        (k, b), figure = worst_cell(mine), failure_map(mine)
         figure["layout"]["meta"] |= {"shows": drawn}
         said = f" {when} anything was added" if when else ""
         page.plot(
             figure,
             f"Where the {located.stage} stage fails{said}: error of {output} in noise floors. "
-            f"Worst: {mine[0].worst()}. A click on a cell shows its moment in the curves above.",
+            f"Worst: {mine[k].told(b)}. A click on a cell shows its moment in the curves above.",
         )

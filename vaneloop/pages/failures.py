@@ -8,9 +8,10 @@ from vaneloop.base.signals import heading
 from vaneloop.discrepancy.locate import Regime
 from vaneloop.pages.figures import Figure, heat
 
-__all__ = ["failure_map"]
+__all__ = ["failure_map", "worst_cell"]
 
 MOST_CONDITIONS = 9  # rows of a failure map
+FEWEST = 20  # samples; a cell with no more stays empty
 
 
 def failure_map(regimes: Sequence[Regime]) -> Figure:
@@ -24,17 +25,30 @@ def failure_map(regimes: Sequence[Regime]) -> Figure:
     places, moments = [], []
     for r in regimes:
         empty = width - len(r.ratio)
-        cells.append([float(v) if n > 20 else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty)
+        cells.append(
+            [float(v) if n > FEWEST else None for v, n in zip(r.ratio, r.samples, strict=True)] + [None] * empty
+        )
         places.append([_range(r, b) for b in range(len(r.ratio))] + [""] * empty)
         moments.append([*(float(v) for v in r.moments), *[None] * empty])
     names = [heading(r.condition, r.condition_unit) for r in regimes]
     columns = [f"eighth {i + 1}" for i in range(width)]
     figure = heat(cells, columns, names, "noise floors", "an eighth of the samples each, lowest values to highest", "",
                   places=places, moments=moments)  # fmt: skip
-    filled = ((v, k, b) for k, row in enumerate(cells) for b, v in enumerate(row) if v is not None)
-    _, k, b = max(filled, key=lambda cell: cell[0])
+    k, b = worst_cell(regimes)
     figure["layout"]["meta"] |= {"worst": moments[k][b]}
     return figure
+
+
+def worst_cell(regimes: Sequence[Regime]) -> tuple[int, int]:
+    """Condition and bin with the greatest error in noise floors among those that a map shows."""
+    filled = [
+        (float(v), k, b)
+        for k, r in enumerate(regimes[:MOST_CONDITIONS])
+        for b, (v, n) in enumerate(zip(r.ratio, r.samples, strict=True))
+        if n > FEWEST
+    ]
+    _, k, b = max(filled, key=lambda cell: cell[0])
+    return k, b
 
 
 def _range(r: Regime, b: int) -> str:

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vaneloop.pages.series import decimate, packed, thin_path
-from vaneloop.pages.style import THEMES, number
+from vaneloop.pages.style import THEMES, cell_role, number
 
 __all__ = ["Figure", "Line", "Panel", "bars", "heat", "histogram", "loop", "overlay", "ranking", "waterfall"]
 
 Figure = dict[str, Any]
+MOST_NAMED = 20  # bars that have their value above them; of more the words are too small
 
 
 @dataclass(frozen=True)
@@ -239,8 +240,9 @@ def bars(
     roles: Mapping[str, str] | None = None,
     marks: Mapping[str, float] | None = None,
     height: int = 360,
+    x_title: str = "",
 ) -> Figure:
-    """Grouped bars with their values above them; ``marks`` are named dashed levels."""
+    """Grouped bars with their values above them, where there is room; ``marks`` are named dashed levels."""
     colours = dict(zip(series, ["measured", "model", "target", "error", "other"], strict=False)) | dict(roles or {})
     data = [
         {
@@ -249,7 +251,7 @@ def bars(
             "x": [_label(g) for g in groups],
             "y": [None if v is None or not math.isfinite(v) else float(v) for v in values],
             "text": [number(v) if v is not None else "none" for v in values],
-            "textposition": "outside",
+            "textposition": "outside" if len(groups) * len(series) <= MOST_NAMED else "none",
             "cliponaxis": False,
             "marker": {"color": _role(colours.get(name, "other"))},
             "hovertemplate": "%{x}: %{text}",
@@ -261,7 +263,7 @@ def bars(
         "barmode": "group",
         "bargap": 0.28,
         "bargroupgap": 0.06,
-        "xaxis": {"type": "category", "showgrid": False},
+        "xaxis": {"type": "category", "showgrid": False, "title": {"text": _label(x_title)}},
         "yaxis": {"title": {"text": _label(y_title)}, "rangemode": "tozero"},
         "shapes": [],
         "annotations": [],
@@ -409,13 +411,13 @@ def heat(
     unit: str,
     x_title: str = "",
     y_title: str = "",
-    signed: bool = False,
     places: Sequence[Sequence[str]] | None = None,
     moments: Sequence[Sequence[float | None]] | None = None,
 ) -> Figure:
     """Map of a figure over two conditions (rows, columns); an empty cell was never visited.
 
-    signed: colours diverge about zero (bias); otherwise they grow from zero (size of an error).
+    Colours grow from zero.
+
     places   the range of values of each cell, where every row has its own: it stands in the cell
     moments  s, what a click on a cell shows in the curves
     """
@@ -429,19 +431,15 @@ def heat(
             for row in zip(text, places, strict=True)
         ]
     reach = float(np.nanmax(np.abs(z))) if np.isfinite(z).any() else 1.0
-    scale = (
-        [[0, "@cold"], [0.5, "@heat0"], [1, "@heat2"]] if signed else [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]]
-    )
-    trace = {
+    reach = reach or 1.0
+    trace: Figure = {
         "type": "heatmap",
         "z": [[None if not math.isfinite(v) else float(v) for v in row] for row in z],
         "x": [_label(c) for c in columns],
         "y": [_label(r) for r in rows],
-        "text": text,
-        "texttemplate": "%{text}",
-        "colorscale": scale,
-        "zmin": -reach if signed else 0.0,
-        "zmax": reach or 1.0,
+        "colorscale": [[0, "@heat0"], [0.5, "@heat1"], [1, "@heat2"]],
+        "zmin": 0.0,
+        "zmax": reach,
         "xgap": 2,
         "ygap": 2,
         "showlegend": False,
@@ -449,23 +447,38 @@ def heat(
         "hovertemplate": f"%{{y}}, %{{x}}: %{{z:.3g}} {_label(unit)}<extra></extra>",
     }
     if places is not None:
-        trace["textfont"] = {"size": 11}
         trace["hovertext"] = [[_label(p) for p in row] for row in places]
         trace["hovertemplate"] = f"%{{y}} %{{hovertext}}: %{{z:.3g}} {_label(unit)}<extra></extra>"
     if moments is not None:
         trace["customdata"] = [
             [None if v is None or not math.isfinite(v) else float(v) for v in row] for row in moments
         ]
+    filled = [(i, j) for i, row in enumerate(text) for j, t in enumerate(row) if t]
+    words = {  # on the cells, each readable on its own colour
+        "type": "scatter",
+        "mode": "text",
+        "x": [trace["x"][j] for _, j in filled],
+        "y": [trace["y"][i] for i, _ in filled],
+        "text": [text[i][j] for i, j in filled],
+        "textfont": {"size": 11, "color": [f"@{cell_role(max(0.0, float(z[i, j])) / reach)}" for i, j in filled]},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
     return {
-        "data": [trace],
+        "data": [trace, words],
         "layout": {
             "meta": {"wide": places is not None},
             "height": 120 + (46 if places is not None else 38) * max(3, len(rows)),
-            "xaxis": {"type": "category", "title": {"text": _label(x_title)}, "showgrid": False},
+            "xaxis": {
+                "type": "category",
+                "title": {"text": _label(x_title)},
+                "range": [-0.5, len(columns) - 0.5],
+                "showgrid": False,
+            },
             "yaxis": {
                 "type": "category",
                 "title": {"text": _label(y_title)},
-                "autorange": "reversed",
+                "range": [len(rows) - 0.5, -0.5],
                 "showgrid": False,
             },
         },

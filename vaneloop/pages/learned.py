@@ -14,6 +14,7 @@ from vaneloop.discrepancy.models.learning import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
+from vaneloop.pages.story import floors
 from vaneloop.pages.style import Tone, capital, number
 
 __all__ = ["ABOUT", "COLUMNS", "HOW", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
@@ -46,7 +47,10 @@ def curve_figure(law: LearnedLaw) -> Figure:
 def visited_figure(law: LearnedLaw) -> Figure:
     """How much of the logs was where."""
     middle = 0.5 * (law.edges[1:] + law.edges[:-1])
-    return bars([f"{v:.3g}" for v in middle], {"share of samples": (100.0 * law.visited).tolist()}, "%")
+    share = (100.0 * law.visited).tolist()
+    return bars(
+        [f"{v:.3g}" for v in middle], {"share": share}, "share of samples [%]", x_title=heading(law.of, law.of_unit)
+    )
 
 
 COLUMNS = ["formula", "held-out error, noise floors", "law of the library"]
@@ -75,7 +79,7 @@ def learned_page(
     title = f"A law learned from {Path(log).name}" if laws else f"Learning from {Path(log).name}"
     page = Page(title, said, tone=TONES[outcome.verdict], command=command, log=log)
     for law in laws:
-        figures = f"{number(law.error_before)} to {number(law.error_after)}"
+        figures = f"{floors(law.error_before)} to {floors(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
     for law in laws:
         page.section(law.name, f"{capital(law.sentence())}. {ABOUT}")

@@ -43,7 +43,7 @@
   const csv = plot => {
     const rows = [["name", "x", "y", "value"]];
     for (const d of plot._fullData) {
-      if (d.visible !== true) continue;
+      if (d.visible !== true || d.mode === "text") continue;  // words on a map's cells are no numbers
       if (d.type === "heatmap") {
         d.z.forEach((row, i) => Array.from(row).forEach((z, j) => rows.push([d.name || "", d.x[j], d.y[i], z ?? ""])));
       } else Array.from(d.x).forEach((x, i) => rows.push([d.name || "", x, d.y[i] ?? "", ""]));

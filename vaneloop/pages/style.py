@@ -4,12 +4,13 @@ reader.
 
 from __future__ import annotations
 
+import bisect
 import math
 from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "capital", "number", "painted"]
+__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "capital", "cell_role", "heat_colour", "number", "painted"]
 
 Tone = Literal["neutral", "good", "bad"]
 # colours of the vane stages side by side, VIGV first
@@ -35,7 +36,6 @@ THEMES: dict[str, dict[str, str]] = {
         "heat0": "#f4f7fa",
         "heat1": "#f6b073",
         "heat2": "#a3240f",
-        "cold": "#1f5fae",
     },
     "dark": {
         "measured": "#63abf5",
@@ -54,9 +54,42 @@ THEMES: dict[str, dict[str, str]] = {
         "heat0": "#1d252e",
         "heat1": "#a8571c",
         "heat2": "#ffb38a",
-        "cold": "#6fb1ff",
     },
 }
+
+
+def _luminance(colour: str) -> float:
+    """Relative luminance of #rrggbb, 0 to 1, as WCAG 2 defines it."""
+    r, g, b = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
+    r, g, b = (v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in (r, g, b))
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+
+def heat_colour(theme: str, level: float) -> str:
+    """Colour of a map's cell at ``level`` of its scale, 0 to 1, as Plotly mixes it."""
+    c = THEMES[theme]
+    low, high, part = (c["heat0"], c["heat1"], 2 * level) if level <= 0.5 else (c["heat1"], c["heat2"], 2 * level - 1)
+    mixed = (round((1 - part) * int(low[i : i + 2], 16) + part * int(high[i : i + 2], 16)) for i in (1, 3, 5))
+    return "#" + "".join(f"{v:02x}" for v in mixed)
+
+
+def _on(colour: str) -> str:
+    """Black or white, whichever is read better on ``colour``: their contrast is 4.58 or more on any."""
+    return "#000000" if _luminance(colour) > 0.179 else "#ffffff"
+
+
+# levels of a map at which words on its cells change from black to white or back, in one theme or the other
+_CHANGES = tuple(
+    k / 200 for k in range(1, 201)
+    if any(_on(heat_colour(t, k / 200)) != _on(heat_colour(t, (k - 1) / 200)) for t in THEMES)
+)  # fmt: skip
+for _name, _theme in THEMES.items():
+    _theme |= {f"cell{i}": _on(heat_colour(_name, level)) for i, level in enumerate((0.0, *_CHANGES))}
+
+
+def cell_role(level: float) -> str:
+    """Role of the words on a map's cell at ``level`` of its scale, 0 to 1."""
+    return f"cell{bisect.bisect_right(_CHANGES, level)}"
 
 
 def number(value: object, digits: int = 3) -> str:
@@ -85,8 +118,9 @@ def number(value: object, digits: int = 3) -> str:
 
 
 def capital(text: str) -> str:
-    """``text`` as a sentence begins."""
-    return text[:1].upper() + text[1:]
+    """``text`` as a sentence begins; a name (x_lvdt, engine.lag) stays as it is written."""
+    first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
+    return text if any(c in first for c in "._") else text[:1].upper() + text[1:]
 
 
 def painted(figure: Any, theme: str = "light") -> Any:

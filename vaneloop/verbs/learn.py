@@ -58,9 +58,12 @@ class Learned(Answer):
                 "unknown": "No honest law of one quantity is there",
             }[self.verdict]
             return f"{said}: {self.outcome.why}."
+        from vaneloop.pages.story import floors
+        from vaneloop.pages.style import capital
+
         text = "; ".join(law.sentence() for law in self.laws)
         before, after = self.laws[0].error_before, self.laws[-1].error_after
-        return f"{text[0].upper()}{text[1:]}. Held-out error in noise floors: {before:.3g} to {after:.3g}."
+        return f"{capital(text)}. Held-out error in noise floors: {floors(before)} to {floors(after)}."
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop learn``."""

@@ -154,7 +154,8 @@ export default {
       const colour = this.colours();
       const legend = new Map();
       const first = this.head.panels.map((p) => p.lines.map((l) => l.name).join());
-      const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own
+      const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own, above them
+      this.own = own;
       const shown = this.head.panels.map((p, i) => i).filter((i) => this.wanted(this.head.panels[i]));
       this.plots = shown.map((i) => {
         const panel = this.head.panels[i];
@@ -224,7 +225,8 @@ export default {
       if (panel.band) { low = Math.min(low, -1.1 * panel.band); high = Math.max(high, 1.1 * panel.band); }
       if (high - low < panel.least) { const m = (low + high) / 2; low = m - panel.least / 2; high = m + panel.least / 2; }
       const more = 0.06 * (high - low) || Math.abs(high) * 0.01 || 1;
-      return [low - more, high + more];
+      const above = this.own && panel.lines.length > 1 ? 20 / Math.max(60, panel.height - 8) : 0; // names lie over no line
+      return [low - more, high + more + (high - low + 2 * more) * above / (1 - above)];
     },
     band(u, panel, colour) {
       if (!panel.band) return;
@@ -268,9 +270,17 @@ export default {
         c.textBaseline = "alphabetic";
         const bands = (this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(left, u.valToPos(a, "x", true)), end: u.valToPos(b, "x", true), text, role: "text" })).filter((m) => m.end > left && m.x < right);
         const words = (list) => this.placed(list, left, right, (t) => c.measureText(t).width, 4 * dots);
-        const above = words(marks), below = words(bands), rows = 12 * dots;
-        above.forEach((m) => { c.fillStyle = colour(m.role); c.fillText(m.text, m.from, top + rows * (m.row + 1)); });
-        below.forEach((m) => { c.fillStyle = colour(m.role); c.fillText(m.text, m.from, top + height - 4 * dots - rows * m.row); });
+        const above = words(marks), below = words(bands), rows = 12 * dots, head = this.own ? 16 * dots : 0;
+        const write = (m, y) => { // legible where a line passes
+          c.globalAlpha = 0.75;
+          c.fillStyle = colour("panel");
+          c.fillRect(m.from - dots, y - 10 * dots, m.to - m.from + 2 * dots, rows);
+          c.globalAlpha = 1;
+          c.fillStyle = colour(m.role);
+          c.fillText(m.text, m.from, y);
+        };
+        above.forEach((m) => write(m, top + head + rows * (m.row + 1)));
+        below.forEach((m) => write(m, top + height - 4 * dots - rows * m.row));
         this.$el.dataset.labels = JSON.stringify([above, below].map((l) => l.map((m) => [m.from, m.to, m.row, m.text])));
       }
       c.restore();

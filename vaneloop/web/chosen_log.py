@@ -7,7 +7,10 @@ from typing import Any
 
 from nicegui import events, ui
 
+from plant import load_geometry
 from vaneloop.base.signals import UNITS
+from vaneloop.base.vanes import VANES
+from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
 from vaneloop.web.frame import Live, card, drop, list_of_moments, opened, table
 from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
@@ -167,9 +170,16 @@ class ChosenLog:
             given = s.seen["signals"].get(name, (name,))[0] if s.seen else name
             rows.append([name, given, unit, f"{len(t):,}", step, f"{t[-1]:.1f}", f"{v.min():.4g} to {v.max():.4g}"])
         table(["signal", "in the log", "unit", "samples", "per s", "until s", "range"], rows, numbers=(3, 4, 5))
-        absent = [n for n in UNITS if n not in s.preview["channels"]]
+        absent = [n for n in self._signals() if n not in s.preview["channels"]]
         if absent:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
+
+    def _signals(self) -> list[str]:
+        """Signals that this machine has, and those of other machines that the log has or a name was given for."""
+        s = self.s
+        own = load_geometry(files_of(s.tables)["geometry"]).vanes
+        there = {*own, *(s.seen or {}).get("signals", ()), *(s.preview or {}).get("channels", ()), *s.choice.mapping}
+        return [n for n in UNITS if n not in VANES or n in there]
 
     def _wrong(self) -> bool:
         return any(self.s.errors.get(x, STOPPED) != STOPPED for x in ("log", "compare"))
@@ -228,7 +238,7 @@ class ChosenLog:
                 "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));"
                 "gap:8px 18px;margin:8px 0"
             ):
-                for signal in ("t", *UNITS):
+                for signal in ("t", *self._signals()):
                     name, unit, how, sure, why, curve = seen["signals"].get(signal, ("", "", "", 0.0, "", []))
                     with ui.element("div").style(
                         "display:grid;grid-template-columns:66px minmax(0,1fr) 84px;gap:2px 8px;"
@@ -243,10 +253,8 @@ class ChosenLog:
                         if how or signal in seen["open"]:
                             ui.html(_curve(curve), sanitize=False)
                             said = f"guessed, {100 * sure:.0f} % sure" if how == "guessed" else how
-                            about = ui.label(said or seen["open"][signal]).classes("soft small guess")
-                            about.style("grid-column:span 2")
-                            if why:
-                                about.props["title"] = why
+                            words = f"{said}: {why}" if said and why else said or seen["open"][signal]
+                            ui.label(words).classes("soft small guess").style("grid-column:span 2")
             with ui.element("div").classes("rowc"):
                 hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
                 rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")

@@ -256,10 +256,18 @@ def command_line(text: str, label: str = "the same as a command") -> None:
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int] = ()) -> None:
-    """A small table; a cell that is a tuple ("html", text) is taken as it is."""
+    """A small table; a cell that is a tuple ("html", text) is taken as it is, the words of a row that has nothing
+    after them have the row.
+    """
 
     def cell(v: Any) -> str:
         return str(v[1]) if isinstance(v, tuple) else html.escape(str(v))
+
+    def filled(row: Sequence[Any]) -> int:
+        return max((i + 1 for i, v in enumerate(row) if v != ""), default=0)
+
+    def over(row: Sequence[Any], i: int) -> str:
+        return f' colspan="{len(row) - i}"' if i + 1 == filled(row) < len(row) else ""
 
     tags = ["th" if c else "td" for c in columns]  # a heading without words is none
     head = "".join(
@@ -268,7 +276,10 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequen
     )
     body = "".join(
         "<tr>"
-        + "".join(f'<td class="{"num" if i in numbers else ""}">{cell(v)}</td>' for i, v in enumerate(r))
+        + "".join(
+            f'<td class="{"num" if i in numbers else ""}"{over(r, i)}>{cell(v)}</td>'
+            for i, v in enumerate(r[: filled(r)])
+        )
         + "</tr>"
         for r in rows
     )

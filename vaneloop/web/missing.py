@@ -10,7 +10,7 @@ from nicegui import events, ui
 from plant.effects import EFFECTS
 from vaneloop.base.signals import heading
 from vaneloop.discrepancy.locate import AGREES, Located
-from vaneloop.pages.failures import failure_map
+from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
@@ -154,7 +154,8 @@ class _Page:
         with ui.element("div").classes("scroll").props('tabindex="0" role="group" aria-label="failure map"'):
             figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
         with ui.element("div").classes("rowc"):
-            ui.label(f"Worst: {mine[0].worst()}. A click on a cell shows its moment.").classes("note")
+            k, b = worst_cell(mine)
+            ui.label(f"Worst: {mine[k].told(b)}. A click on a cell shows its moment.").classes("note")
             ui.button("Show me the worst moment", icon="visibility", on_click=lambda: self._show(worst)).props(
                 "outline dense padding='2px 12px'"
             ).classes("show-worst")
