@@ -332,6 +332,8 @@ def test_steps_are_named_by_what_they_add_and_what_they_drop():
     ]  # fmt: skip
     said.steps = [("nominal", 9.0), ("+ a", 3.0), ("+ b", 1.2), ("without numerical error", 1.1)]
     assert [n for n, _ in falling(said)] == ["nominal", "+ a", "+ b", "without numerical error", "noise floor"]
+    said.steps = [("nominal", 9.0), ("+ a", 1.201), ("without numerical error", 1.199)]  # nothing that a reader sees
+    assert [n for n, _ in falling(said)] == ["nominal", "+ a", "noise floor"]
 
 
 def test_an_effect_s_share_is_its_part_of_the_way_in_decades():

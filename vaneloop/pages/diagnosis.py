@@ -28,6 +28,7 @@ from vaneloop.pages.story import (
     fall,
     falling,
     floors,
+    jumps,
     reached,
     stage_tone,
     untold,
@@ -312,12 +313,9 @@ def _floors_anew(page: Page, d: Diagnosis, bound: Bound) -> None:
 def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) -> None:
     stage = _stage(bound, s.stage)
     judge = Judge(stage, s.floor)
-    page.section(
-        f"The {s.stage} stage",
-        f"Verdict: {word(s, extended)}. Noise is correlated by a factor of {s.correlation:.1f} in variance.",
-    )
+    page.section(f"The {s.stage} stage", f"Verdict: {word(s, extended)}.{_correlated(s.correlation)}")
     page.plot(
-        waterfall(falling(s), "held-out error [noise floors]", floor=1.0),
+        waterfall(falling(s), "held-out error [noise floors]", floor=1.0, told=floors),
         "How the error falls as effects are added, down to the noise floor. All outputs of the stage together.",
     )
     if worth := worths(s):
@@ -364,8 +362,15 @@ def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]],
             for i, (name, _, role) in enumerate(models)
         ]
         panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=1.0))
-    page.plot(overlay(panels), caption + ". The grey band is three noise floors to each side.")
+    page.plot(overlay(panels), f"{caption}. The grey band is three noise floors to each side.{jumps(stage.window)}")
     return len(page.figures) - 1
+
+
+def _correlated(factor: float) -> str:
+    """How the noise limits what the log can tell, where it does."""
+    if factor < 1.05:
+        return ""
+    return f" Neighbouring errors are alike, so {factor:.1f} samples tell as much as one of white noise."
 
 
 def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> None:

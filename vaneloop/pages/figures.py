@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -273,7 +273,11 @@ def bars(
 
 
 def waterfall(
-    steps: Sequence[tuple[str, float]], y_title: str, floor: float | None = None, height: int = 400
+    steps: Sequence[tuple[str, float]],
+    y_title: str,
+    floor: float | None = None,
+    height: int = 400,
+    told: Callable[[float], str] = number,
 ) -> Figure:
     """How an error falls step by step, on a logarithmic axis, so that a small step is seen beside a great one.
 
@@ -281,6 +285,7 @@ def waterfall(
 
     steps  (name, level reached, above 0); the first is where it starts, the last where it ends
     floor  level that cannot be undercut, drawn as a line
+    told   a level for a reader
     """
     names = [_label(s[0]) for s in steps]
     levels = [float(s[1]) for s in steps]
@@ -314,13 +319,7 @@ def waterfall(
         },
         "shapes": connectors,
         "annotations": [
-            {
-                "x": i,
-                "y": math.log10(max(b + d, bottom)),
-                "text": number(level),
-                "showarrow": False,
-                "yanchor": "bottom",
-            }
+            {"x": i, "y": math.log10(max(b + d, bottom)), "text": told(level), "showarrow": False, "yanchor": "bottom"}
             for i, (level, b, d) in enumerate(zip(levels, base, size, strict=True))
         ],
     }

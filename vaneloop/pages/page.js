@@ -82,6 +82,7 @@
     if (narrow) {  // a phone: the curves get the width, and the buttons do not cover the names
       painted.layout.template.layout.margin = {l: 44, r: 8, t: 60, b: 46};
       painted.layout.template.layout.font.size = 11;
+      for (const a of ["xaxis", "yaxis"]) painted.layout.template.layout[a].title.font = {size: 11};
       painted.layout.template.layout.dragmode = false;
     }
     if (narrow && painted.layout.meta && painted.layout.meta.wide) element.style.width = "1040px";

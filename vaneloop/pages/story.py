@@ -16,7 +16,7 @@ from vaneloop.pages.style import Tone, capital
 __all__ = [
     "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
     "falling", "floors",
-    "reached", "stage_tone", "untold", "verdict_word", "word", "word_of_located", "worths",
+    "jumps", "reached", "stage_tone", "untold", "verdict_word", "word", "word_of_located", "worths",
 ]  # fmt: skip
 
 FITS = "fits"  # no error beyond the noise
@@ -35,6 +35,11 @@ def untold(not_observed: Iterable[str]) -> str:
     """What the log says nothing about, as a sentence to follow the answer; "": it tells of every stage."""
     names = list(not_observed)
     return f" {capital(CANNOT)}: {', '.join(names)}." if names else ""
+
+
+def jumps(window: float | None) -> str:
+    """Why the curve of a stage's model jumps, as a sentence to follow; "": it does not. ``window`` s, of the stage."""
+    return f" It integrates, so its model starts anew every {window:g} s: there its curve may jump." if window else ""
 
 
 def reached(s: StageDiagnosis) -> bool:
@@ -125,7 +130,8 @@ def falling(s: StageDiagnosis) -> list[tuple[str, float]]:
     before: set[str] = set()
     for name, level in s.steps:
         if name in ("nominal", "model", "without numerical error"):
-            out.append((name, level))
+            if name != "without numerical error" or floors(level) != floors(out[-1][1]):  # else it is no step
+                out.append((name, level))
             continue
         now = [e for e in name.split(" + ") if e] if not name.startswith("+ ") else [*before, name[2:]]
         new, gone = [e for e in now if e not in before], sorted(before - set(now))

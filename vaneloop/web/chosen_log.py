@@ -235,7 +235,7 @@ class ChosenLog:
                 for name in s.offered[:500]:
                     ui.element("option").props["value"] = name
             with ui.element("div").style(
-                "display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));"
+                "display:grid;width:100%;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));"
                 "gap:8px 18px;margin:8px 0"
             ):
                 for signal in ("t", *self._signals()):

@@ -14,7 +14,7 @@ from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
-from vaneloop.pages.story import CANNOT, doubt, fall, falling, floors, reached, worths
+from vaneloop.pages.story import CANNOT, doubt, fall, falling, floors, jumps, reached, worths
 from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
@@ -220,9 +220,10 @@ class _Page:
 
     def _title(self) -> None:
         s = self.s
+        windows = s.compared["windows"] if s.compared is not None else {}
         text = (
             f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors "
-            f"to each side."
+            f"to each side.{jumps(windows.get(s.stage))}"
             if s.stage
             else ""
         )
@@ -347,7 +348,7 @@ class _Page:
                 f"{r.outputs[k]} with {names}: {number(r.error_before[k])} → {number(r.error_after[k])} {r.units[k]}, "
                 f"noise floor {number(r.floor[k])}, held out. {end}"
             ).classes("l")
-        figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0), dark(s), height=250)
+        figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0, told=floors), dark(s), height=250)
 
     def _sliders(self) -> None:
         s = self.s

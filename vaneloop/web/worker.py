@@ -160,6 +160,7 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
         "verdict": located_sentence(located, chain.not_observed),
         "tone": located_tone(located, chain.not_observed),
         "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
+        "windows": {x.name: x.window for x in chain.stages},
     }  # fmt: skip
 
 
