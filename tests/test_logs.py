@@ -703,6 +703,26 @@ def test_times_too_coarse_for_their_samples_are_refused(tmp_path: Path, stamp: s
     assert "n_dem" in line and "of 2,000 samples have the time of the next" in line and "--map NAME=t" in line
 
 
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [
+        ("n_dem=rmp", "unit is not known (did you mean rpm?); allowed: %, rpm, Hz or rad/s"),
+        ("n_r=-parsec/h", "unit does not convert"),
+        ("x_lvdt=mmm", "did you mean mm?"),
+        ("x_lvdt=degC", "unit does not convert; allowed: mm or what converts to it"),
+        ("t=seconds_", "unit is not known"),
+    ],
+)
+def test_a_unit_that_is_none_is_refused_before_any_name_is_looked_for(tmp_path: Path, unit: str, said: str) -> None:
+    """Else a name that would be guessed is not, and the answer is one of a log without it."""
+    file = csv(
+        tmp_path,
+        "Zeit_s,N1_Demand,Stroke_Position_mm\n" + "".join(f"{i / 10},{60 + i % 7},{9 + i % 5}\n" for i in range(60)),
+    )
+    line = refused(file, units=dict([unit.split("=", 1)]))
+    assert f"--unit {unit}: " in line and said in line
+
+
 def test_a_row_written_twice_is_read_once(tmp_path: Path) -> None:
     rows = "".join(f"{i / 100},{60 + i / 10}\n" * 4 for i in range(200))
     assert read_log(csv(tmp_path, f"t,n_dem\n{rows}")).channels["n_dem"].t.size == 200

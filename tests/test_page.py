@@ -462,10 +462,10 @@ def test_a_stage_that_fails_under_one_condition_only_is_not_said_to_fail_by_what
 
 
 def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
-    """A log without a stroke tells nothing of servo and actuator: neither sentence nor colour may call that good."""
+    """A log without a stroke tells nothing of servo and actuator: the sentence says so."""
     from vaneloop.discrepancy.locate import Located, StageFigures
     from vaneloop.discrepancy.workflow import Diagnosis
-    from vaneloop.pages.diagnosis import located_sentence, located_tone, verdict_sentence
+    from vaneloop.pages.diagnosis import located_sentence, verdict_sentence
 
     fine, bad = (
         Located("engine", None, np.ones(1), (StageFigures("engine", "n_r", "%", r, r, 1.0, 8000),), (), None)  # type: ignore[arg-type]
@@ -475,7 +475,6 @@ def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
     end = "Cannot tell from this log: servo, actuator."
     assert located_sentence([fine], silent).startswith("Every stage that the log tells of fits")
     assert all(located_sentence([x], silent).endswith(end) for x in (fine, bad))
-    assert located_tone([fine]) == "good" and located_tone([fine], silent) == "neutral"
     for verdict in ("none", "missing"):
         assert verdict_sentence(Diagnosis(verdict, [], {}, silent, 1.0)).endswith(end)
     assert "every stage fits" not in verdict_sentence(Diagnosis("none", [], {}, silent, 1.0))

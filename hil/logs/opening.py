@@ -19,7 +19,8 @@ from hil.logs.names import unit_in_name
 from hil.logs.source import LogError, Options, Source, close_names, find
 from hil.logs.table import Table
 from hil.logs.times import guess_unit
-from hil.logs.units import Units, factor_of
+from hil.logs.units import NO_UNIT, USUAL_UNITS, Units, factor_of
+from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
 
 __all__ = ["Opened", "is_ours", "open_log", "wanted_design_speed"]
@@ -49,6 +50,21 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, 
             raise LogError(f"{path}: both {out[signal]!r} and {name!r} are mapped to {signal}")
         out[signal] = name
     return out
+
+
+def _known_units(path: Path, stated: Mapping[str, str], signals: Mapping[str, str]) -> None:
+    """Refuse a unit that the user states and that is none of its signal's: no name is looked for under it."""
+    for signal, unit in stated.items():
+        text = unit.strip().removeprefix("-")
+        own = signals.get(signal, "s")
+        if signal == "state" or text == own or text.casefold() in NO_UNIT:
+            continue
+        speed = signal in ("n_dem", "n_r") and isinstance(factor_of(text, "rpm"), tuple)
+        factor = factor_of(text, own)
+        if not speed and not isinstance(factor, tuple):
+            what = f"unit is not known{meant(text, USUAL_UNITS)}" if factor is None else "unit does not convert"
+            allowed = "%, rpm, Hz or rad/s" if signal in ("n_dem", "n_r") else f"{own} or what converts to it"
+            raise LogError(f"{path}: --unit {signal}={unit}: {what}; allowed: {allowed}")
 
 
 @dataclass
@@ -86,6 +102,7 @@ def open_log(
     guess = guess and mapping_file is None  # a mapping file says it all
     dbc, design_rpm = dbc or bench.dbc, design_rpm or bench.design_rpm
     stated = {**bench.units, **(units or {})}
+    _known_units(path, units or {}, signals)
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
     options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)

@@ -15,7 +15,7 @@ import numpy as np
 from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
-__all__ = ["NO_UNIT", "Units", "factor_of", "registry"]
+__all__ = ["NO_UNIT", "USUAL_UNITS", "Units", "factor_of", "registry"]
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
@@ -82,6 +82,10 @@ def factor_of(unit: str, into: str) -> tuple[float, float] | None | str:
     return b - a, a
 
 
+USUAL_UNITS = (
+    "%", "ratio", "rpm", "Hz", "rad/s", "mm", "cm", "m", "um", "inch", "mA", "A", "uA", "MPa", "bar", "psi", "kPa",
+    "Pa", "degC", "degF", "K", "deg", "rad", "s", "ms", "us",
+)  # fmt: skip
 NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
 
 

@@ -45,7 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from plant import Model
-    from vaneloop.pages.story import floors, word
+    from vaneloop.pages.story import falling, floors, word
     from vaneloop.verbs.learn import with_law_files
     from vaneloop.verbs.search import extended, known
 
@@ -92,10 +92,7 @@ def command(args: argparse.Namespace) -> int:
             )
             terminal.say(args, f"{f.effect}: {values}")
         terminal.say(
-            args,
-            f"{r.stage}, in noise floors: "
-            + " -> ".join(f"{name} {floors(level)}" for name, level in r.steps)
-            + " -> noise floor 1.00",
+            args, f"{r.stage}, in noise floors: " + " -> ".join(f"{name} {floors(level)}" for name, level in falling(r))
         )
     terminal.say(args, answer.sentence())
     terminal.say(args, f"model: {args.out}")

@@ -85,12 +85,10 @@ def located_sentence(located: Sequence[Located], not_observed: Iterable[str] = (
     return f"The model fails most in the {worst.stage} stage: {off}.{also}{silent}"
 
 
-def located_tone(located: Sequence[Located], not_observed: Iterable[str] = ()) -> Tone:
-    """Whether that is good news; that nothing fails is none where the log says nothing of a stage."""
+def located_tone(located: Sequence[Located]) -> Tone:
+    """Whether that is good news, of the stages that the log tells of."""
     failing = [x.worst.ratio for x in located if x.fails]
-    if not failing:
-        return "neutral" if any(True for _ in not_observed) else "good"
-    return "bad" if max(failing) > 2.0 else "neutral"
+    return "good" if not failing else "bad" if max(failing) > 2.0 else "neutral"
 
 
 def _stage(bound: Bound, name: str) -> Stage:
@@ -110,7 +108,7 @@ def compare_page(
     page = Page(
         f"{title}: {Path(log).name}",
         located_sentence(located, bound.not_observed),
-        tone=located_tone(located, bound.not_observed),
+        tone=located_tone(located),
         command=command,
         log=log,
     )
@@ -198,8 +196,7 @@ def diagnosis_page(
 ) -> Page:
     """The page of ``vaneloop diagnose``."""
     title = f"What is missing: {Path(log).name}"
-    tone = "neutral" if d.verdict == "none" and d.not_observed else TONE_OF[d.verdict]
-    page = Page(title, verdict_sentence(d, by_log), tone=tone, command=command, log=log)
+    page = Page(title, verdict_sentence(d, by_log), tone=TONE_OF[d.verdict], command=command, log=log)
     return _told(page, d, bound, experiment, by_log, tested)
 
 

@@ -158,7 +158,7 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     return {
         "figures": figures, "located": {x.stage: x for x in located},
         "verdict": located_sentence(located, chain.not_observed),
-        "tone": located_tone(located, chain.not_observed),
+        "tone": located_tone(located),
         "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
         "windows": {x.name: x.window for x in chain.stages},
     }  # fmt: skip
