@@ -295,6 +295,7 @@ def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
     layout = painted(f["layout"], c)
     for key in [k for k in layout if k.startswith(("xaxis", "yaxis"))]:
         layout[key] = {**axis, **layout[key]}
+        layout[key]["title"] = {"font": {"size": 12}, **layout[key].get("title", {})}  # whole on a phone
     layout |= {
         "font": {"family": "system-ui, sans-serif", "size": 12.5, "color": c["text"]},
         "paper_bgcolor": "rgba(0,0,0,0)",

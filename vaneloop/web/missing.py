@@ -348,7 +348,7 @@ class _Page:
                 f"{r.outputs[k]} with {names}: {number(r.error_before[k])} → {number(r.error_after[k])} {r.units[k]}, "
                 f"noise floor {number(r.floor[k])}, held out. {end}"
             ).classes("l")
-        figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0, told=floors), dark(s), height=250)
+        figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0, told=floors), dark(s), height=300)
 
     def _sliders(self) -> None:
         s = self.s
