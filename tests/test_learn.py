@@ -373,6 +373,30 @@ def test_a_slope_that_parameters_take_is_left_to_them_and_the_formula_is_found(t
         learn(records[:1], limited, without=["u.satration"])
 
 
+@pytest.mark.parametrize("law", ["force.coulomb", "force.stribeck", "force.spring"])
+def test_a_law_is_searched_for_without_another_that_it_holds(law: str) -> None:
+    """Each effect that says what it holds within it names one that is there; friction without its plain law is found
+    by another.
+    """
+    axis = System(
+        "axis", "force", lambda u, p: p.mass * u.acceleration, position="x", outputs={"force": "N"},
+        parameters=[unknown("mass", 1.0, "kg")], without=[law],
+    )  # fmt: skip
+    t = np.arange(0.0, 20.0, 0.01)
+    x = np.sin(2.0 * t) + 0.3 * np.sin(5.1 * t)
+    speed = np.gradient(x, t)
+    force = (
+        3.0 * np.gradient(speed, t)
+        + 4.0 * np.tanh(speed / 0.05)
+        + 0.1 * np.random.default_rng(0).standard_normal(len(t))
+    )
+    record = Record("there and back", t, {"x": x, "force": force})
+    there = {e.name: e for e in axis.bind([record]).effects}
+    assert law not in there
+    assert all(held in there for e in there.values() for held, _ in e.holds)
+    assert law not in diagnose([record], axis).diagnosis.stages[0].final.effects
+
+
 # ---- what remembers --------------------------------------------------------------------------------------------------
 
 

@@ -94,7 +94,11 @@ class Bound:
                     f"without {name!r}: not a law that system {self.system.name!r} can have; it has {', '.join(names)}"
                 )
         keep = [k for k, name in enumerate(names) if name not in self.system.without]
-        self.placed, self.effects = [self.placed[k] for k in keep], [self.effects[k] for k in keep]
+        self.placed = [self.placed[k] for k in keep]
+        self.effects = [  # none is said to hold a law within it that is not there
+            replace(self.effects[k], holds=tuple(h for h in self.effects[k].holds if h[0] not in self.system.without))
+            for k in keep
+        ]
 
     def _make(self) -> None:
         """Fit what is unknown, place the laws, and make the stage."""
