@@ -210,7 +210,8 @@ class Learner:
     def learned(self) -> Outcome:
         """Curves one after the other, each earning its place; at most two."""
         out = Outcome("none")
-        if not self.form.fails(self.base):
+        unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
+        if self.d.verdict == "none" or not (unknown or self.form.fails(self.base)):
             out.why = "the model comes down to the noise of its samples: nothing is missing"
             return out
         named = self._named()
@@ -220,7 +221,9 @@ class Learner:
             return out
         current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
         fit = self.base
-        while current is not None and len(out.tried) < MOST_CURVES and self.form.fails(fit):
+        while current is not None and len(out.tried) < MOST_CURVES:
+            if not self.form.fails(fit) and (out.tried or not unknown):
+                break
             finalists = self._finalists(current)
             out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
             good = [t for t in finalists if self._earns(fit, t)]
