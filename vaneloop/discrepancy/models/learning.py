@@ -211,7 +211,7 @@ class Learner:
         """Curves one after the other, each earning its place; at most two."""
         out = Outcome("none")
         unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
-        if self.d.verdict == "none" or not (unknown or self.form.fails(self.base)):
+        if not (unknown or self.form.fails(self.base)):
             out.why = "the model comes down to the noise of its samples: nothing is missing"
             return out
         named = self._named()
