@@ -43,6 +43,7 @@ MOST_CURVES = 2
 WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
 SCREENED = 1.0  # of them, where candidates are screened
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
+SURE = 3  # of the latter that are chosen by data left out
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 OTHER = 1.5  # times as large: another amplitude
@@ -385,7 +386,10 @@ class Learner:
         done = []
         over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
         quick = [t for t in quick if t not in over_time]
-        for k, t in enumerate(quick[:FINISHED]):
+        # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit
+        first, others = quick[:SURE], quick[SURE:]
+        others.sort(key=lambda t: float(t.fit.cost.sum()))
+        for k, t in enumerate([*first, *others[: FINISHED - SURE]]):
             options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
             done.append(self._with_its_lag(current, min(options, key=lambda o: score(self.judge, o.fit)), TIMES[:1]))
             self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
