@@ -74,7 +74,7 @@ class Bus:
             self._silent[key] = self._silent[str(signal.name)] = f"all {missing} frames say not available"
         elif missing:
             self.notes.append(f"{key}: {missing} frames say not available: left out")
-        return Series(self.frames.t[rows], values, str(signal.unit or ""))
+        return Series(self.frames.t[rows], values, str(signal.unit or ""), framed=True)
 
 
 def bus_reader(read: Callable[[Path], Frames]) -> Callable[[Path, Options], Source]:

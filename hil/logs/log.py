@@ -155,7 +155,7 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
         if s.t.size:
             notes.append(f"{signal} ({key}): no sample that can be used")
         return None
-    return Channel(np.ascontiguousarray(t, np.float64), np.ascontiguousarray(values, np.float64))
+    return Channel(np.ascontiguousarray(t, np.float64), np.ascontiguousarray(values, np.float64), s.framed)
 
 
 def read_log(
@@ -276,7 +276,7 @@ def _inside(
         f"{far.size:,} of {inside.size:,} samples are outside {r.low:g} to {r.high:g}{unit} (furthest {furthest:.6g})"
     )
     notes.append(f"{signal} ({key}): {what}: left out")
-    return Channel(c.t[inside], c.values[inside])
+    return replace(c, t=c.t[inside], values=c.values[inside])
 
 
 def _one_run(
@@ -295,7 +295,7 @@ def _one_run(
     for name, c in channels.items():
         use = (c.t >= first) & (c.t <= last)
         if use.any():
-            out[name] = Channel(c.t[use], c.values[use])
+            out[name] = replace(c, t=c.t[use], values=c.values[use])
         if name in require and np.count_nonzero(use) < 2:
             raise LogError(f"{path}: no {name} in the part of the log that is kept ({note})")
     return out
@@ -320,7 +320,7 @@ def _shift(channels: dict[str, Channel], notes: list[str], era: str) -> None:
         since = f"counts from {era}" if start > _EPOCH else "does not count from the start"
         notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
         for name, c in channels.items():
-            channels[name] = Channel(c.t - start, c.values)
+            channels[name] = replace(c, t=c.t - start)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -64,8 +64,8 @@ class Groups:
         if key not in self._series:
             self.notes.append(f"{key}: {self._why.get(key, 'has no samples')}")
             return Series(np.empty(0), np.empty(0))
-        t, values, unit = self._series[key]
-        return Series(t, values, unit)
+        t, values, unit, framed = self._series[key]
+        return Series(t, values, unit, framed=framed)
 
 
 def open_mdf(path: Path, options: Options) -> Source:
@@ -85,9 +85,10 @@ def open_mdf(path: Path, options: Options) -> Source:
 def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[str, Any], Frames | None]:
     """Channels and CAN frames of a file.
 
-    Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit) of the keys that
-    answer to ``wanted`` (with ``guess``, of those too whose name or comment means one of our signals), "comments" of
-    these, "why" (key -> reason it has no numbers), and the frames of its bus logging, if any.
+    Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit, whether they came
+    in frames of a bus) of the keys that answer to ``wanted`` (with ``guess``, of those too whose name or comment means
+    one of our signals), "comments" of these, "why" (key -> reason it has no numbers), and the frames of its bus
+    logging, if any.
     """
     head = read_bytes(path, 168)
     if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or head[64:68] != b"##HD":
@@ -109,7 +110,9 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         array = np.frombuffer(body, kind, int(np.prod(shape)), at).reshape(shape)
         at += array.nbytes
         arrays[name] = array
-    series = {key: (arrays[f"t{i}"], arrays[f"v{i}"], unit) for key, (i, unit) in reply["series"].items()}
+    series = {
+        key: (arrays[f"t{i}"], arrays[f"v{i}"], unit, framed) for key, (i, unit, framed) in reply["series"].items()
+    }
     parts = []
     for i in range(reply["buses"]):
         t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
@@ -190,6 +193,8 @@ def answer(request: bytes, out: BinaryIO) -> None:
 
 def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """Names, wanted series and bus frames of an open file; numbers go to ``arrays``."""
+    from asammdf.blocks.v4_constants import SOURCE_BUS
+
     found, buses = [], 0
     for g, group in enumerate(mdf.groups):
         names = [str(c.name) for c in group.channels]
@@ -227,7 +232,8 @@ def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray
         if s.samples.ndim != 1 or s.samples.dtype.kind not in "biuf":
             reply["why"][key] = f"holds {s.samples.dtype}, not numbers"
             continue
-        reply["series"][key] = (n, str(s.unit or "")[:40])
+        source = mdf.groups[g].channels[i].source or mdf.groups[g].channel_group.acq_source
+        reply["series"][key] = (n, str(s.unit or "")[:40], bool(source and source.source_type == SOURCE_BUS))
         arrays[f"t{n}"], arrays[f"v{n}"] = s.timestamps.astype(np.float64), s.samples.astype(np.float64)
     return reply
 

@@ -12,7 +12,9 @@ from hil.logs.source import ABSENT, Channel, LogError, Options, Source, check_fi
 from hil.logs.table import Table, polars_table, time_column
 from hil.logs.times import from_dates
 
-__all__ = ["open_parquet", "write_parquet"]
+__all__ = ["FRAME_COLUMNS", "open_parquet", "write_parquet"]
+
+FRAME_COLUMNS = ("time", "id", "extended", "kind", "tx", "length", "bytes")  # of a table that has a row a frame
 
 _MOST_ROWS = (
     4_000_000,
@@ -112,7 +114,7 @@ def open_parquet(path: Path, options: Options) -> Source:
         except damage as e:
             raise LogError(f"{path}: column {key!r} cannot be read ({str(e)[:160]})") from None
 
-    table = Table(list(schema.names), load, 1, time, {})
+    table = Table(list(schema.names), load, 1, time, {}, framed=set(FRAME_COLUMNS) <= set(schema.names))
     return table
 
 

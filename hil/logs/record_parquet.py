@@ -16,6 +16,7 @@ import numpy as np
 
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
+from hil.logs.parquet_format import FRAME_COLUMNS
 from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, REMOTE, append_whole
 from hil.logs.signals import cut_signal, select
 from hil.logs.source import LogError
@@ -156,7 +157,7 @@ def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time (us since 1970), both words (`hil.bus.frames`) and direction of each frame of a recording."""
     import pyarrow.parquet as pq
 
-    names = ["time", "id", "extended", "kind", "tx", "length", "bytes"]
+    names = list(FRAME_COLUMNS)
     held = pq.ParquetFile(path).schema_arrow.names
     if missing := [n for n in names if n not in held]:
         raise LogError(f"{path}: no column {missing[0]!r}: holds signals, not frames")

@@ -35,15 +35,21 @@ class LogError(InputError):
 
 @dataclass(frozen=True)
 class Channel:
-    """Samples of one signal: t in s, strictly increasing; values in the signal's unit, finite."""
+    """Samples of one signal: t in s, strictly increasing; values in the signal's unit, finite.
+
+    framed  it came in the frames of a bus: a value holds from its frame on. Else it was polled, sampled or resampled.
+    """
 
     t: np.ndarray
     values: np.ndarray
+    framed: bool = False
 
 
 @dataclass(frozen=True)
 class Series:
-    """Samples as they stand in the file; sample k is called "``word`` ``first`` + k" (row 17)."""
+    """Samples as they stand in the file; sample k is called "``word`` ``first`` + k" (row 17); ``framed`` as of
+    `Channel`.
+    """
 
     t: np.ndarray
     values: np.ndarray
@@ -51,6 +57,7 @@ class Series:
     t_unit: str = ""
     word: str = "sample"
     first: int = 1
+    framed: bool = False
 
 
 class Source(Protocol):

@@ -20,18 +20,25 @@ _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 
 class Table:
     """Columns of a CSV or Parquet file. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`; so may a row of its own,
-    ``units``.
+    ``units``. Where it is ``framed``, a row is a frame of a bus.
     """
 
     kind = "column"
     sorted = False
 
     def __init__(
-        self, headers: list[str], load: Callable[[str], np.ndarray], first: int, time: Time, units: Mapping[str, str]
+        self,
+        headers: list[str],
+        load: Callable[[str], np.ndarray],
+        first: int,
+        time: Time,
+        units: Mapping[str, str],
+        framed: bool = False,
     ):
         self.notes = list(time.notes)
         self.guessed = time.sure  # how surely the column is the time, where that is guessed; 0 where it is stated
         self._load, self._first, self.time, self._units = load, first, time.name, units
+        self._framed = framed
         self.time_unit = units.get(time.name) or split_unit(time.name)[1] or time.unit
         self._t: np.ndarray | None = None
         self.names = {h: tuple(dict.fromkeys((h, h.strip(), split_unit(h)[0]))) for h in headers if h != time.name}
@@ -47,7 +54,7 @@ class Table:
         if values.size != t.size:
             raise LogError(f"column {key!r} has {values.size} rows, the time column {self.time!r} has {t.size}")
         unit = self._units.get(key) or split_unit(key)[1]
-        return Series(t, values, unit, self.time_unit, "row", self._first)
+        return Series(t, values, unit, self.time_unit, "row", self._first, self._framed)
 
     def times(self) -> np.ndarray:
         """The time column's numbers as they stand."""

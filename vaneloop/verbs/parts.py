@@ -61,8 +61,6 @@ def records_of(record: Record, spans: Sequence[Span]) -> list[Record]:
 
 def part_of(log: Log, spans: Sequence[Span]) -> Log:
     """A log's samples within these parts; without parts, the log."""
-    from hil.logs import Channel
-
     if not spans:
         return log
     whole = np.unique(np.concatenate([c.t for c in log.channels.values()]))
@@ -72,7 +70,7 @@ def part_of(log: Log, spans: Sequence[Span]) -> Log:
     for name, c in log.channels.items():
         use = np.any([(c.t >= s.low) & (c.t < s.high) for s in spans], axis=0)
         if np.count_nonzero(use) > 1:
-            channels[name] = Channel(c.t[use], c.values[use])
+            channels[name] = dataclasses.replace(c, t=c.t[use], values=c.values[use])
     return dataclasses.replace(log, channels=channels)
 
 
