@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from vaneloop.base.vanes import VANES
@@ -68,7 +68,8 @@ def replay(
     from controller import load_calibration
     from hil.figures import error_figures
     from hil.logs import LogError
-    from hil.loop.lockstep import Stimulus, lockstep
+    from hil.logs.held import ANSWERS, COMMANDS, answers, held, phase_of_ticks, taken
+    from hil.loop.lockstep import FRAME, Stimulus, lockstep
     from plant import build_plant
     from vaneloop.base.signals import UNITS
 
@@ -79,15 +80,19 @@ def replay(
     if end < 0.1:
         raise LogError(f"{log.path}: n_dem: lasts {end:g} s; at least 0.1 s is needed")
     raster = float(np.median(np.diff(demand.t))) if len(demand.t) > 1 else end
-    frames = np.arange(int(end * 100.0 + 1e-6) + 1) * 1e-2
-    held = {
-        name: _hold(log.channels[name], frames) for name in ("n_dem", "n_r", "p_s", "t_oil") if name in log.channels
+    first = phase_of_ticks(log.channels, FRAME)
+    ticks = first + np.arange(int((end - first) * 100.0 + 1e-6) + 1) * 1e-2
+    had = taken(log.channels, ticks, 0.5 * FRAME)
+    given = {
+        name: c.values[held(c, had if name in COMMANDS and c.framed else ticks)]
+        for name in ("n_dem", "n_r", "p_s", "t_oil")
+        if (c := log.channels.get(name)) is not None
     }
     stimulus = Stimulus.of(
-        held["n_dem"],
-        held.get("n_r"),
-        held["p_s"] * 1e6 if "p_s" in held else machine.usual["p_s"] * 1e6,
-        held.get("t_oil", machine.usual["t_oil"]),
+        given["n_dem"],
+        given.get("n_r"),
+        given["p_s"] * 1e6 if "p_s" in given else machine.usual["p_s"] * 1e6,
+        given.get("t_oil", machine.usual["t_oil"]),
     )
     angles = tuple(np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in machine.vanes)
     start = float(log.channels["x_dem"].values[0]) * 1e-3 if "x_dem" in log.channels else None
@@ -103,7 +108,7 @@ def replay(
         progress=progress,
     )
 
-    t, model = run.t, {name: run.columns[name] for name in UNITS if name in run.columns}
+    t, model = first + run.t, {name: run.columns[name] for name in UNITS if name in run.columns}
     model["n_r"] = run.columns["n_engine"]
     if "i_motor" in run.columns:
         model["i_motor"] = run.columns["i_motor"]
@@ -117,15 +122,19 @@ def replay(
             f"n_dem: {int(holes.sum())} gaps longer than {gap:g} s; the last value is held and errors there do not "
             f"count"
         )
+    in_ticks = answers(log.channels) is not None
     signals = []
     for name, stage in STAGE.items():
         if name in log.channels and name not in model:
             notes.append(f"{name}: this machine has no such stage (geometry); not compared")
         elif name in log.channels:
             c = log.channels[name]
-            use = (c.t <= end + 1e-9) & ~_in_hole(c.t, demand.t, gap)
+            if name in COMMANDS and c.framed:  # the plant's engine gets a demand when the controller has it
+                c = _when_had(c, ticks, had)
+            use = (c.t <= end + 1e-9) & ~_in_hole(c.t, demand, gap)
             if use.any():
-                values = _model_at(name, t, model[name], c.t)
+                sent = in_ticks and c.framed and name in ANSWERS and name != "i_cmd"
+                values = _model_at(name, t, model[name], _in_tick(c.t, t) if sent else c.t)
                 signals.append(
                     error_figures(
                         name,
@@ -142,7 +151,7 @@ def replay(
             else:
                 notes.append(f"{name}: no sample while n_dem is known; not compared")
         if name in target:
-            use = ~_in_hole(t, demand.t, gap)
+            use = ~_in_hole(t, demand, gap)
             noise = known.get(name, float(machine.sigma[1]) * 180.0 / np.pi)
             signals.append(
                 error_figures(
@@ -154,20 +163,29 @@ def replay(
     )
 
 
-def _hold(channel: Channel, t: np.ndarray) -> np.ndarray:
-    """Value of the last sample at or before each ``t``; before the first sample, the first."""
+def _when_had(c: Channel, ticks: np.ndarray, had: np.ndarray) -> Channel:
+    """A command in frames, each at the first of the ``ticks`` that had it; ``had`` as of `hil.logs.held.taken`."""
     import numpy as np
 
-    i = np.searchsorted(channel.t, t + 1e-6, side="right") - 1
-    return channel.values[np.maximum(i, 0)]
+    from hil.logs.held import held
+
+    row = held(c, had)
+    new = np.flatnonzero(np.diff(row, prepend=-1))
+    return replace(c, t=ticks[new], values=c.values[row[new]])
 
 
-def _in_hole(t: np.ndarray, known: np.ndarray, gap: float) -> np.ndarray:
-    """True where the last of the ``known`` times is longer ago than ``gap`` (s)."""
+def _in_tick(when: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The nearest of the simulated times ``t``: what the controller sent is that of its tick, when the bus was free."""
     import numpy as np
 
-    i = np.maximum(np.searchsorted(known, t + 1e-6, side="right") - 1, 0)
-    return t - known[i] > gap
+    return t[np.clip(np.rint((when - t[0]) / (t[1] - t[0])).astype(int), 0, len(t) - 1)]
+
+
+def _in_hole(t: np.ndarray, c: Channel, gap: float) -> np.ndarray:
+    """True where a channel's last sample is longer ago than ``gap`` (s)."""
+    from hil.logs.held import held
+
+    return t - c.t[held(c, t)] > gap
 
 
 def _model_at(name: str, t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ opening          which name of a log is which signal: stated, in a mapping file 
 names, guess, times
                  what a name says; which guess is made; the time of a table
 survey           all of that shown before anybody reads the log
+held             what a controller had received: a value in a frame holds from that frame on
 units, plausible which unit a number is in, and whether it can be
 recorder         frames from a bus to a file, in the formats of record_formats and record_parquet
 """

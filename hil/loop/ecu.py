@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hil.bus.frames import R_LAST, R_LAST_TICK
+from hil.logs.held import held
 from hil.logs.plausible import LONGEST
 from hil.loop.node import Ecu
 from vaneloop.base.errors import InputError
@@ -134,8 +135,8 @@ def demand_of_log(log: Any) -> Demand:
     if "n_r" in log.channels:
         r = log.channels["n_r"]
         t = np.union1d(c.t, r.t)
-        n_r = r.values[np.maximum(np.searchsorted(r.t, t, side="right") - 1, 0)]
-    n_dem = c.values[np.maximum(np.searchsorted(c.t, t, side="right") - 1, 0)]
+        n_r = r.values[held(r, t)]
+    n_dem = c.values[held(c, t)]
     return _checked(Demand(t - t[0], n_dem, n_r, held=True), log.path)
 
 

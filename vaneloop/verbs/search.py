@@ -502,6 +502,7 @@ def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Recor
     if system.read is not None:
         return Record(name, *_by_its_own_reader(str(path), system)), []
     from hil.logs import read_log
+    from hil.logs.held import held
 
     motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
         c: "" for c in (system.velocity,) if c
@@ -513,7 +514,8 @@ def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Recor
     columns = {}
     for c, channel in log.channels.items():
         step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
-        v = np.interp(t, channel.t, channel.values)
+        holds = c in system.inputs and channel.framed and system.holds
+        v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)
         if c in system.outputs:  # outputs are never made up: far from a sample there is none
             i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
             v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan

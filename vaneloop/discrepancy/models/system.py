@@ -117,6 +117,11 @@ class System:
     laws: Sequence[Law] = ()
     without: Sequence[str] = ()
 
+    @property
+    def holds(self) -> bool:
+        """Whether an input keeps its value until the next one comes."""
+        return self.kind in ("simulate", "closed_loop") and self.between == "hold"
+
     def __post_init__(self) -> None:
         """Check what the user wrote; one line says what is wrong and what is allowed."""
         self._check()

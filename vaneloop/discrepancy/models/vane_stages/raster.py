@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hil.logs import Channel, Log, LogError
+from hil.logs.held import COMMANDS, answers, held, taken
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = [
@@ -37,6 +38,8 @@ SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and pla
 def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
     """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
     its own; notes.
+
+    Where commands came in frames, a row is a tick of the controller: what it sent then, with the commands that it had.
     """
     channels = log.channels
     steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
@@ -46,18 +49,26 @@ def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str
     start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
     end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
     start += _to_frame(channels, start, dt)
-    reference = max((c for c in channels.values()), key=lambda c: len(c.t))
+    reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
     own = float(np.median(np.diff(reference.t)))
     phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
     t = np.arange(max(1, int((end - start) / dt + 1e-6) + 1)) * dt
+    when = t + start + phase
+    had = taken(channels, when, 0.5 * dt)
     fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
     columns = {}
     for name, c in channels.items():
         if len(c.t) < 2:
             columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
             continue
-        when = t + start + phase
         step = float(np.median(np.diff(c.t)))
+        if name in COMMANDS and c.framed:
+            i = held(c, had)
+            columns[name], age = c.values[i], had - c.t[i]
+            fresh &= age < 3.0 * max(step, dt)  # two frames are bridged, as two rows are below
+            lost = np.append(np.diff(c.t), step) > 1.5 * max(step, dt)
+            missing |= lost[i] & (age > 0.75 * step)
+            continue
         uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
         if name == "i_cmd" and step < 0.6 * dt:
             total = np.concatenate([[0.0], np.cumsum(c.values)])
