@@ -268,6 +268,13 @@ def test_frames_that_never_follow_each_other_say_nothing_of_the_wire() -> None:
     assert time_on_wire(bus(apart=2.4e-4, ecu=0.005, framed=False)) == 0.0
 
 
+def test_an_ecu_that_passes_close_by_now_and_then_says_nothing_of_the_wire() -> None:
+    """On a virtual bus its frame comes at any time, now and then a fraction of a millisecond before the answer."""
+    passing = {"n_dem": Channel(TICKS * 1.001, TICKS, True), "x_dem": Channel(TICKS + 0.005, TICKS, True)}
+    apart = np.diff(np.sort(np.concatenate([c.t for c in passing.values()])))
+    assert (apart < 5e-4).any() and time_on_wire(passing) == 0.0
+
+
 def test_without_commands_in_frames_the_log_has_no_answers() -> None:
     channels = bus(apart=2.4e-4, ecu=0.004)
     assert answers(channels) is channels["x_dem"]
