@@ -268,11 +268,11 @@ def log_page(key: str, answer: dict[str, Any]) -> Page:
         f"Log {key[:8]}", f"Verdict: {verdict_word(answer['verdict'])}.", tone=tones.get(answer["verdict"], "neutral"),  # type: ignore[arg-type]
         subtitle="fleet", log=answer["log"], command=f"vaneloop diagnose {answer['log']} --report diagnosis.html",
     )  # fmt: skip
-    page.section("Stages", "RMS errors on held-out data. The command below gives the page with all curves.")
     columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     fields = ("stage", "verdict", "signal", "error_before", "error_after", "noise_floor", "unit")
-    rows = [{**s, "verdict": verdict_word(s["verdict"])} for s in answer["stages"]]
-    page.table(columns, [[s.get(k) for k in fields] for s in rows])
+    if rows := [{**s, "verdict": verdict_word(s["verdict"])} for s in answer["stages"]]:
+        page.section("Stages", "RMS errors on held-out data. The command below gives the page with all curves.")
+        page.table(columns, [[s.get(k) for k in fields] for s in rows])
     if answer["effects"]:
         page.section("Effects")
         page.table(

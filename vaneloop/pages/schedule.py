@@ -135,10 +135,10 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
             lb = {"initial": s.lb_initial, "built": s.lb_built, "adjusted": s.lb}[name]
             lc = s.lc if name == "adjusted" else s.lc_built
             figures = (s.at_design[name], s.rms[name], s.largest[name])
-            rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *(f"{v:.3f}" for v in figures)])
+            rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *(f"{v:z.3f}" for v in figures)])
         for name in ("extension", "retraction"):
             figures = (s.at_design[name], s.rms[name], s.largest[name])
-            rows.append([NAMES[s.stage], f"on the {name} curve", "", "", *(f"{v:.3f}" for v in figures)])
+            rows.append([NAMES[s.stage], f"on the {name} curve", "", "", *(f"{v:z.3f}" for v in figures)])
     page.table(
         columns,
         rows,
@@ -185,7 +185,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
              (3, "mean", "text", "dot"))]  # fmt: skip
     page.plot(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]", 420))
     rows = [
-        [f"{c[0]:g}", *(f"{v:.3f}" for v in c[1:]), *(f"{s.error[i]:.3f}" for s in others)]
+        [f"{c[0]:g}", *(f"{v:z.3f}" for v in c[1:]), *(f"{s.error[i]:z.3f}" for s in others)]
         for i, c in enumerate(result.table.T)
     ]
     page.table(
