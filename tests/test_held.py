@@ -11,17 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vaneloop
+from hil.figures import SignalError
 from hil.logs import Channel, Log, read_log, write_log
 from hil.logs.candump import read_candump
 from hil.logs.held import answers, held, phase_of_ticks, taken, time_on_wire
 from hil.replay import replay
 from tests.bus_logs import by_ticks, by_wire, with_effect, write_frames
+from vaneloop.base.spans import Span
 from vaneloop.cli.main import main
 from vaneloop.discrepancy.diagnose import diagnose_stage
 from vaneloop.discrepancy.locate import AGREES
 from vaneloop.discrepancy.models.vane_stages.raster import on_raster, rms
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
 from vaneloop.discrepancy.stage_answer import StageDiagnosis
+from vaneloop.verbs.parts import part_of
 
 PHASES = range(10)  # ms after the controller's tick at which the ECU's frame is taken
 ON_WIRE = (0.0, 0.2, 3.7, 9.5, 9.8, 9.9)  # ms at which it is queued; at 9.8 and later the status frame waits for it
@@ -36,6 +39,11 @@ def in_floors(chain: Chain) -> dict[str, float]:
         off = s.run(s.neutral()[None])[0] - np.where(np.isfinite(s.measured), s.measured, 0.0)
         out[s.name] = float(np.max(rms(s, off) / s.floor))
     return out
+
+
+def settled_loop(log: Log) -> dict[str, SignalError]:
+    """Figures of the whole loop from a dwell on: a record begins with a controller that was just switched on."""
+    return {e.signal: e for e in replay(part_of(log, [Span(10.0, np.inf)])).signals if e.reference == "measured"}
 
 
 def demand_of(path: Path) -> StageDiagnosis:
@@ -84,6 +92,20 @@ def test_on_a_wire_too(phase: float, tmp_path: Path) -> None:
     log = read_log(by_wire(tmp_path / "run.log", "slam", phase))
     errors = in_floors(build_chain(log))
     assert errors["demand"] < 0.2 and max(errors.values()) < AGREES, errors
+    assert settled_loop(log)["x_dem"].rms < 5e-3  # a frame too many or too few: 0.06 mm
+    n_r = next(e for e in replay(log).signals if e.signal == "n_r")
+    assert n_r.rms < AGREES * n_r.noise_floor
+
+
+def test_the_jitter_of_a_loggers_stamps_leaves_the_figures(tmp_path: Path) -> None:
+    """A busy computer stamps frames up to a millisecond late; the controller's ticks are as even as ever."""
+    frames = read_candump(by_wire(tmp_path / "run.log", "slam", 5.0))
+    late = np.random.default_rng(1).uniform(0.0, 1e-3, frames.t.size)
+    write_frames(tmp_path / "late.log", replace(frames, t=np.maximum.accumulate(frames.t + late)))
+    plain, other = (read_log(tmp_path / f"{name}.log") for name in ("run", "late"))
+    assert in_floors(build_chain(other))["demand"] < 0.2
+    for name in ("x_dem", "x_lvdt"):
+        assert settled_loop(other)[name].rms == pytest.approx(settled_loop(plain)[name].rms, rel=0.05), name
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc", ".mf4"])
@@ -197,9 +219,6 @@ def test_channel_groups_that_were_taken_out_of_frames_came_in_frames(tmp_path: P
 
 
 def test_parts_and_other_clocks_of_a_log_of_frames_stay_frames(tmp_path: Path) -> None:
-    from vaneloop.base.spans import Span
-    from vaneloop.verbs.parts import part_of
-
     log = read_log(by_ticks(tmp_path / "run.log", "slam", 1, seconds=15.0))
     part = part_of(log, [Span(0.0, 10.0)])
     assert part.channels["n_dem"].t[-1] < 10.0 and all(c.framed for c in part.channels.values())
