@@ -223,7 +223,7 @@ def defect(e: BaseException) -> str:
     if type(e).__name__ == "BrokenProcessPool":
         return (
             "a process of the search was ended from outside (killed, or short of memory); nothing is kept of it: start "
-            "it again, --workers 1 needs less memory"
+            "it again (--workers 1, at the command line, needs less memory)"
         )
     lines = "".join(traceback.format_exception(e))
     place = traceback.extract_tb(e.__traceback__)[-1:]
