@@ -166,7 +166,7 @@ def learn(
     The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
     InputError for logs that the system cannot be held against.
     """
-    tell = progress or (lambda _: None)
+    tell, shape = progress or (lambda _: None), checked_shape(shape)
     if not isinstance(model, System):
         from vaneloop.verbs.search import chain_for, not_given
 
@@ -175,7 +175,7 @@ def learn(
         return learned(not_given(chain, without), name, machine.added, workers, tell, shape=shape)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
-        return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f), checked_shape(shape))
+        return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f), shape)
     except StageError as e:
         raise InputError(str(e)) from None
 

@@ -23,7 +23,7 @@ from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["Candidate", "OwnGround", "Quantity", "basis_for", "candidates", "on_logs", "quantities", "with_curves"]
+__all__ = ["Candidate", "OwnGround", "Quantity", "candidates", "on_logs", "quantities", "with_curves"]
 
 
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
@@ -109,20 +109,20 @@ class Candidate:
         if not shape or self.quantity.stops:
             return self
         c = replace(self, shape=tuple(shape))
-        basis = c.basis_of(IN_TIME if c.quantity.name == TIME else COUNT)
+        basis = c.basis_of()
         if basis is None or len(basis.bend) < 3:
             return None
         return replace(c, basis=basis)
 
-    def basis_of(self, count: int) -> Basis | None:
-        """So many splines for it."""
+    def basis_of(self, count: int = 0) -> Basis | None:
+        """Splines for it, ``count`` of them (0: as many as usual)."""
         q, shape = self.quantity, self.shape
         if not shape or q.stops:
             return basis_for(q, count)
         x = q.visited[np.isfinite(q.visited)]
         if not shape_fits(shape, x):
             return None
-        basis = basis_of(np.concatenate([x, -x]) if "odd" in shape else x, count)
+        basis = basis_of(np.concatenate([x, -x]) if "odd" in shape else x, count or usual(q))
         if basis is not None and (rises := ("rising" in shape) - ("falling" in shape)):
             basis = basis.rising(rises)
         return basis.zeroed() if basis is not None and "zero" in shape else basis
@@ -146,8 +146,12 @@ class Candidate:
         """The same with another function from so many parameters to its table."""
         q = self.quantity
         if q.stops:  # where they have not moved they make nothing
-            rising = table
-            table = lambda values: rising(values) - rising(values)[0]  # noqa: E731
+            whole = table
+
+            def table(values: Array) -> Array:
+                y = whole(values)
+                return y - y[0]
+
         curve = Curve(self.how, self.place, q.of, q.name, self.basis.low, self.basis.high, table)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
@@ -231,11 +235,16 @@ def _remembering(bound: Bound, shared: set[str]) -> list[Quantity]:
     return out
 
 
+def usual(q: Quantity) -> int:
+    """How many splines a curve of a quantity has."""
+    return IN_TIME if q.name == TIME else COUNT
+
+
 def basis_for(q: Quantity, count: int = 0) -> Basis | None:
     """Splines of a curve of a quantity, ``count`` of them (0: as many as usual); None where it has been at too few
     values.
     """
-    count = count or (IN_TIME if q.name == TIME else COUNT)
+    count = count or usual(q)
     if q.stops:  # from a radius of 0 to where every way there and back is within it
         return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)
     return basis_of(q.visited, count)

@@ -111,13 +111,10 @@ class LearnedLaw:
 def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list[str]) -> LearnedLaw:
     """Everything that is said of the last curve of ``tried``."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
-    amplitudes = fit.theta[judge.stage.index()[c.name]]
-    placed = tried.curves[-1][0]
-    assert placed.curve is not None
-    grid = c.grid
-    y = placed.curve.table(amplitudes)
+    table, amplitudes = tried.table()
+    grid, y = c.grid, table(amplitudes)
     formulas = _formulas(ground, tried, y)
-    low, high = _with_formulas(c, y, *_band(tried, placed.curve.table), formulas)
+    low, high = _with_formulas(c, y, *_band(tried), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
     return LearnedLaw(
@@ -127,11 +124,12 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list
     )  # fmt: skip
 
 
-def _band(tried: Tried, table: object) -> tuple[Array, Array]:
+def _band(tried: Tried) -> tuple[Array, Array]:
     """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
     the fit. What the log cannot tell apart is as wide as it was known before.
     """
     judge, fit, c = tried.judge, tried.fit, tried.candidate
+    table, amplitudes = tried.table()
     scale = judge.scale[fit.free]
     prior = fit.prior * scale**2
     n = judge.n_blocks
@@ -145,10 +143,10 @@ def _band(tried: Tried, table: object) -> tuple[Array, Array]:
     for w, drawn in zip(weights, known, strict=True):
         a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
         step = np.linalg.solve(a, (w - 1.0) @ fit.gradients + drawn)
-        curves.append(table(np.clip(fit.theta[fit.free] + step * scale, *bounds)[mine]))  # type: ignore[operator]
+        curves.append(table(np.clip(fit.theta[fit.free] + step * scale, *bounds)[mine]))
     edge = 50.0 * (1.0 - BAND)
     low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
-    y = table(fit.theta[at])  # type: ignore[operator]
+    y = table(amplitudes)
     return np.minimum(low, y), np.maximum(high, y)
 
 

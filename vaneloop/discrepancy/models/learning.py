@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 
-from vaneloop.discrepancy.curves import COUNT
 from vaneloop.discrepancy.error_share import (
     BETTER,
     HARM,
@@ -81,6 +80,7 @@ class Tried:
 
     curves  each as it runs and as the search has it, the new one last
     told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
+    levels  log of its error in noise floors, log by log, once that has been simulated
     """
 
     candidate: Candidate
@@ -89,6 +89,13 @@ class Tried:
     fit: Fit
     curves: Placings
     told: Fit | None = None
+    levels: dict[str, float] | None = None
+
+    def table(self) -> tuple[Callable[[Array], Array], Array]:
+        """From the new curve's amplitudes to its table, and these amplitudes."""
+        curve = self.curves[-1][0].curve
+        assert curve is not None
+        return curve.table, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
 
 
 @dataclass
@@ -154,13 +161,6 @@ def with_held_out(judge: Judge, fit: Fit) -> Fit:
         return fit
     held = held_out(fit.cost, fit.gradients, fit.normals, mine, fit.prior * scale**2, deviation)
     return replace(fit, held_out=held)
-
-
-def _drawn(tried: Tried) -> Array:
-    """The curve of what was tried last."""
-    placed = tried.curves[-1][0]
-    assert placed.curve is not None
-    return placed.curve.table(tried.fit.theta[tried.judge.stage.index()[tried.candidate.name]])
 
 
 def _moves(tried: Tried) -> tuple[Array, Array]:
@@ -301,8 +301,10 @@ class Learner:
 
     def _earns(self, before: Fit, tried: Tried) -> bool:
         c = tried.candidate
-        if c.quantity.stops and not dissipates(c.basis.low, c.basis.high, _drawn(tried)):
-            return False
+        if c.quantity.stops:
+            table, amplitudes = tried.table()
+            if not dissipates(c.basis.low, c.basis.high, table(amplitudes)):
+                return False
         return worth(self.judge, before, tried.fit, self.form.form).good
 
     def _left(self, before: Tried, tried: Tried) -> float:
@@ -347,7 +349,7 @@ class Learner:
         c = best.candidate
         assert c.quantity.slower is not None
         q = c.quantity.slower(times)
-        basis = replace(c, quantity=q).basis_of(COUNT) if q is not None else None
+        basis = replace(c, quantity=q).basis_of() if q is not None else None
         if q is None or basis is None or basis.turn.shape != c.basis.turn.shape:
             return None
         name = c.name.replace(c.quantity.name, q.name)
@@ -483,12 +485,12 @@ class Learner:
 
     def _change(self, before: Tried, tried: Tried) -> dict[str, float]:
         """Log of the error with a curve over that without, log by log."""
-        floor = self.ground.floor
+        was, now = self._levels(before), self._levels(tried)
+        return {log: now[log] - was[log] for log in was if log in now}
 
-        def levels(of: Tried) -> dict[str, float]:
+    def _levels(self, of: Tried) -> dict[str, float]:
+        if of.levels is None:
             by = self.ground.figures(of.curves, of.fit.theta)
             good = {log: v for log, v in by.items() if np.isfinite(v).all()}
-            return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in good.items()}
-
-        was, now = levels(before), levels(tried)
-        return {log: now[log] - was[log] for log in was if log in now}
+            of.levels = {log: float(np.log(np.maximum(v / self.ground.floor, 1.0)).mean()) for log, v in good.items()}
+        return of.levels

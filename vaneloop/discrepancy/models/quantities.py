@@ -1,6 +1,5 @@
 """Quantities of which a law may be a function and which are known before a model runs: other columns of the log, time,
-what follows from how a channel turns, and what it was before
-(`vaneloop.discrepancy.models.memory`).
+what follows from how a channel turns, and what it was before (`vaneloop.discrepancy.models.memory`).
 """
 
 from __future__ import annotations
