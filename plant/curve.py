@@ -10,7 +10,8 @@ stage is held against a log, they are what the log says (`take`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from plant.layout import (
     C_HIGH,
     C_LOW,
     C_OF,
+    C_PERIOD,
     C_SITE,
     C_TABLE,
     CURVE_ROWS,
@@ -32,13 +34,14 @@ from plant.layout import (
 from plant.places import N_R, POT, SPEED, X
 from vaneloop.base.compiled import compiled, in_place, inlined
 from vaneloop.base.curve import POINTS, between_points
+from vaneloop.base.durations import of_name
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
     "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS", "LVDT_ADDS",
     "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
-    "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow", "take",
-    "turn", "turns",
+    "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow",
+    "quantity_of", "take", "turn", "turns",
 ]  # fmt: skip
 
 (
@@ -58,12 +61,15 @@ S_FARTHEST = SIGNAL_AT + KNOWN
 
 @dataclass(frozen=True)
 class Quantity:
-    """A signal as a log and a reader have it: name, unit, factor to SI, its number in `SIGNALS`."""
+    """A signal as a log and a reader have it: name, unit, factor to SI, its number in `SIGNALS`, and the period (SI)
+    after which what is a function of it repeats itself; 0: it does not.
+    """
 
     name: str
     unit: str
     si: float
     of: int
+    period: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -137,6 +143,14 @@ PLACES = {
 }
 
 
+def quantity_of(name: str) -> Quantity | None:
+    """The quantity of this name, of those in `QUANTITIES` and ``time_every_TIME``; None: there is none."""
+    found = of_name(name, "every")
+    if found and found[0] == "time":
+        return replace(QUANTITIES["time"], name=name, period=found[1])
+    return QUANTITIES.get(name)
+
+
 def at_curve(p: np.ndarray, place: Place, q: Quantity, low: float, high: float, tables: np.ndarray) -> None:
     """Put a curve at a place behind those that ``p`` has; its range and ``tables`` (a column a lane, or one for all)
     are in border units.
@@ -149,6 +163,7 @@ def at_curve(p: np.ndarray, place: Place, q: Quantity, low: float, high: float, 
     r = CURVES + 1 + c * CURVE_ROWS
     p[CURVES] = c + 1
     p[r + C_SITE], p[r + C_OF], p[r + C_LOW], p[r + C_HIGH] = place.site, q.of, low * q.si, high * q.si
+    p[r + C_PERIOD] = q.period
     p[r + C_TABLE : r + CURVE_ROWS] = tables * place.si
 
 
@@ -159,7 +174,9 @@ def bend(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
     for c in range(int(p[CURVES, j])):
         r = CURVES + 1 + c * CURVE_ROWS
         if p[r + C_SITE, j] == site:
-            x = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
+            x, period = s[SIGNAL_AT + int(p[r + C_OF, j]), j], p[r + C_PERIOD, j]
+            if period > 0.0:
+                x -= math.floor(x / period) * period
             k, share = between_points(x, p[r + C_LOW, j], p[r + C_HIGH, j], POINTS)
             a = p[r + C_TABLE + k, j]
             total += a + share * (p[r + C_TABLE + k + 1, j] - a)

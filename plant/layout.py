@@ -19,6 +19,7 @@ __all__ = [
     "C_HIGH",
     "C_LOW",
     "C_OF",
+    "C_PERIOD",
     "C_SITE",
     "C_TABLE",
     "DAMPING",
@@ -104,7 +105,8 @@ NOMINAL_STATE = (
 
 # ---- curves that were learned (`plant.curve`): behind all others too
 MOST_CURVES = 4
-(C_SITE, C_OF, C_LOW, C_HIGH, C_TABLE) = range(5)  # rows of one: where, of which signal, its range, its table
+# rows of one: where, of which signal, its range, the period after which it repeats itself (0: it does not), its table
+(C_SITE, C_OF, C_LOW, C_HIGH, C_PERIOD, C_TABLE) = range(6)
 CURVE_ROWS = C_TABLE + POINTS
 SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature in degC)
     "i_cmd",

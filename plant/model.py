@@ -37,7 +37,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from plant import chain
-from plant.curve import PLACES, QUANTITIES, at_curve
+from plant.curve import PLACES, QUANTITIES, at_curve, quantity_of
 from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import MOST_CURVES, PLAY
@@ -181,14 +181,17 @@ class Model(Table):
         for name, curve in self.curves.items():
             where = f"{source}: curves.{name}"
             places = {k: v for k, v in PLACES.items() if plant.kind in v.kinds and v.vane in ("", *plant.vanes)}
-            own = {q: v for q, v in QUANTITIES.items() if q not in VANES or q in plant.vanes}
+            own = [q for q in QUANTITIES if q not in VANES or q in plant.vanes]
             if f"{curve.at} {curve.how}" not in places:
                 raise InputError(
                     f"{where}: at, how (={curve.at!r}, {curve.how!r}) is {_not(curve.at, plant, ())}; allowed: "
                     f"{', '.join(places)}"
                 )
-            if curve.of not in own:
-                raise InputError(f"{where}: of (={curve.of!r}) is unknown; allowed: {', '.join(own)}")
+            if curve.of not in own and (curve.of in VANES or quantity_of(curve.of) is None):
+                raise InputError(
+                    f"{where}: of (={curve.of!r}) is unknown; allowed: {', '.join(own)}, time_every_TIME such as "
+                    f"time_every_20_ms"
+                )
             curve.check(where)
             values = self.effects.get(name, {})
             if unknown := next((k for k in values if k not in curve.numbers), None):
@@ -224,7 +227,8 @@ class Model(Table):
 def put_curve(p: np.ndarray, curve: Learned, values: Mapping[str, float]) -> None:
     """Put a curve with these ``values`` (what is not named: as learned) behind those that ``p`` has, in every lane."""
     numbers = np.array(curve.now(values).values)
-    place, of = PLACES[f"{curve.at} {curve.how}"], QUANTITIES[curve.of]
+    place, of = PLACES[f"{curve.at} {curve.how}"], quantity_of(curve.of)
+    assert of is not None  # `Model.check`
     at_curve(p, place, of, curve.low, curve.high, curve.table()(numbers)[:, None])
 
 

@@ -27,7 +27,7 @@ LEARNED: dict[tuple[str, str], frozenset[str]] = {
         ("dc_motor", "cogging", "speed.curve_of_angle"),
         ("dc_motor", "weakening", "inertia.gain_of_time"),  # the current's sensor does not see it
         ("rectified_drive", "slip", ""),  # of the difference of two speeds
-        ("rectified_drive", "ripple", ""),  # 35 periods a log
+        ("rectified_drive", "ripple", "motor.curve_of_time drive.curve_of_time"),
         ("battery", "empties", "r0.gain_of_charge fall.gain_of_current"),  # proportional to charge times current
         ("battery", "cold", "r0.gain_of_time"),
         ("levitation", "saturates", ""),
@@ -44,13 +44,13 @@ LEARNED: dict[tuple[str, str], frozenset[str]] = {
         ("hysteretic_damper", "membrane", "stiffness.gain_of_position force.curve_of_position"),
         ("hydraulic_cylinder", "leakage", "position.curve_of_load"),
         ("hydraulic_cylinder", "worn_edge", "valve.curve_of_valve gain.gain_of_valve"),
-        ("pendulum", "shaken", ""),
+        ("pendulum", "shaken", "gravity.gain_of_time"),
         ("pendulum", "cable", "rate.curve_of_angle gravity.gain_of_angle torque.curve_of_angle"),
         ("quarter_car", "rebound", "rate.curve_of_rate damping.gain_of_rate damping.gain_of_direction_of_travel "
          "axle.curve_of_rate"),
         ("quarter_car", "bump_stop", "rate.curve_of_travel spring.gain_of_travel axle.curve_of_travel"),
         ("resonator", "one_sided", "speed.curve_of_place spring.gain_of_place force.curve_of_place"),
-        ("resonator", "pumped", ""),
+        ("resonator", "pumped", "spring.gain_of_time"),
         ("rolling_ship", "cargo", "frequency.gain_of_time"),  # the model has one number for lever and waves
         ("rolling_ship", "lever", "rate.curve_of_roll slope.curve_of_roll"),
     )

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.durations import within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
@@ -195,7 +196,7 @@ def learned_right(row: dict[str, Any]) -> bool:
     effect of the library is named that has its law, and its cause is said.
     """
     said = json.loads(row["learned"])
-    names = {n for law in said["laws"] for n in law["names"]}
+    names = {within_no_period(n) for law in said["laws"] for n in law["names"]}
     return bool(names & CURVES_OF[row["truth"][0]]) or (said["verdict"] == "named" and _told(row))
 
 
@@ -416,11 +417,12 @@ CURVES_OF: dict[str, set[str]] = {
     "servo_gain_warm": _of("servo.current", "t_oil"),
     "lvdt_over_pressure": _of("sensors.lvdt", "p_s"),
     "acceleration_by_speed": _of("engine.acceleration", "n_r n_dem"),
+    "lvdt_ripple": _of("sensors.lvdt", "time"),
+    "driver_oscillation": _of("valve.current", "time"),
 }
 # what is no function of one quantity at one place: shaking, resonance, memory, a signal's own clock
 NO_CURVE = (
-    "lvdt_ripple", "vane_vibration", "valve_silting", "ring_creep", "linkage_resonance", "driver_oscillation",
-    "stall_rumble", "lvdt_lost_bits",
+    "vane_vibration", "valve_silting", "ring_creep", "linkage_resonance", "stall_rumble", "lvdt_lost_bits",
 )  # fmt: skip
 CURVES_OF |= {name: set() for name in NO_CURVE}
 

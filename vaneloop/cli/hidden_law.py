@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.durations import within_no_period
 from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
@@ -291,7 +292,7 @@ def _learned_right(row: Row, said: dict[str, Any]) -> bool:
     if said["verdict"] == "named":
         return _right(row)
     curves = set(json.loads(row["curves"]))
-    return bool(said["laws"]) and any(curves & set(law["names"]) for law in said["laws"])
+    return bool(said["laws"]) and any(curves & {within_no_period(n) for n in law["names"]} for law in said["laws"])
 
 
 def by_size(rows: list[Row]) -> list[list[str]]:

@@ -18,12 +18,13 @@ import numpy as np
 from vaneloop.base.curve import DEGREE, splines
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["COUNT", "LEVEL", "Basis", "basis_of"]
+__all__ = ["COUNT", "LEVEL", "Basis", "basis_of", "waves_of"]
 
 COUNT = 10  # splines of a curve
 LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
 LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
+HARMONICS, AROUND = 3, 27  # waves of a curve that repeats itself, and splines that they are made of
 EDGE = 0.001  # share of the visited values beyond the first and the last knot
 
 
@@ -35,6 +36,7 @@ class Basis:
     turn    float64[splines, functions]: B-spline coefficients of each function; function 0 is a constant, 1 a straight
             line, both and all others with mean square 1 over the visited values
     bend    float64[functions]: mean square of the second derivative over the range, as a share of that of function 2
+    period  of one whose functions are sines and cosines, with no straight line; 0: it is none
     rises   functions but the constant are steps up (1) or down (-1) from one spline to the next, of amplitudes that are
             not below 0; 0: none of this
     """
@@ -43,6 +45,7 @@ class Basis:
     turn: Array
     bend: Array
     rises: int = 0
+    period: float = 0.0
 
     @property
     def low(self) -> float:
@@ -64,6 +67,11 @@ class Basis:
         steps = sign * np.tril(np.ones((n, n)))[:, 1:]
         return replace(self, turn=np.column_stack([np.ones(n), steps]), bend=np.ones(n), rises=sign)
 
+    @property
+    def straight(self) -> int:
+        """How many of its functions do not bend: the constant, and the straight line where there is one."""
+        return 1 if self.rises or self.period else 2
+
     def design(self, x: Array) -> Array:
         """`splines` of its knots at ``x``."""
         return splines(self.knots, x)
@@ -78,9 +86,10 @@ class Basis:
         wide = float(np.sqrt(3.0) * LEVEL * size)
         out = []
         for k in kept:
-            step = self.rises and k > 0
-            own = f"step_{k}" if step else ("mean", "slope")[k] if k < 2 else f"bend_{k - 1}"
-            tolerance = wide if k < 2 and not step else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
+            step, plain = self.rises and k > 0, k < self.straight
+            bend = f"step_{k}" if step else f"wave_{k}" if self.period else f"bend_{k - 1}"
+            own = ("mean", "slope")[k] if plain else bend
+            tolerance = wide if plain else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
             out.append(Parameter(own, 0.0, unit, 0.0 if step else -np.inf, scale=size, tolerance=tolerance))
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
                        for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3)
@@ -129,6 +138,19 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     line /= np.sqrt(line @ gram @ line)
     turn = np.column_stack([one, line, turn[:, 2:]])
     return Basis(low + (high - low) * knots, turn, np.concatenate([[0.0, 0.0], bends[2:] / bends[2]]))
+
+
+def waves_of(period: float) -> Basis:
+    """The basis for a quantity that repeats itself: a constant, a sine and a cosine of its ``period``, and `HARMONICS`
+    times as fast ones.
+    """
+    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0.0, 1.0, AROUND - DEGREE + 1), np.ones(DEGREE)])
+    z = np.linspace(0.0, 1.0, 8 * AROUND)
+    order = np.arange(1, HARMONICS + 1)
+    turns = 2.0 * np.pi * z[:, None] * order
+    waves = np.sqrt(2.0) * np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(len(z), -1)
+    turn = np.linalg.lstsq(splines(knots, z), np.column_stack([np.ones(len(z)), waves]), rcond=None)[0]
+    return Basis(period * knots, turn, np.concatenate([[0.0], np.repeat(order, 2) ** 4.0]), period=period)
 
 
 def _straight(x: Array, low: float, high: float) -> Basis:

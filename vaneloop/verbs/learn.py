@@ -77,6 +77,8 @@ class Learned(Answer):
     @property
     def notes(self) -> list[str]:
         """What the user should know."""
+        from vaneloop.discrepancy.models.quantities import period_of
+
         out = list(self.outcome.notes)
         for law in self.laws:
             if law.untold:
@@ -85,6 +87,8 @@ class Learned(Answer):
                 out.append(f"{law.name}: its {what} cannot be told from these logs{trades}")
             if law.rivals:
                 out.append(f"{law.name}: as good: {', '.join(law.rivals)}")
+            if period_of(law.of):
+                continue
             reach = f"[{law.x[0]:.4g}, {law.x[-1]:.4g}] {law.of_unit.strip('-')}".strip()
             out.append(f"{law.name}: {law.of} has been in {reach}; beyond, the curve stays as at its end")
         return out

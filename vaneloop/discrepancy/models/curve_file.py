@@ -11,7 +11,7 @@ from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, period_of
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Effect, Parameter, StageError
 
@@ -47,7 +47,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     shaped = {prefix + c for c in columns for prefix in (WAY, DISTANCE, SINCE, STOPS)}
     lag = named_lag(law.of)
     of = known.get(law.of, COLUMN)
-    if of == COLUMN and law.of not in (TIME, *columns, *shaped) and not (lag and lag[0] in columns):
+    if of == COLUMN and not (law.of in (TIME, *columns, *shaped) or period_of(law.of) or lag and lag[0] in columns):
         raise wrong("of", law.of, ", ".join([*known, TIME, *sorted(columns - set(known))]))
     try:
         law.check(f"curves.{name}")

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vaneloop.base.curve import POINTS
-from vaneloop.discrepancy.curves import COUNT, Basis, basis_of
+from vaneloop.discrepancy.curves import COUNT, Basis, basis_of, waves_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
 from vaneloop.discrepancy.models.nominal import nominal_course
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.periods import Course
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, every, period_of
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, Effect, Stage
@@ -59,6 +60,11 @@ class Quantity:
     def stops(self) -> bool:
         """Whether a curve of it is a hysteresis (`vaneloop.discrepancy.models.memory`)."""
         return self.name.startswith(STOPS)
+
+    @property
+    def period(self) -> float:
+        """Of the time within each period (s): this period; 0: it is another quantity."""
+        return period_of(self.name)
 
     @property
     def remembers(self) -> bool:
@@ -126,6 +132,14 @@ class Candidate:
         if basis is not None and (rises := ("rising" in shape) - ("falling" in shape)):
             basis = basis.rising(rises)
         return basis.zeroed() if basis is not None and "zero" in shape else basis
+
+    def every(self, period: float) -> Candidate:
+        """The same of the time within each ``period`` (s), of a candidate of time."""
+        q = self.quantity
+        name = every(period, float(np.ptp(q.visited)) / period)
+        period = period_of(name)  # as the name has it
+        again = replace(q, name=name, visited=q.visited % period)
+        return replace(self, name=self.name.removesuffix(q.name) + name, quantity=again, basis=waves_of(period))
 
     @property
     def turn(self) -> Array:
@@ -244,6 +258,8 @@ def basis_for(q: Quantity, count: int = 0) -> Basis | None:
     """Splines of a curve of a quantity, ``count`` of them (0: as many as usual); None where it has been at too few
     values.
     """
+    if q.period:
+        return waves_of(q.period)
     count = count or usual(q)
     if q.stops:  # from a radius of 0 to where every way there and back is within it
         return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)
@@ -373,3 +389,11 @@ class OwnGround:
     def figures(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
         """RMS error of each output, log by log, test logs too."""
         return on_logs(self.logs, curves).figures(theta)
+
+    def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
+        """The error of every sample of the logs that are fitted."""
+        bound = with_curves(self.logs.fitted, (), curves)
+        error = (bound.run(theta[None])[0] - bound.measured) / self.floor[:, None]
+        error[~np.isfinite(error)] = 0.0
+        parts = zip(bound.data.records, bound.logs.values(), bound.data.u, strict=True)
+        return [Course(r.t, error[:, at], u) for r, at, u in parts]

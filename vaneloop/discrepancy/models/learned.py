@@ -16,6 +16,7 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.learning import Ground, Tried, with_held_out
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
+from vaneloop.discrepancy.models.quantities import period_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
@@ -91,6 +92,8 @@ class LearnedLaw:
         what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of}"
         if lag:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
+        if period := period_of(self.of):
+            what = f"a function of the time within each {period:.6g} s"
         does = {
             "parameter times": f"{self.at} is multiplied by 1 + {what}",
             "input adds": f"{what} is added to {self.at}",

@@ -30,6 +30,7 @@ from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.memory import dissipates, named_lag
+from vaneloop.discrepancy.models.periods import Course, periods_of
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
@@ -47,6 +48,7 @@ OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which the change must help
+SMALL = 1e-2  # a constant by which a place is moved to see what a swing there would do
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
 Placings = tuple[tuple[Placed, Effect], ...]
 
@@ -72,6 +74,9 @@ class Ground(Protocol):
 
     def figures(self, curves: Placings, theta: Array) -> dict[str, Array]:
         """RMS error of each output, log by log, test logs too."""
+
+    def courses(self, curves: Placings, theta: Array) -> list[Course]:
+        """The error of every sample of the logs that are fitted."""
 
 
 @dataclass
@@ -127,7 +132,7 @@ def _strange(candidate: Candidate) -> int:
         return 0
     if candidate.quantity.remembers:
         return 4
-    if name.startswith((WAY, DISTANCE, SINCE)):
+    if name.startswith((WAY, DISTANCE, SINCE)) or candidate.quantity.period:
         return 3
     return 2 if name == TIME else 1
 
@@ -365,7 +370,7 @@ class Learner:
         whole = best.candidate
         found = dict(zip(whole.kept, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
         nominal = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]]
-        for untold in ((0, 1), (1,), (0,)) if not whole.basis.rises else ((0,),):
+        for untold in ((0, 1), (1,), (0,)) if whole.basis.straight == 2 else ((0,),):
             c = replace(whole, untold=untold)
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
@@ -430,14 +435,33 @@ class Learner:
         quick = self._judge((), current.curves, True)
         slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
         have = {q.effect for q, _ in current.curves}
-        out = sorted(
-            (self._promise(current, c, slopes) for c in self.candidates if c.name not in have), key=lambda o: o[0]
-        )
+        every = [c for c in (*self.candidates, *self._periodic(current)) if c.name not in have]
+        out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
             lag = named_lag(one[1].quantity.name)
             best.setdefault((one[1].how, one[1].at, f"lag of {lag[0]}" if lag else one[1].quantity.name), one)
         return list(best.values())
+
+    def _periodic(self, current: Tried) -> list[Candidate]:
+        """Every curve over time that may repeat itself, with the periods of the error; none where a shape is known."""
+        over_time = [c for c in self.candidates if c.quantity.name == TIME and not c.shape]
+        if not over_time:
+            return []
+        fit = current.fit
+        courses = self.ground.courses(current.curves, fit.theta)
+        out, plain = [], periods_of(courses)
+        for c in over_time:
+            periods = plain
+            if c.how.endswith("times"):
+                whole = replace(c, mean=True, untold=())
+                values = np.zeros(len(whole.kept))
+                values[0] = SMALL
+                curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
+                moved = self.ground.courses(curves, np.concatenate([fit.theta, values]))
+                periods = periods_of(courses, [m.error - w.error for m, w in zip(moved, courses, strict=True)])
+            out += [c.every(p) for p in periods]
+        return out
 
     def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, Array]:
         """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best.

@@ -8,11 +8,10 @@ weight. It can then be learned, drawn, stored and put into a formula as every ot
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from vaneloop.base.compiled import compiled
+from vaneloop.base.durations import in_name, of_name
 from vaneloop.discrepancy.stage import Array
 
 __all__ = ["STOPS", "dissipates", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
@@ -21,8 +20,6 @@ STOPS = "stops_of_"
 RADII = 64  # of the stops of a hysteresis, closer the smaller: most of it slips early
 COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
 NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
-_LAGGED = re.compile(r"(.+)_lagged_by_([1-9]\d*)_(s|ms|us|ns)")
-_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def is_memory(name: str) -> bool:
@@ -32,19 +29,12 @@ def is_memory(name: str) -> bool:
 
 def named_lag(name: str) -> tuple[str, float] | None:
     """Channel and time constant (s) of a lagged quantity; None: it is none."""
-    found = _LAGGED.fullmatch(name)
-    return (found[1], int(found[2]) * _UNITS[found[3]]) if found else None
+    return of_name(name, "lagged_by")
 
 
 def lagged_name(channel: str, tau: float) -> str:
     """Name of a channel lagged by ``tau`` (s), to three digits."""
-    tau = float(f"{tau:.3g}")
-    unit = next((u for u, size in _UNITS.items() if tau / size >= 1.0 - 1e-9 and _whole(tau / size)), "ns")
-    return f"{channel}_lagged_by_{max(round(tau / _UNITS[unit]), 1)}_{unit}"
-
-
-def _whole(x: float) -> bool:
-    return abs(x - round(x)) < 1e-6 * x
+    return f"{channel}_lagged_by_{in_name(tau, 3)}"
 
 
 @compiled

@@ -39,11 +39,8 @@ def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
     stride = max(1, len(y) // SAMPLES)
     y, m = y[::stride], m[::stride]
     error = y - m - np.mean(y - m)
-    with_error, of_values = np.empty(len(f)), np.empty(len(f))
-    for i in range(0, len(f), 256):
-        turn = 2j * np.pi * f[i : i + 256, None]
-        with_error[i : i + 256] = np.abs(np.exp(turn * (m - m[0])) @ error)
-        of_values[i : i + 256] = np.abs(np.exp(turn * (y - y[0])).mean(axis=1))
+    with_error = _sums(f, m - m[0], error)
+    of_values = _sums(f, y - y[0], np.full(len(y), 1.0 / len(y)))
     out: set[float] = set()
     finer = 1.0 / (FINER * max(float(np.max(np.abs(m))), span))
     for height in (with_error, of_values):
@@ -56,3 +53,11 @@ def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
             best = f[k] + finer * (int(np.argmin(left)) - many)
             out |= {float(1.0 / (best + near * finer)) for near in (-1.0, 0.0, 1.0)}
     return sorted(out)
+
+
+def _sums(f: Array, x: Array, weights: Array) -> Array:
+    """Magnitude of the sum of weights times exp(2 pi i f x), at evenly spaced frequencies ``f``."""
+    many = min(len(f), 256)
+    turned = np.exp(2j * np.pi * (f[:many, None] - f[0]) * x)  # from the first frequency of a block to each of it
+    parts = [np.abs(turned @ (weights * np.exp(2j * np.pi * f[i] * x))) for i in range(0, len(f), many)]
+    return np.concatenate(parts)[: len(f)]

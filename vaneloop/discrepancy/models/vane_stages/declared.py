@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from plant import chain
-from plant.curve import PLACES, QUANTITIES, Place, at_curve
+from plant.curve import PLACES, Place, at_curve, quantity_of
 from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
 from plant.parameters import nominal
@@ -145,7 +145,9 @@ def lanes(driven: Driven, thetas: Array, rows: Array, si: Array) -> Array:
     p = np.repeat(driven.machine.p, len(thetas), axis=1)
     p[rows] = (thetas[:, : len(rows)] * si).T
     for place, curve, tables in tables_of(driven, thetas):
-        at_curve(p, place, QUANTITIES[curve.quantity], curve.low, curve.high, tables)
+        q = quantity_of(curve.quantity)
+        assert q is not None
+        at_curve(p, place, q, curve.low, curve.high, tables)
     return p
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from controller import Calibration
 from plant import Plant
-from plant.curve import KNOWN, QUANTITIES
+from plant.curve import KNOWN, QUANTITIES, quantity_of
 from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS
 from plant.stages.blocks import NOTHING
@@ -58,9 +58,12 @@ class Driven(NamedTuple):
         return bool(self.curves) or bool(self.machine.p[CURVES].any())
 
     def quantity(self, name: str) -> Array | None:
-        """One of `plant.curve.QUANTITIES` on the log, in its unit; None: the log has it not."""
-        if name == "time":
+        """A quantity of `plant.curve` on the log, in its unit; None: the log has it not."""
+        q = quantity_of(name)
+        if q is not None and q.name == "time":
             return self.t
+        if q is not None and q.period:
+            return self.t % q.period
         if name == "x_lvdt":  # with less noise, where it can be had
             return self.columns.get("stroke", self.columns.get(name))
         values = self.columns.get(name)
@@ -76,9 +79,9 @@ class Driven(NamedTuple):
             return NOTHING
         out = np.full((KNOWN, len(self.t)), np.nan)
         have = {int(of) for of in self.machine.p[CURVES + 1 + C_OF :: CURVE_ROWS, 0]}
-        tried = {c.curve.quantity for c, _ in self.curves if c.curve is not None}
+        have |= {q.of for c, _ in self.curves if c.curve is not None and (q := quantity_of(c.curve.quantity))}
         for q in QUANTITIES.values():
-            if q.of in have or q.name in tried:
+            if q.of in have:
                 values = self.quantity(q.name)
                 if values is not None:
                     out[q.of] = values * q.si

@@ -19,6 +19,7 @@ from vaneloop.discrepancy.models.curve import COLUMN, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.curved import IN_TIME, Candidate, Quantity
 from vaneloop.discrepancy.models.motion import smoothed
+from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
 from vaneloop.discrepancy.models.vane_stages.driven import Made
@@ -49,6 +50,7 @@ NEAR = {
     "servo.current": ("i_cmd",), "actuator.flow_gain": ("x_lvdt", "t_oil"), "linkage.ring": ("x_lvdt",),
     "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
 }  # fmt: skip
+DRIVERS = ("n_dem", "n_r", "x_dem", "p_s", "t_oil")  # channels that move the machine
 OF_STROKE = (  # what `reversals` works out
     "speed_of_x_lvdt", "direction_of_x_lvdt", "distance_since_reversal_of_x_lvdt", "time_since_reversal_of_x_lvdt",
 )  # fmt: skip
@@ -157,6 +159,14 @@ class VaneGround:
             error = judge.errors(theta[None])[0] * judge.floor[:, None]
             out[name] = np.sqrt(np.sum(error**2, axis=1, where=judge.valid) / np.maximum(judge.valid.sum(axis=1), 1))
         return out
+
+    def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
+        """The error of every sample of the log."""
+        stage = remade(self.all, (), curves)
+        error = (stage.run(theta[None])[0] - stage.measured) / self.floor[:, None]
+        error[~np.isfinite(error)] = 0.0
+        drivers = [v for c, v in self.driven.columns.items() if c in DRIVERS and np.isfinite(v).all()]
+        return [Course(stage.t, error, np.array(drivers).reshape(len(drivers), len(stage.t)))]
 
     # ---- candidates --------------------------------------------------------------------------------------------------
 

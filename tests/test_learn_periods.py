@@ -1,0 +1,229 @@
+"""Laws that repeat themselves in time: their periods against closed forms, what is driven and no period, and from a log
+to a file that another log and the loop take.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.logs import Channel, Log
+from plant import Model, build_plant, load_model
+from plant.curve import LVDT_ADDS, S_TIME, bend, quantity_of
+from plant.effects import N_STATE
+from tests import rig
+from tests.firmware_on_rig import firmware
+from tests.test_learn import TANK
+from tests.test_learn_vanes import columns, curved, law
+from vaneloop import Record
+from vaneloop.base.durations import in_name, of_name, within_no_period
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import read
+from vaneloop.discrepancy import StageError
+from vaneloop.discrepancy.curves import waves_of
+from vaneloop.discrepancy.models.curve_file import from_file
+from vaneloop.discrepancy.models.periods import Course, periods_of
+from vaneloop.discrepancy.models.quantities import every, period_of
+from vaneloop.verbs.learn import learn, learned
+from vaneloop.verbs.search import diagnosed
+
+Array = np.ndarray
+
+
+# ---- names and curves
+
+
+@given(st.floats(1e-8, 1e5), st.integers(3, 8))
+def test_the_name_of_a_period_says_how_long(period: float, digits: int) -> None:
+    name = f"place.curve_of_time_every_{in_name(period, digits)}"
+    channel, said = of_name(name, "every") or ("", 0.0)
+    assert channel == within_no_period(name) == "place.curve_of_time"
+    assert "." not in name.removeprefix("place.")
+    assert said == pytest.approx(period, rel=max(0.5 * 10.0 ** (1 - digits), 0.5e-9 / period))
+
+
+@given(st.floats(1e-3, 1e3), st.floats(6.0, 1e4))
+def test_a_period_is_named_so_closely_that_the_last_cycle_still_fits(period: float, cycles: float) -> None:
+    said = period_of(every(period, cycles))
+    assert abs(cycles * (said - period)) < 0.05 * period
+
+
+@given(st.floats(1e-3, 10.0), st.integers(0, 1000))
+def test_a_curve_that_repeats_itself_is_waves_without_a_seam(period: float, seed: int) -> None:
+    basis = waves_of(period)
+    a = np.random.default_rng(seed).standard_normal(7)
+    t = np.linspace(0.0, period, 400, endpoint=False)
+    wave = [np.ones(len(t))] + [
+        np.sqrt(2.0) * f(2.0 * np.pi * k * t / period) for k in (1, 2, 3) for f in (np.sin, np.cos)
+    ]
+    ours = basis.design(t) @ basis.turn @ a
+    assert ours == pytest.approx(a @ np.array(wave), abs=0.01 * np.abs(a).sum())
+    ends = basis.design(np.array([0.0, period])) @ basis.turn @ a
+    assert ends[0] == pytest.approx(ends[1], abs=0.01 * np.abs(a).sum())
+
+
+# ---- periods
+
+
+def course(seed: int, wave: float, f: float, phase: float = 0.0, driver: Array | None = None) -> Course:
+    rng = np.random.default_rng(seed)
+    t = np.arange(4000) * 0.01
+    pushed = np.repeat(rng.uniform(-1.0, 1.0, 100), 40) if driver is None else driver
+    error = rng.standard_normal(len(t)) + wave * np.sin(2.0 * np.pi * f * t + phase)
+    return Course(t, error[None], pushed[None])
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 35.0), st.floats(0.4, 3.0))
+def test_a_wave_in_the_error_is_found_and_noise_is_none(seed: int, f: float, wave: float) -> None:
+    (found, *more) = periods_of([course(seed, wave, f)])
+    assert not more
+    assert abs(found - 1.0 / f) * f * f * 40.0 < 0.1  # of a turn, over the whole log
+    assert periods_of([course(seed, 0.0, f)]) == []
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 35.0))
+def test_a_gain_that_swings_is_found_beside_the_motion_that_it_acts_on(seed: int, f: float) -> None:
+    rng = np.random.default_rng(seed)
+    plain = course(seed, 0.0, f)
+    motion = np.repeat(rng.choice([-1.0, 1.0], 200) * rng.uniform(0.5, 1.5, 200), 20)
+    motion -= motion.mean()
+    c = plain._replace(error=plain.error + motion * np.sin(2.0 * np.pi * f * plain.t))
+    found = periods_of([c], [motion[None]])
+    assert any(abs(p - 1.0 / f) * f * f * 40.0 < 0.2 for p in found)
+
+
+@given(st.integers(0, 10_000), st.floats(0.5, 5.0), st.integers(1, 5))
+def test_what_drives_the_model_has_no_period_of_time(seed: int, f: float, order: int) -> None:
+    t = np.arange(4000) * 0.01
+    assert periods_of([course(seed, 3.0, order * f, driver=np.sin(2.0 * np.pi * f * t))]) == []
+    again = np.tile(np.repeat(np.random.default_rng(seed).standard_normal(100), 10), 4)  # the same four times
+    assert periods_of([course(seed, 3.0, order / 10.0 + 1.0, driver=again)]) == []
+
+
+def test_of_two_logs_a_driven_line_counts_where_its_phase_is_the_same() -> None:
+    t = np.arange(4000) * 0.01
+    rng = np.random.default_rng(1)
+    both = [np.sin(2.0 * np.pi * 1.7 * t + p) + 0.5 * rng.standard_normal(len(t)) for p in (0.0, 2.0)]
+    alike = [course(k, 2.0, 1.7, 0.3, driver=u) for k, u in enumerate(both)]
+    assert [round(1.0 / p, 2) for p in periods_of(alike)] == [1.7]
+    unlike = [course(k, 2.0, 1.7, 0.3 + 2.0 * k, driver=u) for k, u in enumerate(both)]
+    assert periods_of(unlike) == []
+
+
+# ---- from a log to a law
+
+
+def hummed(seed: int, name: str, size: float, n: int = 1500) -> Record:
+    """A tank whose pump hums, so that its flow swings with 0.11 Hz; what it is told is logged."""
+    t = np.arange(float(n))
+    rng = np.random.default_rng(seed)
+    pump = np.repeat(rng.uniform(0.0, 8.0, n // 50), 50)
+    x, level = 20.0, []
+    for k in range(n):
+        level.append(x)
+        for m in range(20):
+            at = t[k] + m / 20.0
+            x += 0.05 * (0.2 * (pump[k] + size * np.sin(2.0 * np.pi * 0.11 * at)) - 0.05 * x)
+    noise = 0.05 * rng.standard_normal(n)
+    return Record(name, t, {"pump": pump, "oil": 40.0 + 0.01 * t, "level": np.array(level) + noise})
+
+
+HELD = replace(TANK, between="hold")
+
+
+@pytest.fixture(scope="module")
+def humming():
+    return learn([hummed(1, "one", 1.0)], HELD, test=[hummed(2, "two", 1.0)])
+
+
+def test_a_hum_is_learned_with_its_period_and_size(humming) -> None:
+    assert humming.verdict == "learned"
+    (found,) = humming.laws
+    names = {within_no_period(n) for n in (found.name, *found.rivals)}
+    assert "pump.curve_of_time" in names
+    assert period_of(found.of) == pytest.approx(1.0 / 0.11, rel=1e-3)
+    assert "within each 9.09" in humming.sentence()
+    assert not any("stays as at its end" in note for note in humming.notes)
+    if found.at == "pump":
+        assert np.ptp(found.y) == pytest.approx(2.0, rel=0.1)
+    before, *_, after = (by["two"][0] for by in humming.by_log.steps.values())
+    assert before > 0.15 and after < 0.06
+
+
+def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
+    humming.write(tmp_path / "law.toml")
+    model = read(tmp_path / "law.toml", Model)
+    (name,) = model.curves
+    other = hummed(3, "three", 1.0)
+    data = HELD.bind([other]).data
+    placed, _ = from_file(name, model.curves[name], data)
+    assert np.allclose(data.column(0, placed.curve.quantity), other.t % period_of(placed.curve.quantity))
+
+    def left(m: Model) -> float:
+        bound = HELD.bind([other], values=m.parameters, present=m.effects, curves=m.curves)
+        return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
+
+    before, after = left(Model(parameters=model.parameters)), left(model)
+    assert before > 0.15 and after < 0.06
+    wrong = model.curves[name].model_copy(update={"of": "time_every_0_s"})
+    with pytest.raises(StageError, match="time_every_0_s"):
+        from_file(name, wrong, data)
+
+
+def test_a_tank_that_does_not_hum_learns_nothing() -> None:
+    assert learn([hummed(4, "one", 0.0)], HELD, test=[hummed(5, "two", 0.0)]).laws == []
+
+
+# ---- the vane chain
+
+
+@given(st.floats(-50.0, 1e4), st.floats(0.01, 20.0))
+def test_in_the_plant_a_curve_of_time_repeats_itself(t: float, period: float) -> None:
+    name = f"time_every_{in_name(period, 9)}"
+    said = period_of(name)
+    p = build_plant(
+        model=curved(law("sensors.lvdt adds", name, "sine", 0.4, 2 * np.pi / said, 1.0, low=0.0, high=said))
+    ).p
+    s = np.zeros((N_STATE, 1))
+    s[S_TIME] = t
+    assert bend(s, p, 0, LVDT_ADDS) == pytest.approx(0.4e-3 * np.sin(2 * np.pi * t / said + 1.0), abs=1e-6)
+
+
+def test_in_the_loop_a_hum_moves_the_stroke_and_one_of_nothing_no_bit() -> None:
+    law_of = {size: law("sensors.lvdt adds", "time_every_270_ms", "sine", size, 23.27, 0.0) for size in (0.0, 0.4)}
+    plain, still, moved = (columns(m) for m in (Model(), *(curved(law_of[size]) for size in (0.0, 0.4))))
+    assert np.array_equal(plain, still, equal_nan=True)
+    assert np.nanmax(np.abs(moved - plain)) > 0.1
+
+
+def test_what_no_machine_has_a_period_of_is_refused() -> None:
+    assert quantity_of("time_every_20_ms").period == 0.02
+    for name in ("n_r_every_20_ms", "time_every_20", "time_every_0_ms", "every_20_ms"):
+        assert quantity_of(name) is None
+        with pytest.raises(InputError, match="time_every_TIME"):
+            build_plant(model=curved(law("sensors.lvdt adds", name, "line", 0.4)))
+
+
+def test_an_oscillating_driver_is_learned_from_a_log_of_the_rig(tmp_path) -> None:
+    hidden = rig.draw("driver_oscillation", 3, np.random.default_rng(1))
+    run = rig.simulate(rig.manoeuvre(12, 120.0), firmware(), [hidden], seed=12, rate=100, randomised=False)
+    log = Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
+    from vaneloop.discrepancy.models.vanes import build_chain
+
+    chain = build_chain(log)
+    chain.stages[:] = [s for s in chain.stages if s.name == "actuator"]
+    answer = learned(chain, "rig", Model(), 1, None, diagnosed(chain, "rig", 1))
+    (found,) = answer.laws
+    assert found.at == "valve.current"
+    assert 1.0 / period_of(found.of) == pytest.approx(hidden.parameters["frequency"], rel=1e-3)
+    assert 0.5 * np.ptp(found.y) == pytest.approx(1e3 * hidden.parameters["amplitude"], rel=0.1)
+    answer.write(tmp_path / "law.toml")
+    again = build_chain(log, build_plant(model=load_model(tmp_path / "law.toml"))).stages
+    stage = next(s for s in again if s.name == "actuator")
+    before = next(s for s in build_chain(log).stages if s.name == "actuator")
+    left = [np.sqrt(np.nanmean((s.run(s.neutral()[None])[0] - s.measured) ** 2)) for s in (before, stage)]
+    assert left[1] < 0.3 * left[0]

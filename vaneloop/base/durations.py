@@ -1,0 +1,32 @@
+"""Times within names of quantities: ``138_s``, ``136986_us``. Names have no dot, which parts place and law."""
+
+from __future__ import annotations
+
+import re
+
+__all__ = ["in_name", "of_name", "within_no_period"]
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+def in_name(seconds: float, digits: int) -> str:
+    """A time (s) to so many digits, as a whole number of a unit."""
+    time = float(f"{seconds:.{digits}g}")
+    unit = next((u for u, size in UNITS.items() if time / size >= 1.0 - 1e-9 and _whole(time / size)), "ns")
+    return f"{max(round(time / UNITS[unit]), 1)}_{unit}"
+
+
+def of_name(name: str, word: str) -> tuple[str, float] | None:
+    """Channel and time (s) of a quantity named ``CHANNEL_word_TIME``; None: it is none."""
+    found = re.fullmatch(rf"(.+)_{word}_([1-9]\d*)_({'|'.join(UNITS)})", name)
+    return (found[1], int(found[2]) * UNITS[found[3]]) if found else None
+
+
+def _whole(x: float) -> bool:
+    return abs(x - round(x)) < 1e-10 * x
+
+
+def within_no_period(name: str) -> str:
+    """A name less the period within which it counts time."""
+    found = of_name(name, "every")
+    return found[0] if found else name
