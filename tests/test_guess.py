@@ -182,6 +182,7 @@ EPOCH = NIGHT.replace(tzinfo=dt.UTC).timestamp()
 TIMES: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
     "seconds": ("Zeit_s", lambda t: t), "ms": ("Time_ms", lambda t: t * 1e3), "us": ("t_us", lambda t: t * 1e6),
     "minutes": ("Zeit [min]", lambda t: t / 60), "elapsed": ("Elapsed Time (s)", lambda t: t),
+    "capitals": ("EpochMs", lambda t: (t + EPOCH) * 1e3),
     "epoch": ("epoch", lambda t: t + EPOCH), "epoch ms": ("Timestamp", lambda t: (t + EPOCH) * 1e3),
     "epoch us": ("time", lambda t: (t + EPOCH) * 1e6),
     "iso": ("Zeitstempel", lambda t: dates(t, "%Y-%m-%dT%H:%M:%S.%fZ", NIGHT)),
@@ -323,6 +324,25 @@ def test_the_measured_speed_is_of_the_rotor_of_the_demand(tmp_path: Path, run: d
 
 
 @pytest.mark.parametrize(
+    "name, signal, unit",
+    [
+        ("supply.pressure [Pa]", "p_s", ""), ("vigv.angle [rad]", "vigv", ""), ("StrokeActMm", "x_lvdt", "mm"),
+        ("OilTempDegC", "t_oil", "degC"), ("VSV_ActPos_in", "x_lvdt", "inch"), ("phiVGV2", "vgv2", ""),
+        ("Model Root/Hydraulik/Versorgungsdruck", "p_s", ""), ("TM_Current_mA", "i_cmd", "mA"),
+    ],
+)  # fmt: skip
+def test_paths_and_capitals_are_read_as_people_read_them(name: str, signal: str, unit: str) -> None:
+    m = meaning(name, ALL)
+    assert m is not None and m.signal == signal and m.unit == unit and m.confidence >= ENOUGH
+
+
+@pytest.mark.parametrize("name", ["coolant.supply_pressure", "Kraftstoff/Versorgungsdruck", "fuel.supply.pressure"])
+def test_the_path_of_another_part_makes_no_guess(name: str) -> None:
+    m = meaning(name, ALL)
+    assert m is None or m.confidence < ENOUGH
+
+
+@pytest.mark.parametrize(
     "name", ["timeout", "dead_time", "date_of_test", "uptime", "Zeitkonstante", "rise_time_s", "T1"]
 )
 def test_a_name_with_time_in_it_is_not_yet_the_time(name: str) -> None:
@@ -358,6 +378,43 @@ def test_a_measurement_that_counts_the_other_way_is_told_with_what_mends_it(
     assert f"it is {demand} with the other sign; --unit {option} turns it" in " ".join(log.notes)
     mended = read_log(file, units=dict([option.split("=", 1)]))
     np.testing.assert_allclose(mended.channels[signal].values, run[signal], rtol=1e-8)
+
+
+def test_without_a_stroke_the_speed_tells_what_is_turned(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "Speed Demand": run["n_dem"], "Speed Measured": run["n_r"], "IGV_deg": -run["vigv"],
+               "VGV1_deg": run["vgv1"], "VGV2_deg": -run["vgv2"], "SV_Current_mA": -run["i_cmd"]}  # fmt: skip
+    log = read_log(table(tmp_path / "a.csv", columns))
+    assert set(log.channels) == {"n_dem", "n_r", "vgv1"}
+    said = " ".join(log.notes)
+    assert all(f"--unit {s}=-{UNITS[s]}" in said for s in ("vigv", "vgv2", "i_cmd"))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [lambda x: x - 24.0, lambda x: x / 0.48, lambda x: x + 12.0],
+    ids=["counted from the middle", "in per cent", "counted from elsewhere"],
+)
+def test_a_stroke_far_from_the_schedule_is_told(
+    tmp_path: Path, run: dict[str, np.ndarray], how: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """Demand and measurement agree with each other, and values of a part of the stroke look like mm."""
+    some = run["x_dem"] < 28.0
+    columns = {"Zeit_s": run["t"][some], "n_soll": run["n_dem"][some], "n_ist": run["n_r"][some],
+               "weg_soll": how(run["x_dem"])[some], "weg_ist": how(run["x_lvdt"])[some]}  # fmt: skip
+    file = table(tmp_path / "a.csv", columns)
+    log = read_log(file)
+    assert set(log.channels) == {"n_dem", "n_r"}
+    assert "the schedule says at n_r; --map NAME=x_lvdt takes it as it is" in " ".join(log.notes)
+    assert "x_lvdt" in read_log(file, mapping={"weg_ist": "x_lvdt"}).channels
+
+
+def test_an_oil_that_may_be_in_either_degree_is_not_guessed(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"t": run["t"], "n_dem": run["n_dem"], "Oil Temperature": run["t_oil"] * 1.8 + 32.0}
+    file = table(tmp_path / "a.csv", columns)
+    log = read_log(file)
+    assert set(log.channels) == {"n_dem"} and "degC or degF?" in " ".join(log.notes)
+    log = read_log(file, units={"t_oil": "degF"})
+    np.testing.assert_allclose(log.channels["t_oil"].values, run["t_oil"], rtol=1e-8)
 
 
 def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:

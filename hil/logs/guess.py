@@ -26,6 +26,8 @@ ENOUGH = 0.7  # confidence below which a name is only mentioned
 ALIKE = 0.1  # two candidates whose confidences differ by no more are not told apart
 _COMMENT = 0.05  # what a comment is worth less than a name
 _LONGEST_COMMENT = 80  # letters
+# a machine with an effect that its model lacks stays nearer to its schedule
+_OFF, _STRETCHED = 8.0, 1.5  # mm, ratio
 
 # unit -> lowest and highest of the 99th percentile of the size, of a run that shows its unit; only units whose ranges
 # tell them apart
@@ -34,7 +36,7 @@ _USUAL: dict[str, dict[str, tuple[float, float]]] = {
     "x_dem": {"mm": (6.0, 60.0), "m": (0.004, 0.06), "um": (6_000.0, 60_000.0), "inch": (0.4, 2.4), "cm": (0.6, 6.0)},
     "i_cmd": {"mA": (0.5, 100.0), "A": (0.0005, 0.1), "uA": (500.0, 1e5)},
     "p_s": {"MPa": (8.0, 40.0), "bar": (80.0, 400.0), "psi": (1_200.0, 5_800.0), "kPa": (8e3, 4e4), "Pa": (8e6, 4e7)},
-    "t_oil": {"degC": (5.0, 160.0), "K": (253.0, 433.0)},
+    "t_oil": {"degC": (5.0, 160.0), "K": (253.0, 433.0), "degF": (90.0, 250.0)},
     "vgv": {"deg": (3.0, 90.0), "rad": (0.05, 1.57)},
 }  # fmt: skip
 _LIKE = {"n_r": "n_dem", "x_lvdt": "x_dem", **dict.fromkeys(VANES, "vgv")}
@@ -226,16 +228,38 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
         for speed in ("n_r", "n_dem"):
             if (p := pair(stroke, speed)) is not None and _together(*p, 8.0, 8.0) < -0.7:
                 blame(stroke, speed, "it runs against {other}: our stroke grows with the speed")
+            if (p := pair(stroke, speed)) is not None and stroke in guessed and (why := _off_schedule(*p)):
+                out[stroke] = f"{why} at {speed}; --map NAME={stroke} takes it as it is"
         for vane in VANES:
             if (p := pair(vane, stroke)) is not None and _together(*p, 4.0, 6.0) < -0.7:
                 blame(vane, stroke, "it runs against {other}; --unit {own} turns its sign")
-    if "i_cmd" in guessed and "x_lvdt" in channels and (p := pair("i_cmd", "x_lvdt")) is not None:
-        t = channels["i_cmd"][0]
-        t = t[(t >= channels["x_lvdt"][0][0]) & (t <= channels["x_lvdt"][0][-1])]
-        rate = np.gradient(np.convolve(p[1], np.ones(9) / 9, "same"), t)[9:-9]
-        if _together(p[0][9:-9], rate, 1.0, 2.0) < -0.5:
-            out["i_cmd"] = "it drives the stroke backwards; --unit i_cmd=-mA turns its sign"
+    for vane in VANES:
+        for speed in ("n_r", "n_dem"):
+            if vane in guessed and (p := pair(vane, speed)) is not None and _together(*p, 4.0, 8.0) < -0.7:
+                blame(vane, speed, "it runs against {other}; --unit {own} turns its sign")
+    for moved in ("x_lvdt", "x_dem", "n_r"):
+        if "i_cmd" in guessed and (p := pair("i_cmd", moved)) is not None:
+            t = channels["i_cmd"][0]
+            t = t[(t >= channels[moved][0][0]) & (t <= channels[moved][0][-1])]
+            rate = np.gradient(np.convolve(p[1], np.ones(9) / 9, "same"), t)[9:-9]
+            if _together(p[0][9:-9], rate, 1.0, 2.0) < -0.5:
+                what = "n_r" if moved == "n_r" else "the stroke"
+                out["i_cmd"] = f"it drives {what} backwards; --unit i_cmd=-mA turns its sign"
     return out
+
+
+def _off_schedule(stroke: np.ndarray, speed: np.ndarray) -> str:
+    """Why a stroke that follows the schedule, in its own way, has another zero or unit; "" where it has not."""
+    from controller import load_calibration
+
+    table = load_calibration().table
+    planned = np.interp(speed, table[0], 1e3 * table[3])
+    if _together(stroke, planned, 4.0, 8.0) < 0.7:
+        return ""
+    times, far = float(np.std(stroke) / np.std(planned)), float(np.median(np.abs(stroke - planned)))
+    if not 1.0 / _STRETCHED < times < _STRETCHED:
+        return f"it moves {times:.2g} times as far as the schedule says"
+    return f"it is {far:.2g} mm away, half of the time, from what the schedule says" if far > _OFF else ""
 
 
 def _together(a: np.ndarray, b: np.ndarray, least_a: float, least_b: float) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 import functools
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vaneloop.base.vanes import VANES
 
@@ -29,7 +29,7 @@ _WORDS = {
     "current": "current curr strom i cur amperage amps",
     "pressure": "pressure press prs druck p",
     "temperature": "temperature temp tmp temperatur t",
-    "angle": "angle ang winkel vane schaufel leitschaufel leitschaufelwinkel stellwinkel potentiometer poti rvdt",
+    "angle": "angle ang winkel vane schaufel leitschaufel leitschaufelwinkel stellwinkel potentiometer poti rvdt phi",
     "vigv": "vigv igv eintrittsleitrad vorleitrad",
     "vgv": "vgv vsv stator stage stufe",
     "time": "time zeit timestamp timestamps zeitstempel datetime epoch uhrzeit elapsed messzeit laufzeit zeitpunkt "
@@ -65,7 +65,7 @@ _UNITS = {
     "nanos": "ns", "min": "min", "minutes": "min", "minuten": "min", "h": "hour", "hours": "hour",
     "rpm": "rpm", "upm": "rpm", "u min": "rpm", "1 min": "rpm", "min 1": "rpm", "r min": "rpm", "umin": "rpm",
     "hz": "Hz", "pct": "%", "percent": "%", "perc": "%", "prozent": "%", "proz": "%",
-    "mm": "mm", "um": "um", "cm": "cm", "m": "m", "inch": "inch", "inches": "inch", "zoll": "inch",
+    "mm": "mm", "um": "um", "cm": "cm", "m": "m", "in": "inch", "inch": "inch", "inches": "inch", "zoll": "inch",
     "deg": "deg", "grad": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "mrad": "mrad",
     "ma": "mA", "a": "A", "ua": "uA", "amp": "A", "amps": "A", "bar": "bar", "mbar": "mbar", "psi": "psi",
     "psig": "psi", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
@@ -84,6 +84,14 @@ _OF = {
 _UMLAUTS = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "µ": "u", "μ": "u"}
 )
+
+
+# parts of a machine that are not ours, as the path before a name says them: coolant.supply_pressure
+_ELSEWHERE = (
+    "fuel kraftstoff coolant cooling kuehlung kuehlwasser kuehlmittel water wasser air luft brake bremse gearbox "
+    "getriebe bearing lager tank battery batterie room raum ambient umgebung"
+)
+_CAMEL = "\x1f"  # between two words that only a capital parts
 
 
 @dataclass(frozen=True)
@@ -112,6 +120,9 @@ _SIGNALS: dict[str, tuple[str, frozenset[str], frozenset[str], str, float]] = {
 # ---- words -----------------------------------------------------------------------------------------------------------
 
 
+_PATH = re.compile(r"::|\.(?=\D)|/(?=\s*\D)")
+
+
 def _plain(name: str) -> str:
     """The part of a name that says what it is: without the path of the model, the device and the port."""
     text = re.sub(r"\[\]?\{[^}]*\}|\{[^}]*\}|[\"'<>]", "", name).strip()
@@ -120,7 +131,7 @@ def _plain(name: str) -> str:
         inside = " ".join(re.findall(r"[a-z]+|\d+", bracket[2].casefold()))
         # a unit stands in the file's own words; (Soll) is part of the name
         text = bracket[1] if not inside or inside in _UNITS else f"{bracket[1]} {inside}"
-    text = re.split(r"::|\.(?=\D)|/(?=\s*\D)", text)[-1] if not re.search(r"(?i)[u1r]/min$", text) else text
+    text = _PATH.split(text)[-1] if not re.search(r"(?i)[u1r]/min$", text) else text
     return text.translate(_UMLAUTS)
 
 
@@ -161,6 +172,7 @@ def _words(text: str) -> tuple[str, ...]:
 def unit_in_name(name: str) -> tuple[tuple[str, ...], str, str]:
     """Words of a name without the unit at its end, that unit ("" without one), and the quantity it is a unit of."""
     text = _plain(name)
+    text = re.sub(r"(?<=[a-z]{2})(?=[A-Z][A-Za-z])", _CAMEL, text)  # PosMm, TimeMs
     raw = re.findall(r"[A-Za-z]+|\d+|%", text)
     for count in (2, 1):
         tail = " ".join(w.casefold() for w in raw[-count:])
@@ -169,11 +181,11 @@ def unit_in_name(name: str) -> tuple[tuple[str, ...], str, str]:
             cut = list(re.finditer(r"[A-Za-z]+|\d+|%", text))[-count].start()
             # one letter is a unit only behind a separator, and m, a, c, f, h, k, s only where the rest is a quantity
             if len(raw[-1]) > 1 or count == 2 or text[cut - 1 : cut] in "_ -.\u00b0":
-                rest = _words(text[:cut])
+                rest = _words(text[:cut].replace(_CAMEL, ""))
                 quantity = _quantity(rest)
                 if quantity and unit in _OF.get("angle" if quantity in ("vigv", "vgv") else quantity, ()):
                     return rest, unit, quantity
-    return _words(text), "", ""
+    return _words(text.replace(_CAMEL, "")), "", ""
 
 
 def _kinds(words: tuple[str, ...]) -> tuple[list[str], list[str], int, bool]:
@@ -235,7 +247,21 @@ def is_time(name: str) -> tuple[float, str]:
 def meaning(name: str, signals: tuple[str, ...]) -> Meaning | None:
     """The signal that a name most likely means; None where it means none of ours. A confidence below 0.7 is for a
     message, not for a guess.
+
+    The path before a name counts where the name alone says too little: supply.pressure.
     """
+    last = _last(name, signals)
+    path = _words(" ".join(_PATH.split(name)[:-1]).translate(_UMLAUTS))
+    if last is not None and not set(_ELSEWHERE.split()).isdisjoint(path):
+        return replace(last, confidence=min(last.confidence, 0.4), why=f"{last.why}, but of another part")
+    if last is not None and last.confidence >= 0.7 or not path:
+        return last
+    whole = _last(_PATH.sub(" ", name), signals)
+    return whole if whole is not None and (last is None or whole.confidence > last.confidence) else last
+
+
+def _last(name: str, signals: tuple[str, ...]) -> Meaning | None:
+    """What the part of a name behind its path says."""
     words, unit, _ = unit_in_name(name)
     plain = re.sub(r"[^a-z0-9]", "", _plain(name).casefold())
     for signal in signals:  # our own name in other letters, or with a unit behind it
