@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
+import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -23,7 +26,9 @@ def test_every_command_and_every_option_is_in_the_script(shell: str, capsys: pyt
     text = script(shell, capsys)
     for name in COMMANDS:
         assert name in text
-        for action in parser_of(name)._actions:
+        actions = parser_of(name)._actions
+        parts = [p for a in actions if isinstance(a, argparse._SubParsersAction) for p in a.choices.values()]
+        for action in [*actions, *(a for p in parts for a in p._actions)]:
             for flag in action.option_strings:
                 assert (flag if shell != "fish" else flag.lstrip("-")) in text, (name, flag)
     if shutil.which(shell):
@@ -31,27 +36,79 @@ def test_every_command_and_every_option_is_in_the_script(shell: str, capsys: pyt
         assert done.returncode == 0 and not done.stderr
 
 
-@pytest.mark.parametrize(
-    "words, offered, not_offered",
-    [
-        (["vaneloop", "rep"], "replay", "record"), (["vaneloop", "replay", "--tol"], "--tolerance", "--tables"),
-        (["vaneloop", "ecu", "--mode", "st"], "standby", "run"), (["vaneloop", "completion", "z"], "zsh", "bash"),
-        (["vaneloop", "replay", "exam"], "example.csv", "--report"),
-    ],
-)  # fmt: skip
-def test_bash_completes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], offered: str, not_offered: str
-) -> None:
-    if not shutil.which("bash"):
-        pytest.skip("no bash")
+# words before the one that is completed, what is offered for it, and what is not
+COMPLETED = [
+    (["vaneloop", "rep"], "replay", "record"), (["vaneloop", "replay", "--tol"], "--tolerance", "--tables"),
+    (["vaneloop", "ecu", "--mode", "st"], "standby", "run"), (["vaneloop", "completion", "z"], "zsh", "bash"),
+    (["vaneloop", "replay", "exam"], "example.csv", "--report"), (["vaneloop", "fleet", "rep"], "report", "run"),
+    (["vaneloop", "fleet", "report", "--tables-"], "--tables-out", "--bus"),
+    (["vaneloop", "fleet", "run", "exam"], "example.csv", "report"),
+    (["vaneloop", "replay", "--plant", "plant_"], "plant_electromechanical.toml", "example.csv"),
+    (["vaneloop", "run", "--bus", "lock"], "lockstep", "local"),
+    (["vaneloop", "extend", "example.csv", "--effect", "valve_dead"], "valve_dead_band", "valve_lag"),
+    (["vaneloop", "inject", "old_"], "old_frames_again", "nominal"),
+    (["vaneloop", "inject", "exam"], "example.csv", "nominal"),
+]  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
     (tmp_path / "example.csv").touch()
-    line = " ".join(f"'{w}'" for w in words)
-    ask = f'\nCOMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _vaneloop; printf "%s\\n" "${{COMPREPLY[@]}}"\n'
+    return tmp_path
+
+
+def asked(shell: str, text: str, folder: Path) -> str:
+    """What a shell prints that reads ``text``."""
+    if not shutil.which(shell):
+        pytest.skip(f"no {shell}")
+    flags = ["-f"] if shell == "zsh" else ["--no-config"] if shell == "fish" else ["--norc"]
+    home = dict(os.environ, HOME=str(folder))
     done = subprocess.run(
-        ["bash"], input=script("bash", capsys) + ask, text=True, capture_output=True, check=True, cwd=tmp_path
+        [shell, *flags], input=text, text=True, capture_output=True, check=True, cwd=folder, env=home, timeout=60
     )
-    found = done.stdout.split()
-    assert offered in found and not_offered not in found and not done.stderr
+    assert not done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("words, offered, not_offered", COMPLETED)
+def test_bash_completes(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], offered: str, not_offered: str
+) -> None:
+    line = " ".join(f"'{w}'" for w in words)
+    ask = f'\nCOMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _vaneloop; printf "%s\n" "${{COMPREPLY[@]}}"\n'
+    found = asked("bash", script("bash", capsys) + ask, folder).split()
+    assert offered in found and not_offered not in found
+
+
+@pytest.mark.parametrize("words, offered, not_offered", COMPLETED)
+def test_fish_completes(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], offered: str, not_offered: str
+) -> None:
+    text = asked("fish", script("fish", capsys) + f"\ncomplete -C '{' '.join(words)}'\n", folder)
+    found = [line.split("\t")[0] for line in text.splitlines()]
+    assert offered in found and not_offered not in found
+
+
+@pytest.mark.parametrize("kept", ["sourced", "in a folder of fpath"])
+def test_zsh_completes_from_the_first_tab_on(folder: Path, capsys: pytest.CaptureFixture[str], kept: str) -> None:
+    """A real line editor: Tab and Enter after the words; what is called prints its words."""
+    (folder / "_vaneloop").write_text(script("zsh", capsys))
+    ready = f"fpath=({folder} $fpath); autoload -Uz compinit; compinit -u -D"
+    if kept == "sourced":
+        ready = f"autoload -Uz compinit; compinit -u -D; source {folder}/_vaneloop"
+    for words, offered, _ in COMPLETED:
+        ask = f"""
+            zmodload zsh/zpty; zpty -b shell zsh -f -i
+            zpty -w shell 'PS1=; {ready}; vaneloop() {{ print -r -- "called<$*>" }}; cd {folder}; print rea""dy'
+            zpty -r -m shell heard '*ready*'
+            zpty -w shell $'{" ".join(words)}\t'
+            zpty -r -m shell heard '*called<*>*'; print -r -- "$heard"
+        """
+        heard = asked("zsh", ask, folder)
+        called = re.findall(r"called<([^>]*)>", heard)
+        assert called and called[-1].split() == [*words[1:-1], offered], (words, heard)
+        if kept != "sourced":
+            break  # what differs is the first call
 
 
 @pytest.mark.parametrize(

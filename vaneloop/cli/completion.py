@@ -6,6 +6,9 @@ import argparse
 import importlib
 import re
 import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError, meant
@@ -21,10 +24,13 @@ examples:
   vaneloop completion zsh
   vaneloop completion fish
 
-to keep it:
-  bash: vaneloop completion bash > ~/.local/share/bash-completion/completions/vaneloop
-  zsh:  vaneloop completion zsh > "${fpath[1]}/_vaneloop"
-  fish: vaneloop completion fish > ~/.config/fish/completions/vaneloop.fish
+to keep it, in the shell's own file (fish: in ~/.config/fish/config.fish):
+  bash: source <(vaneloop completion bash)
+  zsh:  autoload -Uz compinit && compinit && source <(vaneloop completion zsh)
+  fish: vaneloop completion fish | source
+
+or as a file, read when it is first needed: completions/vaneloop of bash-completion, _vaneloop in a folder of zsh's
+fpath, completions/vaneloop.fish of fish
 
 exit codes: 0 printed, 2 bad input"""
 
@@ -42,25 +48,72 @@ def command(args: argparse.Namespace) -> int:
     return 0
 
 
-def _options() -> dict[str, list[argparse.Action]]:
-    """The options of every command."""
+@dataclass(frozen=True)
+class _Taken:
+    """An option or a place of a command.
+
+    flags   of an option; empty for a place
+    words   what it takes; ``only`` these, or files as well
+    value   whether it takes anything
+    """
+
+    flags: tuple[str, ...]
+    words: tuple[str, ...]
+    only: bool
+    value: bool
+    about: str
+
+
+def _known() -> dict[str, tuple[str, ...]]:
+    """Words that options and places take beside files, where the parser does not list them."""
+    import hil.inject
+    from controller import STRATEGIES
+    from hil.loop.ecu import BUILTIN
+    from plant.effects import EFFECTS
+    from vaneloop.design.links import CRITERIA
+
+    profiles = (*BUILTIN, "engine-test")
+    scenarios = (Path(hil.inject.__file__).parent / "scenarios").glob("*.toml")
+    return {
+        "--bus": ("lockstep", "local", "vcan0"), "ecu --profile": profiles, "run --profile": profiles,
+        "--strategy": tuple(STRATEGIES), "--effect": tuple(EFFECTS), "--without": tuple(EFFECTS),
+        "--criterion": CRITERIA, "--plant": ("plant_electromechanical.toml",), "--on": ("local", "slurm"),
+        "inject scenario": tuple(sorted(f.stem for f in scenarios)), "completion shell": SHELLS,
+    }  # fmt: skip
+
+
+_ALONE = ("--strategy", "--criterion", "--on", "--without", "shell")  # no file is one of these
+
+
+def _commands() -> dict[str, list[_Taken]]:
+    """What every command takes, and every part of a command (fleet run)."""
     from vaneloop.cli.main import COMMANDS
 
-    out = {}
+    known = _known()
+
+    def taken(name: str, parser: argparse.ArgumentParser) -> Iterator[tuple[str, list[_Taken]]]:
+        out: list[_Taken] = []
+        yield name, out
+        for a in parser._actions:
+            what = a.option_strings[-1] if a.option_strings else a.dest
+            words = tuple(map(str, a.choices or ())) or known.get(f"{name} {what}", known.get(what, ()))
+            only = bool(a.choices) or what in _ALONE
+            out.append(_Taken(tuple(a.option_strings), words, only, a.nargs != 0, _help(a)))
+            if isinstance(a, argparse._SubParsersAction):
+                for part, its in a.choices.items():
+                    yield from taken(f"{name} {part}", its)
+
+    found: dict[str, list[_Taken]] = {}
     for name, (module, _) in COMMANDS.items():
         try:
             loaded = importlib.import_module(module)
         except ImportError:  # the workbench, where its packages are not installed
-            out[name] = list[argparse.Action]()
+            found[name] = []
             continue
         parser = terminal.Parser(prog=name)
         loaded.add_options(parser)
-        out[name] = list(parser._actions)
-    return out
-
-
-def _choices(action: argparse.Action) -> list[str]:
-    return [str(c) for c in action.choices or ()]
+        found.update(taken(name, parser))
+    return found
 
 
 def _about() -> dict[str, str]:
@@ -75,28 +128,40 @@ def _help(action: argparse.Action) -> str:
     return re.split(r"[;(\n]", text)[0].strip()
 
 
+def _parts(commands: dict[str, list[_Taken]]) -> str:
+    """A shell pattern of all commands of two words."""
+    return "|".join(f'"{name}"' for name in commands if " " in name)
+
+
 def _bash() -> str:
-    options = _options()
+    commands = _commands()
     lines, words = [], []
-    for name, actions in options.items():
-        flags = " ".join(f for a in actions for f in a.option_strings)
-        lines.append(f'        {name}) words="{flags}" ;;')
-        for a in actions:
-            if _choices(a):
-                at = "|".join(f'"{name} {f}"' for f in a.option_strings) or f'"{name} {name}"'
-                words.append(f'        {at}) COMPREPLY=($(compgen -W "{" ".join(_choices(a))}" -- "$cur")); return ;;')
-    shells = f'        "completion completion") COMPREPLY=($(compgen -W "{" ".join(SHELLS)}" -- "$cur")); return ;;'
+    for name, all_taken in commands.items():
+        flags = " ".join(f for a in all_taken for f in a.flags)
+        places = [a for a in all_taken if not a.flags and a.words]
+        place = f' place="{" ".join(places[0].words)}"' if places else ""
+        files = " files=" if places and places[0].only else ""
+        lines.append(f'        "{name}") words="{flags}"{place}{files} ;;')
+        for a in all_taken:
+            if a.words and a.flags:
+                at = "|".join(f'"{name} {f}"' for f in a.flags)
+                more = "" if a.only else ' $(compgen -f -- "$cur")'
+                offered = f'$(compgen -W "{" ".join(a.words)}" -- "$cur")'
+                words.append(f"        {at}) COMPREPLY=({offered}{more}); return ;;")
     return "\n".join([
         "_vaneloop() {",
-        '    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" name="${COMP_WORDS[1]}" words=""',
+        '    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" name="${COMP_WORDS[1]}"',
+        '    local words="" place="" files=yes',
         "    COMPREPLY=()",
         '    if [ "$COMP_CWORD" -eq 1 ]; then',
-        f'        COMPREPLY=($(compgen -W "{" ".join(options)} --help --version" -- "$cur")); return',
+        f'        COMPREPLY=($(compgen -W "{" ".join(_about())} --help --version" -- "$cur")); return',
         "    fi",
-        '    case "$name $prev" in', *words, shells, "    esac",
+        f'    case "$name ${{COMP_WORDS[2]}}" in {_parts(commands)})',
+        '        if [ "$COMP_CWORD" -gt 2 ]; then name="$name ${COMP_WORDS[2]}"; fi ;;', "    esac",
+        '    case "$name $prev" in', *words, "    esac",
         '    case "$name" in', *lines, "    esac",
         '    if [[ "$cur" == -* ]]; then COMPREPLY=($(compgen -W "$words" -- "$cur"))',
-        '    else COMPREPLY=($(compgen -f -- "$cur")); fi',
+        '    else COMPREPLY=($(compgen -W "$place" -- "$cur") ${files:+$(compgen -f -- "$cur")}); fi',
         "}",
         "complete -o filenames -F _vaneloop vaneloop",
     ])  # fmt: skip
@@ -106,28 +171,37 @@ def _zsh() -> str:
     def spec(word: str, text: str) -> str:
         return shlex.quote(f"{word}:{text}")
 
+    commands = _commands()
     lines, words = [], []
-    for name, actions in _options().items():
-        flags = " ".join(spec(f, _help(a)) for a in actions for f in a.option_strings)
-        lines.append(f"        {name}) options=({flags}) ;;")
-        for a in actions:
-            if _choices(a) and a.option_strings:
-                at = "|".join(f'"{name} {f}"' for f in a.option_strings)
-                words.append(f"        {at}) compadd -- {shlex.join(_choices(a))}; return ;;")
+    for name, all_taken in commands.items():
+        flags = " ".join(spec(f, a.about) for a in all_taken for f in a.flags)
+        places = [a for a in all_taken if not a.flags and a.words]
+        place = f" place=({shlex.join(places[0].words)})" if places else ""
+        files = " files=" if places and places[0].only else ""
+        lines.append(f'        "{name}") options=({flags}){place}{files} ;;')
+        for a in all_taken:
+            if a.words and a.flags:
+                at = "|".join(f'"{name} {f}"' for f in a.flags)
+                more = "" if a.only else " _files;"
+                words.append(f"        {at}) compadd -- {shlex.join(a.words)};{more} return ;;")
     return "\n".join([
         "#compdef vaneloop",
         "_vaneloop() {",
-        "    local -a commands options",
+        '    local -a commands options place; local name="$words[2]" files=yes',
         "    if (( CURRENT == 2 )); then",
         f"        commands=({' '.join(spec(n, t) for n, t in _about().items())})",
         "        _describe command commands; return",
         "    fi",
-        '    case "$words[2] $words[CURRENT-1]" in', *words,
-        f'        "completion completion") compadd -- {" ".join(SHELLS)}; return ;;', "    esac",
-        '    case "$words[2]" in', *lines, "    esac",
-        '    if [[ "$PREFIX" == -* ]]; then _describe option options; else _files; fi',
+        f'    case "$words[2] $words[3]" in {_parts(commands)})',
+        '        if (( CURRENT > 3 )); then name="$words[2] $words[3]"; fi ;;', "    esac",
+        '    case "$name $words[CURRENT-1]" in', *words, "    esac",
+        '    case "$name" in', *lines, "    esac",
+        '    if [[ "$PREFIX" == -* ]]; then _describe option options; return; fi',
+        "    compadd -a place",
+        '    if [[ -n "$files" ]]; then _files; fi',
         "}",
-        "compdef _vaneloop vaneloop",
+        # a file of fpath is the function itself when it is first called
+        'if [[ "$funcstack[1]" == _vaneloop ]]; then _vaneloop "$@"; else compdef _vaneloop vaneloop; fi',
     ])  # fmt: skip
 
 
@@ -135,13 +209,25 @@ def _fish() -> str:
     def quoted(text: str) -> str:
         return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
-    out = [f"complete -c vaneloop -f -n __fish_use_subcommand -a {n} -d {quoted(t)}" for n, t in _about().items()]
-    for name, actions in _options().items():
-        seen = f"-n '__fish_seen_subcommand_from {name}'"
-        for a in actions:
-            long = " ".join(f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in a.option_strings)
-            takes = "" if a.nargs == 0 else f" -x -a {quoted(' '.join(_choices(a)))}" if _choices(a) else " -r"
+    commands = _commands()
+    out = [
+        "function __vaneloop_is", "    set -l words (commandline -opc)",
+        '    string match -q -- "$argv *" "$words[2..-1] "', "end",
+        "complete -c vaneloop -n __fish_use_subcommand -l help",
+        "complete -c vaneloop -n __fish_use_subcommand -l version",
+    ]  # fmt: skip
+    out += [f"complete -c vaneloop -f -n __fish_use_subcommand -a {n} -d {quoted(t)}" for n, t in _about().items()]
+    for name, all_taken in commands.items():
+        seen = f"__vaneloop_is {name}"
+        for a in all_taken:
+            long = " ".join(f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in a.flags)
+            takes = (" -x" if a.only else " -r -F") + f" -a {quoted(' '.join(a.words))}" if a.words else " -r"
             if long:
-                out.append(f"complete -c vaneloop {seen} {long}{takes} -d {quoted(_help(a))}")
-    out.append(f"complete -c vaneloop -f -n '__fish_seen_subcommand_from completion' -a '{' '.join(SHELLS)}'")
+                out.append(
+                    f"complete -c vaneloop -n {quoted(seen)} {long}{takes if a.value else ''} -d {quoted(a.about)}"
+                )
+            elif a.words:
+                first = f"{seen}; and test (count (commandline -opc)) -eq {1 + len(name.split())}" if a.only else seen
+                files = "-f" if a.only else "-F"
+                out.append(f"complete -c vaneloop {files} -n {quoted(first)} -a {quoted(' '.join(a.words))}")
     return "\n".join(out)
