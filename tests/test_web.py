@@ -164,6 +164,23 @@ def tab_to(page: Any, selector: str) -> None:
     raise AssertionError(f"{selector} cannot be reached by keyboard")
 
 
+# curves that show what a cell of a failure map leads to
+SHOWS_4_S = (
+    "[...document.querySelectorAll('.curves')].some((c) => c.dataset.view && "
+    "Math.abs(c.dataset.view.split(' ')[1] - c.dataset.view.split(' ')[0] - 4) < 0.01)"
+)
+
+
+def holds_focus(page: Any, selector: str) -> None:
+    """What matches has the focus, or gets it, and shows it: by an outline, a shadow, or a border that changes."""
+    page.wait_for_function("(s) => document.activeElement.matches(s)", arg=selector)
+    shows = "(c) => c.outlineStyle !== 'none' || c.boxShadow !== 'none' || c.borderTopWidth === '2px'"
+    page.wait_for_function(
+        f"""() => {{ const e = document.activeElement, f = e.closest(".q-field__control");
+            return [getComputedStyle(e), ...(f ? [getComputedStyle(f, "::after")] : [])].some({shows}); }}"""
+    )
+
+
 def looks(page: Any, name: str) -> None:
     """Pictures: a laptop, a wide screen, a phone, in light and dark. Nothing sticks out, axe-core is content."""
     for width, dark in ((1280, False), (360, False), (360, True), (1920, True)):
@@ -214,12 +231,18 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
         page.keyboard.press("ArrowDown")
     page.keyboard.press("Enter")
     page.get_by_text("fails most in the actuator stage").wait_for()
-    tab_to(page, ".show-worst")
+    holds_focus(page, ".choose input")  # drawn anew meanwhile
+    tab_to(page, "[aria-label^='failure map']")
+    for key in ("ArrowDown", "ArrowRight", "ArrowUp"):  # the lowest row has no eight cells
+        page.keyboard.press(key)
+    page.get_by_text(re.compile(r"stroke .*: 1\d\d noise floors")).wait_for(state="attached")
+    assert page.locator(".shapelayer path").count() == 1
+    page.keyboard.press("Enter")
+    page.wait_for_function(SHOWS_4_S)
+    page.keyboard.press("Tab")
+    holds_focus(page, ".show-worst")
     page.keyboard.press("Enter")  # the curves go to the worst moment of the map
-    page.wait_for_function(
-        "[...document.querySelectorAll('.curves')].some((c) => c.dataset.view && "
-        "Math.abs(c.dataset.view.split(' ')[1] - c.dataset.view.split(' ')[0] - 4) < 0.01)"
-    )
+    page.wait_for_function(SHOWS_4_S)
     search = page.get_by_role("button", name="Find the missing physics")
 
     # a cancelled search leaves nothing behind
@@ -228,15 +251,17 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     page.get_by_text("stages searched").wait_for()
     during = server.searching()
     assert len(during) >= 2, "a search has a worker and its own processes"
-    page.get_by_role("button", name="Cancel").click()
+    holds_focus(page, ".cancel")  # the button that began it is gone
+    page.keyboard.press("Enter")
     page.get_by_text("stopped").wait_for()
+    holds_focus(page, ".find-missing")
     deadline = time.monotonic() + 60
     while during & set(server.workers()) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not during & set(server.workers())  # workers and the spare process that had nothing to do stay
 
     # a reload in the middle of a search keeps it
-    search.click()
+    page.keyboard.press("Enter")
     page.get_by_text("stages searched").wait_for()
     page.reload()
     page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
@@ -558,7 +583,24 @@ def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Se
     page.get_by_text("Channels: 2 of 3 shown").wait_for()
     page.wait_for_function("document.querySelector('.curves').dataset.view === '8.0000 12.0000'")
 
+    # a layout is shown again after the view has changed; by keyboard the cursors of all curves move
+    tab_to(page, ".curves-stack")
+    for key in ("Home", "ArrowRight", "Enter", "ArrowRight"):
+        page.keyboard.press(key)
+    said = page.locator(".curves [role=status]").first.inner_text()
+    assert len(readings := said.split("; ")) == 2 and all("to the reference" in r for r in readings), said
+    page.get_by_label("show a layout that was kept").select_option("fault")
+    page.wait_for_function("document.querySelector('.curves').dataset.view === '8.0000 12.0000'")
+
     # what is exported is what is seen: dashes, bands, names
+    page.locator(".curves-name", has_text="renamed.csv").first.click()
+    with page.expect_download() as download:
+        page.get_by_label("save these curves as CSV").first.click()
+    rows = [line.split(",") for line in Path(download.value.path()).read_text().splitlines()]
+    assert rows[0] == ["channel", "line", "t", "value"] and not any("renamed.csv" in name for _, name, *_ in rows)
+    stroke = {float(t): float(v) for channel, _, t, v in rows[1:] if channel == "x_lvdt [mm]"}
+    assert stroke and all(8.0 <= t <= 12.0 and abs(v - 20.0 - np.sin(t)) < 1e-3 for t, v in stroke.items())
+    page.locator(".curves-name", has_text="renamed.csv").first.click()
     with page.expect_download() as download:
         page.get_by_label("save these curves as SVG").first.click()
     drawn = Path(download.value.path()).read_text()

@@ -24,13 +24,11 @@ examples:
   vaneloop completion zsh
   vaneloop completion fish
 
-to keep it, in the shell's own file (fish: in ~/.config/fish/config.fish):
-  bash: source <(vaneloop completion bash)
-  zsh:  autoload -Uz compinit && compinit && source <(vaneloop completion zsh)
-  fish: vaneloop completion fish | source
-
-or as a file, read when it is first needed: completions/vaneloop of bash-completion, _vaneloop in a folder of zsh's
-fpath, completions/vaneloop.fish of fish
+to keep it (make the folder where there is none):
+  bash: vaneloop completion bash > ~/.local/share/bash-completion/completions/vaneloop
+  zsh:  vaneloop completion zsh > ~/.zfunc/_vaneloop, and in ~/.zshrc, once:
+        fpath=(~/.zfunc $fpath); autoload -Uz compinit; compinit
+  fish: vaneloop completion fish > ~/.config/fish/completions/vaneloop.fish
 
 exit codes: 0 printed, 2 bad input"""
 

@@ -361,8 +361,7 @@ def ranking(
         "y": [_label(names[i]) for i in order],
         "x": [float(values[i]) for i in order],
         "text": [number(values[i]) + (f"  {_label(notes[i])}" if notes else "") for i in order],
-        "textposition": "outside",
-        "cliponaxis": False,
+        "textposition": "none",
         "marker": {"color": ["@model" if names[i] in highlight else "@muted" for i in order]},
         "hovertemplate": "%{y}: %{text}",
     }
@@ -400,6 +399,14 @@ def ranking(
                 "text": _label(name), "showarrow": False, "font": {"size": 11, "color": "@soft"},
             }
         )  # fmt: skip
+    ends = high or values
+    layout["annotations"] += [  # the numbers, on a ground of their own: no line crosses them
+        {
+            "x": math.log10(max(ends[i], 1e-300)) if log else ends[i], "y": y, "xanchor": "left", "xshift": 2,
+            "text": text, "showarrow": False, "bgcolor": "@panel", "borderpad": 1, "font": {"size": 12},
+        }
+        for y, i, text in zip(bar["y"], order, bar["text"], strict=True)
+    ]  # fmt: skip
     return {"data": [bar], "layout": layout}
 
 

@@ -12,18 +12,18 @@ export default {
       <template v-if="tree"><input v-model="name" class="curves-find" placeholder="name of a layout" aria-label="name of a layout" @keydown.enter="keep">
       <button type="button" class="curves-tool" @click="keep" aria-label="keep this layout: view, channels, lines hidden, reference">Keep layout</button>
       <select v-if="Object.keys(kept).length" class="curves-tool" aria-label="show a layout that was kept" @change="recall($event.target.value)">
-        <option value="">layouts kept</option><option v-for="(_, n) in kept" :key="n" :value="n" :selected="n === name">{{ n }}</option></select>
+        <option value="" :selected="!shown">layouts kept</option><option v-for="(_, n) in kept" :key="n" :value="n" :selected="n === shown">{{ n }}</option></select>
       <button v-if="kept[name]" type="button" class="curves-tool" @click="forget" :aria-label="'forget the layout ' + name">Forget</button></template></div>
     <details v-if="tools && tree" class="curves-tree"><summary>Channels: {{ names.filter((c) => wanted(c)).length }} of {{ names.length }} shown</summary>
       <div class="curves-groups"><fieldset v-for="group in groups()" :key="group.name"><legend><label><input type="checkbox" :checked="group.list.every((c) => !off[c.title])"
         @change="show(group.list, $event.target.checked)"> {{ group.name }}</label></legend>
         <label v-for="c in group.list" :key="c.title"><input type="checkbox" :checked="!off[c.title]" @change="show([c], $event.target.checked)"> {{ c.title }}</label></fieldset></div></details>
     <div ref="legend" class="curves-legend"></div>
-    <div ref="stack" class="curves-stack" tabindex="0" role="group" :aria-label="'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference'" @keydown="key_"></div>
+    <div ref="stack" class="curves-stack" :tabindex="tools ? 0 : undefined" role="group" :aria-label="!tools ? 'curves' : 'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference'" @keydown="key_"></div>
     <div ref="said" class="away" role="status"></div>
     <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; click: reference for differences &middot; double-click: everything</div></div>`,
   props: { src: String, version: Number, live: Number, unit: String, tree: Boolean },
-  data() { return { tools: false, word: "", name: "", names: [], off: {}, kept: {} }; },
+  data() { return { tools: false, word: "", name: "", shown: "", names: [], off: {}, kept: {} }; },
   mounted() {
     this.plots = [];
     this.view = null; // [from, to] in s; null: everything
@@ -120,10 +120,12 @@ export default {
         if (b > high) { a -= b - high; b = high; }
         this.view = [a, b];
       }
+      this.shown = "";
       this.scale();
       this.fetch();
     },
     everything() {
+      this.shown = "";
       this.view = null;
       this.scale();
       this.fetch();
@@ -143,6 +145,7 @@ export default {
       return [...out].map(([name, list]) => ({ name: name || "other", list }));
     },
     show(list, on) {
+      this.shown = "";
       list.forEach((c) => { this.off[c.title] = !on; });
       this.build();
     },
@@ -214,7 +217,7 @@ export default {
         mark.style.borderTopColor = colour(l.role);
         if (l.dash && l.dash.length) mark.style.borderTopStyle = "dashed";
         b.append(mark, document.createTextNode(name));
-        b.onclick = () => { this.hidden[name] = !this.hidden[name]; this.build(); };
+        b.onclick = () => { this.shown = ""; this.hidden[name] = !this.hidden[name]; this.build(); };
         return b;
       });
       this.$refs.legend.replaceChildren(...(legend.size > 1 ? names : []));
@@ -310,7 +313,7 @@ export default {
       const [a, b] = this.view || this.head.span, w = b - a, u = this.plots[0];
       const at = u.cursor.left >= 0 && u.cursor.left !== undefined && u.cursor.left !== null ? u.posToVal(u.cursor.left, "x") : (a + b) / 2;
       const step = (e.shiftKey ? 0.1 : 0.01) * w;
-      const cursor = (t) => { u.setCursor({ left: u.valToPos(Math.min(b, Math.max(a, t)), "x"), top: 10 }); this.$refs.said.textContent = this.plots.map((p) => this.head.panels[p.panel].title + " " + p.readout.textContent).join("; "); };
+      const cursor = (t) => { u.setCursor({ left: u.valToPos(Math.min(b, Math.max(a, t)), "x"), top: 10 }, true, true); this.$refs.said.textContent = this.plots.map((p) => this.head.panels[p.panel].title + " " + p.readout.textContent).join("; "); };
       const acts = { ArrowLeft: () => cursor(at - step), ArrowRight: () => cursor(at + step), "+": () => this.look(at - w / 4, at + w / 4), "-": () => this.look(at - w, at + w),
         PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => this.everything(), Enter: () => this.refer(at) };
       if (!acts[e.key] || this.live) return;
@@ -318,6 +321,7 @@ export default {
       acts[e.key]();
     },
     refer(t) {
+      this.shown = "";
       this.at = this.at !== null && Math.abs(this.at - t) < 1e-9 ? null : t;
       this.plots.forEach((p) => p.redraw(false));
     },
@@ -328,7 +332,7 @@ export default {
       const q = (v) => (/[",]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v);
       this.plots.forEach((p) => this.head.panels[p.panel].lines.forEach((l, j) => p.data[0].forEach((t, k) => {
         const v = p.data[j + 1][k];
-        if (t >= a && t <= b && v !== null && v !== undefined) rows.push([q(this.head.panels[p.panel].title), q(l.name), t, v].join(","));
+        if (!this.hidden[l.name] && t >= a && t <= b && v !== null && v !== undefined) rows.push([q(this.head.panels[p.panel].title), q(l.name), Number(t.toPrecision(12)), v].join(","));
       })));
       this.save(this.file("csv"), URL.createObjectURL(new Blob([rows.join("\n") + "\n"], { type: "text/csv" })));
     },
@@ -382,12 +386,12 @@ export default {
           [(this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(L, x(a)), end: x(b), text, role: "text" })), (m) => top + T + H - 4 - 12 * m.row]]
           .map(([list, at]) => this.placed(list.filter((m) => m.end >= L && m.x <= L + W), L, L + W, wide, 4).map((m) => `<text x="${m.from}" y="${at(m)}" fill="${colour(m.role)}">${e(m.text)}</text>`).join("")).join("");
         const { min, max } = p.scales.y;
-        const words = [[L - 6, top + T + 10, "end", max.toPrecision(4)], [L - 6, top + T + H, "end", min.toPrecision(4)], [L + 4, top + T + 12, "start", panel.title]]
+        const words = [[L - 6, top + T + 10, "end", Number(max.toPrecision(4))], [L - 6, top + T + H, "end", Number(min.toPrecision(4))], [L + 4, top + T + 12, "start", panel.title]]
           .map(([x, at, anchor, text]) => `<text x="${x}" y="${at}" text-anchor="${anchor}">${e(text)}</text>`).join("");
         return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${spans}${floor}${lines}${upright}</g>${named}${words}`;
       }).join("");
       const [a, b] = this.view || this.head.span;
-      const foot = `<text x="66" y="${y + 14}">${a.toPrecision(6)} s</text><text x="${w - 14}" y="${y + 14}" text-anchor="end">${b.toPrecision(6)} s</text>`;
+      const foot = `<text x="66" y="${y + 14}">${Number(a.toPrecision(6))} s</text><text x="${w - 14}" y="${y + 14}" text-anchor="end">${Number(b.toPrecision(6))} s</text>`;
       const text = `<svg xmlns="http://www.w3.org/2000/svg" width="${w}" height="${y + 20}" font-family="sans-serif" font-size="11" fill="${colour("text")}"><rect width="100%" height="100%" fill="${colour("panel")}"/>${legend}${parts}${foot}</svg>`;
       this.save(this.file("svg"), URL.createObjectURL(new Blob([text], { type: "image/svg+xml" })));
     },
@@ -399,17 +403,18 @@ export default {
       for (let k = 1; !this.name.trim(); k += 1) if (!this.kept["layout " + k]) this.name = "layout " + k;
       this.name = this.name.trim();
       this.kept[this.name] = { view: this.view, word: this.word, hidden: { ...this.hidden }, off: { ...this.off }, at: this.at };
+      this.shown = this.name;
       this.store();
     },
     forget() {
       delete this.kept[this.name];
-      this.name = "";
+      this.name = this.shown = "";
       this.store();
     },
     recall(name) {
       const kept = this.kept[name];
       if (!kept) return;
-      this.name = name;
+      this.name = this.shown = name;
       this.word = kept.word;
       this.hidden = { ...kept.hidden };
       this.off = { ...kept.off };

@@ -44,11 +44,40 @@ def styles() -> str:
     return "\n".join([*themes, (Path(__file__).parent / "style.css").read_text(encoding="utf-8")])
 
 
+# What holds the focus may be drawn anew, or go: the same control in its place has it then, or else the answer, what
+# stops the work that has begun, the main button, the heading of its card. A press elsewhere gives the focus up.
+FOCUS = """<script>(() => {
+  let last = null, soon = 0;
+  const name = (e) => e.getAttribute("aria-label") || e.innerText || e.tagName;
+  const there = (e) => e.getClientRects().length > 0;
+  const lost = () => last && document.activeElement === document.body && !(last.at.isConnected && there(last.at));
+  const title = (card) => card.querySelector("h2")?.innerText;
+  addEventListener("pointerdown", () => { last = null; }, true);
+  addEventListener("focusin", (e) => {
+    const card = e.target.closest(".vcard");
+    last = card && e.target.tabIndex >= 0 ? { at: e.target, name: name(e.target), title: title(card) } : null;
+  }, true);
+  const again = () => {
+    const card = lost() && [...document.querySelectorAll(".vcard")].find((c) => title(c) === last.title);
+    if (!card) return;
+    const all = (css) => [...card.querySelectorAll(css)].filter(there);
+    const alike = (e) => e.tabIndex >= 0 && name(e) === last.name && !e.matches(".cancel");
+    const next = all("[tabindex],button,input,a,select,summary").find(alike) || all(".verdict")[0]
+      || all(".cancel")[0] || all(".q-btn--unelevated")[0] || all("h2")[0];
+    if (next && next.tabIndex < 0) next.tabIndex = -1;
+    next?.focus({ preventScroll: true, focusVisible: true });
+  };
+  addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
+    if (!soon && lost()) soon = setTimeout(() => { soon = 0; again(); }, 100);
+  }).observe(document.body, { childList: true, subtree: true, attributes: true, attributeFilter: ["class", "style"] }));
+})();</script>"""
+
+
 @contextmanager
 def frame(session: Session, here: str) -> Iterator[None]:
     """Head, theme and the column in which a page's cards stand."""
     ui.add_css(styles())
-    ui.add_head_html('<link rel="stylesheet" href="/assets/uPlot.css">')
+    ui.add_head_html('<link rel="stylesheet" href="/assets/uPlot.css">' + FOCUS)
     ui.colors(primary=PRIMARY)
     mode = ui.dark_mode(value=session.dark)
     with ui.element("header").classes("head"):

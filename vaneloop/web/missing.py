@@ -151,11 +151,11 @@ class _Page:
         mine = [r for r in hot if r.output == output]
         figure = failure_map(mine)
         worst = figure["layout"]["meta"]["worst"]
-        with ui.element("div").classes("scroll").props('tabindex="0" role="group" aria-label="failure map"'):
+        with ui.element("div").classes("scroll"):
             figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
         with ui.element("div").classes("rowc"):
             k, b = worst_cell(mine)
-            ui.label(f"Worst: {mine[k].told(b)}. A click on a cell shows its moment.").classes("note")
+            ui.label(f"Worst: {mine[k].told(b)}. A click on a cell, or Enter, shows its moment.").classes("note")
             ui.button("Show me the worst moment", icon="visibility", on_click=lambda: self._show(worst)).props(
                 "outline dense padding='2px 12px'"
             ).classes("show-worst")
@@ -244,15 +244,17 @@ class _Page:
             tones = {"missing": "", "none": "good", "unknown": "bad"}
             ui.label(s.diagnosis["verdict"]).classes(f"verdict {tones[j['verdict']]}")
             for u in j["unknown"]:
-                near = (
-                    f" Nearest in the library: {', '.join(u['nearest_effects'])}." if u.get("nearest_effects") else ""
-                )
-                ui.label(f"What is left in the {u['stage']} stage: {u['shape']}.{near}").classes("note")
+                left = "; ".join(x for x in u["shape"].split("; ") if x not in s.diagnosis["verdict"])
+                near = ", ".join(u.get("nearest_effects") or ())
+                said = [f"What is left in the {u['stage']} stage: {left}."] if left else []
+                said += [f"Nearest to it in the library, for the {u['stage']} stage: {near}."] if near else []
+                if said:
+                    ui.label(" ".join(said)).classes("note")
         command_line(s.command("diagnose"))
 
     def _stages(self) -> None:
         if self.s.diagnosis is not None:
-            self._stage_toggle([x.stage for x in self.s.diagnosis["diagnosis"].stages], "padding='2px 8px' size=sm")
+            self._stage_toggle([x.stage for x in self.s.diagnosis["diagnosis"].stages], "padding='2px 8px'")
 
     def _switched(self) -> None:
         """Switches and their marks as the session has them."""
