@@ -118,16 +118,16 @@ def test_the_loop_notes_what_was_injected_and_the_record_keeps_it(tmp_path: Path
     assert lp.recorded is not None and lp.recorded.marks == ((1.5, "demand_stops"),)
 
 
-def test_the_charts_stop_at_the_fault_asked_for_and_at_a_moment_pressed(tmp_path: Path) -> None:
+def test_the_charts_stop_at_the_fault_or_mode_asked_for_and_at_a_moment_pressed(tmp_path: Path) -> None:
     lp = live(tmp_path)
     t = np.arange(0.0, 60.0, 0.1)
     tracking = 1 << FAULTS.index("tracking")
     faults = np.where(t >= 20.0, STALE, 0) | np.where(t >= 30.0, tracking, 0)
-    for lp.trigger, held in (("", None), (ANY, 20.0), ("tracking", 30.0)):
+    for lp.trigger, held in (("", None), (ANY, 20.0), ("tracking", 30.0), ("mode DEGRADED", 40.0)):
         lp.last, lp.held, lp.filled = (-1, 0), None, 0
-        lp._news(news(rows_of(t, 2.0, faults)))
+        lp._news(news(rows_of(t, np.where(t >= 40.0, 3.0, 2.0), faults)))
         assert lp.held == (None if held is None else pytest.approx(held))
-    assert lp.session.curves["run"].panels[0].t[-1] == pytest.approx(33.0, abs=0.11)
+    assert lp.session.curves["run"].panels[0].t[-1] == pytest.approx(43.0, abs=0.11)
     lp.show(10.0)
     assert lp.session.curves["run"].panels[0].t[-1] == pytest.approx(13.0, abs=0.11)
     lp.go_on()

@@ -243,7 +243,6 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     holds_focus(page, ".show-worst")
     page.keyboard.press("Enter")  # the curves go to the worst moment of the map
     page.wait_for_function(SHOWS_4_S)
-    search = page.get_by_role("button", name="Find the missing physics")
 
     # a cancelled search leaves nothing behind
     tab_to(page, ".find-missing")

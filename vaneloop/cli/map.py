@@ -60,7 +60,7 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, f"cannot be read so: {seen.complaint}")
     terminal.write_json(args, seen.to_dict())
     if args.out:
-        head = f"How VaneLoop reads the logs of this bench (--mapping). Written by vaneloop map from {Path(args.log).name}."
+        head = f"How VaneLoop reads the logs of this bench (--mapping). From {Path(args.log).name}."
         remarks = {r.signal: f"guessed, {100 * r.confidence:.0f} % sure" for r in seen.rows if r.how == "guessed"}
         write_mapping(args.out, seen.bench(), remarks, head)
         terminal.say(args, f"mapping: {args.out}")

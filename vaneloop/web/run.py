@@ -214,6 +214,7 @@ class _Page:
                     self.loop.trigger = e.value or ""
 
                 options = {"": "never", ANY: ANY, **{f: f.replace("_", " ") for f in FAULTS}}
+                options |= {f"mode {m}": f"mode {m}" for m in MODES}
                 ui.select(options, value=self.loop.trigger, label="hold the charts at", on_change=arm).props(
                     "outlined dense options-dense"
                 ).style("min-width:190px").classes("trigger")

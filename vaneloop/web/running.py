@@ -63,7 +63,7 @@ class Loop:
     changes: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # values and pages changed, likewise
     asked: str = ""  # the scenario asked for last
     last: tuple[int, int] = (-1, 0)  # latest mode and faults
-    trigger: str = ""  # the charts stop at the next fault of this name (ANY: whichever)
+    trigger: str = ""  # the charts stop at the next fault of this name (ANY: whichever), or "mode RUN"
     held: float | None = None  # s: the moment that they stop at
     first: float = 0.0  # s: the first row, where the record begins
     clock: float = 0.0  # s of this machine's clock at the listener's start
@@ -385,7 +385,9 @@ class Loop:
             new = told(t, *now, self.last)
             self.last = now
             self._tell(*new)
-            if self.held is None and any(m.fault and self.trigger in (ANY, m.fault) for m in new):
+            if self.held is None and any(
+                (m.fault and self.trigger in (ANY, m.fault)) or m.text == self.trigger for m in new
+            ):
                 self.held = t
 
     def _draw(self) -> None:
