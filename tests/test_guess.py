@@ -417,6 +417,21 @@ def test_an_oil_that_may_be_in_either_degree_is_not_guessed(tmp_path: Path, run:
     np.testing.assert_allclose(log.channels["t_oil"].values, run["t_oil"], rtol=1e-8)
 
 
+def test_a_name_of_a_user_s_system_is_taken_in_other_letters_where_it_is_the_only_one(tmp_path: Path) -> None:
+    signals = {"pump": "V", "level": "cm"}
+    t = np.arange(0.0, 50.0)
+    columns = {"Time": t, "Pump (V)": np.sin(t), "LEVEL [mm]": 10.0 * t}
+    file = table(tmp_path / "a.csv", columns)
+    log = read_log(file, signals=signals, require=tuple(signals))
+    np.testing.assert_allclose(log.channels["level"].values, t, atol=1e-8)
+    assert sum("its name in other letters" in n for n in log.notes) == 2
+    with pytest.raises(LogError, match="no pump"):
+        read_log(file, signals=signals, require=tuple(signals), guess=False)
+    file = table(tmp_path / "b.csv", {**columns, "Level": t})
+    with pytest.raises(LogError, match="no level"):
+        read_log(file, signals=signals, require=tuple(signals))
+
+
 def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:
     assert contradictions({s: (run["t"], run[s]) for s in SIGNALS}, set(SIGNALS)) == {}
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from hil.logs import plausible
 from hil.logs.formats import format_of
-from hil.logs.guess import Guesses, design_speed, withdrawn
+from hil.logs.guess import Guess, Guesses, design_speed, withdrawn
 from hil.logs.guess import guess as guess_names
 from hil.logs.mapping import Bench, read_mapping
-from hil.logs.names import unit_in_name
+from hil.logs.names import CERTAIN, unit_in_name
 from hil.logs.source import LogError, Options, Source, close_names, find
 from hil.logs.table import Table
 from hil.logs.times import guess_unit
@@ -132,6 +132,11 @@ def open_log(
             stated,
             design_rpm,
         )
+        for signal in signals:  # of a system of the user's own: its name in other letters, no more
+            alike = find(source, signal, True) if not keys[signal] and signal not in named else []
+            if len(alike) == 1 and alike[0] not in out.taken and not is_ours(signal, signals):
+                unit = source.series(alike[0]).unit or signals[signal]
+                out.guesses.made[signal] = Guess(signal, alike[0], unit, CERTAIN, "its name in other letters")
     if out.guesses.made:
         sketch = _sketch(path, out, signals)
         withdrawn(out.guesses, sketch)

@@ -169,7 +169,7 @@ class ChosenLog:
             step = f"{1.0 / ((t[-1] - t[0]) / (len(t) - 1)):.4g}" if len(t) > 1 and t[-1] > t[0] else "-"
             given = s.seen["signals"].get(name, (name,))[0] if s.seen else name
             rows.append([name, given, unit, f"{len(t):,}", step, f"{t[-1]:.1f}", f"{v.min():.4g} to {v.max():.4g}"])
-        table(["signal", "in the log", "unit", "samples", "per s", "until s", "range"], rows, numbers=(3, 4, 5))
+        table(["signal", "in the log", "unit", "samples", "per s", "until s", "range"], rows, numbers=(3, 4, 5, 6))
         absent = [n for n in self._signals() if n not in s.preview["channels"]]
         if absent:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")

@@ -152,7 +152,7 @@ class _Page:
         figure = failure_map(mine)
         worst = figure["layout"]["meta"]["worst"]
         with ui.element("div").classes("scroll"):
-            figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:920px")
+            figure_of(figure, dark(self.s)).on("cell", lambda e: self._show(e.args)).style("min-width:1040px")
         with ui.element("div").classes("rowc"):
             k, b = worst_cell(mine)
             ui.label(f"Worst: {mine[k].told(b)}. A click on a cell, or Enter, shows its moment.").classes("note")
