@@ -204,10 +204,10 @@ def _drive_step(
         gain *= curve.factor(s, p, j, curve.FLOW_TIMES)
         load += curve.bend(s, p, j, curve.LOAD_ADDS)
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
-    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), load)
     d, z = drive.prepare(p, j), drive.taken(s, j)
+    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), load, 0.5 * d.per_area / p_s)
     for _ in range(substeps):
-        z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True)
+        z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True, True)
     drive.stored(s, j, z)
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
 

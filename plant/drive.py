@@ -126,12 +126,15 @@ class Drive(NamedTuple):
 
 
 class Feed(NamedTuple):
-    """What is fed to it over a step: flow gains of either direction (m/s), root of the supply's share (-), load (N)."""
+    """What is fed to it over a step: flow gains of either direction (m/s), root of the supply's share (-), load (N),
+    half of what a newton on the piston is of the supply (1/N).
+    """
 
     extending: float
     retracting: float
     root: float
     load: float
+    half_share: float
 
 
 @inlined
@@ -193,15 +196,25 @@ def stored(s: np.ndarray, j: int, z: DriveState) -> None:
 
 @inlined
 def step(
-    z: DriveState, d: Drive, f: Feed, i: float, p_s: float, dt: float, loaded: bool, lossy: bool, sticky: bool
+    z: DriveState,
+    d: Drive,
+    f: Feed,
+    i: float,
+    p_s: float,
+    dt: float,
+    loaded: bool,
+    lossy: bool,
+    sticky: bool,
+    limited: bool,
 ) -> DriveState:
     """One plant step ``dt`` (s) under the valve's current ``i`` (A) at the supply pressure ``p_s`` (Pa).
 
     loaded  False leaves out what needs the load pressure: for lanes with `DRIVE_LOADED` 0, where it changes nothing
     lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where
             these are neutral
+    limited False leaves out the valve's lag, the LVDT's second one and the flow's limit, likewise
     """
-    lagged = valve_lag.step(z.lagged, i, d.valve_share)
+    lagged = valve_lag.step(z.lagged, i, d.valve_share) if limited else i
     spool, spool_rate = valve_step(z.spool, z.spool_rate, lagged / d.rated, d.a11, d.a12, d.a21, d.a22)
     opening = valve_dead_band.step(spool, d.overlap)
     gain = f.extending if opening > 0.0 else f.retracting
@@ -214,7 +227,7 @@ def step(
             speed = supply_pressure_droop.step(speed, p_s - against, d.droop)
             speed = valve_flow_saturation.step(speed, d.limit, d.roundness)
             speed = internal_leakage.step(speed, p_load, d.drag * d.per_area, d.leakage)
-        else:
+        elif limited:
             speed = valve_flow_saturation.corner(speed, d.limit)
         travel = 0.5 * (z.speed + speed) * dt
         level = piston_stiction.step(d.friction, speed, d.excess, d.stribeck) if sticky else d.friction
@@ -222,15 +235,15 @@ def step(
         k = 1.0 - r * r
         force = piston_friction.step(z.force, travel, level, d.stiffness / k)
         moved = force - z.force
-        off_centre, back = piston_friction.recentre(
-            z.off_centre, r * moved, abs(travel) * d.stiffness * (0.5 * d.per_area / p_s)
-        )
+        off_centre, back = piston_friction.recentre(z.off_centre, r * moved, abs(travel) * d.stiffness * f.half_share)
         give = oil_compressibility.step(f.load, speed, d.compliance, d.drag)
         travel += (give - z.give) - (k * moved + r * back) / d.stiffness
     else:
-        speed = valve_flow_saturation.corner(opening * (gain * f.root), d.limit)
+        speed = opening * (gain * f.root)
+        if limited:
+            speed = valve_flow_saturation.corner(speed, d.limit)
         travel = 0.5 * (z.speed + speed) * dt
     x = min(max(z.x + travel, d.low), d.high)
     x_lvdt = z.x_lvdt + d.lvdt_factor * (x - z.x_lvdt)
-    reading = lvdt_lag.step(z.reading, x_lvdt, d.lvdt_share)
+    reading = lvdt_lag.step(z.reading, x_lvdt, d.lvdt_share) if limited else x_lvdt
     return DriveState(spool, spool_rate, speed, x, x_lvdt, lagged, force, off_centre, give, reading)

@@ -40,10 +40,14 @@ def _compiled(source: str, space: dict[str, Any]) -> Callable[..., Any]:
     return out
 
 
-def getter(kind: type[NamedTuple], which: str = "") -> Callable[..., Any]:
-    """Compiled function (block, lane) -> ``kind``: what stands there; ``which`` "k": (block, k, lane)."""
+def getter(kind: type[NamedTuple], which: str = "", **known: float) -> Callable[..., Any]:
+    """Compiled function (block, lane) -> ``kind``: what stands there; ``which`` "k": (block, k, lane).
+
+    known  fields that are these numbers in every lane, whatever stands there
+    """
     at = f"{which}, j" if which else "j"
-    return _compiled(f"def f(b, {at}): return Kind({', '.join(f'b.{n}[{at}]' for n in kind._fields)})", {"Kind": kind})
+    fields = (repr(known[n]) if n in known else f"b.{n}[{at}]" for n in kind._fields)
+    return _compiled(f"def f(b, {at}): return Kind({', '.join(fields)})", {"Kind": kind})
 
 
 def putter(kind: type[NamedTuple], which: str = "") -> Callable[..., Any]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from plant import chain, curve, electromechanical
 from plant.chain import bent_reading, measured_stroke, straightened, true_stroke
-from plant.effects import CURVES, aero_load, oil_compressibility, valve_null_bias
+from plant.effects import CURVES, aero_load, oil_compressibility, valve_flow_saturation, valve_null_bias
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
 from plant.places import (
     AERO_LOAD,
@@ -20,6 +20,7 @@ from plant.places import (
     READING,
     SCREW_PITCH_ERROR,
     SUPPLY_PRESSURE_DROOP,
+    VALVE_FLOW_SATURATION,
     VALVE_HYSTERESIS,
     VALVE_LAG,
     VALVE_NULL_BIAS,
@@ -73,18 +74,13 @@ def actuator_run(
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
     motor = p[KIND, 0] != 0.0  # all lanes are of one machine
     alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED) | (p[CURVES] != 0.0)
-    lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0)
-    # hysteresis costs much beside a load and little without one: it stands at either end
-    order = np.lexsort(
-        (
-            (p[VALVE_HYSTERESIS] != 0.0) == (p[DRIVE_LOADED] != 0.0),
-            p[PISTON_STICTION] != 0.0,
-            lossy,
-            p[DRIVE_LOADED] != 0.0,
-            p[SCREW_PITCH_ERROR] != 0.0,
-            alone,
-        )
-    )
+    loaded, memory, sticky = (p[row] != 0.0 for row in (DRIVE_LOADED, VALVE_HYSTERESIS, PISTON_STICTION))
+    lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0) | (p[VALVE_FLOW_SATURATION + 1] != 0.0)
+    limited = (p[VALVE_SHARE] < 1.0) | (p[LVDT_SHARE] < 1.0) | (p[VALVE_NULL_BIAS] != 0.0)
+    limited |= p[VALVE_FLOW_SATURATION] < valve_flow_saturation.OFF
+    # neighbours are those that cost little more together
+    need = np.where(loaded, 4 + 8 * lossy + 4 * limited + 2 * sticky - memory, limited + 2 * memory)
+    order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
 
     def run(part: range) -> None:

@@ -13,11 +13,21 @@ from plant.effects import (
     aero_load,
     lvdt_nonlinearity,
     oil_viscosity,
+    valve_flow_saturation,
     valve_gain_asymmetry,
     valve_hysteresis,
     valve_null_bias,
 )
-from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, FLOW_GAIN, P_REF, STROKE
+from plant.parameters import (
+    DRIVE_EFFECTS,
+    DRIVE_LOADED,
+    FLOW_GAIN,
+    LVDT_SHARE,
+    P_REF,
+    RATED_CURRENT,
+    STROKE,
+    VALVE_SHARE,
+)
 from plant.places import (
     AERO_LOAD,
     CURRENT,
@@ -67,6 +77,7 @@ _MEMORY = ("y1", "y2", "y3", "y4")  # A, of the valve's hysteresis
 BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, _Around, more=(*_MEMORY, "logged"))
 _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
+_rated_drive = lanes.getter(drive.Drive, rated=1.0)  # for currents that are shares of the rated one
 _feed, _put_around = lanes.getter(drive.Feed), lanes.putter(_Around)
 
 
@@ -106,9 +117,10 @@ def run(
     n, substeps = current.shape
     h = dt / substeps
     b = block[0]
+    rated = p[RATED_CURRENT, 0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
-        loaded = lossy = sticky = memory = viscous = sensed = curved = False
+        loaded = lossy = sticky = memory = limited = viscous = sensed = curved = False
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
@@ -119,6 +131,13 @@ def run(
             )
             sticky |= p[PISTON_STICTION, q] != 0.0
             memory |= p[VALVE_HYSTERESIS, q] != 0.0
+            limited |= (
+                p[VALVE_SHARE, q] < 1.0
+                or p[LVDT_SHARE, q] < 1.0
+                or p[VALVE_FLOW_SATURATION, q] < valve_flow_saturation.OFF
+                or p[VALVE_NULL_BIAS, q] != 0.0
+                or p[RATED_CURRENT, q] != rated
+            )
             viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
             curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
@@ -136,27 +155,37 @@ def run(
                 if loaded:
                     for j in range(W):
                         b.load[j] = aero_load.step(speed, b.aero[j])
+                        b.half_share[j] = 0.5 * b.per_area[j] / supply
                 else:
                     for j in range(W):
                         b.root[j] = speed_factor(supply, 0.0, b.p_ref[j])
-                if loaded and (memory or (lossy and sticky)):
+                if loaded and (lossy and (memory or sticky) or memory and (sticky or limited)):
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, True, True, True, True)
+                        _substep(b, current[k, m], rated, supply, h, True, True, True, True, True)
                 elif lossy:
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, True, True, False, False)
+                        _substep(b, current[k, m], rated, supply, h, True, True, False, False, True)
+                elif loaded and limited:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], rated, supply, h, True, False, True, False, True)
                 elif sticky:
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, True, False, True, False)
+                        _substep(b, current[k, m], rated, supply, h, True, False, True, False, False)
+                elif loaded and memory:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], rated, supply, h, True, False, False, True, False)
                 elif loaded:
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, True, False, False, False)
+                        _substep(b, current[k, m], rated, supply, h, True, False, False, False, False)
+                elif limited:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], rated, supply, h, False, False, False, True, True)
                 elif memory:
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, False, False, False, True)
+                        _substep(b, current[k, m], rated, supply, h, False, False, False, True, False)
                 else:
                     for m in range(substeps):
-                        _substep(b, current[k, m], supply, h, False, False, False, False)
+                        _substep(b, current[k, m], rated, supply, h, False, False, False, False, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
                     put_where_seen(b, j, true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k]), k == 0)
@@ -175,6 +204,11 @@ def run(
                     )
             for j in range(last):
                 out[order[j0 + j], k] = b.logged[j]
+        if n > 1 and not memory:  # what steps without these do not keep
+            for j in range(W):
+                i = valve_null_bias.step(current[n - 1, substeps - 1], b.bias[j])
+                b.y1[j], b.y2[j], b.y3[j], b.y4[j] = i, i, i, i
+                b.lagged[j] = b.lagged[j] if limited else i
         for j in range(last):
             q = order[j0 + j]
             drive.stored(s, q, _state(b, j))
@@ -182,16 +216,32 @@ def run(
 
 
 @inlined
-def _substep(b: Any, i_cmd: float, p_s: float, h: float, loaded: bool, lossy: bool, sticky: bool, memory: bool) -> None:
-    """One plant step of every lane of the block; ``memory``: some of them have hysteresis, the others see
-    `plant.drive.step`.
+def _substep(
+    b: Any,
+    i_cmd: float,
+    rated: float,
+    p_s: float,
+    h: float,
+    loaded: bool,
+    lossy: bool,
+    sticky: bool,
+    memory: bool,
+    limited: bool,
+) -> None:
+    """One plant step of every lane of the block under the current ``i_cmd`` (A); ``rated`` (A) that of them all.
+
+    memory  some of them have hysteresis; the others see `plant.drive.step`
     """
+    share = valve_null_bias.step(i_cmd, 0.0) / rated
     for j in range(W):
+        if not memory and not limited:  # all lanes have the same current: it is divided once
+            z = drive.step(_state(b, j), _rated_drive(b, j), _feed(b, j), share, p_s, h, loaded, lossy, sticky, limited)
+            _put_state(b, j, z)
+            continue
         i = valve_null_bias.step(i_cmd, b.bias[j])
-        y1 = y2 = y3 = y4 = i
         if memory:
             y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
             i = valve_hysteresis.mean(y1, y2, y3, y4)
-        z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky)
+            b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+        z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky, limited)
         _put_state(b, j, z)
-        b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
