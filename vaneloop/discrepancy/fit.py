@@ -102,6 +102,8 @@ class Judge:
         self.scale = self._scales()
         names = stage.outputs  # what each parameter moves: the only output, the only log
         self._moves = [(names.index(p.output) if p.output in names else None, p.log) for p in stage.all_parameters()]
+        self._bounds = self._limits()
+        self._turning = [c for c, p in enumerate(stage.all_parameters()) if p.period > 0.0]
         self._counts: Array | None = None
         if self.window_start is not None:
             self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
@@ -179,10 +181,7 @@ class Judge:
             free += list(range(sl.start, sl.stop))
         return np.array(free, dtype=int)
 
-    def bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself
-        has no bound.
-        """
+    def _limits(self) -> tuple[Array, Array]:
         s = self.stage
         low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [
             p.low for e in s.effects for p in e.parameters
@@ -193,11 +192,16 @@ class Judge:
         endless = np.array([p.period > 0.0 for p in s.all_parameters()], dtype=bool)
         return np.where(endless, -np.inf, low), np.where(endless, np.inf, high)
 
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest value of every column; nominal parameters stay within their tolerance, what repeats itself
+        has no bound.
+        """
+        return self._bounds
+
     def wrapped(self, theta: Array) -> Array:
         """The same parameters, those that repeat themselves within one turn."""
-        for c, p in enumerate(self.stage.all_parameters()):
-            if p.period > 0.0:
-                theta[c] = p.wrapped(theta[c])
+        for c in self._turning:
+            theta[c] = self.stage.all_parameters()[c].wrapped(theta[c])
         return theta
 
     def totals(self, errors: Array, thetas: Array) -> Array:
@@ -467,7 +471,10 @@ def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
     step = np.zeros(len(g))
     moves = np.ones(len(g), dtype=bool)
     for _ in range(len(g)):
-        step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
+        if moves.all():
+            step = np.linalg.solve(a, g)
+        else:
+            step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
         beyond = moves & ((step < low) | (step > high))
         if not beyond.any():
             break
