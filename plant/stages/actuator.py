@@ -79,7 +79,7 @@ def actuator_run(
     limited = (p[VALVE_SHARE] < 1.0) | (p[LVDT_SHARE] < 1.0) | (p[VALVE_NULL_BIAS] != 0.0)
     limited |= p[VALVE_FLOW_SATURATION] < valve_flow_saturation.OFF
     # neighbours are those that cost little more together
-    need = np.where(loaded, 4 + 8 * lossy + 4 * limited + 2 * sticky - memory, limited + 2 * memory)
+    need = np.where(loaded, 4 + 8 * lossy + 2 * limited + 4 * sticky - memory, limited + 2 * memory)
     order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
 

@@ -165,9 +165,12 @@ def run(
                 elif lossy:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, True, True, False, False, True)
-                elif loaded and limited:
+                elif sticky and limited:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, True, False, True, False, True)
+                elif loaded and limited:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], rated, supply, h, True, False, False, False, True)
                 elif sticky:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, True, False, True, False, False)
@@ -177,9 +180,12 @@ def run(
                 elif loaded:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, True, False, False, False, False)
-                elif limited:
+                elif limited and memory:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, False, False, False, True, True)
+                elif limited:
+                    for m in range(substeps):
+                        _substep(b, current[k, m], rated, supply, h, False, False, False, False, True)
                 elif memory:
                     for m in range(substeps):
                         _substep(b, current[k, m], rated, supply, h, False, False, False, True, False)
