@@ -17,6 +17,7 @@ from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI, Request, Response
+from fastapi.middleware.gzip import GZipMiddleware
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from nicegui import Client, ui
 from nicegui import app as pages
@@ -222,6 +223,8 @@ def _serve(
         api, title="VaneLoop", dark=None, language="en-US", tailwind=False, storage_secret=secrets.token_hex(32),
         show_welcome_message=False,
         reconnect_timeout=RECONNECT,
+        # within one machine it gains nothing, and took half of the server's time for a first page
+        gzip_middleware_factory=None if loopback else GZipMiddleware,
         session_middleware_kwargs={"same_site": "strict", "session_cookie": f"vaneloop_session_{port}"},
     )  # fmt: skip
     for name in ("nicegui", "asyncio", "uvicorn.error"):
@@ -230,7 +233,7 @@ def _serve(
     guard = Guard(api, token, port, most, loopback=loopback, pages=PAGES)
     config = uvicorn.Config(  # h11 bounds the headers of a request
         guard, http="h11", log_config=None, log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2,
-        lifespan="on",
+        lifespan="on", ws_per_message_deflate=not loopback,
     )  # fmt: skip
 
     class Told(uvicorn.Server):
