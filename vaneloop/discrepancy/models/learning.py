@@ -48,7 +48,7 @@ OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which the change must help
-SMALL = 1e-2  # a constant by which a place is moved to see what a swing there would do
+PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
 Placings = tuple[tuple[Placed, Effect], ...]
 
@@ -454,7 +454,7 @@ class Learner:
         for c in over_time:
             periods = plain
             if c.how.endswith("times"):
-                whole = replace(c, mean=True, untold=())
+                whole = replace(c, name=PROBE, mean=True, untold=())
                 values = np.zeros(len(whole.kept))
                 values[0] = SMALL
                 curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
