@@ -7,6 +7,7 @@ Data: shared/data beside the checkout, or VANELOOP_DATA (`data_dir`); skipped wh
 from __future__ import annotations
 
 import json
+import runpy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ import pytest
 import vaneloop
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import System, unknown
+from vaneloop.discrepancy.models.by_log import bind
+from vaneloop.discrepancy.models.curved import on_logs
 from vaneloop.verbs.search import Diagnosed, read_record
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -180,3 +183,37 @@ def test_a_closed_valve_whose_flow_answers_nothing_is_unknown(data_dir: Path) ->
 @pytest.mark.parametrize("loop", ["10201", "20502", "40102B", "40102C", "40102E", "41004", "45102C", "51001"])
 def test_no_loop_that_is_not_labelled_is_said_to_stick(data_dir: Path, loop: str) -> None:
     assert not said_of_valve(data_dir, f"other_FIC{loop}")[1] & {"play", "stiction", "stick_slip"}
+
+
+# ---- laws that are learned from one kind of log, on the other kinds --------------------------------------------------
+
+
+def worse_elsewhere(system: System, fit: str, others: list[str]) -> list[str]:
+    """Other logs on which what `learn` finds in one log is worse than the best laws with names."""
+    records = [read_record(path, system)[0] for path in (fit, *others)]
+    answer = vaneloop.learn(records[:1], system)
+    if not answer.laws:
+        return []
+    logs, last = bind(system, records[:1], records[1:]), answer.outcome.tried[-1]
+    named = logs.figures(answer.diagnosed.diagnosis.stages[0].final.theta)
+    learned = on_logs(logs, last.curves).figures(last.fit.theta)
+    return [log for log in named if (learned[log] > 1.001 * named[log]).any()]
+
+
+DAYS = ("0609", "0825", "1002")
+MOTIONS = ("0.25Hz", "0.5Hz", "1Hz", "2Hz", "Kocaeli")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", range(len(DAYS)))
+def test_what_is_learned_from_a_day_of_the_valve_harms_no_other_day(data_dir: Path, k: int) -> None:
+    logs = find(data_dir, *(f"flow_valves/stiction_FIC20102_{day}.csv" for day in DAYS))
+    assert not worse_elsewhere(VALVE, logs.pop(k), logs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", range(len(MOTIONS)))
+def test_what_is_learned_from_one_motion_of_the_damper_harms_no_other(data_dir: Path, k: int) -> None:
+    system = runpy.run_path(str(ROOT / "examples" / "friction_damper.py"))["system"]
+    logs = find(data_dir, *(f"friction_damper/*__{motion}*.json" for motion in MOTIONS))
+    assert not worse_elsewhere(system, logs.pop(k), logs)

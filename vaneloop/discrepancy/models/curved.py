@@ -45,8 +45,8 @@ class Quantity:
     """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had; of stops,
     the radii.
 
-    course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag so many
-            times as long
+    course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag, or a period, so
+            many times as long
     """
 
     name: str
@@ -135,11 +135,17 @@ class Candidate:
 
     def every(self, period: float) -> Candidate:
         """The same of the time within each ``period`` (s), of a candidate of time."""
-        q = self.quantity
-        name = every(period, float(np.ptp(q.visited)) / period)
-        period = period_of(name)  # as the name has it
-        again = replace(q, name=name, visited=q.visited % period)
-        return replace(self, name=self.name.removesuffix(q.name) + name, quantity=again, basis=waves_of(period))
+        time = self.quantity
+        span = float(np.ptp(time.visited))
+
+        def within(period: float) -> Quantity:
+            name = every(period, span / period)
+            said = period_of(name)
+            return replace(time, name=name, visited=time.visited % said, slower=lambda times: within(said * times))
+
+        q = within(period)
+        name = self.name.removesuffix(time.name) + q.name
+        return replace(self, name=name, quantity=q, basis=waves_of(q.period))
 
     @property
     def turn(self) -> Array:

@@ -47,8 +47,9 @@ SURE = 3  # of the latter that are chosen by data left out
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 OTHER = 1.5  # times as large: another amplitude
-TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which the change must help
+TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
+TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
 Placings = tuple[tuple[Placed, Effect], ...]
 
@@ -342,8 +343,12 @@ class Learner:
         return True
 
     def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
-        """The curve with the lag that suits it best, by such ``steps`` up and down."""
-        for times in steps if best.candidate.quantity.slower is not None else ():
+        """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""
+        q = best.candidate.quantity
+        if q.period:  # by so many turns over the whole time
+            span = float(np.ptp(best.judge.stage.t))
+            steps = [1.0 + turns * q.period / span for turns in TURNS]
+        for times in steps if q.slower is not None else ():
             for factor in (times, 1.0 / times):
                 while (more := self._slower(current, best, factor)) is not None:
                     best = more
