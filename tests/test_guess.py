@@ -300,6 +300,142 @@ def test_no_name_breaks_the_dictionary(name: str) -> None:
     assert 0.0 <= is_time(name)[0] <= 1.0
 
 
+# ---- names put together from words ---------------------------------------------------------------------------------
+
+DEMAND, ACTUAL = ["Demand", "Cmd", "Setpoint", "Set Point", "Soll", "Ref"], ["Sense", "Feedback", "Ist", "Act", "Meas"]
+THINGS: dict[str, tuple[list[str], list[str], list[str]]] = {  # signal -> things, roles, units
+    "n_dem": (["NH", "N2", "HP Speed", "Core Speed", "Drehzahl", "Gas Generator Speed"], DEMAND, ["rpm", "pct"]),
+    "n_r": (["NH", "NR", "HP Speed", "Core Speed", "Drehzahl", "Gas Generator Speed"], ACTUAL, ["rpm", "pct"]),
+    "x_dem": (["VSV", "VSV Act", "VGV", "Actuator", "Stellglied", "Ram Position", "Zylinder"], DEMAND, ["mm", "inch"]),
+    "x_lvdt": (["VSV", "VSV Actuator", "VGV", "Actuator", "Stellglied", "Stellung"], ACTUAL, ["mm", "cm"]),
+    "i_cmd": (["EHSV", "Servo Valve", "Torque Motor", "VSV TM", "Ventilstrom"], ["", *DEMAND], ["mA"]),
+    "p_s": (["Hyd Supply", "Hydraulic System", "Versorgung", "Supply Pressure"], ["", *ACTUAL], ["psi", "bar"]),
+    "t_oil": (["Oil", "Hyd Oil", "Hydraulic Fluid", "Oel Temperatur"], ["", *ACTUAL], ["degC", "degF"]),
+    "vigv": (["IGV", "VIGV", "Inlet Guide Vane", "Vorleitrad", "Leitschaufel 0"], ["", *ACTUAL, "Pos"], ["deg", "rad"]),
+    "vgv1": (["Vane 1", "Leitschaufel 1", "VSV 1", "Stator Vane 1", "Stage 1"], ["", *ACTUAL, "Pos"], ["deg", "rad"]),
+    "vgv2": (["Vane 2", "Guide Vane 2", "VSV S2", "Leitrad 2", "Stufe 2"], ["", *ACTUAL, "Winkel"], ["deg", "rad"]),
+}  # fmt: skip
+WRITTEN: dict[str, Callable[[list[str]], str]] = {
+    "snake": "_".join, "blanks": " ".join,
+    "capitals": lambda w: "_".join(w).upper(), "low": lambda w: "_".join(w).lower(),
+    "camel": lambda w: "".join(x if x.isupper() else x.capitalize() for x in w), "hyphens": "-".join,
+}  # fmt: skip
+BESIDE: list[Callable[[str], tuple[str, str]]] = [  # unit -> what stands behind the name, the unit of the file
+    lambda u: (f"_{u}", ""), lambda u: (f"[{u}]", ""), lambda u: (f" ({u})", ""), lambda u: ("", u),
+]  # fmt: skip
+
+
+@given(st.data())
+@settings(max_examples=600, deadline=None)
+def test_words_in_any_order_and_writing_with_a_unit_are_understood(draw: st.DataObject) -> None:
+    signal = draw.draw(st.sampled_from(sorted(THINGS)))
+    things, roles, units = THINGS[signal]
+    thing, role, unit = (draw.draw(st.sampled_from(x)) for x in (things, roles, units))
+    groups = [thing.split(), role.split()] if draw.draw(st.booleans()) else [role.split(), thing.split()]
+    if thing[-1].isdigit() and role and not role[-1].isdigit():
+        groups = [thing.split(), role.split()]  # Ist_VSV_1 is said by none
+    name = WRITTEN[draw.draw(st.sampled_from(sorted(WRITTEN)))]([w for g in groups for w in g])
+    behind, in_file = draw.draw(st.sampled_from(BESIDE))(unit)
+    m = meaning(name + behind, ALL, in_file)
+    assert m is not None and m.signal == signal and m.confidence >= ENOUGH, (name + behind, m)
+    assert in_file or behind[0] != "_" or m.unit
+
+
+KINDS = {"mm": "stroke", "inch": "stroke", "mA": "current", "bar": "pressure", "psi": "pressure", "degC": "temperature",
+         "deg": "angle", "rad": "angle", "rpm": "speed"}  # fmt: skip
+OF = {"n": "speed", "x": "stroke", "i": "current", "p": "pressure", "t": "temperature", "v": "angle"}
+
+
+OUR_WORDS = sorted({w for things, roles, _ in THINGS.values() for x in (*things, *roles) for w in x.split()})
+
+
+@given(
+    st.lists(st.sampled_from(OUR_WORDS), min_size=1, max_size=4),
+    st.sampled_from(sorted(KINDS)),
+    st.sampled_from(BESIDE),
+)  # fmt: skip
+@settings(max_examples=1500, deadline=None)
+def test_no_order_of_our_words_makes_a_signal_of_another_kind_or_role(
+    words: list[str], unit: str, beside: Callable[[str], tuple[str, str]]
+) -> None:
+    behind, in_file = beside(unit)
+    m = meaning("_".join(words) + behind, ALL, in_file)
+    if m is None or m.confidence < ENOUGH:
+        return
+    if m.unit:  # a unit of the file that is none of the signal is told in `guess`
+        assert KINDS[unit] == OF[m.signal[0]]
+    demands = any(w in ("Demand", "Cmd", "Setpoint", "Set", "Soll", "Ref") for w in words)
+    assert not (demands and m.signal in ("n_r", "x_lvdt", *(v for v in ALL if v.startswith("v"))))
+
+
+@pytest.mark.parametrize(
+    "names, signal",
+    [(("NHSense_rpm", "NH_Fbk_rpm"), "n_r"), (("VSV_ActCmd_mm", "ActuatorSetpoint[mm]"), "x_dem"),
+     (("HydSupply_MPa", "Hydraulic System [MPa]"), "p_s"), (("LVDT_A", "LVDT_B"), "x_lvdt"),
+     (("EHSV_mA", "TorqueMotor_mA"), "i_cmd"), (("Leitschaufelwinkel 1", "Stator Vane 1"), "vgv1")],
+)  # fmt: skip
+def test_two_names_that_say_the_same_are_told_and_neither_is_taken(
+    tmp_path: Path, run: dict[str, np.ndarray], names: tuple[str, str], signal: str
+) -> None:
+    scale = 380.0 if signal == "n_r" else 1.0
+    columns = {
+        "t": run["t"],
+        "n_dem": run["n_dem"],
+        **{n: run[signal] * scale * (1 + 0.01 * k) for k, n in enumerate(names)},
+    }
+    seen = survey(table(tmp_path / "a.csv", columns), design_rpm=38000)
+    assert {r.signal for r in seen.rows} == {"t", "n_dem"}
+    assert all(seen.other[n].startswith(f"two could be {signal}: ") for n in names)
+
+
+def test_a_bench_of_names_that_only_their_units_explain_maps_itself(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
+    columns = {"Zeit_s": run["t"], "NHDemand_rpm": run["n_dem"] * 380, "NHSense_rpm": run["n_r"] * 380,
+               "ActuatorSetpoint[mm]": run["x_dem"], "VSV_ActFbk_in": run["x_lvdt"] / 25.4,
+               "EHSV_mA": run["i_cmd"], "HydSupply_psi": run["p_s"] * 145.0377377, "Oil_degF": run["t_oil"] * 1.8 + 32,
+               "Leitschaufelwinkel 0": run["vigv"], "Leitschaufelwinkel 1": run["vgv1"],
+               "Leitschaufelwinkel 2": run["vgv2"]}  # fmt: skip
+    same(table(tmp_path / "a.csv", columns), run, design_rpm=38000)
+
+
+def test_what_is_not_used_says_why(
+    tmp_path: Path, run: dict[str, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns: dict[str, np.ndarray | list[str]] = {
+        "t": run["t"], "n_dem": run["n_dem"], "x_lvdt": run["x_lvdt"], "Fuel": run["p_s"], "Nr": np.arange(ROWS),
+        "VGV_Pos": run["x_lvdt"], "Leitschaufelwinkel": run["vgv1"], "HydSupply": run["p_s"],
+        "Fuel Pressure": run["p_s"], "HydSupply_bar": run["p_s"] * 0.1,
+        "Oil Temp degC [K]": run["t_oil"], "VGV1_Soll": run["vgv1"],
+        "Oil Temp": ["warm"] * ROWS, "Leitschaufelwinkel 1": run["vigv"], "Zeile Nr": np.arange(ROWS) + 1,
+        "Drehzahl_Ist_pct": np.arange(ROWS) + 1,
+        "Hub_Stellung": run["x_lvdt"],
+    }  # fmt: skip
+    file = table(tmp_path / "a.csv", columns)
+    seen = survey(file)
+    assert [r.signal for r in seen.rows] == ["t", "n_dem", "x_lvdt"]
+    for name, why in {
+        "Fuel": "no signal of the model has such a name", "Nr": "is called n_r", "VGV_Pos": "x_lvdt has a name already",
+        "Leitschaufelwinkel": "it does not say of which stage", "HydSupply": "a unit would",
+        "Fuel Pressure": "fuel is not known", "HydSupply_bar": "a supply has 8 to 40", 
+        "VGV1_Soll": "no demand of a vane", "Hub_Stellung": "x_lvdt has a name already",
+        "Oil Temp degC [K]": "the log says K, its name says degC", "Oil Temp": "words, not numbers",
+        "Leitschaufelwinkel 1": "it moves as vigv does", "Drehzahl_Ist_pct": "it counts the rows",
+    }.items():  # fmt: skip
+        assert why in seen.other[name], (name, seen.other[name])
+    assert main(["map", str(file), "--json", str(tmp_path / "a.json")]) == 0
+    assert "not used: Fuel: no signal of the model has such a name" in capsys.readouterr().out
+    answer = json.loads((tmp_path / "a.json").read_text())
+    assert answer["other"] == list(answer["why_not"]) and all(answer["why_not"].values())
+
+
+def test_vanes_counted_from_one_are_not_guessed_where_no_name_is_the_inlet(
+    tmp_path: Path, run: dict[str, np.ndarray]
+) -> None:
+    columns = {"t": run["t"], "n_dem": run["n_dem"], "Leitschaufelwinkel 1": run["vigv"],
+               "Leitschaufelwinkel 2": run["vgv1"], "Leitschaufelwinkel 3": run["vgv2"]}  # fmt: skip
+    log = read_log(table(tmp_path / "a.csv", columns))
+    assert set(log.channels) == {"n_dem"} and any("no name of an inlet vane: 1 may be it" in n for n in log.notes)
+
+
 def test_two_rotors_are_named_and_neither_is_guessed(tmp_path: Path, run: dict[str, np.ndarray]) -> None:
     columns = {"t": run["t"], "N1_Dem": run["n_dem"], "N2_Dem": run["n_dem"] * 0.9, "x_lvdt": run["x_lvdt"]}
     file = table(tmp_path / "a.csv", columns)

@@ -8,13 +8,14 @@ names with their own units need no guess. docs/logs.md is the user's page.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.names import Meaning, meaning, spool
+from hil.logs.names import Meaning, bracketed, lacks, meaning, spool, unit_kind
 from hil.logs.source import LogError, Source
 from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.signals import UNITS
@@ -66,10 +67,14 @@ class Guess:
 
 @dataclass
 class Guesses:
-    """What is guessed, by signal, and what is not and why: ``open`` signal -> words, the names in them."""
+    """What is guessed, by signal, and what is not and why: ``open`` signal -> words, the names in them.
+
+    unused  name of the log -> why it is no signal, in a few words
+    """
 
     made: dict[str, Guess] = field(default_factory=dict)
     open: dict[str, str] = field(default_factory=dict)
+    unused: dict[str, str] = field(default_factory=dict)
     rpm: dict[str, str] = field(default_factory=dict)  # speeds that wait for the design speed: signal -> name
 
 
@@ -87,29 +92,46 @@ def guess(
     out = Guesses()
     doubts: dict[str, list[str]] = {}
     for key in source.names:
-        m = None if key in taken else _meant(key, comments.get(key, ""), signals)
-        if m is None:
+        if key in taken:
             continue
-        if m.confidence < ENOUGH:
-            if m.confidence >= 0.5:
-                doubts.setdefault(m.signal, []).append(f"{key!r} ({m.why}; that is not enough)")
+        m, comment = _meant(key, comments.get(key, ""), signals), comments.get(key, "")
+        out.unused[key] = lacks(key)
+        if m is None and out.unused[key].startswith("no signal"):
             continue
         try:
             s = source.series(key)
         except LogError:
-            continue  # words, not numbers
-        unit, sure, why = _unit(m.signal, stated.get(m.signal, ""), s.unit, m.unit, s.values, design_rpm)
+            out.unused[key] = "words, not numbers"
+            continue
+        if (m is None or m.confidence < ENOUGH) and unit_kind(s.unit):  # the unit may say what the name does not
+            m, out.unused[key] = _meant(key, comment, signals, s.unit), lacks(key, s.unit)
+        if m is None:
+            other = _meant(key, comment, tuple(UNITS), s.unit)
+            if other is not None and other.confidence >= 0.5:
+                out.unused[key] = f"{other.signal} has a name already"
+            continue
+        out.unused[key] = f"{m.signal}? {m.why}"
+        if m.confidence < ENOUGH:
+            if m.confidence >= 0.5:
+                doubts.setdefault(m.signal, []).append(f"{key!r} ({m.why}; that is not enough)")
+            continue
+        unit, sure, why = _unit(
+            m.signal, stated.get(m.signal, ""), s.unit, m.unit or bracketed(key), s.values, design_rpm
+        )
         if unit is None:
+            out.unused[key] = f"{m.signal}? {why}"
             doubts.setdefault(m.signal, []).append(f"{key!r} ({why})")
             continue
         found.setdefault(m.signal, []).append(Guess(m.signal, key, unit, m.confidence * sure, f"{m.why}; {why}"))
     _of_one_rotor(found, doubts)
+    _counted_from_the_inlet(found, doubts, "vigv" in signals)
     for signal, candidates in found.items():
         first, *rest = sorted(candidates, key=lambda g: -g.confidence)
         alike = [g for g in rest if g.confidence >= first.confidence - ALIKE]
         if alike:
             names = " or ".join(repr(g.name) for g in (first, *alike[:3]))
             out.open[signal] = f"may be {names}: not guessed; --map NAME={signal} takes one"
+            out.unused |= dict.fromkeys((g.name for g in candidates), f"two could be {signal}: {names}")
         elif first.confidence < ENOUGH:
             doubts.setdefault(signal, []).append(f"{first.name!r} ({first.why})")
         elif signal in ("n_dem", "n_r") and design_rpm is None and isinstance(factor_of(first.unit, "rpm"), tuple):
@@ -117,6 +139,8 @@ def guess(
             out.open[signal] = f"{first.name!r} is in {first.unit} and needs the design speed: --design-rpm R"
         else:
             out.made[signal] = first
+            out.unused |= {g.name: f"{signal} is {first.name!r}, more surely" for g in rest}
+            del out.unused[first.name]
     for signal, which in doubts.items():
         if signal not in out.made and signal not in out.open:
             out.open[signal] = f"may be {' or '.join(which[:3])}: not guessed; --map NAME={signal} takes one"
@@ -136,11 +160,22 @@ def _of_one_rotor(found: dict[str, list[Guess]], doubts: dict[str, list[str]]) -
         found.pop("n_r", None)
 
 
-def _meant(key: str, comment: str, signals: tuple[str, ...]) -> Meaning | None:
-    """What a name means, or the comment that its database has on it."""
-    m = meaning(key, signals)
+def _counted_from_the_inlet(found: dict[str, list[Guess]], doubts: dict[str, list[str]], no_inlet: bool) -> None:
+    """Leave vanes out that are counted 1, 2, 3 where no name says which is the inlet's: it may be 1."""
+    numbered = [v for v in VANES[1:4] if v in found and not re.search("(?i)v[gs]v", found[v][0].name)]
+    if no_inlet and "vigv" not in found and len(numbered) == 3:
+        for v in VANES[1:]:
+            for g in found.pop(v, []):
+                doubts.setdefault(v, []).append(
+                    f"{g.name!r} (counted from 1 and no name of an inlet vane: 1 may be it)"
+                )
+
+
+def _meant(key: str, comment: str, signals: tuple[str, ...], unit: str = "") -> Meaning | None:
+    """What a name means in its unit, or the comment that its database has on it."""
+    m = meaning(key, signals, unit)
     if (m is None or m.confidence < ENOUGH) and 0 < len(comment) <= _LONGEST_COMMENT:
-        said = meaning(comment, signals)
+        said = meaning(comment, signals, unit)
         if said is not None and said.confidence >= ENOUGH:
             return Meaning(said.signal, said.unit, said.confidence - _COMMENT, f"its comment: {comment!r}")
     return m
@@ -154,6 +189,10 @@ def _unit(
     if not v.size:
         return None, 0.0, "it has no sample"
     own = UNITS[signal]
+    if not stated and in_file and in_name and _differ(in_file, in_name):
+        return None, 0.0, f"the log says {in_file}, its name says {in_name}"
+    if v.size > 20 and np.array_equal(v, v[0] + np.arange(v.size)):
+        return None, 0.0, "it counts the rows"
     for unit, where in ((stated, "you say"), (in_file, "the log says"), (in_name, "its name says")):
         if unit.strip().casefold() in NO_UNIT or unit.strip() == "1":
             continue
@@ -172,6 +211,9 @@ def _unit(
             return None, 0.0, f"{where} {unit}, which is no unit of {signal}"
         if why := plausible.judge(signal, sign * v * factor[0] + factor[1])[1]:
             return None, 0.0, f"{where} {unit}, but {why}"
+        size = float(np.percentile(np.abs(v * factor[0] + factor[1]), 99.0))
+        if signal == "p_s" and where != "you say" and not _USUAL["p_s"]["MPa"][0] <= size <= _USUAL["p_s"]["MPa"][1]:
+            return None, 0.0, f"{where} {unit}, but its values reach {size:.3g} MPa, and a supply has 8 to 40"
         return given, 1.0, f"{where} {given}"
     size = float(np.percentile(np.abs(v), 99.0))
     able = [u for u, (low, high) in _USUAL[_LIKE.get(signal, signal)].items() if low <= size <= high]
@@ -181,6 +223,12 @@ def _unit(
     if own in able:  # the signal's own unit and a smaller one, such as mm and cm
         return None, 0.0, f"{said}: {' or '.join(able)}? --unit {signal}={own} states it"
     return None, 0.0, f"{said}, which no {signal} does in any usual unit" if not able else f"{said}: {', '.join(able)}?"
+
+
+def _differ(a: str, b: str) -> bool:
+    """Whether two units are of one kind and not the same."""
+    factor = factor_of(a, b)
+    return isinstance(factor, tuple) and not np.allclose(factor, (1.0, 0.0), rtol=1e-9, atol=1e-9)
 
 
 # ---- against the other signals ---------------------------------------------------------------------------------------
@@ -193,6 +241,7 @@ def withdrawn(found: Guesses, channels: Mapping[str, _Samples]) -> None:
     for signal, why in contradictions(channels, set(found.made)).items():
         g = found.made.pop(signal)
         found.open[signal] = f"{g.name!r} would be it by name, but {why}: not guessed"
+        found.unused[g.name] = f"{signal}? {why}"
 
 
 def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[str, str]:
@@ -237,6 +286,8 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
         for speed in ("n_r", "n_dem"):
             if vane in guessed and (p := pair(vane, speed)) is not None and _together(*p, 4.0, 8.0) < -0.7:
                 blame(vane, speed, "it runs against {other}; --unit {own} turns its sign")
+        if vane in guessed and (like := _other_vane(vane, channels)):
+            out.setdefault(vane, f"it moves as {like} does; --map NAME={vane} takes it as it is")
     for moved in ("x_lvdt", "x_dem", "n_r"):
         if "i_cmd" in guessed and (p := pair("i_cmd", moved)) is not None:
             t = channels["i_cmd"][0]
@@ -260,6 +311,25 @@ def _off_schedule(stroke: np.ndarray, speed: np.ndarray) -> str:
     if not 1.0 / _STRETCHED < times < _STRETCHED:
         return f"it moves {times:.2g} times as far as the schedule says"
     return f"it is {far:.2g} mm away, half of the time, from what the schedule says" if far > _OFF else ""
+
+
+def _other_vane(vane: str, channels: Mapping[str, _Samples]) -> str:
+    """The stage whose schedule a vane follows instead of its own, by the rotor speed; "" where none is clear."""
+    from plant.geometry import load_schedules
+
+    schedules = load_schedules()
+    speed = next((channels[s] for s in ("n_r", "n_dem") if s in channels), None)
+    if vane not in channels or vane not in schedules.vanes or speed is None:
+        return ""
+    t, angle = channels[vane]
+    inside = (t >= speed[0][0]) & (t <= speed[0][-1])
+    if np.count_nonzero(inside) <= 20 or np.ptp(angle[inside]) < 4.0:
+        return ""
+    planned = np.rad2deg(schedules.targets(np.interp(t[inside], *speed)))
+    far = np.median(np.abs(planned - angle[inside, None]), axis=0)
+    nearest = schedules.vanes[int(np.argmin(far))]
+    own = float(far[schedules.vanes.index(vane)])
+    return nearest if own > max(2.0, 3.0 * float(far.min())) else ""
 
 
 def _together(a: np.ndarray, b: np.ndarray, least_a: float, least_b: float) -> float:

@@ -11,52 +11,58 @@ from __future__ import annotations
 
 import difflib
 import functools
+import itertools
 import re
 from dataclasses import dataclass, replace
 
 from vaneloop.base.vanes import VANES
 
-__all__ = ["CERTAIN", "Meaning", "is_time", "meaning", "spool", "unit_in_name"]
+__all__ = ["CERTAIN", "Meaning", "bracketed", "is_time", "lacks", "meaning", "spool", "unit_in_name", "unit_kind"]
 
 CERTAIN = 0.98  # of a name that says all that there is to say
 
 # meaning -> words, English and German, as loggers and signal lists write them
 _WORDS = {
     "speed": "speed spd drehzahl drehz rpm n nh nl nhp nlp xn spool rotorspeed rotationalspeed umdrehungen upm "
-    "rev revs",
+    "rev revs nr xnh xnl ng ngg",
     "stroke": "stroke hub weg position pos posn x s xpos displacement lvdt kolbenweg stellweg kolbenhub ram "
-    "piston kolben extension auslenkung",
-    "current": "current curr strom i cur amperage amps",
+    "piston kolben extension auslenkung stellung",
+    "current": "current curr strom i cur amperage amps stellstrom steuerstrom",
     "pressure": "pressure press prs druck p",
     "temperature": "temperature temp tmp temperatur t",
-    "angle": "angle ang winkel vane schaufel leitschaufel leitschaufelwinkel stellwinkel potentiometer poti rvdt phi",
-    "vigv": "vigv igv eintrittsleitrad vorleitrad",
-    "vgv": "vgv vsv stator stage stufe",
+    "angle": "angle ang winkel stellwinkel potentiometer poti rvdt phi",
+    "vigv": "vigv igv eintrittsleitrad vorleitrad vlr eintrittsleitschaufel vorleitschaufel inletguidevane",
+    "vgv": "vgv vsv variablestatorvane",
+    "vane": "vane vanes guidevane statorvane schaufel leitschaufel leitrad verstellleitschaufel verstellleitrad",
+    "stage": "stator stage stufe stg",
     "time": "time zeit timestamp timestamps zeitstempel datetime epoch uhrzeit elapsed messzeit laufzeit zeitpunkt "
     "abszeit relzeit date datum clock systime abstime reltime",
     "demand": "demand dem dmd demanded cmd command commanded kommando soll sollwert set setp setpoint setpt stp "
-    "sp ref reference request requested req reqd target tgt trgt desired des vorgabe fuehrung "
+    "cmnd sp ref reference request requested req reqd target tgt trgt desired des vorgabe fuehrung "
     "fuehrungsgroesse w",
     "actual": "actual act ist istwert meas measured measurement mess messwert gemessen fbk fdbk feedback fb "
-    "sensor sns snsr sensed val r rueckmeldung",
+    "sensor sns snsr sensed sense sel selected voted transducer geber val r rueckmeldung",
     "supply": "supply sup sply versorgung versorgungs system sys systems hydraulic hydraulics hydraulik hyd "
     "hydr pump pumpe pumpen vorlauf speise",
     "oil": "oil oel fluid fld fluessigkeit lube",
     "valve": "valve ventil servovalve servoventil servo sv ehsv torquemotor coil spule tm moog",
-    "drive": "actuator aktuator aktor stellzylinder zylinder cylinder cyl act1 jack",
+    "drive": "actuator aktuator aktor stellzylinder zylinder cylinder cyl act1 jack stellglied stellantrieb",
     "rotor": "rotor engine eng motordrehzahl triebwerk tw turbine gasgenerator gg core hp lp hd nd compressor "
-    "verdichter welle shaft",
+    "verdichter welle shaft gasgenerator hochdruckwelle niederdruckwelle",
     "filler": "signal sig value wert of der des die das und and channel chan ch kanal raw phys cal eng1 bench rig "
     "pruefstand test data daq adc ai input output analog messung measuredvalue out logsout model root plant vw mp "
-    "m degree scaled filt filtered gefiltert",
+    "m degree scaled filt filtered gefiltert ecu eec fadec",
     "clock": "abs absolute relative rel since start log logger gps utc local recorder of the in and daq",
 }  # fmt: skip
 _CLOCK = frozenset(_WORDS.pop("clock").split())  # what only a time may be called, besides
 _MEANING = {word: what for what, words in _WORDS.items() for word in words.split()} | dict.fromkeys(
     ("of", "the", "in", "and"), "filler"
 )
+_ACRONYMS = ("hp", "lp", "nh", "nl", "nr", "ng", "sv", "tm")  # that names write before a word without a gap: NHist
+_PLACE = {"position", "pos", "posn", "stellung"}  # of a stroke, or of a vane
+_VANES = ("vigv", "vgv", "vane", "stage")
 _SHORT = {"n": "speed", "x": "stroke", "s": "stroke", "p": "pressure", "t": "temperature", "i": "current"}
-_QUANTITIES = ("speed", "stroke", "current", "pressure", "temperature", "angle", "vigv", "vgv")
+_QUANTITIES = ("speed", "stroke", "current", "pressure", "temperature", "angle", *_VANES)
 
 # how names write units: the last words of a name -> unit as pint or hil.logs.units knows it
 _UNITS = {
@@ -136,11 +142,11 @@ def _plain(name: str) -> str:
 
 
 def _compound(word: str) -> list[str] | None:
-    """A word made of words of the dictionary, of three letters or more: solldrehzahl, versorgungsdruck."""
+    """A word made of words of the dictionary, of three letters or more: solldrehzahl, versorgungsdruck, nhist."""
     if not word:
         return []
-    for n in range(len(word), 2, -1):
-        if word[:n] in _MEANING:
+    for n in range(len(word), 1, -1):
+        if word[:n] in (_MEANING if n > 2 else _ACRONYMS):
             for rest in (word[n:], word[n + 1 :] if word[n : n + 1] in ("s", "n") and len(word) > n + 1 else None):
                 if rest is not None and (tail := _compound(rest)) is not None:
                     return [word[:n], *tail]
@@ -152,9 +158,13 @@ def _parts(chunk: str) -> list[str]:
     low = chunk.casefold()
     if low in _MEANING:
         return [low]
-    camel = [p.casefold() for p in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", chunk)]
+    if low[-1] == "s" and _MEANING.get(low[:-1]) in _VANES:  # VSVs, VSVS1
+        return [low[:-1]]
+    camel = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", chunk)
     if len(camel) > 1:
-        return [w for p in camel for w in (_parts(p) if p != low else [p])]
+        cuts = [camel, re.findall(r"[A-Z]{2,}|[A-Z]?[a-z]+", chunk)]  # NHist: N, Hist or NH, ist
+        read = [[w for p in cut for w in _parts(p if p.isupper() else p.casefold())] for cut in cuts if len(cut) > 1]
+        return next((words for words in read if _MEANING.keys() >= set(words)), read[0])
     if whole := _compound(low):
         return whole
     if low[0] in _SHORT and _MEANING.get(low[1:]) in ("demand", "actual", "supply", "oil", "valve", "drive", "rotor"):
@@ -164,13 +174,42 @@ def _parts(chunk: str) -> list[str]:
 
 @functools.lru_cache(maxsize=4096)
 def _words(text: str) -> tuple[str, ...]:
-    return tuple(
+    words = [
         w for chunk in re.findall(r"[A-Za-z]+|\d+|%", text) for w in (_parts(chunk) if chunk.isalpha() else [chunk])
+    ]
+    for count in (3, 2):  # words that are written apart: set point, inlet guide vane
+        for k in range(len(words) - count, -1, -1):
+            if (joined := "".join(words[k : k + count])) in _MEANING and not _MEANING.keys() >= {*words[k : k + count]}:
+                words[k : k + count] = [joined]
+    vanes = any(_MEANING.get(w) in _VANES for w in words)
+    return tuple(
+        "stage" if vanes and w in ("s", "st") and after.isdigit() else w  # VSV_S1
+        for w, after in itertools.zip_longest(words, words[1:], fillvalue="")
     )
 
 
-def unit_in_name(name: str) -> tuple[tuple[str, ...], str, str]:
-    """Words of a name without the unit at its end, that unit ("" without one), and the quantity it is a unit of."""
+@functools.lru_cache(maxsize=256)
+def unit_kind(unit: str) -> str:
+    """The quantity that a unit is of, as files and users write it; "" where it tells nothing, as % does."""
+    text = unit.strip().removeprefix("-")
+    known = _UNITS.get(" ".join(re.findall(r"[a-z]+|\d+", text.casefold().translate(_UMLAUTS))), text)
+    for kind, units in _OF.items():
+        if known in units:
+            return "" if known == "%" else kind
+    return "angle" if text == "\u00b0" else "temperature" if "\u00b0" in text else ""
+
+
+def bracketed(name: str) -> str:
+    """The unit in the bracket at a name's end; "" without one."""
+    m = re.fullmatch(r".*[\[(]([^\[\]()]+)[\])]\s*", name)
+    return m[1].strip() if m and (unit_kind(m[1]) or m[1].strip() == "%") else ""
+
+
+def unit_in_name(name: str, said: str = "") -> tuple[tuple[str, ...], str, str]:
+    """Words of a name without the unit at its end, that unit ("" without one), and the quantity it is a unit of.
+
+    said  the unit that the log states for it: with words that name no quantity it says which is meant
+    """
     text = _plain(name)
     text = re.sub(r"(?<=[a-z]{2})(?=[A-Z][A-Za-z])", _CAMEL, text)  # PosMm, TimeMs
     raw = re.findall(r"[A-Za-z]+|\d+|%", text)
@@ -182,10 +221,11 @@ def unit_in_name(name: str) -> tuple[tuple[str, ...], str, str]:
             # one letter is a unit only behind a separator, and m, a, c, f, h, k, s only where the rest is a quantity
             if len(raw[-1]) > 1 or count == 2 or text[cut - 1 : cut] in "_ -.\u00b0":
                 rest = _words(text[:cut].replace(_CAMEL, ""))
-                quantity = _quantity(rest)
+                quantity = _quantity(rest, unit_kind(unit) if len(raw[-1]) > 1 or count == 2 else "")
                 if quantity and unit in _OF.get("angle" if quantity in ("vigv", "vgv") else quantity, ()):
                     return rest, unit, quantity
-    return _words(text.replace(_CAMEL, "")), "", ""
+    words = _words(text.replace(_CAMEL, ""))
+    return words, "", _quantity(words, unit_kind(said or bracketed(name)))
 
 
 def _kinds(words: tuple[str, ...]) -> tuple[list[str], list[str], int, bool]:
@@ -209,20 +249,28 @@ def _kinds(words: tuple[str, ...]) -> tuple[list[str], list[str], int, bool]:
 _LONG = [w for w in _MEANING if len(w) > 5]
 
 
-def _quantity(words: tuple[str, ...]) -> str:
-    """The one quantity that words speak of; "" where there is none, or several."""
+def _quantity(words: tuple[str, ...], unit: str = "") -> str:
+    """The one quantity that words and the ``unit`` beside them (its kind) speak of; "" where there is none, or several.
+
+    Words that name no quantity have that of the unit: an actuator's setpoint in mm is a stroke.
+    """
     kinds = _kinds(words)[0]
     # t beside oil is a temperature, alone it is the time; s and x beside another quantity are no stroke
     if words == ("t",):
         return "time"
-    several = list(dict.fromkeys(k for k in kinds if k in (*_QUANTITIES, "time")))
-    if len(several) == 2 and several[0] in ("vigv", "vgv") and several[1] == "angle":
-        several = several[:1]
-    elif len(several) == 2 and several[1] in ("vigv", "vgv") and several[0] == "angle":
-        several = several[1:]
-    elif set(several) == {"stroke", "vgv"}:  # the stroke of the vanes' actuator
-        several = ["stroke"]
-    return several[0] if len(several) == 1 else ""
+    several = {k for k in kinds if k in (*_QUANTITIES, "time")}
+    vane = "vigv" if "vigv" in several else "vgv" if several & set(_VANES) else ""
+    several -= set(_VANES)
+    place = {w for w in words if _MEANING.get(w) == "stroke"} <= _PLACE
+    if not several:  # the unit says it, beside what has it; ActCmd_mm is the actuator's command
+        moved = vane == "vgv" and {"actual", "demand"} & set(kinds) or "act" in words and "demand" in kinds
+        for of, says in (("stroke", "drive"), ("current", "valve"), ("pressure", "supply"), ("temperature", "oil")):
+            if unit == of and (says in kinds or (of == "stroke" and moved)):
+                return of
+    if vane and (several <= {"angle"} or (several <= {"angle", "stroke"} and unit == "angle" and place)):
+        return vane
+    # the stroke of the vanes' actuator, the current of its valve
+    return several.pop() if len(several) == 1 and (not vane or several & {"stroke", "current"}) else ""
 
 
 # ---- meaning ---------------------------------------------------------------------------------------------------------
@@ -244,38 +292,41 @@ def is_time(name: str) -> tuple[float, str]:
 
 
 @functools.lru_cache(maxsize=8192)
-def meaning(name: str, signals: tuple[str, ...]) -> Meaning | None:
+def meaning(name: str, signals: tuple[str, ...], unit: str = "") -> Meaning | None:
     """The signal that a name most likely means; None where it means none of ours. A confidence below 0.7 is for a
-    message, not for a guess.
+    message, not for a guess. ``unit`` is the one that the log states for the name.
 
     The path before a name counts where the name alone says too little: supply.pressure.
     """
-    last = _last(name, signals)
+    last = _last(name, signals, unit)
     path = _words(" ".join(_PATH.split(name)[:-1]).translate(_UMLAUTS))
     if last is not None and not set(_ELSEWHERE.split()).isdisjoint(path):
         return replace(last, confidence=min(last.confidence, 0.4), why=f"{last.why}, but of another part")
     if last is not None and last.confidence >= 0.7 or not path:
         return last
-    whole = _last(_PATH.sub(" ", name), signals)
+    whole = _last(_PATH.sub(" ", name), signals, unit)
     return whole if whole is not None and (last is None or whole.confidence > last.confidence) else last
 
 
-def _last(name: str, signals: tuple[str, ...]) -> Meaning | None:
-    """What the part of a name behind its path says."""
-    words, unit, _ = unit_in_name(name)
+def _last(name: str, signals: tuple[str, ...], said: str) -> Meaning | None:
+    """What the part of a name behind its path says, in the unit that the log states."""
+    words, unit, quantity = unit_in_name(name, said)
+    kind = unit_kind(unit or said or bracketed(name))
     plain = re.sub(r"[^a-z0-9]", "", _plain(name).casefold())
     for signal in signals:  # our own name in other letters, or with a unit behind it
         own = signal.replace("_", "")
         if signal != "state" and plain.startswith(own):
             behind = "" if plain == own else _UNITS.get(plain.removeprefix(own), "no unit")
             if not behind or behind in _OF[_SIGNALS[signal][0] if signal in _SIGNALS else "angle"]:
-                return Meaning(signal, behind, CERTAIN, f"is called {signal}")
-    quantity = _quantity(words)
+                sure = 0.5 if words == ("nr",) and not behind and not kind else CERTAIN  # Nr counts rows in German
+                return Meaning(signal, behind, sure, f"is called {signal}")
     kinds, unknown, numbers, misspelt = _kinds(words)
     roles = {k for k in kinds if k in ("demand", "actual")}
     if not quantity or quantity == "time":
         return None
     more = {k for k in kinds if k not in (*_QUANTITIES, "demand", "actual", "filler")}
+    numbers += unknown == ["a"] or unknown == ["b"]  # the two channels of a sensor
+    unknown = [] if unknown in (["a"], ["b"]) and words[-1] == unknown[0] else unknown
     if len(roles) == 2 and [w for w in words if _MEANING.get(w) == "actual"] == ["act"]:  # ACT_POS_CMD: the actuator's
         roles, more = {"demand"}, more | {"drive"}
     if quantity == "speed" and "n" in words and numbers == 1:
@@ -283,11 +334,17 @@ def _last(name: str, signals: tuple[str, ...]) -> Meaning | None:
     less = 0.1 * (numbers > 0) + 0.1 * misspelt
     if quantity in ("vigv", "vgv"):
         digits = [w for w in words if w.isdigit()]
-        signal = "vigv" if quantity == "vigv" else f"vgv{int(digits[0])}" if len(digits) == 1 else ""
-        if signal not in VANES or signal not in signals or "demand" in roles or more - {"drive"}:
+        signal = (
+            VANES[int(digits[0])] if len(digits) == 1 and len(digits[0]) < 3 and int(digits[0]) < len(VANES) else ""
+        )
+        signal = "vigv" if quantity == "vigv" else signal
+        if signal not in signals or "demand" in roles or more - {"drive"}:
             return None
-        known = not unknown and not (quantity == "vgv" and not {"vgv", "vsv"} & set(words) and "angle" not in kinds)
-        return Meaning(signal, unit, (CERTAIN - 0.1 * misspelt) if known else 0.4, _why(quantity, roles, more, unknown))
+        sure = CERTAIN if signal == quantity or "vgv" in kinds and signal != "vigv" else CERTAIN - 0.1  # Vane 1, VSV0
+        sure -= 0.1 * misspelt
+        known = not unknown and ({"vigv", "vgv", "vane", "angle"} & set(kinds) or kind == "angle")
+        why = _why("vane" if signal != quantity and quantity == "vgv" else quantity, roles, more, unknown)
+        return Meaning(signal, unit, round(sure, 2) if known else 0.4, why)
     for signal, (of, must, may, role, unsaid) in _SIGNALS.items():
         if of != quantity or signal not in signals or len(roles) > 1:
             continue
@@ -301,6 +358,9 @@ def _last(name: str, signals: tuple[str, ...]) -> Meaning | None:
         sure -= less
         if not roles and not more and (len(words) == 1 or numbers) and len(words[0]) == 1:
             sure = 0.5  # one letter, or one letter and a number, may be anything
+        place = {w for w in words if _MEANING.get(w) == "stroke"} <= _PLACE
+        if of == "stroke" and place and not kind and not more and set(_VANES) & set(kinds):
+            return Meaning(signal, unit, 0.5, "a stroke or an angle: no unit says which")
         if of == "stroke" and {"x", "s"} & set(words) and kinds.count("stroke") > 1 and "lvdt" not in words:
             sure = 0.5  # position_x is a coordinate
         if unknown or more - must - may:
@@ -309,6 +369,32 @@ def _last(name: str, signals: tuple[str, ...]) -> Meaning | None:
             sure = 0.5
         return Meaning(signal, unit, round(sure, 2), _why(quantity, roles, more, unknown))
     return None
+
+
+def lacks(name: str, unit: str = "") -> str:
+    """What keeps a name from being a signal of the model, in a few words; ``unit`` as the log states it."""
+    words, _, quantity = unit_in_name(name, unit)
+    kinds, unknown, numbers, _ = _kinds(words)
+    ours = set(kinds) - {"filler", "demand", "actual", "time"}
+    vanes = bool(ours & set(_VANES))
+    if not ours or unknown or ours <= {"rotor"}:
+        which = f": {', '.join(map(repr, unknown[:3]))} is not known" if ours and unknown else ""
+        return f"no signal of the model has such a name{which}"
+    if quantity in ("vigv", "vgv") and "demand" in kinds:
+        return "a stroke or an angle: no unit says which" if not numbers and "angle" not in kinds else (
+            "the model has no demand of a vane's angle"
+        )  # fmt: skip
+    if quantity == "vgv" and not numbers:
+        return "it does not say of which stage"
+    if not quantity:
+        several = [q for q in dict.fromkeys(kinds) if q in _QUANTITIES]
+        return (
+            f"it says {' and '.join(several)}"
+            if len(several) > 1 and not vanes
+            else "it does not say what is measured; a unit would"
+        )
+    said = ", ".join(dict.fromkeys(k for k in kinds if k != "filler"))
+    return f"the model has no such signal: {said}"
 
 
 def spool(name: str) -> tuple[str, ...]:

@@ -51,7 +51,7 @@ class Survey:
     """All that is to be known before a log is read.
 
     open        signals that are not found, and why, in words
-    other       names that are no signal of ours
+    other       names that are no signal of ours, and why: name -> a few words
     notes       what reading would note beside the guesses
     complaint   the line with which reading refuses the log; "" where it reads
     damaged     what reading refuses is a channel itself: other names or units will not mend it
@@ -61,7 +61,7 @@ class Survey:
     path: str
     rows: list[Row]
     open: dict[str, str]
-    other: list[str]
+    other: dict[str, str]
     notes: list[str]
     complaint: str
     design_rpm: float | None
@@ -85,7 +85,8 @@ class Survey:
         """The survey as the JSON of ``vaneloop map``."""
         rows = [{k: getattr(r, k) for k in Row.__dataclass_fields__ if k != "curve"} for r in self.rows]
         return {
-            "log": self.path, "signals": rows, "open": self.open, "other": self.other, "notes": self.notes,
+            "log": self.path, "signals": rows, "open": self.open, "other": list(self.other), "why_not": self.other,
+            "notes": self.notes,
             "complaint": self.complaint, "design_rpm": self.design_rpm, "suggested_rpm": self.suggested_rpm,
         }  # fmt: skip
 
@@ -125,6 +126,7 @@ def survey(
         how = "guessed" if g else "stated" if stated else "named"
         rows.append(_row(signal, keys[0], unit, how, g.confidence if g else 1.0, g.why if g else "", s.values))
     used = {r.name for r in rows}
+    other = {n: out.guesses.unused.get(n, "") for n in out.source.names if n not in used}
     open_, suggested = dict(out.guesses.open), None
     if out.guesses.rpm:
         signal, suggested, words = wanted_design_speed(path, out)
@@ -142,7 +144,7 @@ def survey(
     if not complaint and not any(r.signal != "t" for r in rows):
         complaint = f"{path}: none of its names is a signal of ours ({', '.join(UNITS)}); --map NAME=signal names one"
     return Survey(
-        str(path), rows, open_, [n for n in out.source.names if n not in used], notes, complaint, out.design_rpm,
+        str(path), rows, open_, other, notes, complaint, out.design_rpm,
         suggested, out.dbc, damaged and bool(complaint),
     )  # fmt: skip
 
