@@ -568,6 +568,55 @@ def test_a_name_of_a_user_s_system_is_taken_in_other_letters_where_it_is_the_onl
         read_log(file, signals=signals, require=tuple(signals))
 
 
+NAMED_UNITS = {"level": ("cm", [("_mm", 10.0, 0.0), ("Mm", 10.0, 0.0), ("_inch", 1 / 2.54, 0.0), ("_cm", 1.0, 0.0)]),
+               "dwell": ("s", [("_min", 1 / 60, 0.0), (" [ms]", 1e3, 0.0), ("_sec", 1.0, 0.0)]),
+               "temp": ("degC", [("_degF", 1.8, 32.0), ("_kelvin", 1.0, 273.15), ("DegC", 1.0, 0.0)]),
+               "pump": ("V", [("_min", 1.0, 0.0), ("_mm", 1.0, 0.0), ("", 1.0, 0.0)])}  # fmt: skip
+
+
+@pytest.mark.parametrize("signal, own, behind", [(s, o, b) for s, (o, bs) in NAMED_UNITS.items() for b in bs])
+def test_a_unit_in_the_name_of_a_user_s_channel_is_converted_and_told(
+    tmp_path: Path, signal: str, own: str, behind: tuple[str, float, float]
+) -> None:
+    """By its own name with the unit behind it, and under any name that is mapped to it; never silently its own unit."""
+    tail, factor, offset = behind
+    t, v = np.arange(0.0, 50.0), 20.0 + np.arange(50.0) ** 0.5
+    for name, mapping in ((f"{signal}{tail}", None), (f"Kanal{tail}", {f"Kanal{tail}": signal})):
+        file = table(tmp_path / "a.csv", {"Time": t, name: v * factor + offset})
+        reading: dict[str, Any] = {"signals": {signal: own}, "require": (), "mapping": mapping}
+        log = read_log(file, **reading)
+        if signal == "pump" and tail and not mapping:  # pump_min is no pump in V
+            assert signal not in log.channels
+        else:
+            np.testing.assert_allclose(log.channels[signal].values, v, rtol=1e-8)
+        converted = factor != 1.0 or offset != 0.0
+        assert not converted or "[" in name or any(n.startswith(signal) for n in log.notes)
+        if mapping:
+            np.testing.assert_allclose(
+                read_log(file, **reading, units={signal: own}).channels[signal].values,
+                v * factor + offset, rtol=1e-8,
+            )  # fmt: skip
+            plain = read_log(file, **reading, guess=False)
+            assert not converted or "[" in name or any("though its name says" in n for n in plain.notes)
+
+
+def test_a_mapped_name_of_ours_and_a_mapped_time_keep_the_unit_that_they_say(
+    tmp_path: Path, run: dict[str, np.ndarray]
+) -> None:
+    columns = {"Lauf_ms": run["t"] * 1e3, "n_dem": run["n_dem"], "Kuehler_degF": run["t_oil"] * 1.8 + 32,
+               "Kanal7_inch": run["x_lvdt"] / 25.4, "Kanal8_rpm": run["n_r"] * 380}  # fmt: skip
+    file = table(tmp_path / "a.csv", columns)
+    mapping = {"Lauf_ms": "t", "Kuehler_degF": "t_oil", "Kanal7_inch": "x_lvdt"}
+    notes = same(file, run, ("n_dem", "t_oil", "x_lvdt"), mapping=mapping)
+    assert sum("as its name says" in n for n in notes) == 3
+    with pytest.raises(LogError, match="Kanal8_rpm.* needs the design speed"):
+        read_log(file, mapping={**mapping, "Kanal8_rpm": "n_r"})
+    same(file, run, ("n_dem", "t_oil", "x_lvdt", "n_r"), mapping={**mapping, "Kanal8_rpm": "n_r"}, design_rpm=38000)
+    seen = survey(file, mapping=mapping)
+    assert {r.signal: r.unit for r in seen.rows}["x_lvdt"] == "inch"  # the mapping file says it too
+    assert seen.bench().units["t_oil"] == "degF"
+
+
 def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:
     assert contradictions({s: (run["t"], run[s]) for s in SIGNALS}, set(SIGNALS)) == {}
 

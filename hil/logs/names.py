@@ -17,7 +17,18 @@ from dataclasses import dataclass, replace
 
 from vaneloop.base.vanes import VANES
 
-__all__ = ["CERTAIN", "Meaning", "bracketed", "is_time", "lacks", "meaning", "spool", "unit_in_name", "unit_kind"]
+__all__ = [
+    "CERTAIN",
+    "Meaning",
+    "bracketed",
+    "is_time",
+    "lacks",
+    "meaning",
+    "spool",
+    "unit_behind",
+    "unit_in_name",
+    "unit_kind",
+]
 
 CERTAIN = 0.98  # of a name that says all that there is to say
 
@@ -203,6 +214,20 @@ def bracketed(name: str) -> str:
     """The unit in the bracket at a name's end; "" without one."""
     m = re.fullmatch(r".*[\[(]([^\[\]()]+)[\])]\s*", name)
     return m[1].strip() if m and (unit_kind(m[1]) or m[1].strip() == "%") else ""
+
+
+def unit_behind(name: str) -> tuple[str, str]:
+    """A name of anything, and the unit behind it, in a bracket or of two letters and more; "" where there is none."""
+    if unit := bracketed(name):
+        return re.split(r"\s*[\[(][^\[(]*$", name)[0], unit
+    text = re.sub(r"(?<=[a-z]{2})(?=[A-Z][A-Za-z])", _CAMEL, _plain(name))
+    for count in (2, 1):
+        parts = list(re.finditer(r"[A-Za-z]+|\d+|%", text))
+        if len(parts) > count:
+            tail = " ".join(p[0].casefold() for p in parts[-count:])
+            if len(tail) > 1 and tail in _UNITS:
+                return text[: parts[-count].start()].replace(_CAMEL, "").rstrip("_ -."), _UNITS[tail]
+    return name, ""
 
 
 def unit_in_name(name: str, said: str = "") -> tuple[tuple[str, ...], str, str]:

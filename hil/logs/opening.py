@@ -15,7 +15,7 @@ from hil.logs.formats import format_of
 from hil.logs.guess import Guess, Guesses, design_speed, withdrawn
 from hil.logs.guess import guess as guess_names
 from hil.logs.mapping import Bench, read_mapping
-from hil.logs.names import CERTAIN, unit_in_name
+from hil.logs.names import CERTAIN, unit_behind, unit_in_name, unit_kind
 from hil.logs.source import LogError, Options, Source, close_names, find
 from hil.logs.table import Table
 from hil.logs.times import guess_unit
@@ -123,6 +123,7 @@ def open_log(
         options.dbc,
         absent,
     )
+    _units_of_names(out, signals, guess)
     if guess:
         _guess_time(path, out)
         out.guesses = guess_names(
@@ -132,10 +133,16 @@ def open_log(
             stated,
             design_rpm,
         )
-        for signal in signals:  # of a system of the user's own: its name in other letters, no more
-            alike = find(source, signal, True) if not keys[signal] and signal not in named else []
-            if len(alike) == 1 and alike[0] not in out.taken and not is_ours(signal, signals):
-                unit = source.series(alike[0]).unit or signals[signal]
+        for signal in signals:  # of a system of the user's own: its name in other letters, with a unit behind, no more
+            if keys[signal] or signal in named or is_ours(signal, signals):
+                continue
+            alike = find(source, signal, True) or [
+                k
+                for k, (name, unit) in ((k, unit_behind(k)) for k in source.names)
+                if name.casefold() == signal.casefold() and isinstance(factor_of(unit, signals[signal]), tuple)
+            ]
+            if len(alike) == 1 and alike[0] not in out.taken:
+                unit = source.series(alike[0]).unit or _said(signal, alike[0], signals[signal]) or signals[signal]
                 out.guesses.made[signal] = Guess(signal, alike[0], unit, CERTAIN, "its name in other letters")
     if out.guesses.made:
         sketch = _sketch(path, out, signals)
@@ -145,6 +152,33 @@ def open_log(
         out.units.setdefault(signal, g.unit)
         notes.append(g.note())
     return out
+
+
+def _said(signal: str, name: str, own: str) -> str:
+    """The unit that a name says, of the kind of the signal's ``own`` and not that one; "" where it says none."""
+    unit = unit_behind(name)[1]
+    speed = signal in ("n_dem", "n_r") and isinstance(factor_of(unit, "rpm"), tuple) if unit else False
+    factor = factor_of(unit, own) if unit and (unit_kind(unit) == "angle") == (unit_kind(own) == "angle") else None
+    return unit if speed or (isinstance(factor, tuple) and not np.allclose(factor, (1.0, 0.0), rtol=1e-12)) else ""
+
+
+def _units_of_names(out: Opened, signals: Mapping[str, str], guess: bool) -> None:
+    """Take the unit that a name says which the user gives, where neither the user nor the file states one; tell it."""
+    mapped = {s: find(out.source, n, True) for s, n in out.named.items() if s in signals and s not in out.units}
+    if isinstance(out.source, Table) and "t" not in out.units and not out.source.time_unit:
+        mapped["t"] = [out.source.time]
+    for signal, keys in mapped.items():
+        own = signals.get(signal, "s")
+        unit = _said(signal, keys[0], own) if len(keys) == 1 else ""
+        stated = "" if not unit or signal == "t" else out.source.series(keys[0]).unit.strip()
+        if not unit or (stated.casefold() not in NO_UNIT and stated != "1"):
+            continue
+        if guess:
+            out.units[signal] = unit
+            taken = f"taken in {unit}, as its name says; --unit {signal}={own} states another"
+        else:
+            taken = f"taken in {own}, though its name says {unit}; --unit {signal}={unit} takes that"
+        out.notes.append(f"{signal} ({keys[0]}): {taken}")
 
 
 def _guess_time(path: Path, out: Opened) -> None:
