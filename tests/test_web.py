@@ -605,6 +605,10 @@ def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Se
     drawn = Path(download.value.path()).read_text()
     assert drawn.count("stroke-dasharray") >= 3  # the other log's name and curve, the reference
     assert all(name in drawn for name in ("renamed.csv", "FAIL_SAFE", "demand_stale")) and "n_dem" not in drawn
+    ticks = [float(x) for x in re.findall(r'text-anchor="middle">([\d.]+)<', drawn)]
+    assert len(ticks) > 3 and len(set(np.diff(ticks).round(6))) == 1 and 8.0 <= ticks[0] < ticks[-1] <= 12.0
+    heights = re.findall(r'y="[\d.]+" text-anchor="end">(-?[\d.,]+)<', drawn)
+    assert len(heights) >= 2 * page.evaluate("document.querySelectorAll('.curves .uplot').length")
     looks(page, "curves")
 
 
@@ -636,7 +640,9 @@ def step(page: Any, name: str) -> None:
 def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page: Any, tmp_path: Path) -> None:
     page.goto(server.at("schedule"))
     page.locator(".loop-log").click()
-    page.get_by_role("option", name="hidden_effect.parquet").click()
+    option = page.get_by_role("option", name="hidden_effect.parquet")
+    assert option.bounding_box()["width"] <= 560  # a list is as wide as what it holds
+    option.click()
 
     # a point of the curve is dragged
     page.get_by_text("As numbers").click()

@@ -27,7 +27,7 @@
       size: 13, color: c.text},
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", xaxis: axis(c), yaxis: axis(c),
     margin: {l: 66, r: 44, t: 44, b: 50}, dragmode: "zoom", showlegend: true,
-    legend: {orientation: "h", x: 0, xanchor: "left", y: 1, yanchor: "bottom", yref: "container"},
+    legend: {orientation: "h", itemsizing: "constant", x: 0, xanchor: "left", y: 1, yanchor: "bottom", yref: "container"},
     hoverlabel: {bgcolor: c.panel, bordercolor: c.muted, font: {color: c.text}},
     modebar: {orientation: "v", bgcolor: "rgba(0,0,0,0)", color: c.muted, activecolor: c.text},
     colorway: [c.measured, c.model, c.target, c.error, c.other]}});
@@ -87,7 +87,7 @@
     }
     if (narrow && painted.layout.meta && painted.layout.meta.wide) element.style.width = "1040px";
     painted.layout.uirevision = "keep";
-    painted.layout.legend = Object.assign({orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container"},
+    painted.layout.legend = Object.assign({orientation: "h", itemsizing: "constant", x: 0, y: 1, yanchor: "top", yref: "container"},
       painted.layout.legend);
     if (width) painted.layout.width = element.closest(".pair") ? width / 2 - 24 : width - 24;
     else painted.layout.autosize = true;

@@ -367,6 +367,10 @@ export default {
         x += 45 + wide(name);
         return `<path d="M${at} 11L${at + 20} 11" stroke-width="2" ${stroke(l)}/><text x="${at + 25}" y="15">${e(name)}</text>`;
       }).join("");
+      const ticks = (p, scale) => { // where uPlot has drawn them, with its words
+        const axis = p.axes.find((a) => a.scale === scale && a._splits) || this.plots.flatMap((o) => o.axes).find((a) => a.scale === scale && a._splits);
+        return axis ? axis._splits.map((v, k) => [v, axis._values[k]]).filter(([v, text]) => text !== null && text !== "" && v >= p.scales[scale].min && v <= p.scales[scale].max) : [];
+      };
       const parts = this.plots.map((p, first) => {
         const panel = this.head.panels[p.panel], h = p.height, dots = devicePixelRatio || 1, box = p.bbox, top = y;
         y += h;
@@ -385,13 +389,13 @@ export default {
         const named = first ? "" : [[(this.head.marks || []).map(([t, text]) => ({ x: x(t), end: x(t), text, role: "bad" })), (m) => top + T + 12 * (m.row + 2)],
           [(this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(L, x(a)), end: x(b), text, role: "text" })), (m) => top + T + H - 4 - 12 * m.row]]
           .map(([list, at]) => this.placed(list.filter((m) => m.end >= L && m.x <= L + W), L, L + W, wide, 4).map((m) => `<text x="${m.from}" y="${at(m)}" fill="${colour(m.role)}">${e(m.text)}</text>`).join("")).join("");
-        const { min, max } = p.scales.y;
-        const words = [[L - 6, top + T + 10, "end", Number(max.toPrecision(4))], [L - 6, top + T + H, "end", Number(min.toPrecision(4))], [L + 4, top + T + 12, "start", panel.title]]
+        const grid = [...ticks(p, "y").map(([v]) => `M${L} ${Y(v)}h${W}`), ...ticks(p, "x").map(([t]) => `M${X(t)} ${top + T}v${H}`)].join("");
+        const words = [...ticks(p, "y").map(([v, text]) => [L - 6, Number(Y(v)) + 4, "end", text]), [L + 4, top + T + 12, "start", panel.title]]
           .map(([x, at, anchor, text]) => `<text x="${x}" y="${at}" text-anchor="${anchor}">${e(text)}</text>`).join("");
-        return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${spans}${floor}${lines}${upright}</g>${named}${words}`;
+        return `<clipPath id="c${p.panel}"><rect x="${L}" y="${top + T}" width="${W}" height="${H}"/></clipPath><rect x="${L}" y="${top + T}" width="${W}" height="${H}" fill="none" stroke="${colour("grid")}"/><path class="grid" d="${grid}" stroke="${colour("grid")}"/><g clip-path="url(#c${p.panel})">${spans}${floor}${lines}${upright}</g>${named}${words}`;
       }).join("");
-      const [a, b] = this.view || this.head.span;
-      const foot = `<text x="66" y="${y + 14}">${Number(a.toPrecision(6))} s</text><text x="${w - 14}" y="${y + 14}" text-anchor="end">${Number(b.toPrecision(6))} s</text>`;
+      const last = this.plots[this.plots.length - 1];
+      const foot = ticks(last, "x").map(([t, text]) => `<text x="${(last.valToPos(t, "x", true) / (devicePixelRatio || 1)).toFixed(1)}" y="${y + 14}" text-anchor="middle">${e(text)}</text>`).join("") + `<text x="${w - 4}" y="${y + 14}" text-anchor="end">s</text>`;
       const text = `<svg xmlns="http://www.w3.org/2000/svg" width="${w}" height="${y + 20}" font-family="sans-serif" font-size="11" fill="${colour("text")}"><rect width="100%" height="100%" fill="${colour("panel")}"/>${legend}${parts}${foot}</svg>`;
       this.save(this.file("svg"), URL.createObjectURL(new Blob([text], { type: "image/svg+xml" })));
     },

@@ -302,7 +302,14 @@ def figure(f: dict[str, Any], dark: bool, height: int | None = None) -> Figure:
         "plot_bgcolor": "rgba(0,0,0,0)",
         "margin": {"l": 60, "r": 24, "t": 26, "b": 42},
         "autosize": True,
-        "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"},
+        "legend": {
+            "orientation": "h",
+            "itemsizing": "constant",
+            "x": 0,
+            "xanchor": "left",
+            "y": 1.02,
+            "yanchor": "bottom",
+        },
         "hoverlabel": {"bgcolor": c["panel"], "bordercolor": c["muted"], "font": {"color": c["text"]}},
         "colorway": [c["measured"], c["model"], c["target"], c["error"], c["other"]],
     }

@@ -102,7 +102,7 @@ class ChosenLog:
 
         ui.select(options, value=at, label="or choose one", on_change=chosen).props(
             "outlined dense options-dense"
-        ).classes("w-full choose")
+        ).classes("choose")
 
     def _other(self) -> None:
         """Other logs laid over this one."""

@@ -189,7 +189,7 @@ class _Page:
 
         ui.select(options, value=at, label="hysteresis log", on_change=chosen).props(
             "outlined dense options-dense"
-        ).classes("w-full loop-log")
+        ).classes("choose loop-log")
 
         def shipped() -> None:
             s.extra["plan"] = Plan.of(s)
