@@ -45,7 +45,7 @@ def replay_page(result: Result, command: str = "", title: str | None = None) -> 
         "All figures",
         "Error is simulated minus reference. The reference is either the signal as the log measured it, or, for vane "
         "angles, the angle that the schedule asks for at the measured rotor speed. The noise floor is the scatter of "
-        "the sensor itself: a perfect model has an RMS error of 1 noise floor, so the last column tells how much is "
+        "the sensor itself: a perfect model has an RMS error of 1 noise floor, so RMS/noise tells how much is "
         "left to explain.",
     )
     _figures_table(page, result.signals)
