@@ -34,7 +34,7 @@ from plant.layout import (
 from plant.places import N_R, POT, SPEED, X
 from vaneloop.base.compiled import compiled, in_place, inlined
 from vaneloop.base.curve import POINTS, between_points
-from vaneloop.base.durations import of_name
+from vaneloop.base.durations import period_of
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
@@ -145,9 +145,8 @@ PLACES = {
 
 def quantity_of(name: str) -> Quantity | None:
     """The quantity of this name, of those in `QUANTITIES` and ``time_every_TIME``; None: there is none."""
-    found = of_name(name, "every")
-    if found and found[0] == "time":
-        return replace(QUANTITIES["time"], name=name, period=found[1])
+    if period := period_of(name):
+        return replace(QUANTITIES["time"], name=name, period=period)
     return QUANTITIES.get(name)
 
 

@@ -303,14 +303,14 @@ def test_what_is_learned_is_counted_where_it_was_asked() -> None:
 
 
 def test_what_is_left_out_is_counted_beside_what_other_laws_say() -> None:
-    def asked(verdict: str, laws: list[dict[str, Any]]) -> Any:
-        said = {"verdict": verdict, "laws": laws, "error": None, "nearest": []}
+    def asked(laws: list[dict[str, Any]], *also: str) -> Any:
+        said = {"verdict": "learned", "laws": laws, "error": None, "nearest": [], "also": also}
         return {**row("left out", ["a.cubic"], [5.0], {}), "learned": json.dumps(said)}
 
     right = {"names": ["a.curve_of_a"], "formulas": ["a^3"], "inside": 0.95, "formula": True}
     narrow = {**right, "inside": 0.5, "formula": False}
     other = {"names": ["b.curve_of_a"], "formulas": []}
-    rows = [asked("learned", [right]), asked("learned", [other, narrow]), asked("learned", [other]), asked("named", [])]
+    rows = [asked([right]), asked([other, narrow]), asked([other]), asked([], "b.gain")]
     s = {k.removeprefix("learned: left out"): (v["hits"], v["of"]) for k, v in hidden_law.summary(rows).items()
          if k.startswith("learned: left out")}  # fmt: skip
     assert s == {

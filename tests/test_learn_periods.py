@@ -20,14 +20,14 @@ from tests.firmware_on_rig import firmware
 from tests.test_learn import TANK
 from tests.test_learn_vanes import columns, curved, law
 from vaneloop import Record
-from vaneloop.base.durations import in_name, of_name, within_no_period
+from vaneloop.base.durations import in_name, of_name, period_of, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import waves_of
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.periods import Course, periods_of
-from vaneloop.discrepancy.models.quantities import every, period_of
+from vaneloop.discrepancy.models.periods import Course, Lines
+from vaneloop.discrepancy.models.quantities import every
 from vaneloop.verbs.learn import learn, learned
 from vaneloop.verbs.search import diagnosed
 
@@ -79,10 +79,10 @@ def course(seed: int, wave: float, f: float, phase: float = 0.0, driver: Array |
 
 @given(st.integers(0, 10_000), st.floats(0.5, 35.0), st.floats(0.4, 3.0))
 def test_a_wave_in_the_error_is_found_and_noise_is_none(seed: int, f: float, wave: float) -> None:
-    (found, *more) = periods_of([course(seed, wave, f)])
+    (found, *more) = Lines([course(seed, wave, f)]).periods()
     assert not more
     assert abs(found - 1.0 / f) * f * f * 40.0 < 0.1  # of a turn, over the whole log
-    assert periods_of([course(seed, 0.0, f)]) == []
+    assert Lines([course(seed, 0.0, f)]).periods() == []
 
 
 @given(st.integers(0, 10_000), st.floats(0.5, 35.0))
@@ -92,16 +92,16 @@ def test_a_gain_that_swings_is_found_beside_the_motion_that_it_acts_on(seed: int
     motion = np.repeat(rng.choice([-1.0, 1.0], 200) * rng.uniform(0.5, 1.5, 200), 20)
     motion -= motion.mean()
     c = plain._replace(error=plain.error + motion * np.sin(2.0 * np.pi * f * plain.t))
-    found = periods_of([c], [motion[None]])
+    found = Lines([c]).periods([motion[None]])
     assert any(abs(p - 1.0 / f) * f * f * 40.0 < 0.2 for p in found)
 
 
 @given(st.integers(0, 10_000), st.floats(0.5, 5.0), st.integers(1, 5))
 def test_what_drives_the_model_has_no_period_of_time(seed: int, f: float, order: int) -> None:
     t = np.arange(4000) * 0.01
-    assert periods_of([course(seed, 3.0, order * f, driver=np.sin(2.0 * np.pi * f * t))]) == []
+    assert Lines([course(seed, 3.0, order * f, driver=np.sin(2.0 * np.pi * f * t))]).periods() == []
     again = np.tile(np.repeat(np.random.default_rng(seed).standard_normal(100), 10), 4)  # the same four times
-    assert periods_of([course(seed, 3.0, order / 10.0 + 1.0, driver=again)]) == []
+    assert Lines([course(seed, 3.0, order / 10.0 + 1.0, driver=again)]).periods() == []
 
 
 def test_of_two_logs_a_driven_line_counts_where_its_phase_is_the_same() -> None:
@@ -109,9 +109,9 @@ def test_of_two_logs_a_driven_line_counts_where_its_phase_is_the_same() -> None:
     rng = np.random.default_rng(1)
     both = [np.sin(2.0 * np.pi * 1.7 * t + p) + 0.5 * rng.standard_normal(len(t)) for p in (0.0, 2.0)]
     alike = [course(k, 2.0, 1.7, 0.3, driver=u) for k, u in enumerate(both)]
-    assert [round(1.0 / p, 2) for p in periods_of(alike)] == [1.7]
+    assert [round(1.0 / p, 2) for p in Lines(alike).periods()] == [1.7]
     unlike = [course(k, 2.0, 1.7, 0.3 + 2.0 * k, driver=u) for k, u in enumerate(both)]
-    assert periods_of(unlike) == []
+    assert Lines(unlike).periods() == []
 
 
 # ---- from a log to a law

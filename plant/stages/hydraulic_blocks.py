@@ -160,38 +160,27 @@ def run(
                     for j in range(W):
                         b.root[j] = speed_factor(supply, 0.0, b.p_ref[j])
                 if loaded and (lossy and (memory or sticky) or memory and (sticky or limited)):
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, True, True, True, True)
+                    _substeps(b, current, k, rated, supply, h, True, True, True, True, True)
                 elif lossy:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, True, False, False, True)
+                    _substeps(b, current, k, rated, supply, h, True, True, False, False, True)
                 elif sticky and limited:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, False, True, False, True)
+                    _substeps(b, current, k, rated, supply, h, True, False, True, False, True)
                 elif loaded and limited:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, False, False, False, True)
+                    _substeps(b, current, k, rated, supply, h, True, False, False, False, True)
                 elif sticky:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, False, True, False, False)
+                    _substeps(b, current, k, rated, supply, h, True, False, True, False, False)
                 elif loaded and memory:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, False, False, True, False)
+                    _substeps(b, current, k, rated, supply, h, True, False, False, True, False)
                 elif loaded:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, True, False, False, False, False)
+                    _substeps(b, current, k, rated, supply, h, True, False, False, False, False)
                 elif limited and memory:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, False, False, False, True, True)
+                    _substeps(b, current, k, rated, supply, h, False, False, False, True, True)
                 elif limited:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, False, False, False, False, True)
+                    _substeps(b, current, k, rated, supply, h, False, False, False, False, True)
                 elif memory:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, False, False, False, True, False)
+                    _substeps(b, current, k, rated, supply, h, False, False, False, True, False)
                 else:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], rated, supply, h, False, False, False, False, False)
+                    _substeps(b, current, k, rated, supply, h, False, False, False, False, False)
             if window > 0 and k % window == 0:
                 for j in range(last):
                     put_where_seen(b, j, true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k]), k == 0)
@@ -222,9 +211,10 @@ def run(
 
 
 @inlined
-def _substep(
+def _substeps(
     b: Any,
-    i_cmd: float,
+    current: np.ndarray,
+    k: int,
     rated: float,
     p_s: float,
     h: float,
@@ -234,20 +224,24 @@ def _substep(
     memory: bool,
     limited: bool,
 ) -> None:
-    """One plant step of every lane of the block under the current ``i_cmd`` (A); ``rated`` (A) that of them all.
+    """The plant steps of row ``k`` of ``current`` (A), of every lane of the block; ``rated`` (A): that of them all.
 
     memory  some of them have hysteresis; the others see `plant.drive.step`
     """
-    share = valve_null_bias.step(i_cmd, 0.0) / rated
-    for j in range(W):
-        if not memory and not limited:  # all lanes have the same current: it is divided once
-            z = drive.step(_state(b, j), _rated_drive(b, j), _feed(b, j), share, p_s, h, loaded, lossy, sticky, limited)
+    for m in range(current.shape[1]):
+        i_cmd = current[k, m]
+        share = valve_null_bias.step(i_cmd, 0.0) / rated
+        for j in range(W):
+            if not memory and not limited:  # all lanes have the same current: it is divided once
+                z = drive.step(
+                    _state(b, j), _rated_drive(b, j), _feed(b, j), share, p_s, h, loaded, lossy, sticky, limited
+                )
+                _put_state(b, j, z)
+                continue
+            i = valve_null_bias.step(i_cmd, b.bias[j])
+            if memory:
+                y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
+                i = valve_hysteresis.mean(y1, y2, y3, y4)
+                b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+            z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky, limited)
             _put_state(b, j, z)
-            continue
-        i = valve_null_bias.step(i_cmd, b.bias[j])
-        if memory:
-            y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
-            i = valve_hysteresis.mean(y1, y2, y3, y4)
-            b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
-        z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky, limited)
-        _put_state(b, j, z)

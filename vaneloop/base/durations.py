@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["in_name", "of_name", "within_no_period"]
+__all__ = ["in_name", "of_name", "period_of", "within_no_period"]
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -22,11 +22,17 @@ def of_name(name: str, word: str) -> tuple[str, float] | None:
     return (found[1], int(found[2]) * UNITS[found[3]]) if found else None
 
 
-def _whole(x: float) -> bool:
-    return abs(x - round(x)) < 1e-10 * x
+def period_of(name: str) -> float:
+    """Period (s) of a quantity ``time_every_TIME``, the time within each; 0: it is another one."""
+    found = of_name(name, "every")
+    return found[1] if found and found[0] == "time" else 0.0
 
 
 def within_no_period(name: str) -> str:
     """A name less the period within which it counts time."""
     found = of_name(name, "every")
     return found[0] if found else name
+
+
+def _whole(x: float) -> bool:
+    return abs(x - round(x)) < 1e-10 * x

@@ -131,21 +131,32 @@ def _parts(commands: dict[str, list[_Taken]]) -> str:
     return "|".join(f'"{name}"' for name in commands if " " in name)
 
 
+def _place(taken: list[_Taken]) -> tuple[tuple[str, ...], str]:
+    """Words that stand at a command's place beside files, and what a shell is told where no file does."""
+    place = next((a for a in taken if not a.flags and a.words), None)
+    return (place.words, " files=" if place.only else "") if place else ((), "")
+
+
+def _with_words(commands: dict[str, list[_Taken]]) -> Iterator[tuple[str, _Taken]]:
+    """Every option that has words, with a shell's pattern of its command and its names."""
+    for name, taken in commands.items():
+        for a in taken:
+            if a.words and a.flags:
+                yield "|".join(f'"{name} {f}"' for f in a.flags), a
+
+
 def _bash() -> str:
     commands = _commands()
     lines, words = [], []
-    for name, all_taken in commands.items():
-        flags = " ".join(f for a in all_taken for f in a.flags)
-        places = [a for a in all_taken if not a.flags and a.words]
-        place = f' place="{" ".join(places[0].words)}"' if places else ""
-        files = " files=" if places and places[0].only else ""
+    for name, taken in commands.items():
+        flags = " ".join(f for a in taken for f in a.flags)
+        own, files = _place(taken)
+        place = f' place="{" ".join(own)}"' if own else ""
         lines.append(f'        "{name}") words="{flags}"{place}{files} ;;')
-        for a in all_taken:
-            if a.words and a.flags:
-                at = "|".join(f'"{name} {f}"' for f in a.flags)
-                more = "" if a.only else ' $(compgen -f -- "$cur")'
-                offered = f'$(compgen -W "{" ".join(a.words)}" -- "$cur")'
-                words.append(f"        {at}) COMPREPLY=({offered}{more}); return ;;")
+    for at, a in _with_words(commands):
+        more = "" if a.only else ' $(compgen -f -- "$cur")'
+        offered = f'$(compgen -W "{" ".join(a.words)}" -- "$cur")'
+        words.append(f"        {at}) COMPREPLY=({offered}{more}); return ;;")
     return "\n".join([
         "_vaneloop() {",
         '    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" name="${COMP_WORDS[1]}"',
@@ -171,17 +182,14 @@ def _zsh() -> str:
 
     commands = _commands()
     lines, words = [], []
-    for name, all_taken in commands.items():
-        flags = " ".join(spec(f, a.about) for a in all_taken for f in a.flags)
-        places = [a for a in all_taken if not a.flags and a.words]
-        place = f" place=({shlex.join(places[0].words)})" if places else ""
-        files = " files=" if places and places[0].only else ""
+    for name, taken in commands.items():
+        flags = " ".join(spec(f, a.about) for a in taken for f in a.flags)
+        own, files = _place(taken)
+        place = f" place=({shlex.join(own)})" if own else ""
         lines.append(f'        "{name}") options=({flags}){place}{files} ;;')
-        for a in all_taken:
-            if a.words and a.flags:
-                at = "|".join(f'"{name} {f}"' for f in a.flags)
-                more = "" if a.only else " _files;"
-                words.append(f"        {at}) compadd -- {shlex.join(a.words)};{more} return ;;")
+    for at, a in _with_words(commands):
+        more = "" if a.only else " _files;"
+        words.append(f"        {at}) compadd -- {shlex.join(a.words)};{more} return ;;")
     return "\n".join([
         "#compdef vaneloop",
         "_vaneloop() {",

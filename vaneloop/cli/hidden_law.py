@@ -137,7 +137,17 @@ def judge_case(
         (h,) = case.hidden
         system = replace(system, without=sorted(case.family.equivalent(h.name)))
         truth = left_out.truth_of(case.family, h, case.greatest.get(h.place, 1.0))
-    said = _said(system, records[:-1], records[-1:], case.floors if learn or leave_out else None, truth)
+    floors = case.floors if learn or leave_out else None
+    said = _said(system, records[:-1], records[-1:], floors, truth)
+    learned, effects, also = said["learned"], said["effects"], set()
+    while leave_out and learned.get("verdict") == "named":  # another law says the same: it is left out, too
+        also |= {name for e in effects for name in (e["effect"], *e["rivals"])}
+        again = _said(
+            replace(system, without=sorted({*system.without, *also})), records[:-1], records[-1:], floors, truth
+        )
+        learned, effects = again["learned"], again["effects"]
+    if leave_out and learned:
+        learned["also"] = sorted(also)
     tried: dict[str, Any] = {}
     if variants and not said["error"]:
         for name, (system, fitted, test) in changes.variants(case, records, nominal.nominal):
@@ -165,7 +175,7 @@ def judge_case(
         "verdict": said["verdict"], "named": [e["effect"] for e in said["effects"]],
         "rivals": json.dumps({e["effect"]: e["rivals"] for e in said["effects"]}), "error": said["error"],
         "seconds": said["seconds"], "intervals": json.dumps(intervals), "variants": json.dumps(tried),
-        "answer": json.dumps(said["answer"]), "learned": json.dumps(said["learned"]),
+        "answer": json.dumps(said["answer"]), "learned": json.dumps(learned),
         "curves": json.dumps(sorted({c for h in case.hidden for c in rig.LEARNED.get((case.family.name, h.name), ())})),
     }  # fmt: skip
 
@@ -264,12 +274,12 @@ def learned_summary(rows: list[Row]) -> dict[str, Any]:
     outside = [(r, said) for r, said in asked if r["kind"] == "outside" and _seen(r)]
     right = [(r, said) for r, said in outside if _learned_right(r, said)]
     gone = [said["laws"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
-    verdicts = [said["verdict"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
+    also = [said["also"] for r, said in asked if r["kind"] == "left out" and _seen(r)]
     curves: list[Row] = [next((law for law in laws if "inside" in law), {}) for laws in gone]
     return {
         "learned: left out of the library, right place and quantity": share([bool(c) for c in curves]),
         "learned: left out, and no other law of the library does as well": share(
-            [bool(c) for c, said in zip(curves, verdicts, strict=True) if said != "named"]
+            [bool(c) for c, others in zip(curves, also, strict=True) if not others]
         ),
         "learned: left out, the curve is the law within its band": share(
             [c.get("inside", 0.0) >= INSIDE for c in curves]

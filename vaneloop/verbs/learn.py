@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vaneloop.base.durations import period_of
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import StageError, System
 from vaneloop.verbs.answer import Answer
@@ -77,8 +78,6 @@ class Learned(Answer):
     @property
     def notes(self) -> list[str]:
         """What the user should know."""
-        from vaneloop.discrepancy.models.quantities import period_of
-
         out = list(self.outcome.notes)
         for law in self.laws:
             if law.untold:

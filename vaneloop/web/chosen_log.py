@@ -80,7 +80,7 @@ class ChosenLog:
                 )
                 self.live.complaint("over")
                 self.live.progress("over")
-                list_of_moments(self.live, lambda: s.moments, lambda t: chart.run_method("moment", t), "log", "over")
+                list_of_moments(self.live, lambda: s.moments, lambda t: chart.run_method("moment", t), "log")
                 chart = Chart("log", tree=True)
             all_channels.props("dense")
             self.live.watch(chart.refetch, "log", "over")

@@ -195,6 +195,7 @@ class Session:
         self.seen = await self.search.call("look", "looking at its names", words=words)
         self.touch("log")
         self.preview = await self.search.call("preview", "reading the log", words=words)
+        self.moments = moments.of_log(self.preview["channels"], self.preview["faults"], self._marks())
         self._draw_log()
         self.touch("log")
         if self.overlays:
@@ -207,16 +208,17 @@ class Session:
             wanted = ", ".join(UNITS)
             raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
 
+    def _marks(self) -> list[Mark]:
+        """What was injected into a run that was recorded here."""
+        return [Mark(t, text) for t, text in self.choice.file.marks] if self.choice.file else []
+
     def _draw_log(self) -> None:
-        """Curves and moments of the log, with what is laid over it."""
+        """Curves of the log, with what is laid over it."""
         if self.preview is None or self.choice.file is None:
             return
-        channels, faults = self.preview["channels"], self.preview["faults"]
-        marks = [Mark(t, text) for t, text in self.choice.file.marks]
         over = [Over(o.file.name, o.channels, o.later) for o in self.overlays if o.channels is not None]
-        spans = moments.fault_bands(faults)
-        self.curves["log"] = of_log(channels, str(self.choice.file.path), over, marks, spans)
-        self.moments = moments.of_log(channels, faults, marks)
+        spans = moments.fault_bands(self.preview["faults"])
+        self.curves["log"] = of_log(self.preview["channels"], str(self.choice.file.path), over, self._marks(), spans)
 
     def lay_over(self, file: LogFile) -> None:
         """Draw another log over this one, read in the same way."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from plant.model import Learned
+from vaneloop.base.durations import period_of
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy.curves import LEVEL
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, period_of
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Effect, Parameter, StageError
 

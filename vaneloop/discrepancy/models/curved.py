@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vaneloop.base.curve import POINTS
+from vaneloop.base.durations import period_of
 from vaneloop.discrepancy.curves import COUNT, Basis, basis_of, waves_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
@@ -19,7 +20,7 @@ from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.periods import Course
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, every, period_of
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, every
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, Effect, Stage

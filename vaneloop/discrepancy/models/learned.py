@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vaneloop.base.curve import POINTS
+from vaneloop.base.durations import period_of
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.error_share import score
 from vaneloop.discrepancy.fit import Fit, Judge
@@ -16,7 +17,6 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.learning import Ground, Tried, with_held_out
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
-from vaneloop.discrepancy.models.quantities import period_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 

@@ -30,7 +30,7 @@ from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.memory import dissipates, named_lag
-from vaneloop.discrepancy.models.periods import Course, periods_of
+from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.promise import Slopes
@@ -455,7 +455,8 @@ class Learner:
             return []
         fit = current.fit
         courses = self.ground.courses(current.curves, fit.theta)
-        out, plain = [], periods_of(courses)
+        lines = Lines(courses)
+        out, plain = [], lines.periods()
         for c in over_time:
             periods = plain
             if c.how.endswith("times"):
@@ -464,7 +465,7 @@ class Learner:
                 values[0] = SMALL
                 curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
                 moved = self.ground.courses(curves, np.concatenate([fit.theta, values]))
-                periods = periods_of(courses, [m.error - w.error for m, w in zip(moved, courses, strict=True)])
+                periods = lines.periods([m.error - w.error for m, w in zip(moved, courses, strict=True)])
             out += [c.every(p) for p in periods]
         return out
 

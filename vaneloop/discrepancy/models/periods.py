@@ -15,7 +15,7 @@ import numpy as np
 
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["Course", "periods_of"]
+__all__ = ["Course", "Lines"]
 
 MOST = 2  # periods of one place that are tried
 CLEAR = 40.0  # times the median power about it: a line; the highest of 100,000 of white noise is 17 times it
@@ -80,37 +80,43 @@ def _coherent(parts: Sequence[_Even], f: float) -> float:
     return float(np.sum(np.abs(total) ** 2))
 
 
-def periods_of(courses: Sequence[Course], times: Sequence[Array] = ()) -> list[float]:
-    """Periods (s) in which the error repeats itself.
+class Lines:
+    """Lines in the errors of some logs, of all frequencies that they can tell."""
 
-    times  what a constant would do to the error at the place that is asked for, log by log; none: the error itself
-    """
-    from scipy.signal import find_peaks
+    def __init__(self, courses: Sequence[Course]):
+        self.courses = courses
+        spans = [float(c.t[-1] - c.t[0]) for c in courses]
+        self.shortest, self.longest = min(spans), max(spans)
+        step = max(span / (len(c.t) - 1) for span, c in zip(spans, courses, strict=True))
+        low, high = CYCLES / self.shortest, 1.0 / (SAMPLES * step)
+        self.f = np.arange(low, high, 1.0 / (FINE * self.longest)) if 2.0 * low < high else np.zeros(0)
+        self.driven = np.array([_driven(c, self.f) for c in courses if len(self.f)])
 
-    weighed = [c.error if not len(times) else c.error * times[k] for k, c in enumerate(courses)]
-    parts = [_even(c.t, w) for c, w in zip(courses, weighed, strict=True)]
-    spans = [float(c.t[-1] - c.t[0]) for c in courses]
-    step = max(span / (len(c.t) - 1) for span, c in zip(spans, courses, strict=True))
-    low, high = CYCLES / min(spans), 1.0 / (SAMPLES * step)
-    if not 2.0 * low < high:
-        return []
-    f = np.arange(low, high, 1.0 / (FINE * max(spans)))
-    own = np.array([_spectrum(part, f) for part in parts])
-    usual = np.array([_about(o) for o in own])
-    driven = np.array([_driven(c, f) for c in courses])
-    alone = np.where(driven, usual, own).sum(axis=0)
+    def periods(self, times: Sequence[Array] = ()) -> list[float]:
+        """Periods (s) in which the error repeats itself.
 
-    def lines(power: Array) -> list[float]:  # the highest first, as far as the length of the logs tells them
-        at = find_peaks(power, CLEAR * usual.sum(axis=0), distance=2 * FINE)[0]
-        return [_highest(parts, f[k], max(spans)) for k in sorted(at, key=lambda k: -power[k])[: 2 * MOST]]
+        times  what a constant would do to the error at the place that is asked for, log by log; none: the error itself
+        """
+        from scipy.signal import find_peaks
 
-    # a line that is driven, too, may be one of time where it has the same phase in every log
-    alike = [g for g in lines(own.sum(axis=0)) if _coherence(parts, g) > ALIKE] if len(parts) > 1 else []
-    out: list[float] = []
-    for g in (*alike, *lines(alone)):
-        if all(abs(g - h) > 2.0 / min(spans) for h in out):
-            out.append(g)
-    return [1.0 / g for g in out[:MOST]]
+        if not len(self.f):
+            return []
+        weighed = [c.error if not len(times) else c.error * times[k] for k, c in enumerate(self.courses)]
+        parts = [_even(c.t, w) for c, w in zip(self.courses, weighed, strict=True)]
+        own = np.array([_spectrum(part, self.f) for part in parts])
+        usual = np.array([_about(o) for o in own])
+
+        def lines(power: Array) -> list[float]:  # the highest first, as far as the length of the logs tells them
+            at = find_peaks(power, CLEAR * usual.sum(axis=0), distance=2 * FINE)[0]
+            return [_highest(parts, self.f[k], self.longest) for k in sorted(at, key=lambda k: -power[k])[: 2 * MOST]]
+
+        # a line that is driven, too, may be one of time where it has the same phase in every log
+        alike = [g for g in lines(own.sum(axis=0)) if _coherence(parts, g) > ALIKE] if len(parts) > 1 else []
+        out: list[float] = []
+        for g in (*alike, *lines(np.where(self.driven, usual, own).sum(axis=0))):
+            if all(abs(g - h) > 2.0 / self.shortest for h in out):
+                out.append(g)
+        return [1.0 / g for g in out[:MOST]]
 
 
 def _highest(parts: Sequence[_Even], f: float, span: float) -> float:
@@ -147,9 +153,7 @@ def _driven(c: Course, f: Array) -> Array:
         lines = (power > CLEAR * _about(power)) & (share > SHARE)
         for order in range(1, ORDERS + 1):
             at = order * fine[lines & (share > (MAIN if order > 1 else SHARE))]
-            if len(at):
-                near = at[np.clip(np.searchsorted(at, f), 1, max(len(at) - 1, 1)) - [[1], [0]]] if len(at) > 1 else at
-                out |= np.min(np.abs(np.atleast_2d(near) - f), axis=0) < width
+            out |= np.searchsorted(at, f - width, "right") < np.searchsorted(at, f + width)
         for again in _repeats(part.rows[0], span / (len(c.t) - 1)):
             out |= np.abs(f * again - np.round(f * again)) < width * again
     return out

@@ -7,13 +7,13 @@ from __future__ import annotations
 import numpy as np
 
 from plant.curve import TURN, turns
-from vaneloop.base.durations import in_name, of_name
+from vaneloop.base.durations import in_name, period_of
 from vaneloop.discrepancy.models.memory import STOPS, lagged, named_lag
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.system import Record
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["DISTANCE", "SINCE", "TIME", "WAY", "column_of", "every", "period_of"]
+__all__ = ["DISTANCE", "SINCE", "TIME", "WAY", "column_of", "every"]
 
 TIME = "time"
 WAY, DISTANCE, SINCE = "direction_of_", "distance_since_reversal_of_", "time_since_reversal_of_"
@@ -22,12 +22,6 @@ WAY, DISTANCE, SINCE = "direction_of_", "distance_since_reversal_of_", "time_sin
 def every(period: float, cycles: float) -> str:
     """Name of the time within each ``period`` (s), to as many digits as so many ``cycles`` tell."""
     return f"{TIME}_every_{in_name(period, max(int(np.ceil(np.log10(200.0 * cycles))), 4))}"
-
-
-def period_of(name: str) -> float:
-    """Period (s) of a quantity that is the time within each; 0: it is another one."""
-    found = of_name(name, "every")
-    return found[1] if found and found[0] == TIME else 0.0
 
 
 def column_of(record: Record, t: Array, name: str) -> Array:
