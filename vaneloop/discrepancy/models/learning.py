@@ -248,7 +248,7 @@ class Learner:
                 )
                 break
             limit = left[best.candidate.name] + RIVAL
-            out.rivals.append([t.candidate.name for t in good if t is not best and left[t.candidate.name] < limit])
+            rivals = [t.candidate.name for t in good if t is not best and left[t.candidate.name] < limit]
             best = self._with_its_lag(current, best, TIMES[1:])
             why = self._harmful(current, best)
             if why:
@@ -256,6 +256,7 @@ class Learner:
                 break
             best = self._settled(current, best)
             out.tried.append(best)
+            out.rivals.append(rivals)
             current, fit = best, best.fit
         if len(out.tried) > 1:
             self._spare_first(out)
