@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import subprocess
@@ -113,6 +114,37 @@ MODULES = {
     "hil.logs.recorder": ("", []),  # it lacks its words
     "hil.bus.broker": ("", []),
 }
+
+
+def test_what_a_number_must_be_is_said_with_the_number() -> None:
+    without = []
+    for file in (ROOT / "vaneloop" / "cli").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
+                said = node.args[0]
+                if isinstance(said, ast.Constant) and "must be" in str(said.value):
+                    without.append(f"{file.name}:{said.lineno} {said.value}")
+    assert without == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["fleet", "demo", "--out", "x", "--logs", "3"], "--logs (=3) must be in [4, 100000]"),
+        (
+            ["fleet", "demo", "--out", "x", "--engines", "9", "--logs", "8"],
+            "--engines (=9) must be in [4, 8], no more than --logs",
+        ),
+        (["fleet", "demo", "--out", "x", "--workers", "0"], "--workers (=0) must be in [1, 64]"),
+        (["hidden-effect", "--logs", "0"], "--logs (=0) must be in [1, 100000]"),
+        (["hidden-effect", "--workers", "65"], "--workers (=65) must be in [1, 64]"),
+        (["hidden-effect", "--duration", "5"], "--duration (=5 s) must be in [30, 1e5]"),
+        (["hidden-effect", "--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
+    ],
+)
+def test_a_number_out_of_range_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_every_module_that_can_be_run_is_in_the_list() -> None:

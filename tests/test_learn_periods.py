@@ -26,6 +26,7 @@ from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import waves_of
 from vaneloop.discrepancy.models.curve_file import from_file
+from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import every
 from vaneloop.verbs.learn import learn, learned
@@ -180,6 +181,18 @@ def test_a_hum_beside_a_gain_that_drifts_is_the_second_law() -> None:
     first, second = answer.laws
     assert first.of == "time" and first.how.endswith("times")
     assert period_of(second.of) == pytest.approx(1.0 / 0.11, rel=1e-3)
+
+
+def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(monkeypatch) -> None:
+    harmful = Learner._harmful
+
+    def second_harms(self, current, best) -> str:
+        return "makes two worse" if current.curves else harmful(self, current, best)
+
+    monkeypatch.setattr(Learner, "_harmful", second_harms)
+    answer = learn([hummed(1, "one", 1.0, 0.4)], HELD, test=[hummed(2, "two", 1.0, 0.4)])
+    (first,) = answer.laws
+    assert first.of == "time" and any("is not learned: makes two worse" in note for note in answer.notes)
 
 
 def test_a_tank_that_does_not_hum_learns_nothing() -> None:

@@ -191,8 +191,12 @@ def _report(args: argparse.Namespace) -> int:
 def _demo(args: argparse.Namespace) -> int:
     from vaneloop.cli.fleet_demo import make
 
-    if not 4 <= args.engines <= args.logs <= 100_000 or not 1 <= args.workers <= 64:
-        raise InputError("--engines must be in [4, logs], --logs in [engines, 100000], --workers in [1, 64]")
+    if not 4 <= args.logs <= 100_000:
+        raise InputError(f"--logs (={args.logs}) must be in [4, 100000]")
+    if not 4 <= args.engines <= args.logs:
+        raise InputError(f"--engines (={args.engines}) must be in [4, {args.logs}], no more than --logs")
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
     if not 30.0 <= args.duration <= 1e5:
         raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
     with terminal.progress_bar(args, "simulating the fleet") as progress:

@@ -579,8 +579,14 @@ def command(args: argparse.Namespace) -> int:
     from hil.loop.lockstep import warm_up
 
     _rig()
-    if not 1 <= args.logs <= 100_000 or not 1 <= args.workers <= 64 or not 30.0 <= args.duration <= 1e5:
-        raise InputError("--logs must be in [1, 100000], --workers in [1, 64], --duration in [30, 100000]")
+    if not 1 <= args.logs <= 100_000:
+        raise InputError(f"--logs (={args.logs}) must be in [1, 100000]")
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    if not 30.0 <= args.duration <= 1e5:
+        raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
+    if args.seed is not None and not 0 <= args.seed < 2**63:
+        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
     machine, path = _machine(args.plant), Path(args.out)
     rows: list[dict[str, Any]] = []
     if path.exists():

@@ -12,6 +12,8 @@ from vaneloop.pages.page import Page
 
 __all__ = ["CampaignView", "GroupView", "Requirement", "campaign_page"]
 
+DIGITS = 6  # of limits: a tolerance may be a thousandth
+
 
 @dataclass(frozen=True)
 class Requirement:
@@ -141,7 +143,8 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
           "search" if g.by_search else "sample"] for g in view.groups],
     )  # fmt: skip
     page.section("What was varied", "Each uniformly and independently of the others, between these limits.")
-    page.table(["quantity", "low", "high", "unit"], [[q["name"], q["low"], q["high"], q["unit"]] for q in view.varied])
+    rows = [[q["name"], q["low"], q["high"], q["unit"]] for q in view.varied]
+    page.table(["quantity", "low", "high", "unit"], rows, digits=DIGITS)
     for g in view.groups:
         _group(page, view, g)
     page.section("Basis")
@@ -164,7 +167,9 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
         page.plot(
             ranking(names, g.total, "share of the least margin's variance (total Sobol index)",
                     notes=[f"({f:.2f} alone)" for f in g.first]),
-            "Which tolerance the least margin depends on.", half=True,
+            "Which tolerance the least margin depends on."
+            + (" A share above 1 is none: it wants more base points (sensitivity)." if max(g.total) > 1.1 else ""),
+            half=True,
         )  # fmt: skip
     order = np.sort(np.array(g.shares))
     line = Line("machines", order, (np.arange(len(order)) + 1.0) / len(order), "model", 2.2)
@@ -177,6 +182,7 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     page.table(
         ["quantity", "worst machine", "low", "high", "unit"],
         [[q["name"], v, q["low"], q["high"], q["unit"]] for q, v in zip(view.varied, g.worst, strict=True)],
+        digits=DIGITS,
     )
     again = "It ran to the same bits" if g.same else "It did NOT run to the same result"
     page.text(f"{again} from its saved files (state {g.state_hash}): {g.command}")

@@ -216,7 +216,8 @@ def _told(
         value = before if s.verdict == "none" else f"{before} → {after}"
         said = word(s, extended)
         if said in (MISSING, EXPLAINED) and s.effects:
-            said = f"{said}: {', '.join(f.effect for f in s.effects)}"
+            names = ", ".join(f.effect for f in s.effects)
+            said = f"{said}, with {names} added" if extended and said == MISSING else f"{said}: {names}"
         page.tile(f"{s.stage}: {s.outputs[k]}", value, "noise floors", f"{said}; {note}", stage_tone(s, extended))
     if experiment:
         _next(page, experiment)

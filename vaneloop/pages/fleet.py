@@ -107,8 +107,9 @@ class FleetView:
         odd = {r["engine"] for r in self.outliers}
         n = len(self.engines)
         return (
-            f"Of {n} engines {len(lack)} lack an effect in the model, {len(change)} change over time, "
-            f"{len(odd)} are unlike their sisters."
+            f"Of {n} engines {len(lack)} {'lacks' if len(lack) == 1 else 'lack'} an effect in the model, {len(change)} "
+            f"{'changes' if len(change) == 1 else 'change'} over time, {len(odd)} {'is' if len(odd) == 1 else 'are'} "
+            f"unlike {'its' if len(odd) == 1 else 'their'} sisters."
         )
 
     def keys(self) -> list[str]:
@@ -206,6 +207,8 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
     if rows:
         columns = ["engine", "quantity", "change", "since", "rate or height", "now", "limit reached", "remark", "log"]
         _table(page, columns, rows)
+    else:
+        page.text("None.")
     for s in view.changed[:SHOWN]:
         page.plot(_drawn(s), f"{s.engine}: {s.quantity}", half=True)
 

@@ -126,14 +126,18 @@ class Page:
         self.parts.append(Plot(len(self.figures), caption, half))
         self.figures.append(figure)
 
-    def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "") -> None:
-        """Add a table; numbers are rounded to three digits and set flush right."""
+    def table(
+        self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "", digits: int = 3
+    ) -> None:
+        """Add a table; numbers are rounded to so many digits and set flush right."""
         e = html.escape
         head = ""
         for i, c in enumerate(columns):
             tag = "th" if c else "td"  # a heading without words is none
             head += f"<{tag}{_right(bool(rows) and all(_is_number(r[i]) for r in rows))}>{e(str(c))}</{tag}>"
-        body = "".join("<tr>" + "".join(f"<td{_kind(v)}>{_cell(v)}</td>" for v in row) + "</tr>\n" for row in rows)
+        body = "".join(
+            "<tr>" + "".join(f"<td{_kind(v)}>{_cell(v, digits)}</td>" for v in row) + "</tr>\n" for row in rows
+        )
         note = f"<caption>{e(caption)}</caption>" if caption else ""
         self.parts.append(
             f'<div class="scroll"{_REGION.format("table")}>'
@@ -255,11 +259,11 @@ def _is_number(value: object) -> bool:
     return value is None or (isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool))
 
 
-def _cell(value: object) -> str:
+def _cell(value: object, digits: int) -> str:
     """Inside of a table cell."""
     if isinstance(value, Link):
         return f'<a href="{html.escape(value.href)}">{html.escape(value.text)}</a>'
-    return html.escape(number(value))
+    return html.escape(number(value, digits))
 
 
 def _kind(value: object) -> str:

@@ -225,8 +225,8 @@ def learned(
             out.nearest += [n for n in one.nearest if n not in out.nearest]
             continue
         last = before_it = learner.judge, learner.base
-        for tried, rivals in zip(one.tried, one.rivals, strict=True):
-            laws.append(law_of(ground, before_it, tried, rivals))
+        for tried in one.tried:
+            laws.append(law_of(ground, before_it, tried))
             last = before_it = tried.judge, tried.fit
         model = _with_stage(_as_model(model, one, laws[-len(one.tried) :]), *last)
     verdict = "learned" if laws else "unknown" if open_ones else "named" if found.effects else "none"
@@ -279,8 +279,8 @@ def _learned(
     if outcome.verdict != "learned":
         return Learned(diagnosed, outcome, [], log=diagnosed.log)
     laws, before = [], (learner.judge, learner.base)
-    for tried, rivals in zip(outcome.tried, outcome.rivals, strict=True):
-        laws.append(law_of(ground, before, tried, rivals))
+    for tried in outcome.tried:
+        laws.append(law_of(ground, before, tried))
         before = tried.judge, tried.fit
     last = outcome.tried[-1]
     names = tuple(e.name for _, e in last.curves)

@@ -111,7 +111,7 @@ class LearnedLaw:
         return f"{does}{said}"
 
 
-def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list[str]) -> LearnedLaw:
+def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLaw:
     """Everything that is said of the last curve of ``tried``."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     table, amplitudes = tried.table()
@@ -123,7 +123,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried, rivals: list
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
-        formulas, c.untold, _trades(tried), rivals,
+        formulas, c.untold, _trades(tried), list(tried.rivals),
     )  # fmt: skip
 
 

@@ -87,6 +87,7 @@ class Tried:
     curves  each as it runs and as the search has it, the new one last
     told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
     levels  log of its error in noise floors, log by log, once that has been simulated
+    rivals  names of candidates that do as well in the new one's place
     """
 
     candidate: Candidate
@@ -96,6 +97,7 @@ class Tried:
     curves: Placings
     told: Fit | None = None
     levels: dict[str, float] | None = None
+    rivals: Sequence[str] = ()
 
     def table(self) -> tuple[Callable[[Array], Array], Array]:
         """From the new curve's amplitudes to its table, and these amplitudes."""
@@ -109,14 +111,13 @@ class Outcome:
     """What learning says.
 
     verdict  learned; named: laws of the library do as well; none: nothing is missing; unknown: no honest law is there
-    tried    the model with its curves, curve by curve; ``rivals``: candidates that do as well in the last one's place
+    tried    the model with its curves, curve by curve
     nearest  the candidates that come nearest, where nothing was learned
     why      in words, where nothing was learned
     """
 
     verdict: str
     tried: list[Tried] = field(default_factory=list)
-    rivals: list[list[str]] = field(default_factory=list)
     nearest: list[str] = field(default_factory=list)
     why: str = ""
     notes: list[str] = field(default_factory=list)
@@ -255,8 +256,7 @@ class Learner:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
                 break
             best = self._settled(current, best)
-            out.tried.append(best)
-            out.rivals.append(rivals)
+            out.tried.append(replace(best, rivals=rivals))
             current, fit = best, best.fit
         if len(out.tried) > 1:
             self._spare_first(out)
@@ -271,7 +271,7 @@ class Learner:
         nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
         alone = self._fitted(nothing, second.candidate, second.wiggle, theta, 16)
         if score(self.judge, alone.fit) <= score(self.judge, second.fit) + BETTER:
-            out.tried, out.rivals = [replace(alone, told=second.told)], out.rivals[1:]
+            out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
 
     def _named(self) -> tuple[Judge, Fit] | None:
         """The best laws of the library, fitted with their held-out errors, where there are any."""
