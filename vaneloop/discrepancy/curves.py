@@ -25,7 +25,8 @@ LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
 LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
 HARMONICS, AROUND = 3, 27  # waves of a curve that repeats itself, and splines that they are made of
-EDGE = 0.001  # share of the visited values beyond the first and the last knot
+EDGE, STRAY = 0.001, 0.25  # share of the visited values at each end that may lie apart; as a share of the others' range,
+# how far apart they are still within the first and the last knot
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     low, high = (float(np.quantile(x, q)) for q in (EDGE, 1.0 - EDGE))
     if not high - low > 1e-12 * max(abs(low), abs(high), 1e-300):
         return None
+    apart = STRAY * (high - low)
+    low, high = max(low - apart, float(x[0])), min(high + apart, float(x[-1]))
     z = (x[(x >= low) & (x <= high)] - low) / (high - low)
     inner = np.quantile(np.unique(z), np.linspace(0.0, 1.0, count - DEGREE + 1)[1:-1])
     inner = np.unique(np.round(inner / RESOLVED)) * RESOLVED

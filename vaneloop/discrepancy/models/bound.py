@@ -18,7 +18,7 @@ from vaneloop.discrepancy.models.stairs import steps_seen
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError
 
-__all__ = ["Bound"]
+__all__ = ["Bound", "rms_of_rows"]
 
 # Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
 # that the user gave, which may be wrong by a factor of ten.
@@ -33,6 +33,13 @@ WINDOWS, LEAST_WINDOW = 60, 10  # of a log that values are first fitted to; samp
 FROM = 4  # of these that a fit begins from, beside the user's own
 MOST_STEPS = 16
 MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
+
+
+def rms_of_rows(error: Array) -> Array:
+    """RMS of each row of an error; NaN of one without a sample."""
+    n = np.isfinite(error).sum(axis=1)
+    return np.where(n > 0, np.sqrt(np.nansum(error**2, axis=1) / np.maximum(n, 1)), np.nan)
+
 
 
 class Bound:
@@ -272,19 +279,10 @@ class Bound:
         out[n_p : n_p + k] = least_squares(error, first, bounds=(low, high), diff_step=1e-3, max_nfev=30).x * size
         return out
 
-    def figures(self, theta: Array) -> dict[str, Array]:
-        """RMS error of every output, log by log."""
+    def errors(self, theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output, log by log; NaN where nothing was measured."""
         e = self.run(theta[None])[0] - self.measured
-        with np.errstate(invalid="ignore"):
-            return {
-                name: np.array(
-                    [
-                        np.sqrt(np.mean(row[np.isfinite(row)] ** 2)) if np.isfinite(row).any() else np.nan
-                        for row in e[:, at]
-                    ]
-                )
-                for name, at in self.logs.items()
-            }
+        return {name: e[:, at] for name, at in self.logs.items()}
 
     def _starts(self) -> list[Parameter]:
         """Initial states that no log tells, or that the user wants fitted, as parameters to fit."""

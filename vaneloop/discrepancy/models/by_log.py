@@ -19,7 +19,7 @@ from vaneloop.discrepancy.diagnose import Judged
 from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.laws import HYSTERETIC
-from vaneloop.discrepancy.models.bound import Bound
+from vaneloop.discrepancy.models.bound import Bound, rms_of_rows
 from vaneloop.discrepancy.models.doubts import doubts
 from vaneloop.discrepancy.models.runner import STARTS_LOADED
 from vaneloop.discrepancy.models.system import Record, System
@@ -38,12 +38,16 @@ class Logs:
     fitted: Bound
     test: Bound | None
 
+    def errors(self, theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output, log by log; NaN where nothing was measured."""
+        out = self.fitted.errors(theta)
+        if self.test is not None:
+            out |= self.test.errors(self.test.theta_from(self.fitted, theta))
+        return out
+
     def figures(self, theta: Array) -> dict[str, Array]:
         """RMS error of every output, log by log."""
-        out = self.fitted.figures(theta)
-        if self.test is not None:
-            out |= self.test.figures(self.test.theta_from(self.fitted, theta))
-        return out
+        return {log: rms_of_rows(e) for log, e in self.errors(theta).items()}
 
     def judged(self) -> Judged:
         """What earns a law its place: its share of the error, and what the test logs say."""

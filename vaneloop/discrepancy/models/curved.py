@@ -393,9 +393,24 @@ class OwnGround:
         starts = len(self.logs.fitted.system.parameters) + len(self.logs.fitted.runner.free_starts)
         return candidates(with_curves(self.logs.fitted, (), ()), theta[:starts])
 
-    def figures(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
-        """RMS error of each output, log by log, test logs too."""
-        return on_logs(self.logs, curves).figures(theta)
+    def errors(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output in noise floors, log by log, test logs too."""
+        return {log: e / self.floor[:, None] for log, e in on_logs(self.logs, curves).errors(theta).items()}
+
+    def within(self, candidate: Candidate) -> dict[str, Array]:
+        """Of test logs, the samples where a candidate's quantity is where its curve was learned."""
+        test, q = self.logs.test, candidate.quantity
+        if test is None or q.stops:
+            return {}
+        if q.of == COLUMN:
+            values = np.concatenate([test.data.column(k, q.name) for k in range(len(test.data.records))])
+        else:
+            starts = len(test.system.parameters) + len(test.runner.free_starts)
+            plain = with_curves(test, (), ())
+            own = [p.value for p in plain.stage.parameters[:starts]]
+            values = next(o.visited for o in quantities(plain, np.array(own)) if o.name == q.name)
+        inside = (values >= candidate.basis.low) & (values <= candidate.basis.high)
+        return {log: inside[at] for log, at in test.logs.items()}
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""

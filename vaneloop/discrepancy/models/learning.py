@@ -9,7 +9,7 @@ laws with names it must do clearly better than the best of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -28,6 +28,7 @@ from vaneloop.discrepancy.error_share import (
 )
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.locate import agrees
+from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.memory import dissipates, named_lag
 from vaneloop.discrepancy.models.periods import Course, Lines
@@ -46,6 +47,7 @@ QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of th
 SURE = 3  # of the latter that are chosen by data left out
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
+PLAINER = 2  # more that are fitted to the end, where the best multiplies: of its quantity, that add
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
@@ -73,8 +75,11 @@ class Ground(Protocol):
     def candidates(self, theta: Array) -> list[Candidate]:
         """Every curve that may be missing, at parameters ``theta`` of a stage without any."""
 
-    def figures(self, curves: Placings, theta: Array) -> dict[str, Array]:
-        """RMS error of each output, log by log, test logs too."""
+    def errors(self, curves: Placings, theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output in noise floors, log by log, test logs too; NaN where none is known."""
+
+    def within(self, candidate: Candidate) -> dict[str, Array]:
+        """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
 
     def courses(self, curves: Placings, theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""
@@ -86,7 +91,7 @@ class Tried:
 
     curves  each as it runs and as the search has it, the new one last
     told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
-    levels  log of its error in noise floors, log by log, once that has been simulated
+    errors  in noise floors, log by log, once they have been simulated
     rivals  names of candidates that do as well in the new one's place
     """
 
@@ -96,7 +101,7 @@ class Tried:
     fit: Fit
     curves: Placings
     told: Fit | None = None
-    levels: dict[str, float] | None = None
+    errors: dict[str, Array] | None = None
     rivals: Sequence[str] = ()
 
     def table(self) -> tuple[Callable[[Array], Array], Array]:
@@ -240,6 +245,7 @@ class Learner:
             left = {t.candidate.name: self._left(current, t) for t in good}
             good.sort(key=lambda t: left[t.candidate.name])
             near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
+            near += [t for t in good if t not in near and self._plainer(current, t, good[0])]
             near.sort(key=lambda t: (_strange(t.candidate), t.candidate.how.endswith("times")))
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
@@ -316,8 +322,21 @@ class Learner:
 
     def _left(self, before: Tried, tried: Tried) -> float:
         """Log of the held-out error that a curve leaves, and of what it makes of the test logs' error."""
-        tests = [v for log, v in self._change(before, tried).items() if log in self.ground.tests]
+        change = self._change(before, tried, self.ground.within(tried.candidate))
+        tests = [v for log, v in change.items() if log in self.ground.tests]
         return score(self.judge, tried.fit) + (float(np.mean(tests)) if tests else 0.0)
+
+    def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
+        """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
+        place before it: a damping times a function of the speed is a force that is one of the speed.
+        """
+        one, other = tried.candidate, best.candidate
+        if one.quantity.name != other.quantity.name or one.how.endswith("times") or not other.how.endswith("times"):
+            return False
+        if worth(self.judge, tried.fit, best.fit, self.form.form).good:
+            return False
+        mine, its = (self._left(before, t) - score(self.judge, t.fit) for t in (tried, best))
+        return mine < its + HARM  # on test logs
 
     def _confirmed(self, before: Tried, tried: Tried) -> bool:
         """Whether another log, or another amplitude, says the same of a curve that remembers.
@@ -403,16 +422,25 @@ class Learner:
         first, others = quick[:SURE], quick[SURE:]
         others.sort(key=lambda t: float(t.fit.cost.sum()))
         for k, t in enumerate([*first, *others[: FINISHED - SURE]]):
-            options = [self._fitted(current, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
-            done.append(self._with_its_lag(current, min(options, key=lambda o: score(self.judge, o.fit)), TIMES[:1]))
+            done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
         done.sort(key=lambda t: score(self.judge, t.fit))
+        if done and done[0].candidate.how.endswith("times"):  # what adds may say the same, and is plainer
+            of, have = done[0].candidate.quantity.name, {t.candidate.name for t in done}
+            adds = [t for t in quick if t.candidate.quantity.name == of and not t.candidate.how.endswith("times")]
+            done += [self._finished(current, t) for t in adds[:PLAINER] if t.candidate.name not in have]
+            done.sort(key=lambda t: score(self.judge, t.fit))
         if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
             finer = [f for t in done[:FINER] if (f := self._finer(current, t)) is not None]
             done = sorted([*done, *finer], key=lambda t: score(self.judge, t.fit))
             best = {t.candidate.name: t for t in reversed(done)}
             done = [t for t in done if best[t.candidate.name] is t]
         return done
+
+    def _finished(self, current: Tried, quick: Tried) -> Tried:
+        """A candidate fitted to the end, as smooth and with the lag that suits it best."""
+        options = [self._fitted(current, quick.candidate, w, quick.fit.theta, 12) for w in WIGGLES]
+        return self._with_its_lag(current, min(options, key=lambda o: score(self.judge, o.fit)), TIMES[:1])
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
@@ -514,14 +542,17 @@ class Learner:
             return f"no log is better by {LEAST_USE:.0%} for it"
         return ""
 
-    def _change(self, before: Tried, tried: Tried) -> dict[str, float]:
-        """Log of the error with a curve over that without, log by log."""
-        was, now = self._levels(before), self._levels(tried)
+    def _change(self, before: Tried, tried: Tried, part: Mapping[str, Array] | None = None) -> dict[str, float]:
+        """Log of the error with a curve over that without, log by log; ``part``: of these logs, of these samples."""
+        was, now = self._levels(before, part or {}), self._levels(tried, part or {})
         return {log: now[log] - was[log] for log in was if log in now}
 
-    def _levels(self, of: Tried) -> dict[str, float]:
-        if of.levels is None:
-            by = self.ground.figures(of.curves, of.fit.theta)
-            good = {log: v for log, v in by.items() if np.isfinite(v).all()}
-            of.levels = {log: float(np.log(np.maximum(v / self.ground.floor, 1.0)).mean()) for log, v in good.items()}
-        return of.levels
+    def _levels(self, of: Tried, part: Mapping[str, Array]) -> dict[str, float]:
+        if of.errors is None:
+            of.errors = self.ground.errors(of.curves, of.fit.theta)
+        out = {}
+        for log, e in of.errors.items():
+            rms = rms_of_rows(e[:, part[log]] if log in part else e)
+            if np.isfinite(rms).all():
+                out[log] = float(np.log(np.maximum(rms, 1.0)).mean())
+        return out

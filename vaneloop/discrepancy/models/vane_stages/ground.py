@@ -147,8 +147,10 @@ class VaneGround:
         """The same stage with only these laws of the library, and these curves, as effects."""
         return remade(self.small if quick else self.whole, laws, curves)
 
-    def figures(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
-        """RMS error of each output on what was fitted, and on the rest of the log where there is one."""
+    def errors(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output in noise floors: of what was fitted, of the rest of the log where there
+        is one, and of the test log.
+        """
         rest = self.rest if REST in self.tests else np.zeros(len(self.all.t), dtype=bool)
         asked = [(LOG, self.all, ~rest), (REST, self.all, rest), (TEST, self.test, None)]
         out = {}
@@ -156,8 +158,20 @@ class VaneGround:
             if stage is None or (name == REST and REST not in self.tests):
                 continue
             judge = Judge(remade(stage, (), curves), self.floor, part)
-            error = judge.errors(theta[None])[0] * judge.floor[:, None]
-            out[name] = np.sqrt(np.sum(error**2, axis=1, where=judge.valid) / np.maximum(judge.valid.sum(axis=1), 1))
+            out[name] = np.where(judge.valid, judge.errors(theta[None])[0], np.nan)
+        return out
+
+    def within(self, candidate: Candidate) -> dict[str, Array]:
+        """Of the rest of the log and of the test log, the samples where a candidate's quantity is where its curve was
+        learned.
+        """
+        out = {}
+        for name, stage in ((REST, self.all), (TEST, self.test)):
+            if name in self.tests and stage is not None:
+                assert isinstance(stage.made, Made)
+                values = stage.made.driven.quantity(candidate.quantity.name)
+                if values is not None:
+                    out[name] = (values >= candidate.basis.low) & (values <= candidate.basis.high)
         return out
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
