@@ -25,7 +25,8 @@ def test_functions_have_unit_size_stand_apart_and_bend_more_and_more(seed: int) 
     x = a_log(seed)
     basis = basis_of(x)
     assert basis is not None
-    inside = x[(x >= basis.low) & (x <= basis.high)]
+    rounding = 1e-9 * (basis.high - basis.low)
+    inside = x[(x >= basis.low - rounding) & (x <= basis.high + rounding)]
     functions = np.array([values(basis, inside, e) for e in np.eye(len(basis.bend))])
     assert np.allclose(functions @ functions.T / len(inside), np.eye(len(functions)), atol=0.05)
     assert np.ptp(functions[0]) < 1e-9
@@ -34,6 +35,17 @@ def test_functions_have_unit_size_stand_apart_and_bend_more_and_more(seed: int) 
     assert basis.bend[0] == basis.bend[1] == 0.0 and basis.bend[2] == 1.0 and (np.diff(basis.bend[2:]) >= 0.0).all()
     straight = values(basis, inside, np.array([0.3, -2.0] + [0.0] * (len(functions) - 2)))
     assert np.allclose(np.polyval(np.polyfit(inside, straight, 1), inside), straight, atol=1e-6)
+
+
+@given(st.integers(0, 200), st.floats(0.0, 1e3))
+def test_a_basis_reaches_as_far_as_the_log_but_not_to_a_stray_value(seed: int, times: float) -> None:
+    x = a_log(seed)
+    x = np.append(x, x.max() + times * np.ptp(x))
+    basis = basis_of(x)
+    assert basis is not None
+    low, high = np.quantile(x, [0.001, 0.999])
+    apart = 0.25 * (high - low)
+    assert np.isclose(basis.low, max(x.min(), low - apart)) and np.isclose(basis.high, min(x.max(), high + apart))
 
 
 @pytest.mark.parametrize("x", [np.zeros(100), np.full(100, np.nan), np.arange(5.0)])
