@@ -77,7 +77,7 @@ class Place:
     """Where a curve may act.
 
     at, how  name of the place; "adds" or "times"
-    stage    of the diagnosis that shows it
+    stages   of the diagnosis that show it; first the one that shows it best
     unit, si of the curve, "-" where it multiplies; its factor to SI
     site     number in the plant's parameters
     vane     the only stage that it moves; "": all
@@ -86,7 +86,7 @@ class Place:
 
     at: str
     how: str
-    stage: str
+    stages: tuple[str, ...]
     unit: str
     si: float
     site: int
@@ -116,21 +116,21 @@ QUANTITIES = {
 PLACES = {
     f"{p.at} {p.how}": p
     for p in (
-        Place("controller.demand", "adds", "demand", "mm", 1e-3, DEMAND_ADDS),
-        Place("servo.current", "adds", "servo", "mA", 1e-3, SERVO_ADDS),
-        Place("servo.current", "times", "servo", "-", 1.0, SERVO_TIMES),
-        Place("engine.demand", "adds", "engine", "%", 1.0, ENGINE_ADDS),
-        Place("engine.lag", "times", "engine", "-", 1.0, LAG_TIMES),
-        Place("engine.acceleration", "times", "engine", "-", 1.0, RISE_TIMES),
-        Place("valve.current", "adds", "actuator", "mA", 1e-3, CURRENT_ADDS),
-        Place("actuator.flow_gain", "times", "actuator", "-", 1.0, FLOW_TIMES, kinds=HYDRAULIC),
-        Place("actuator.load", "adds", "actuator", "N", 1.0, LOAD_ADDS),
-        Place("sensors.lvdt", "adds", "linkage", "mm", 1e-3, LVDT_ADDS),
-        Place("sensors.lvdt", "times", "linkage", "-", 1.0, LVDT_TIMES),
-        Place("linkage.ring", "adds", "linkage", "deg", _DEG, RING_ADDS),
-        Place("linkage.play", "adds", "linkage", "deg", _DEG, PLAY_ADDS),
+        Place("controller.demand", "adds", ("demand",), "mm", 1e-3, DEMAND_ADDS),
+        Place("servo.current", "adds", ("servo",), "mA", 1e-3, SERVO_ADDS),
+        Place("servo.current", "times", ("servo",), "-", 1.0, SERVO_TIMES),
+        Place("engine.demand", "adds", ("engine",), "%", 1.0, ENGINE_ADDS),
+        Place("engine.lag", "times", ("engine",), "-", 1.0, LAG_TIMES),
+        Place("engine.acceleration", "times", ("engine",), "-", 1.0, RISE_TIMES),
+        Place("valve.current", "adds", ("actuator",), "mA", 1e-3, CURRENT_ADDS),
+        Place("actuator.flow_gain", "times", ("actuator",), "-", 1.0, FLOW_TIMES, kinds=HYDRAULIC),
+        Place("actuator.load", "adds", ("actuator",), "N", 1.0, LOAD_ADDS),
+        Place("sensors.lvdt", "adds", ("linkage", "actuator"), "mm", 1e-3, LVDT_ADDS),
+        Place("sensors.lvdt", "times", ("linkage",), "-", 1.0, LVDT_TIMES),
+        Place("linkage.ring", "adds", ("linkage",), "deg", _DEG, RING_ADDS),
+        Place("linkage.play", "adds", ("linkage",), "deg", _DEG, PLAY_ADDS),
         *(
-            Place(at, how, "linkage", unit, si, base + 1 + k, v)
+            Place(at, how, ("linkage",), unit, si, base + 1 + k, v)
             for k, v in enumerate(VANES)
             for at, how, unit, si, base in (
                 (f"linkage.{v}_ring", "adds", "deg", _DEG, RING_ADDS),

@@ -95,7 +95,7 @@ def test_a_curve_of_nothing_changes_no_reading() -> None:
 @pytest.mark.parametrize("place", [k for k, p in PLACES.items() if p.vane in ("", "vigv", "vgv1", "vgv2")])
 def test_every_place_acts_in_the_loop(place: str) -> None:
     size = {"-": 0.2, "mm": 0.5, "mA": 2.0, "N": 5e3, "deg": 1.0, "%": 3.0}[PLACES[place].unit]
-    of = "n_dem" if PLACES[place].stage in ("engine", "demand") else "t_oil"
+    of = "n_dem" if PLACES[place].stages[0] in ("engine", "demand") else "t_oil"
     assert not np.array_equal(columns(Model()), columns(curved(law(place, of, "constant", size))), equal_nan=True)
 
 
@@ -124,7 +124,7 @@ def chain(model: Model | None = None):
 def test_in_its_stage_a_curve_is_the_effect_that_it_imitates(what: str) -> None:
     curve, effects = SAME[what]
     log, plain = chain()
-    stage = PLACES[f"{curve.at} {curve.how}"].stage
+    stage = PLACES[f"{curve.at} {curve.how}"].stages[0]
     nominal = plain.stage(stage).run(plain.stage(stage).neutral()[None])[0]
     ours = build_chain(log, build_plant(model=curved(curve))).stage(stage)
     got = ours.run(ours.neutral()[None])[0]
@@ -156,7 +156,7 @@ def test_candidates_are_places_times_quantities_that_say_something() -> None:
         some = ground.candidates(stage.neutral()[: len(stage.parameters)])
         assert some and len({c.name for c in some}) == len(some)
         for c in some:
-            assert PLACES[f"{c.at} {c.how}"].stage == stage.name and c.quantity.name in QUANTITIES
+            assert stage.name in PLACES[f"{c.at} {c.how}"].stages and c.quantity.name in QUANTITIES
         only = remade(stage, (), [(some[0].placed(), some[0].effect(1.0))])
         assert np.allclose(only.run(only.neutral()[None]), stage.run(stage.neutral()[None]), atol=1e-9)
 

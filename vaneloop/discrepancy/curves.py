@@ -25,8 +25,8 @@ LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
 LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
 HARMONICS, AROUND = 3, 27  # waves of a curve that repeats itself, and splines that they are made of
-EDGE, STRAY = 0.001, 0.25  # share of the visited values at each end that may lie apart; as a share of the others' range,
-# how far apart they are still within the first and the last knot
+EDGE = 0.001  # share of the visited values at each end that may lie apart from the others
+STRAY = 0.25  # of the others' range: no further from them are the first and the last knot
 
 
 @dataclass(frozen=True)

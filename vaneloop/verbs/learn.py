@@ -225,10 +225,16 @@ def learned(
             out.nearest += [n for n in one.nearest if n not in out.nearest]
             continue
         last = before_it = learner.judge, learner.base
+        own = []
         for tried in one.tried:
-            laws.append(law_of(ground, before_it, tried))
+            own.append(law_of(ground, before_it, tried))
             last = before_it = tried.judge, tried.fit
-        model = _with_stage(_as_model(model, one, laws[-len(one.tried) :]), *last)
+        new = [k for k, law in enumerate(own) if not any(law.of_the_kind_of(known) for known in laws)]
+        said += [f"{d.stage}: {law.name}: another stage says it, too" for k, law in enumerate(own) if k not in new]
+        laws += [own[k] for k in new]
+        if new:
+            kept = replace(one, tried=[one.tried[k] for k in new])
+            model = _with_stage(_as_model(model, kept, [own[k] for k in new]), *last)
     verdict = "learned" if laws else "unknown" if open_ones else "named" if found.effects else "none"
     why = {
         "named": f"{', '.join(found.effects)} of the library",

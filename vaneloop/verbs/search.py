@@ -426,7 +426,8 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
     for name in dict.fromkeys([*before.effects, *wanted]):
         if law := laws.get(name):
-            where = PLACES[f"{law.at} {law.how}"].stage
+            shown = PLACES[f"{law.at} {law.how}"].stages
+            where = next((s for s in shown if any(s == c.name for c in chain.stages)), shown[0])
             if all(where != c.name for c in chain.stages):
                 why = chain.not_observed.get(where, "not observed")
                 raise InputError(f"{log}: --effect {name}: the log does not show its stage ({where}: {why})")

@@ -41,7 +41,6 @@ def rms_of_rows(error: Array) -> Array:
     return np.where(n > 0, np.sqrt(np.nansum(error**2, axis=1) / np.maximum(n, 1)), np.nan)
 
 
-
 class Bound:
     """A system held against logs: the `Stage`, and which samples belong to which log.
 

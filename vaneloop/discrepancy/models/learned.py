@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vaneloop.base.curve import POINTS
-from vaneloop.base.durations import period_of
+from vaneloop.base.durations import period_of, within_no_period
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.error_share import score
 from vaneloop.discrepancy.fit import Fit, Judge
@@ -85,6 +85,11 @@ class LearnedLaw:
     untold: tuple[int, ...] = ()
     trades: list[str] = field(default_factory=list)
     rivals: list[str] = field(default_factory=list)
+
+    def of_the_kind_of(self, other: LearnedLaw) -> bool:
+        """Whether it does the same, at the same place and of the same quantity, whatever its curve and its period."""
+        mine, its = (within_no_period(law.of) for law in (self, other))
+        return (self.how, self.at, mine) == (other.how, other.at, its)
 
     def sentence(self) -> str:
         """What it is, in words."""
@@ -189,10 +194,10 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
     visited = np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
     at_visited = np.interp(visited, x, y)
     shaped = []
-    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line
+    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line, or a constant
     warm = c.quantity.unit in DEGREES
     for form in FORMS:
-        if (few and form.name != "line") or (not warm and form.name == "Arrhenius"):
+        if (few and form.name not in ("constant", "line")) or (not warm and form.name == "Arrhenius"):
             continue
         if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
             continue

@@ -209,12 +209,12 @@ class VaneGround:
                 known.append((Quantity(signal.name, signal.unit, COLUMN, values[rows]), basis))
         out = []
         for number, place in enumerate(ALL_PLACES):
-            if place.stage != stage.name or driven.machine.kind not in place.kinds:
+            if stage.name not in place.stages or driven.machine.kind not in place.kinds:
                 continue
             if place.vane and place.vane not in stage.outputs:
                 continue
             for q, basis in known:
-                if self._idle(place, q.name):
+                if self._idle(place, q.name, stage.name):
                     continue
                 word = "gain" if place.how == "times" else "curve"
                 name = f"{place.at}.{word}_of_{q.name}"
@@ -223,18 +223,20 @@ class VaneGround:
                 out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis, near))
         return out
 
-    def _idle(self, place: Place, q: str) -> bool:
-        """Whether a curve there would say nothing of its own."""
+    def _idle(self, place: Place, q: str, stage: str) -> bool:
+        """Whether a curve there would say nothing of its own in a stage."""
         own = OWN.get(place.at, place.at.removeprefix("sensors."))
         if q == own and place.how == "times":
             return True
-        if place.stage == "demand":
+        if stage == "demand":
             return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
-        if place.stage == "engine":
+        if stage == "engine":
             return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
-        if place.stage == "servo":
+        if stage == "servo":
             return q in VANES
-        if place.stage == "actuator":
+        if place.at == "sensors.lvdt" and stage == "actuator":  # a reading's curve of what the drive does is one of it
+            return q not in ("time", "p_s")
+        if stage == "actuator":
             return q in VANES or q == "x_dem"
         return q in ("i_cmd", "x_dem", "n_dem")
 
