@@ -30,8 +30,9 @@ from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import begin, text_of
+from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import candidates, with_curves
+from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
 from vaneloop.discrepancy.models.learning import held_out
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
@@ -541,3 +542,50 @@ def test_a_curve_that_is_known_to_rise_from_zero_is_learned_so() -> None:
 def test_a_shape_that_no_curve_has_is_refused(shape: list[str]) -> None:
     with pytest.raises(InputError, match=r"^shape \(="):
         learn([bent_valve()], VALVE, shape=shape)
+
+
+def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
+    run = run_of_a_tank()
+    further = replace(run, name="further", columns={**run.columns, "oil": run.columns["oil"] + 15.0})
+    ground = OwnGround(bind(TANK, [run], [further]))
+    every = ground.candidates(TANK.bind([run]).stage.neutral()[:2])
+    assert {c.quantity.name for c in every} >= {"oil", "pump", "level", "time", "direction_of_pump"}
+    for c in every:
+        if c.quantity.stops:
+            assert not ground.within(c)
+            continue
+        inside = ground.within(c)["further"]
+        if c.quantity.name == "oil":
+            oil = further.columns["oil"]
+            assert np.array_equal(inside, (oil >= c.basis.low) & (oil <= c.basis.high)) and 0.4 < inside.mean() < 0.9
+        elif not c.quantity.remembers:
+            assert inside.mean() > 0.99, c.name
+
+
+def boom(seed: int, size: float) -> Record:
+    """A boom that is moved, with a spring that nobody listed: 40 cos(angle) is its weight, 14 angle the spring."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 60.0, 0.02)
+    angle = sum(
+        size * rng.uniform(0.3, 1.0) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (0.05, 0.11, 0.23)
+    )
+    speed = np.gradient(angle, t)
+    torque = 2.0 * np.gradient(speed, t) + 40.0 * np.cos(angle) + 5.0 * speed + 14.0 * angle
+    return Record(f"boom {seed}", t, {"angle": angle, "torque": torque + 0.01 * rng.standard_normal(len(t))})
+
+
+def test_a_force_is_not_said_as_a_gain_of_a_parameter() -> None:
+    """The weight times a function of the angle is any function of the angle: what adds is said first."""
+
+    def model(u, p):
+        return p.inertia * u.acceleration + p.weight * np.cos(u.position) + p.viscous * u.velocity
+
+    parameters = [unknown("inertia", 1.0, "t m^2", low=0.0), unknown("weight", 60.0, "kN m")]
+    system = System(
+        "boom", "force", model, position="angle", units={"position": "rad"}, outputs={"torque": "kN m"},
+        parameters=[*parameters, unknown("viscous", 2.0, "kN m s/rad", low=0.0)], cutoff=1.5,
+        without=["force.spring", "force.cubic_spring", "force.elastic_plastic", "force.bouc_wen"],
+    )  # fmt: skip
+    said = learn([boom(1, 0.3)], system, test=[boom(2, 0.4)])
+    assert [law.name for law in said.laws] == ["force.curve_of_position"] and said.laws[0].formulas
+    slope = np.polyfit(said.laws[0].x, said.laws[0].y, 1)[0]
+    assert slope == pytest.approx(14.0, rel=0.05) or 1 in said.laws[0].untold
