@@ -28,7 +28,7 @@ from vaneloop.pages.failures import failure_map
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.replay import replay_page
-from vaneloop.pages.series import MAX_POINTS, decimate
+from vaneloop.pages.series import MAX_POINTS, decimate, distribution
 from vaneloop.pages.story import falling, worths
 from vaneloop.pages.style import THEMES, number
 
@@ -85,10 +85,7 @@ def full_page(name="vigv"):
     page.plot(loop([Line(name, t, t)], name, name), name, half=True)
     page.plot(bars([name, "b"], {name: [1.0, None]}, name, marks={name: 0.5}), name)
     page.plot(waterfall([(name, 1.0), ("effect", 0.3), ("end", 0.2)], name, floor=0.1), name)
-    page.plot(
-        ranking([name, "b"], [0.9, 0.1], name, notes=[name, ""], highlight=[name], low=[0.8, 0.0], high=[0.95, 0.2]),
-        name,
-    )
+    page.plot(ranking([name, "b"], [0.9, 0.1], name, highlight=[name], low=[0.8, 0.0], high=[0.95, 0.2]), name)
     page.plot(heat([[1.0, None], [0.2, 0.3]], [name, "c"], [name, "r"], name, name, name), name)
     return page
 
@@ -220,6 +217,21 @@ def test_a_spike_of_one_sample_survives():
     y[1_234_567] = 1.0
     x, v = decimate(np.arange(y.size) * 1e-3, y)
     assert v.max() == 1.0 and x[v.argmax()] == 1234.567
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(-8000, 8000).map(lambda k: k / 8), min_size=1, max_size=60))
+def test_a_distribution_is_drawn_in_steps(values):
+    """At every place the line stands at the share of values that are not above it, far values too."""
+    drawn = overlay([Panel("share", [Line("all", *distribution(values))])])["data"][0]
+    x, y = unpack(drawn["x"]), unpack(drawn["y"])
+    assert np.all((np.diff(x) == 0.0) | (np.diff(y) == 0.0)) and np.isfinite(y).all()
+    for v in values:
+        assert y[x == v].max() == pytest.approx(np.mean(np.array(values) <= v))
+
+
+def test_float_noise_adds_no_digits_to_a_number():
+    assert [number(v, 6) for v in (497.27000000000004, 0.1 + 0.2, 1.68 * (1 + 2e-16))] == ["497.27", "0.3", "1.68"]
 
 
 @pytest.mark.parametrize("n", [500, 100_000])

@@ -24,6 +24,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hil.logs.survey import survey
 from tests.browser import CHROMIUM, LONG, SHOTS, WHY_NOT, look_at, shot, violations
 from tests.conftest import ROOT
 from tests.test_realtime import ON_TIME_US
@@ -104,6 +105,7 @@ def renamed(path: Path) -> None:
     other = {"n_dem": ("N1_DEM", 380.0), "n_r": ("N1", 380.0), "x_lvdt": ("ACT_POS", 1e-3)}
     other |= {name: (name, 1.0) for name in ("x_dem", "i_cmd")}
     columns = {name: log.channels[signal].values[:3000] * scale for signal, (name, scale) in other.items()}
+    columns["Fuel"] = log.channels["n_r"].values[:3000] * 0.1  # no signal of ours
     table = np.column_stack([log.channels["n_r"].t[:3000], *columns.values()])
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(["t", *columns]), comments="")
 
@@ -408,6 +410,8 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     page.get_by_text(re.compile("guessed, 8. % sure")).first.wait_for()
     assert page.locator(".spark").count() >= 4
     page.get_by_text("--design-rpm 38000, if that is 100 %").first.wait_for()
+    # what the log has beside them is named, with the reason, in the words of `vaneloop map`
+    assert page.locator(".unused li").all_inner_texts() == survey(server.folder / "renamed.csv").unused() != []
     looks(page, "guessed")
     for ours, name in (("n_dem", "N1_DEM"), ("n_r", "N1"), ("x_lvdt", "ACT_POS")):
         page.get_by_label(f"name of {ours} in the log").fill(name)

@@ -21,6 +21,7 @@ from vaneloop.base.signals import UNITS
 
 __all__ = ["Row", "Survey", "sparkline", "survey"]
 
+MOST_LISTED = 20  # names with one reason
 _BLOCKS = "▁▂▃▄▅▆▇█"
 
 
@@ -73,6 +74,15 @@ class Survey:
     def guessed(self) -> bool:
         """Whether anything is guessed."""
         return any(r.how == "guessed" for r in self.rows)
+
+    def unused(self) -> list[str]:
+        """What the log has and is not used, a line a reason: the names, and why."""
+        out = []
+        for why in dict.fromkeys(self.other.values()):
+            names = [n for n, w in self.other.items() if w == why]
+            more = f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+            out.append(f"{', '.join(names[:MOST_LISTED])}{more}{f': {why}' if why else ''}")
+        return out
 
     def bench(self) -> Bench:
         """The mapping file that says all that is shown here."""

@@ -50,11 +50,8 @@ def command(args: argparse.Namespace) -> int:
     )  # fmt: skip
     for signal, why in seen.open.items():
         terminal.say(args, f"open: {signal}: {why}")
-    if seen.other:
-        for why in dict.fromkeys(seen.other.values()):
-            names = [n for n, w in seen.other.items() if w == why]
-            more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-            terminal.say(args, f"not used: {', '.join(names[:20])}{more}{f': {why}' if why else ''}")
+    for line in seen.unused():
+        terminal.say(args, f"not used: {line}")
     for note in seen.notes:
         if "guessed to be" not in note and not any(note.startswith(f"{s}: {w}") for s, w in seen.open.items()):
             terminal.say(args, f"note: {note}")

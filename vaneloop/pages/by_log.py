@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from vaneloop.discrepancy.models.by_log import NO_HELP, ByLog
-from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
+from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 
 __all__ = ["curves_by_log", "heads", "log_by_log", "short_names"]
@@ -42,7 +42,7 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
         "alone. A law that only imitates what is missing makes some test log worse.",
     )
     rows = [[short.get(log, log), what, d.outputs[k], *errors, d.units[k]] for log, what, k, errors, _ in by_log.rows()]
-    page.table(["log", "", "signal", *heads(by_log), "unit"], rows)
+    page.table(["log", "fitted or test", "signal", *heads(by_log), "unit"], rows)
     if by_log.ablation:
         names = list(by_log.ablation)
         page.section(
@@ -87,16 +87,16 @@ def curves_by_log(page: Page, by_log: ByLog) -> None:
             t = bound.t[at] - bound.t[at][0]
             for i, output in enumerate(d.outputs):
                 m = bound.measured[i, at]
-                lines = [Line("measured", t, m, "measured"), Line("as given", t, y[0, i, at], "error", 1.0)]
+                lines = [Line("measured", t, m, "measured", UNDER), Line("as given", t, y[0, i, at], "error", 1.0)]
                 errors = [Line("as given", t, m - y[0, i, at], "error", 1.0)]
                 if not looks:
-                    lines.append(Line("with the laws", t, y[1, i, at], "model"))
+                    lines.append(Line("with the laws", t, y[1, i, at], "model", 1.0))
                     errors.append(Line("with the laws", t, m - y[1, i, at], "model"))
                 panels += [Panel(f"{output} [{d.units[i]}]", lines, height=1.2), Panel(f"error [{d.units[i]}]", errors)]
             page.plot(overlay(panels), f"{name} ({'fitted' if bound is by_log.logs.fitted else 'test'}).")
             if bound.system.kind == "force" and d.outputs:
                 x, m = np.concatenate(bound.u, axis=1)[0, at], bound.measured[0, at]
-                lines = [Line("measured", x, m, "measured", 1.0), Line("as given", x, y[0, 0, at], "error", 1.0)]
+                lines = [Line("measured", x, m, "measured", UNDER), Line("as given", x, y[0, 0, at], "error", 1.0)]
                 if not looks:
                     lines.append(Line("with the laws", x, y[1, 0, at], "model", 1.0))
                 over = f"displacement [{bound.system.units.get('position', 'm')}]"

@@ -9,6 +9,7 @@ import numpy as np
 
 from vaneloop.pages.figures import Line, Panel, overlay, ranking
 from vaneloop.pages.page import Page
+from vaneloop.pages.series import distribution
 
 __all__ = ["CampaignView", "GroupView", "Requirement", "campaign_page"]
 
@@ -107,9 +108,10 @@ class CampaignView:
         near = min(self.groups, key=lambda g: g.least)
         rule = "no claim may break" if self.allowed is None else f"at most {self.allowed:g} of the machines may fail"
         n = len(self.groups)
+        what = "is broken most" if near.least < 0.0 else "comes closest to failing"
         return (
             f"{n - len(bad)} of {n} combinations of scenario, calibration and firmware pass ({rule}); "
-            f"{near.name} comes closest to failing, with a least margin of {near.least:.3g} of what is allowed."
+            f"{near.name} {what}, with a least margin of {near.least:.3g} of what is allowed."
         )
 
     def json(self) -> dict[str, Any]:
@@ -164,17 +166,22 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
                          for r in g.requirements])  # fmt: skip
     names = [q["name"] for q in view.varied]
     if g.total:
+        total, first = np.round(g.total, 3).tolist(), np.round(g.first, 3).tolist()
         page.plot(
-            ranking(names, g.total, "share of the least margin's variance (total Sobol index)",
-                    notes=[f"({f:.2f} alone)" for f in g.first]),
-            "Which tolerance the least margin depends on."
-            + (" A share above 1 is none: it wants more base points (sensitivity)." if max(g.total) > 1.1 else ""),
+            ranking(names, total, "total Sobol index"),
+            "Which tolerance the least margin depends on: the share of its variance that a quantity has, alone and "
+            "together with others."
+            + (" A share above 1 is none: it wants more base points (sensitivity)." if max(total) > 1.1 else ""),
             half=True,
-        )  # fmt: skip
-    order = np.sort(np.array(g.shares))
-    line = Line("machines", order, (np.arange(len(order)) + 1.0) / len(order), "model", 2.2)
+        )
+    line = Line("machines", *distribution(g.shares), "model", 2.2)
     page.plot(overlay([Panel("share of machines", [line])], "least margin at or below", 320),
               "How the least margin is spread over the machines.", half=True)  # fmt: skip
+    if g.total:
+        page.table(
+            ["quantity", "share of the variance, alone", "with others (total)"],
+            sorted(zip(names, first, total, strict=True), key=lambda row: -row[2]),
+        )
     how = f"by the search ({g.runs} runs)"
     if not g.by_search:
         how = f"among the samples; {f'the search ({g.runs} runs) found none' if g.runs else 'no search was made'}"

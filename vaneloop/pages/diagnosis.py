@@ -17,7 +17,7 @@ from vaneloop.discrepancy.stage_answer import StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.failures import failure_map, worst_cell
-from vaneloop.pages.figures import Line, Panel, loop, overlay, ranking, waterfall
+from vaneloop.pages.figures import UNDER, Line, Panel, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import (
     CANNOT,
@@ -212,8 +212,10 @@ def _told(
     """Fill the page of a diagnosis, of an extended model or of the next experiment."""
     for s in d.stages:
         k, before, after = fall(s)
-        note = f"{number(s.error_before[k])} to {number(s.error_after[k])} {s.units[k]}; floor {number(s.floor[k])}"
-        value = before if s.verdict == "none" else f"{before} → {after}"
+        moved = s.verdict != "none"
+        note = f"{number(s.error_before[k])}{f' to {number(s.error_after[k])}' if moved else ''} {s.units[k]}"
+        note += f"; noise floor {number(s.floor[k])}"
+        value = f"{before} → {after}" if moved else before
         said = word(s, extended)
         if said in (MISSING, EXPLAINED) and s.effects:
             names = ", ".join(f.effect for f in s.effects)
@@ -348,19 +350,24 @@ def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) ->
 
 
 def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]], caption: str) -> int:
-    """Draw measured curves and errors; return the number of the plot."""
+    """Draw what was measured under what each model says, and the errors; return the number of the plot."""
     stage = judge.stage
     e = judge.errors(np.array([m[1] for m in models])) * judge.floor[None, :, None]
     panels = []
     for k, output in enumerate(stage.outputs):
         y = np.where(judge.valid[k], stage.measured[k], np.nan)
-        panels.append(Panel(f"{output} [{stage.units[k]}]", [Line("measured", stage.t, y, "measured")], height=1.0))
-        lines = [
-            Line(name, stage.t, np.where(judge.valid[k], e[i, k], np.nan), role, 1.0)
-            for i, (name, _, role) in enumerate(models)
-        ]
+        curves, lines = [Line("measured", stage.t, y, "measured", UNDER)], []
+        for i, (name, _, role) in enumerate(models):
+            error = np.where(judge.valid[k], e[i, k], np.nan)
+            curves.append(Line(name, stage.t, y - error, role, 1.0))
+            lines.append(Line(name, stage.t, error, role, 1.0))
+        panels.append(Panel(f"{output} [{stage.units[k]}]", curves, height=1.0))
         panels.append(Panel(f"error [{stage.units[k]}]", lines, band=3.0 * float(judge.floor[k]), height=1.0))
-    page.plot(overlay(panels), f"{caption}. The grey band is three noise floors to each side.{jumps(stage.window)}")
+    page.plot(
+        overlay(panels),
+        f"{caption}. The error is measured minus model; the grey band is three noise floors to each side."
+        f"{jumps(stage.window)}",
+    )
     return len(page.figures) - 1
 
 

@@ -79,7 +79,7 @@ def learned_page(
     title = f"A law learned from {Path(log).name}" if laws else f"Learning from {Path(log).name}"
     page = Page(title, said, tone=TONES[outcome.verdict], command=command, log=log)
     for law in laws:
-        figures = f"{floors(law.error_before)} to {floors(law.error_after)}"
+        figures = f"{floors(law.error_before)} → {floors(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
     for law in laws:
         page.section(law.name, f"{capital(law.sentence())}. {ABOUT}")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["MAX_POINTS", "break_at_holes", "decimate", "packed", "thin_path"]
+__all__ = ["MAX_POINTS", "break_at_holes", "decimate", "distribution", "packed", "thin_path"]
 
 Array = NDArray[np.float64]
 MAX_POINTS = 4500  # points a line, three times the pixels of a wide plot; 48 kB of the file
@@ -28,6 +28,15 @@ def break_at_holes(x: Array, y: Array) -> tuple[Array, Array]:
     if holes.size == 0 or holes.size > x.size // 20:  # many holes: an irregular raster, not a broken one
         return x, y
     return np.insert(x, holes + 1, x[holes] + usual), np.insert(y, holes + 1, np.nan)
+
+
+def distribution(values: ArrayLike) -> tuple[Array, Array]:
+    """Empirical distribution as a line in steps: at each of the sorted ``values`` the share rises, between two of them
+    it stays. From 0 at the least value to 1 at the greatest.
+    """
+    order = np.sort(np.asarray(values, dtype=float))
+    shares = np.arange(order.size + 1) / max(order.size, 1)
+    return np.repeat(order, 2), np.repeat(shares, 2)[1:-1]
 
 
 def decimate(x: ArrayLike, y: ArrayLike, limit: int = MAX_POINTS) -> tuple[Array, Array]:

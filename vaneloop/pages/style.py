@@ -111,7 +111,7 @@ def number(value: object, digits: int = 3) -> str:
         if not 1e-3 <= abs(v) < 1e5:
             return f"{v:.{digits - 1}e}"
         decimals = max(0, digits - 1 - math.floor(math.log10(abs(v))))
-        while decimals > 0 and round(v, decimals - 1) == v:  # 0.55 as published, not 0.550
+        while decimals > 0 and math.isclose(round(v, decimals - 1), v, rel_tol=1e-12):  # 0.55 as published, not 0.550
             decimals -= 1
         return f"{v:,.{decimals}f}"
     return str(value)

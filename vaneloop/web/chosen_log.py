@@ -255,6 +255,13 @@ class ChosenLog:
                             said = f"guessed, {100 * sure:.0f} % sure" if how == "guessed" else how
                             words = f"{said}: {why}" if said and why else said or seen["open"][signal]
                             ui.label(words).classes("soft small guess").style("grid-column:span 2")
+            if seen["unused"]:
+                ui.label("Names of the log that are not used:").classes("small")
+                about = 'tabindex=0 aria-label="names of the log that are not used"'
+                with ui.element("ul").classes("unused soft small").props(about):
+                    for line in seen["unused"]:
+                        with ui.element("li"):
+                            ui.label(line)
             with ui.element("div").classes("rowc"):
                 hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
                 rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")

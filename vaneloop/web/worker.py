@@ -116,9 +116,13 @@ def look(progress: Progress, words: list[str]) -> dict[str, Any]:
     try:
         seen = survey(args.log, **options.log_options(args))
     except NoTime as e:
-        return {"signals": {}, "open": {"t": str(e).partition(": ")[2]}, "suggested_rpm": None, "damaged": False}
+        open_ = {"t": str(e).partition(": ")[2]}
+        return {"signals": {}, "open": open_, "unused": [], "suggested_rpm": None, "damaged": False}
     rows = {r.signal: (r.name, r.unit, r.how, r.confidence, r.why, r.curve.tolist()) for r in seen.rows}
-    return {"signals": rows, "open": seen.open, "suggested_rpm": seen.suggested_rpm, "damaged": seen.damaged}
+    return {
+        "signals": rows, "open": seen.open, "unused": seen.unused(), "suggested_rpm": seen.suggested_rpm,
+        "damaged": seen.damaged,
+    }  # fmt: skip
 
 
 def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
