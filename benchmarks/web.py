@@ -22,6 +22,7 @@ __all__ = ["MEASUREMENTS"]
 
 REPEATS = 15  # the example's 200 s, so often: 3,000 s at 100 Hz, 11 signals and the time
 PATIENCE = 240_000  # ms
+EMPTY = 2.0  # s until the browser has a tab ready: it starts a process for it, whatever the tab shows then
 QUIET = 12.0  # s after which what a page has begun to load for its first log is loaded
 
 # One step on the chart of all channels: ms until the browser has drawn the moved view, and until the points of that
@@ -120,6 +121,7 @@ def web() -> Iterator[Row]:
                 context = browser.new_context(viewport={"width": 1920, "height": 1000})
                 page = context.new_page()
                 page.set_default_timeout(PATIENCE)
+                time.sleep(EMPTY)
                 began = time.perf_counter()
                 page.goto(url)
                 page.locator(".choose").click()

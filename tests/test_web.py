@@ -442,6 +442,48 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     shot(page, "mapped_1280_light")
 
 
+def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is() -> None:
+    """The same bytes and headers; what is for one browser, may change, or is asked for in part goes to the pages."""
+    import asyncio
+
+    from vaneloop.web.lasting import Lasting
+
+    asked: list[str] = []
+    lasting = [(b"cache-control", b"public, max-age=31536000, immutable")]
+    headers = {"/file": lasting, "/page": [], "/own": [*lasting, (b"set-cookie", b"id=1")], "/gone": lasting}
+
+    async def pages(scope: Any, receive: Any, send: Any) -> None:
+        asked.append(scope["path"])
+        status = 404 if scope["path"] == "/gone" else 200
+        await send({"type": "http.response.start", "status": status, "headers": list(headers[scope["path"]])})
+        await send({"type": "http.response.body", "body": b"one, ", "more_body": True})
+        await send({"type": "http.response.body", "body": b"two"})
+
+    app = Lasting(pages)
+
+    def get(path: str, **more: Any) -> tuple[int, list[Any], bytes]:
+        said: list[Any] = []
+
+        async def send(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"].append((b"from", b"the guard"))  # as the guard adds its own: to this answer only
+            said.append(message)
+
+        scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b"", **more}
+        asyncio.run(app(scope, None, send))  # type: ignore[arg-type]
+        return said[0]["status"], said[0]["headers"], b"".join(m["body"] for m in said[1:])
+
+    for path in headers:
+        assert get(path) == get(path) == get(path), path
+    assert asked.count("/file") == 1 and all(asked.count(p) == 3 for p in headers if p != "/file")
+    assert get("/file")[2] == b"one, two"
+    for more in ({"method": "HEAD"}, {"query_string": b"x=1"}, {"headers": [(b"Range", b"bytes=0-1")]},
+                 {"headers": [(b"if-none-match", b"x")]}):  # fmt: skip
+        before = len(asked)
+        get("/file", **more)
+        assert len(asked) == before + 1, more
+
+
 def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_told(tmp_path: Path) -> None:
     import asyncio
     from concurrent.futures import ThreadPoolExecutor

@@ -27,6 +27,7 @@ from vaneloop.web import fleet, missing, run, schedule
 from vaneloop.web.charts import Curves, view
 from vaneloop.web.guard import Guard
 from vaneloop.web.jobs import Cancelled, Spare
+from vaneloop.web.lasting import Lasting
 from vaneloop.web.private import private_folder
 from vaneloop.web.session import LOG_SUFFIXES, LogFile, Session
 
@@ -217,6 +218,7 @@ def _serve(
 
     pages.add_static_file(local_file=HERE / "uplot" / "uPlot.css", url_path="/assets/uPlot.css")
     pages.on_shutdown(sessions.close)
+    FileResponse.chunk_size = 1 << 20  # bytes; at 64 KiB a page's files wait for a thread some fifty times
     # Quasar would show a bar without a name at every request of a chart; what takes long has a bar of its own.
     pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run_with(
@@ -230,7 +232,7 @@ def _serve(
     for name in ("nicegui", "asyncio", "uvicorn.error"):
         logger = logging.getLogger(name)
         logger.handlers, logger.propagate = [Plain(logging.WARNING)], False
-    guard = Guard(api, token, port, most, loopback=loopback, pages=PAGES)
+    guard = Guard(Lasting(api) if loopback else api, token, port, most, loopback=loopback, pages=PAGES)
     config = uvicorn.Config(  # h11 bounds the headers of a request
         guard, http="h11", log_config=None, log_level="warning", ws_max_size=4 << 20, timeout_graceful_shutdown=2,
         lifespan="on", ws_per_message_deflate=not loopback,
