@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from tests.test_logs import DATA, data
 from vaneloop.base.errors import InputError
 from vaneloop.base.signals import UNITS
 from vaneloop.cli.main import main
+from vaneloop.verbs.machine import files_of
 
 ROWS = 3000
 SIGNALS = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "vgv2")
@@ -615,6 +617,33 @@ def test_a_mapped_name_of_ours_and_a_mapped_time_keep_the_unit_that_they_say(
     seen = survey(file, mapping=mapping)
     assert {r.signal: r.unit for r in seen.rows}["x_lvdt"] == "inch"  # the mapping file says it too
     assert seen.bench().units["t_oil"] == "degF"
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 2.0])
+def test_a_stroke_is_held_against_the_schedule_of_its_own_machine(
+    tmp_path: Path, run: dict[str, np.ndarray], scale: float
+) -> None:
+    """A machine whose piston has another way to go: with its tables the guess is made, with the shipped ones not."""
+
+    def strokes(text: re.Match[str]) -> str:
+        return re.sub(r"\d+\.\d+|\d+(?=,)", lambda m: f"{float(m[0]) * scale:.5f}", text[0])
+
+    own = tmp_path / "own"
+    own.mkdir()
+    shipped = (ROOT / "tables" / "stroke_tables.toml").read_text()
+    head, rest = shipped.split("[extension]")
+    (own / "stroke_tables.toml").write_text(head + "[extension]" + re.sub(r"values = \[[^]]*\]", strokes, rest))
+    at = run["x_lvdt"] * scale
+    columns = {"t": run["t"], "n_dem": run["n_dem"], "n_r": run["n_r"], "Hub_Ist_mm": np.minimum(at, 60.0)}
+    file = table(tmp_path / "a.csv", columns)
+    assert "x_lvdt" not in read_log(file).channels
+    assert "x_lvdt" in read_log(file, tables=files_of(own)).channels
+    assert "x_lvdt" in {r.signal for r in survey(file, tables=files_of(own)).rows}
+    shipped_file = table(tmp_path / "b.csv", {**columns, "Hub_Ist_mm": run["x_lvdt"]})
+    assert "x_lvdt" in read_log(shipped_file).channels
+    assert "x_lvdt" not in read_log(shipped_file, tables=files_of(own)).channels
+    assert main(["map", str(file), "--tables", str(own), "--json", str(tmp_path / "a.json"), "--quiet"]) == 0
+    assert "x_lvdt" in {s["signal"] for s in json.loads((tmp_path / "a.json").read_text())["signals"]}
 
 
 def test_our_own_signs_contradict_nothing(run: dict[str, np.ndarray]) -> None:

@@ -445,6 +445,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
 def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is() -> None:
     """The same bytes and headers; what is for one browser, may change, or is asked for in part goes to the pages."""
     import asyncio
+    from concurrent.futures import ThreadPoolExecutor
 
     from vaneloop.web.lasting import Lasting
 
@@ -470,7 +471,8 @@ def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is()
             said.append(message)
 
         scope = {"type": "http", "method": "GET", "path": path, "headers": [], "query_string": b"", **more}
-        asyncio.run(app(scope, None, send))  # type: ignore[arg-type]
+        with ThreadPoolExecutor(1) as apart:  # the browser's own loop may run in this thread
+            apart.submit(asyncio.run, app(scope, None, send)).result()  # type: ignore[arg-type]
         return said[0]["status"], said[0]["headers"], b"".join(m["body"] for m in said[1:])
 
     for path in headers:

@@ -21,14 +21,14 @@ from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
-__all__ = ["ENOUGH", "Guess", "Guesses", "contradictions", "design_speed", "guess", "withdrawn"]
+__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "withdrawn"]
 
 ENOUGH = 0.7  # confidence below which a name is only mentioned
 ALIKE = 0.1  # two candidates whose confidences differ by no more are not told apart
 _COMMENT = 0.05  # what a comment is worth less than a name
 _LONGEST_COMMENT = 80  # letters
 # a machine with an effect that its model lacks stays nearer to its schedule
-_OFF, _STRETCHED = 8.0, 1.5  # mm, ratio
+_OFF, _STRETCHED = 0.18, 1.5  # of the schedule's reach (8 mm of the shipped 44 mm), ratio
 
 # unit -> lowest and highest of the 99th percentile of the size, of a run that shows its unit; only units whose ranges
 # tell them apart
@@ -236,15 +236,21 @@ def _differ(a: str, b: str) -> bool:
 _Samples = tuple[np.ndarray, np.ndarray]  # t (s), values (own unit)
 
 
-def withdrawn(found: Guesses, channels: Mapping[str, _Samples]) -> None:
-    """Withdraw the guesses that contradict the log's other signals; ``channels`` signal -> t (s), values (own unit)."""
-    for signal, why in contradictions(channels, set(found.made)).items():
+Files = Mapping[str, str]  # a machine's own tables: name without suffix -> file; the others are the shipped ones
+_SHIPPED: Files = {}
+
+
+def withdrawn(found: Guesses, channels: Mapping[str, _Samples], tables: Files = _SHIPPED) -> None:
+    """Withdraw the guesses that contradict the log's other signals or the machine's schedule; ``channels`` signal ->
+    t (s), values (own unit).
+    """
+    for signal, why in contradictions(channels, set(found.made), tables).items():
         g = found.made.pop(signal)
         found.open[signal] = f"{g.name!r} would be it by name, but {why}: not guessed"
         found.unused[g.name] = f"{signal}? {why}"
 
 
-def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[str, str]:
+def contradictions(channels: Mapping[str, _Samples], guessed: set[str], tables: Files = _SHIPPED) -> dict[str, str]:
     """Guessed signals that cannot be what they are taken for, each with words.
 
     The machine's own signs are the measure: rising speed extends the piston, a longer stroke opens the vanes, current
@@ -277,7 +283,7 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
         for speed in ("n_r", "n_dem"):
             if (p := pair(stroke, speed)) is not None and _together(*p, 8.0, 8.0) < -0.7:
                 blame(stroke, speed, "it runs against {other}: our stroke grows with the speed")
-            if (p := pair(stroke, speed)) is not None and stroke in guessed and (why := _off_schedule(*p)):
+            if (p := pair(stroke, speed)) is not None and stroke in guessed and (why := _off_schedule(*p, tables)):
                 out[stroke] = f"{why} at {speed}; --map NAME={stroke} takes it as it is"
         for vane in VANES:
             if (p := pair(vane, stroke)) is not None and _together(*p, 4.0, 6.0) < -0.7:
@@ -286,7 +292,7 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
         for speed in ("n_r", "n_dem"):
             if vane in guessed and (p := pair(vane, speed)) is not None and _together(*p, 4.0, 8.0) < -0.7:
                 blame(vane, speed, "it runs against {other}; --unit {own} turns its sign")
-        if vane in guessed and (like := _other_vane(vane, channels)):
+        if vane in guessed and (like := _other_vane(vane, channels, tables)):
             out.setdefault(vane, f"it moves as {like} does; --map NAME={vane} takes it as it is")
     for moved in ("x_lvdt", "x_dem", "n_r"):
         if "i_cmd" in guessed and (p := pair("i_cmd", moved)) is not None:
@@ -299,25 +305,32 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str]) -> dict[
     return out
 
 
-def _off_schedule(stroke: np.ndarray, speed: np.ndarray) -> str:
-    """Why a stroke that follows the schedule, in its own way, has another zero or unit; "" where it has not."""
+def _mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
+    """The controller's mean curve: rotor speed (%), stroke (mm)."""
     from controller import load_calibration
 
-    table = load_calibration().table
-    planned = np.interp(speed, table[0], 1e3 * table[3])
-    if _together(stroke, planned, 4.0, 8.0) < 0.7:
+    calibration, strokes, angles = (tables.get(n, f"{n}.toml") for n in ("calibration", "stroke_tables", "vane_angles"))
+    table = load_calibration(calibration, strokes, angles=angles).table
+    return table[0], 1e3 * table[3]
+
+
+def _off_schedule(stroke: np.ndarray, speed: np.ndarray, tables: Files) -> str:
+    """Why a stroke that follows the schedule, in its own way, has another zero or unit; "" where it has not."""
+    at, curve = _mean_stroke(tables)
+    planned, off = np.interp(speed, at, curve), _OFF * float(np.ptp(curve))
+    if off <= 0.0 or _together(stroke, planned, 0.5 * off, off) < 0.7:
         return ""
     times, far = float(np.std(stroke) / np.std(planned)), float(np.median(np.abs(stroke - planned)))
     if not 1.0 / _STRETCHED < times < _STRETCHED:
         return f"it moves {times:.2g} times as far as the schedule says"
-    return f"it is {far:.2g} mm away, half of the time, from what the schedule says" if far > _OFF else ""
+    return f"it is {far:.2g} mm away, half of the time, from what the schedule says" if far > off else ""
 
 
-def _other_vane(vane: str, channels: Mapping[str, _Samples]) -> str:
+def _other_vane(vane: str, channels: Mapping[str, _Samples], tables: Files) -> str:
     """The stage whose schedule a vane follows instead of its own, by the rotor speed; "" where none is clear."""
     from plant.geometry import load_schedules
 
-    schedules = load_schedules()
+    schedules = load_schedules(tables.get("schedules", "schedules.toml"))
     speed = next((channels[s] for s in ("n_r", "n_dem") if s in channels), None)
     if vane not in channels or vane not in schedules.vanes or speed is None:
         return ""
@@ -339,7 +352,7 @@ def _together(a: np.ndarray, b: np.ndarray, least_a: float, least_b: float) -> f
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def design_speed(speed: _Samples, stroke: _Samples | None) -> tuple[float, str]:
+def design_speed(speed: _Samples, stroke: _Samples | None, tables: Files = _SHIPPED) -> tuple[float, str]:
     """Design speed (rpm) that a log in rpm suggests, and why: never taken, only proposed.
 
     speed   t (s), rotor speed (rpm)
@@ -353,13 +366,11 @@ def design_speed(speed: _Samples, stroke: _Samples | None) -> tuple[float, str]:
     top = float(np.percentile(n, 99.9))
     best, why = top, f"the largest speed is {top:,.0f} rpm"
     if stroke is not None and np.ptp(stroke[1]) > 8.0:
-        from controller import load_calibration
-
-        table = load_calibration().table
+        of, curve = _mean_stroke(tables)
         at = np.linspace(t[0], t[-1], 2000)
         speeds, strokes = np.interp(at, t, n), np.interp(at, *stroke)
         trial = top * np.linspace(0.7, 1.6, 901)
-        far = [np.median(np.abs(np.interp(100.0 * speeds / r, table[0], 1e3 * table[3]) - strokes)) for r in trial]
+        far = [np.median(np.abs(np.interp(100.0 * speeds / r, of, curve) - strokes)) for r in trial]
         k = int(np.argmin(far))
         if far[k] < 2.0 and 0 < k < len(trial) - 1:
             best, why = float(trial[k]), f"the stroke follows the schedule best with {trial[k]:,.0f} rpm"

@@ -18,7 +18,7 @@ import numpy as np
 
 from hil.logs import plausible
 from hil.logs.formats import FORMATS, Format, format_of
-from hil.logs.guess import Guess
+from hil.logs.guess import Files, Guess
 from hil.logs.opening import is_ours, open_log, wanted_design_speed
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
 from hil.logs.table import NoTime
@@ -169,6 +169,7 @@ def read_log(
     signals: Mapping[str, str] = UNITS,
     guess: bool = True,
     mapping_file: str | Path | None = None,
+    tables: Files | None = None,
 ) -> Log:
     """Read a log of any format into channels with the product's names and units.
 
@@ -183,6 +184,8 @@ def read_log(
     guess       guess names and units that nobody states (`hil.logs.guess`), each with a note; not with a mapping file
     mapping_file  names, units, design speed and database of a bench (`hil.logs.mapping`); what is given beside it goes
                 before
+    tables      the machine's own tables, against whose schedule guesses are held: name without suffix -> file;
+                default: the shipped ones
 
     Raises LogError, one line, for whatever cannot be used.
     """
@@ -197,7 +200,7 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file)
+    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {})
     source, named, notes, units = log.source, log.named, log.notes, log.units
     if log.guesses.rpm:
         speed, _, words = wanted_design_speed(path, log)

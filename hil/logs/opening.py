@@ -12,7 +12,7 @@ import numpy as np
 
 from hil.logs import plausible
 from hil.logs.formats import format_of
-from hil.logs.guess import Guess, Guesses, design_speed, withdrawn
+from hil.logs.guess import Files, Guess, Guesses, design_speed, withdrawn
 from hil.logs.guess import guess as guess_names
 from hil.logs.mapping import Bench, read_mapping
 from hil.logs.names import CERTAIN, unit_behind, unit_in_name, unit_kind
@@ -74,6 +74,7 @@ class Opened:
     named    signal -> name in the log, where that is not our own: mapped or guessed
     units    signal -> unit in the log, where the user, a mapping file or a guess says it
     absent   signals of the mapping file that the log does not have
+    tables   of the machine, that a guess is held against
     """
 
     source: Source
@@ -85,6 +86,7 @@ class Opened:
     taken: set[str]
     dbc: Path | None
     absent: dict[str, str]
+    tables: Files
 
 
 def open_log(
@@ -96,6 +98,7 @@ def open_log(
     signals: Mapping[str, str],
     guess: bool,
     mapping_file: str | Path | None,
+    tables: Files,
 ) -> Opened:
     """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`."""
     bench = read_mapping(mapping_file, signals) if mapping_file is not None else Bench()
@@ -122,6 +125,7 @@ def open_log(
         {k for ks in keys.values() for k in ks},
         options.dbc,
         absent,
+        tables,
     )
     _units_of_names(out, signals, guess)
     if guess:
@@ -146,7 +150,7 @@ def open_log(
                 out.guesses.made[signal] = Guess(signal, alike[0], unit, CERTAIN, "its name in other letters")
     if out.guesses.made:
         sketch = _sketch(path, out, signals)
-        withdrawn(out.guesses, sketch)
+        withdrawn(out.guesses, sketch, tables)
     for signal, g in out.guesses.made.items():
         named[signal] = g.name
         out.units.setdefault(signal, g.unit)
@@ -234,7 +238,7 @@ def wanted_design_speed(path: Path, out: Opened) -> tuple[str, float, str]:
     good = np.isfinite(t) & np.isfinite(s.values)
     sketch = _sketch(path, out, UNITS)
     speed = t[good], s.values[good] * (factor[0] if isinstance(factor, tuple) else 1.0)
-    rpm, why = design_speed(speed, sketch.get("x_lvdt", sketch.get("x_dem")))
+    rpm, why = design_speed(speed, sketch.get("x_lvdt", sketch.get("x_dem")), out.tables)
     words = (
         f"{name!r} is in {unit} and needs the design speed to become %: --design-rpm {rpm:g}, if that is 100 % ({why})"
     )

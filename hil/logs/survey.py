@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.logs.guess import Files
 from hil.logs.log import read_log
 from hil.logs.mapping import Bench
 from hil.logs.opening import open_log, wanted_design_speed
@@ -110,6 +111,7 @@ def survey(
     design_rpm: float | None = None,
     guess: bool = True,
     mapping_file: str | Path | None = None,
+    tables: Files | None = None,
 ) -> Survey:
     """Look at a log as `read_log` would read it with the same arguments; a log that cannot be read is shown with its
     complaint.
@@ -117,7 +119,7 @@ def survey(
     Raises LogError only for a file that cannot be opened at all, NoTime for a table without a time.
     """
     path = Path(path)
-    out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file)
+    out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file, tables or {})
     rows, damaged = [], False
     if isinstance(out.source, Table):
         rows.append(_time(path, out.source, out.units, {*(mapping or {}), *(mapping or {}).values()}))
@@ -145,7 +147,7 @@ def survey(
     try:
         notes = read_log(
             path, dbc=dbc, mapping=mapping, units=units, design_rpm=design_rpm, require=(), guess=guess,
-            mapping_file=mapping_file,
+            mapping_file=mapping_file, tables=tables,
         ).notes  # fmt: skip
     except InputError as e:
         complaint = str(e)

@@ -131,8 +131,8 @@ def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     if args.plant:
         given["plant"] = str(tables.file_of(args.plant))
     reading = options.log_options(args, source="LOGS")
-    for in_files in ("dbc", "mapping_file"):
-        reading.pop(in_files)
+    for in_files in ("dbc", "mapping_file", "tables"):
+        reading.pop(in_files, None)
     return {"files": copies_of(given), "reading": reading, "limit": args.limit}, given
 
 

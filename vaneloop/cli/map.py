@@ -25,6 +25,7 @@ exit codes: 0 the log can be read so, 1 a line says what is missing, 2 bad input
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
+    options.add_tables_option(parser, plant=False)
     terminal.add_output_options(parser)
     parser.add_argument("--out", metavar="F.toml", help="write the mapping file")
 

@@ -139,15 +139,16 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def add_tables_option(group: Any) -> None:
-    """Declare ``--tables`` and ``--plant``."""
+def add_tables_option(group: Any, plant: bool = True) -> None:
+    """Declare ``--tables``, and ``--plant`` where that counts."""
     group.add_argument(
         "--tables",
         metavar="DIR",
         help=f"folder whose {', '.join(TABLES)} (.toml, any of them) replace the shipped ones; vaneloop schedule "
         f"--out writes one",
     )
-    add_plant_option(group)
+    if plant:
+        add_plant_option(group)
 
 
 def add_without_option(parser: Any) -> None:
@@ -267,6 +268,7 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
         "design_rpm": args.design_rpm,
         "guess": not args.no_guess,
         "mapping_file": args.mapping,
+        **({"tables": files_of(args.tables)} if getattr(args, "tables", None) else {}),
     }
 
 

@@ -20,12 +20,13 @@ def diagnose_log(path: str, options: dict[str, Any], run: str) -> dict[str, Any]
     options  files (of the machine, within the run's folder), and how logs are read (`hil.logs.read_log`)
     """
     from hil.logs import read_log
+    from vaneloop.verbs.machine import files_of
     from vaneloop.verbs.search import diagnose
 
     files = {name: str(Path(run) / f) for name, f in options["files"].items()}
     reading = dict(options["reading"])
     reading |= {k: files[n] for k, n in (("dbc", "dbc"), ("mapping_file", "mapping")) if n in files}
-    log = read_log(path, require=(), **reading)
+    log = read_log(path, require=(), **reading, tables=files_of(files.get("tables")))
     said = diagnose(log, _machine(files), workers=1)
     answer = said.to_dict()
     answer.pop("elapsed_s")

@@ -178,9 +178,10 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     page.plot(overlay([Panel("share of machines", [line])], "least margin at or below", 320),
               "How the least margin is spread over the machines.", half=True)  # fmt: skip
     if g.total:
+        order = np.argsort(-np.array(total)).tolist()
         page.table(
             ["quantity", "share of the variance, alone", "with others (total)"],
-            sorted(zip(names, first, total, strict=True), key=lambda row: -row[2]),
+            [[names[k], first[k], total[k]] for k in order],
         )
     how = f"by the search ({g.runs} runs)"
     if not g.by_search:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hil.replay import ReplayResult, replay_json
 from hil.replay import replay as run
 from vaneloop.verbs.answer import Answer
-from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.machine import Machine, files_of
 
 if TYPE_CHECKING:
     from hil.figures import SignalError
@@ -58,11 +58,13 @@ class Replay(Answer):
         return replay_page(self.result, command)
 
 
-def log_of(log: Log | str | Path, require: tuple[str, ...] = ("n_dem",)) -> Log:
-    """The log, read where it is a file's name."""
+def log_of(log: Log | str | Path, machine: Machine, require: tuple[str, ...] = ("n_dem",)) -> Log:
+    """The log, read where it is a file's name: what is guessed is held against the machine's own tables."""
     from hil.logs import read_log
 
-    return read_log(log, require=require) if isinstance(log, str | Path) else log
+    if not isinstance(log, str | Path):
+        return log
+    return read_log(log, require=require, tables=files_of(machine.tables))
 
 
 def replay(
@@ -80,4 +82,4 @@ def replay(
     Raises LogError for a log that cannot drive the loop.
     """
     m = machine or Machine()
-    return Replay(run(log_of(log), plant=m.plant, calibration=m.calibration, progress=progress, floors=floors))
+    return Replay(run(log_of(log, m), plant=m.plant, calibration=m.calibration, progress=progress, floors=floors))

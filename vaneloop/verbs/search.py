@@ -224,7 +224,7 @@ def _tested_json(rows: Sequence[Tested]) -> dict[str, Any]:
 
 def chain_for(log: Log | str | Path, machine: Machine, fit: Any = (), test: Any = ()) -> tuple[Chain, str]:
     """A log in the stages of a machine, and the log's name."""
-    read = log_of(log, require=())
+    read = log_of(log, machine, require=())
     to_fit, to_test, others = split(fit, test)
     if others:
         raise InputError(f"test={others[0]!r}: the vane chain takes parts of its log, such as (200, None)")
