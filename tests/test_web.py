@@ -440,6 +440,19 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     command = page.locator(".cmd code").first.inner_text()
     assert "--map N1=n_r" in command and "--unit x_lvdt=m" in command and "--design-rpm 38000" in command
     shot(page, "mapped_1280_light")
+    # another day: the mapping file first, then a log of that bench
+    file = server.folder / "mapping_of_the_bench.toml"
+    file.write_bytes(Path(download.value.path()).read_bytes())
+    context = page.context.browser.new_context(viewport={"width": 1280, "height": 800})
+    later = context.new_page()
+    later.set_default_timeout(LONG)
+    later.goto(server.url)
+    later.locator("input[type=file]").first.set_input_files(str(file))
+    later.locator(".for-the-next", has_text="mapping_of_the_bench.toml").wait_for()
+    choose(later, "renamed.csv")
+    later.get_by_text("fails most in the").wait_for()
+    assert "--mapping mapping_of_the_bench.toml" in later.locator(".cmd code").first.inner_text()
+    context.close()
 
 
 def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is() -> None:

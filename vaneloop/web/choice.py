@@ -41,6 +41,10 @@ class Choice:
     guess: bool = True
     tables: str | None = None
 
+    def beside(self) -> list[str]:
+        """Names of the files that are taken beside the log."""
+        return [f.name for f in (self.dbc, self.model, self.bench) if f is not None]
+
     def words(self, real: bool) -> list[str]:
         """Words of the command line after the verb; ``real``: as the worker needs them, else as the user would type
         them.

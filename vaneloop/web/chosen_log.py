@@ -68,7 +68,7 @@ class ChosenLog:
                     self.live.part(self._loading, "jobs", shows=lambda: (s.search.loading if not s.jobs else "",))
                     self.live.part(self._about, "log", shows=lambda: (s.preview,))
                 with ui.element("div").classes("stackc"):
-                    self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview))
+                    self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview, *s.choice.beside()))
             self.live.part(self._form, "log", "compare", shows=self._form_shows)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
                 self.live.part(
@@ -161,6 +161,10 @@ class ChosenLog:
                 "Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model "
                 "lacks."
             ).classes("soft")
+            if beside := s.choice.beside():
+                ui.label(f"For the log to come: {' and '.join(beside)}.").classes("soft for-the-next").props(
+                    'role="status"'
+                )
             return
         if s.preview is None:
             return
@@ -266,9 +270,9 @@ class ChosenLog:
                 hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
                 rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")
                 rpm.props('label="design speed [rpm]"')
-                beside = [f for f in (choice.dbc, choice.model, choice.bench) if f is not None]
+                beside = choice.beside()
                 ui.label(
-                    "with " + " and ".join(f.name for f in beside)
+                    "with " + " and ".join(beside)
                     if beside
                     else "a .dbc, a mapping .toml or a model .toml: drop it above"
                 ).classes("soft small")

@@ -162,7 +162,7 @@ class Session:
     # ---- the log
 
     def choose(self, file: LogFile) -> None:
-        """Take a log; a database or a model file is taken beside it."""
+        """Take a log; a database, a model file or a mapping file is taken beside it, or for the first log to come."""
         if file.path.suffix.lower() == ".dbc":
             self.choice.dbc = file
         elif file.path.suffix.lower() == ".toml":
@@ -170,7 +170,8 @@ class Session:
             setattr(self.choice, "bench" if mapping else "model", file)
         else:
             dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
-            self.choice = Choice(file=file, dbc=dbc, tables=self.tables)
+            first = self.choice if self.choice.file is None else Choice()
+            self.choice = Choice(file=file, dbc=dbc, model=first.model, bench=first.bench, tables=self.tables)
             self.offered, self.seen, self.draft, self.overlays = [], None, {}, []
         if self.choice.file is not None:
             self.read()
