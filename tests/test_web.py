@@ -802,11 +802,11 @@ def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: A
     page.goto(server.at("fleet"))
     page.locator(".run-folder").click()
     page.get_by_role("option", name="engines/run").click()
-    page.get_by_text("128 of 180 different contents done (180 logs)").wait_for()
+    page.get_by_text("128 of 180 logs done").wait_for()
     page.get_by_text(so_far.sentence()).wait_for()
     page.get_by_text("vaneloop fleet work engines/run").wait_for()
     (tmp_path / last.name).rename(last)
-    page.get_by_text("180 of 180 different contents done (180 logs)").wait_for()  # by itself
+    page.get_by_text("180 of 180 logs done").wait_for()  # by itself
     view = view_of(roll_up(folder), {})
     page.get_by_text(view.sentence()).wait_for()
     for title in ("Engines and effects", "What changes", "Unlike their sisters", "What the logs could not show"):

@@ -21,6 +21,7 @@ from tsdownsample import MinMaxDownsampler
 from controller import MODES
 from vaneloop.base.signals import heading
 from vaneloop.base.vanes import VANES
+from vaneloop.pages.figures import UNDER
 from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import THEMES
 
@@ -229,7 +230,7 @@ def of_stage(curves: Mapping[str, Any], by_hand: Mapping[str, Any] | None, key: 
         over = [Trace(n, measured - e, STAGE_ROLES[n]) for n, e in errors.items()]
         left = [Trace(n, e, STAGE_ROLES[n]) for n, e in errors.items()]
         panels.append(
-            Panel(heading(output, unit), unit, t, [Trace("measured", measured, "measured", 1.5), *over], height=150)
+            Panel(heading(output, unit), unit, t, [Trace("measured", measured, "measured", UNDER), *over], height=150)
         )
         panels.append(Panel(heading("error", unit), unit, t, left, band=3.0 * c["floor"], height=150))
     return Curves(panels, key)

@@ -180,7 +180,9 @@ class _Page:
         s = f.state
         share = s["done"] / max(s["contents"], 1)
         what = "trials" if s["campaign"] else "logs"
-        words = f"{s['done']:,} of {s['contents']:,} different contents done ({s['logs']:,} {what})"
+        words = f"{s['done']:,} of {s['contents']:,} {what} done"
+        if s["logs"] != s["contents"]:
+            words += f"; {s['logs']:,} files, some of them with the same content"
         ui.label(words).classes("verdict good" if f.complete else "verdict").props('role="status"')
         ui.linear_progress(round(share, 3), show_value=False).props('rounded aria-label="share that is done"')
         if s["came_to"]:
@@ -188,8 +190,8 @@ class _Page:
         for name, kind in s["workers"].items():
             ui.label(f"at work: {kind} {name}").classes("small mono")
         if s["campaign"]:
-            ui.label("This is a campaign's run: vaneloop campaign PLAN.toml with --report shows it.").classes("soft")
-            command_line(shlex.join(["vaneloop", "campaign", "PLAN.toml", "--out", f.run]))
+            ui.label("This is a campaign's run. With its plan, this writes its page:").classes("soft")
+            command_line(shlex.join(["vaneloop", "campaign", "PLAN.toml", "--out", f.run, "--report", "campaign.html"]))
         elif not f.complete:
             command_line(shlex.join(["vaneloop", "fleet", "work", f.run]), "joins the run from another terminal")
         else:
