@@ -23,13 +23,14 @@ from typing import Protocol
 
 import numpy as np
 
-from benchmarks.ours import COLUMNS, OurLoop, Setup, profile
+from benchmarks.ours import COLUMNS, OurLanes, OurLoop, Setup, profile
 from hil.loop.lockstep import Stimulus, lockstep
 
 __all__ = ["MEASUREMENTS", "Row", "machine"]
 
 ROOT = Path(__file__).resolve().parent.parent
 LONG = 300.0  # s simulated where only compiled loops run
+LANES_LONG = 60.0  # s, of each loop side by side: 64 of them are over an hour
 ROUNDS = 15
 REPLAYED = 3000.0  # s
 # largest difference to a peer that integrates the same equations with another method: one count of the LVDT is 0.00076
@@ -144,6 +145,31 @@ def against_c() -> Iterator[Row]:
     ):
         wall = min(lockstep(setup.stimulus, hashed=hashed).wall_s for _ in range(5))
         yield Row(what, _speed(LONG, wall), note=note)
+
+
+def in_lanes() -> Iterator[Row]:
+    """Many loops side by side on one core, against as many one after the other in C, and in the loop alone."""
+    from benchmarks.in_c import FAST, CLoop
+
+    setup = Setup(Stimulus.of(profile(LANES_LONG)))
+    out, c_out = _rows(setup), _rows(setup)
+    for count, least in ((64, 6.0), (8, None)):
+        lanes_out = OurLanes(setup, count).lanes.room(setup.ticks)
+        best = dict.fromkeys(("lanes", "alone", "c"), float("inf"))
+        for _ in range(ROUNDS):
+            best["lanes"] = min(best["lanes"], cpu_time(OurLanes(setup, count), lanes_out) / count)
+            best["c"] = min(best["c"], cpu_time(CLoop(setup, FAST), c_out))
+            best["alone"] = min(best["alone"], cpu_time(OurLoop(setup), out))
+        ratio, to_alone = best["c"] / best["lanes"], best["alone"] / best["lanes"]
+        yield Row(
+            f"{count} loops in lanes, C -O3 -march=native",
+            _speed(LANES_LONG, best["lanes"]),
+            _speed(LANES_LONG, best["c"]),
+            ratio,
+            "" if least is None else f">= {least:g}",
+            None if least is None else ratio >= least,
+            f"one core; {to_alone:.1f} times the loop alone",
+        )
 
 
 def interpreted() -> Iterator[Row]:
@@ -417,6 +443,7 @@ def real_time() -> Iterator[Row]:
 
 MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
     "the loop in C": against_c,
+    "the loop in lanes": in_lanes,
     "the loop in python-control": against_control,
     "the loop in pathsim": against_pathsim,
     "the interpreted loop": interpreted,

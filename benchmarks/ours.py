@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from controller import Calibration, load_calibration
+from hil.loop.lanes import Lanes
 from hil.loop.lockstep import WARM_UP, Stimulus, advance, columns_of
 from hil.loop.tick import new_loop
-from plant import Plant, build_plant
+from plant import Model, Plant, build_plant, chain_lanes
+from plant.parameters import nominal
 from vaneloop.base.vanes import VANES
 
-__all__ = ["COLUMNS", "OurLoop", "Setup", "profile", "troubled"]
+__all__ = ["COLUMNS", "OurLanes", "OurLoop", "Setup", "profile", "troubled"]
 
 COLUMNS = columns_of(VANES[:3])
 _SILENT, _NO_SNAPSHOTS = np.zeros((1, 5)), np.empty((0, 0))
@@ -68,6 +70,29 @@ class OurLoop:
     def faults(self) -> int:
         """Fault bits that stand now."""
         return int(self.loop.given.faults)
+
+
+class OurLanes:
+    """As many closed loops side by side, each a machine of its own within 2 % of flow gain and play."""
+
+    def __init__(self, setup: Setup, count: int):
+        s = self._setup = setup
+        n_dem, t_oil = s.stimulus.rows[0, 0], s.stimulus.rows[0, 3]
+        known = {n.name: n.value for n in nominal(s.plant.table, s.plant.geometry)}
+        loops = []
+        for j in range(count):
+            share = 0.98 + 0.04 * j / max(count - 1, 1)
+            model = Model(parameters={n: known[n] * share for n in ("actuator.flow_gain", "linkage.vigv_play")})
+            plant = model.plant(s.plant)
+            loops.append(new_loop(plant, s.calibration, n_engine=n_dem, n_r=n_dem, t_oil=t_oil, noisy=False))
+            loops[-1].state.direction = loops[-1].state.blend = 1.0
+        way = chain_lanes.way(s.plant.p)
+        assert way is not None
+        self.lanes = Lanes(loops, [s.stimulus] * count, way, s.every)
+
+    def advance(self, out: np.ndarray) -> None:
+        """Run the stimulus from its start into ``out`` (`hil.loop.lanes.Lanes.room`)."""
+        self.lanes.advance(0, self._setup.ticks, None, out)
 
 
 def profile(seconds: float) -> np.ndarray:

@@ -50,7 +50,7 @@ from vaneloop.base.compiled import inlined
 if TYPE_CHECKING:
     from controller.calibration import Calibration
 
-__all__ = ["give", "tick"]
+__all__ = ["act", "aim", "filter_speed", "give", "tick", "watch"]
 
 
 @inlined
@@ -65,33 +65,57 @@ def tick(inputs: Record, state: Record, calibration: Calibration) -> None:
     `MODES`.
     """
     inputs, z, k = as_inputs(inputs), as_state(state), as_scalars(calibration.k)
-    pause = min(inputs.pause, 1e6) if inputs.pause > 0.0 else 0.0  # not NaN
-    condition_lvdt(z, k, inputs.x_lvdt, pause)
-    monitor_demand(inputs, z, k, pause)
-    debounce(z, F_PAUSED, pause > 0.0, TICK, k.recover_time)
+    watch(inputs, z, k)
     if k.strategy >= INVERSE:
         z.x_slow += STROKE_SHARE * (z.x_meas - z.x_slow)
     if k.strategy == ADAPTIVE:
         filter_pots(z, k, inputs)
-    mode = int(z.mode)
     phase = int(z.ticks) % SLOW
     if phase == 0:
         if z.demand_seen == 1.0:
-            z.n_r += (z.n_r_raw - z.n_r) * SLOW_TICK / (k.speed_filter + SLOW_TICK)
-            trend_step(z, k, z.n_dem)
+            filter_speed(z, k)
             if k.strategy <= DUAL:
                 schedule_step(z, k, calibration.table)
             else:
                 if k.strategy == ADAPTIVE:
                     learn(z, k)
                 inverse_step(z, k, calibration.table, calibration.angles)
-        if mode == RUN or mode == DEGRADED:
-            move_demand(z, k, z.x_target, k.stroke_rate)
-        elif mode == FAIL_SAFE:
-            move_demand(z, k, k.fail_safe_stroke, k.fail_safe_rate)
-        else:
-            z.x_from = z.x_dem
+        aim(z, k)
+    act(z, k, phase)
 
+
+@inlined
+def watch(inputs: Record, z: Record, k: Record) -> None:
+    """First part of every tick: what came in, and whether it can be believed."""
+    pause = min(inputs.pause, 1e6) if inputs.pause > 0.0 else 0.0  # not NaN
+    condition_lvdt(z, k, inputs.x_lvdt, pause)
+    monitor_demand(inputs, z, k, pause)
+    debounce(z, F_PAUSED, pause > 0.0, TICK, k.recover_time)
+
+
+@inlined
+def filter_speed(z: Record, k: Record) -> None:
+    """Every 10 ms: the measured speed without its noise, and the trend of the demand."""
+    z.n_r += (z.n_r_raw - z.n_r) * SLOW_TICK / (k.speed_filter + SLOW_TICK)
+    trend_step(z, k, z.n_dem)
+
+
+@inlined
+def aim(z: Record, k: Record) -> None:
+    """Every 10 ms: the stroke demand of the present mode."""
+    mode = int(z.mode)
+    if mode == RUN or mode == DEGRADED:
+        move_demand(z, k, z.x_target, k.stroke_rate)
+    elif mode == FAIL_SAFE:
+        move_demand(z, k, k.fail_safe_stroke, k.fail_safe_rate)
+    else:
+        z.x_from = z.x_dem
+
+
+@inlined
+def act(z: Record, k: Record, phase: int) -> None:
+    """Last part of every tick, the ``phase``-th of ten: servo, its monitors, the next mode."""
+    mode = int(z.mode)
     servo_on = mode != INIT and not (mode == FAIL_SAFE and (int(z.faults) & LVDT_MASK) != 0)
     if not servo_on:
         z.x_dem = min(max(z.x_meas, k.stroke_min), k.stroke_max)  # bumpless: the servo starts from where the piston is

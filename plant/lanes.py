@@ -10,9 +10,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
 from numba import njit
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-__all__ = ["block", "getter", "putter"]
+__all__ = ["block", "filler", "getter", "on_stack", "putter"]
 
 
 def block(
@@ -40,18 +43,51 @@ def _compiled(source: str, space: dict[str, Any]) -> Callable[..., Any]:
     return out
 
 
-def getter(kind: type[NamedTuple], which: str = "", **known: float) -> Callable[..., Any]:
+def getter(kind: type[NamedTuple], which: str = "", prefix: str = "", **known: float) -> Callable[..., Any]:
     """Compiled function (block, lane) -> ``kind``: what stands there; ``which`` "k": (block, k, lane).
 
+    prefix before the names of the fields in the block
     known  fields that are these numbers in every lane, whatever stands there
     """
     at = f"{which}, j" if which else "j"
-    fields = (repr(known[n]) if n in known else f"b.{n}[{at}]" for n in kind._fields)
+    fields = (repr(known[n]) if n in known else f"b.{prefix}{n}[{at}]" for n in kind._fields)
     return _compiled(f"def f(b, {at}): return Kind({', '.join(fields)})", {"Kind": kind})
 
 
-def putter(kind: type[NamedTuple], which: str = "") -> Callable[..., Any]:
-    """Compiled function (block, lane, ``kind``) that puts it there; ``which`` as of `getter`."""
+def putter(kind: type[NamedTuple], which: str = "", prefix: str = "") -> Callable[..., Any]:
+    """Compiled function (block, lane, ``kind``) that puts it there; ``which`` and ``prefix`` as of `getter`."""
     at = f"{which}, j" if which else "j"
-    lines = "".join(f"    b.{n}[{at}] = v.{n}\n" for n in kind._fields)
+    lines = "".join(f"    b.{prefix}{n}[{at}] = v.{n}\n" for n in kind._fields)
     return _compiled(f"def f(b, {at}, v):\n{lines}", {})
+
+
+def filler(names: dict[str, int], prefix: str, put: bool) -> Callable[..., Any]:
+    """Compiled function (block, lane, record) that fills the record from the block; ``put``: the block from the record.
+
+    names   of the record's numbers, and how many there are of each: 0 for one that is no array
+    prefix  before these names in the block
+    """
+    lines = []
+    for name, count in names.items():
+        for q in range(count or 1):
+            own, there = (f"v.{name}[{q}]", f"{name}[{q}, j]") if count else (f"v.{name}", f"{name}[j]")
+            lines.append(f"    b.{prefix}{there} = {own}\n" if put else f"    {own} = b.{prefix}{there}\n")
+    return _compiled(f"def f(b, j, v):\n{''.join(lines)}", {})
+
+
+def _on_stack(_: Any, layout: Any) -> Any:
+    """Return a record of the dtype ``layout`` in the frame of the compiled function that calls this; not filled.
+
+    The compiler keeps its numbers in registers where it can, so a function that works on a record works on lanes, too.
+    """
+    kind = layout.dtype
+
+    def build(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        there = _helpers.alloca_once(builder, ir.ArrayType(ir.IntType(8), kind.size))
+        return builder.bitcast(there, context.get_value_type(kind))
+
+    return kind(layout), build
+
+
+_helpers: Any = cgutils
+on_stack: Any = intrinsic(_on_stack)

@@ -26,9 +26,9 @@ from controller.records import SLOW, as_inputs, as_outputs
 from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free
-from vaneloop.base.vanes import own_rows
+from vaneloop.base.vanes import VANES, own_rows
 
-__all__ = ["FRAME", "Run", "Stimulus", "columns_of", "lockstep", "snapshot_names", "warm_up"]
+__all__ = ["FRAME", "Run", "Stimulus", "columns_of", "lockstep", "snapshot_names", "to_border", "warm_up"]
 
 CHUNK = 10_000  # ticks between two calls of the progress function
 WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller reaches RUN and the servo settles
@@ -161,6 +161,12 @@ def columns_of(vanes: tuple[str, ...], motor: bool = False) -> tuple[str, ...]:
     return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()))
 
 
+def to_border(out: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Return the columns ``out[:, i]`` (SI) with their ``names`` (`columns_of`) in border units."""
+    factor = {**_BORDER, **dict.fromkeys(VANES, 180.0 / np.pi)}
+    return {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
+
+
 def snapshot_names(plant: Plant) -> list[str]:
     """Names of the numbers whose digest is the state hash: the firmware's, then the plant's, that this machine has."""
     return [*(STATE[i] for i in own_rows(STATE, plant.vanes)), *(chain.STATE[row] for row in plant.rows)]
@@ -247,9 +253,7 @@ def lockstep(
             if progress is not None:
                 progress((k0 + n) / ticks)
     wall = time.perf_counter() - started
-    factor = {**_BORDER, **dict.fromkeys(machine.vanes, 180.0 / np.pi)}
-    columns = {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
-    return Run(columns, ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))
+    return Run(to_border(out, names), ticks * 1e-3, wall, digest.hexdigest() if hashed else "", int(loop.given.faults))
 
 
 def _starting_curve(cal: Calibration, n: float, stroke_demand: float | None) -> tuple[float, float]:

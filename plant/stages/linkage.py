@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant import chain, curve, lanes, stem
+from plant import chain, curve, lanes, linkage_lanes, stem
 from plant.chain import straight_reading, straightened, true_stroke
 from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
@@ -23,7 +23,6 @@ from plant.places import (
     POT_LAG_ERROR,
     X,
 )
-from plant.series import arctangent, tangent
 from plant.stages.blocks import NOTHING, elsewhere, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
@@ -133,28 +132,25 @@ def _linkage_lanes(
                 out[j, k, m] = s[POT + k, j]
 
 
-class _Crank(NamedTuple):
-    """What a block of lanes needs of each crank; by how much (s) the LVDT trails the stroke; its straight line."""
+class _Lvdt(NamedTuple):
+    """What a block of lanes needs of each LVDT: by how much (s) it trails the stroke; its straight line."""
 
-    lx0: float
-    x1: float
-    y1: float
-    le: float
     late: float
     lvdt_gain: float
     lvdt_drift: float
     lvdt_bias: float
 
 
-_OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever"))
+_OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever", "span", "half"))
 
 
 @lru_cache
 def _linkage(stages: int) -> np.dtype[np.void]:
     """Block for that many stages: the compiler knows how often its loops over them go."""
-    return lanes.block(WIDE, _Crank, more=("stroke", "c", "d"), each=(stages, *_OF_STAGE))
+    return lanes.block(WIDE, linkage_lanes.Crank, _Lvdt, more=("stroke", "c", "d"), each=(stages, *_OF_STAGE))
 
 
+_crank, _put_crank = lanes.getter(linkage_lanes.Crank), lanes.putter(linkage_lanes.Crank)
 _stem, _put_stem = lanes.getter(stem.Stem, "k"), lanes.putter(stem.Stem, "k")
 _stem_state, _put_stem_state = lanes.getter(stem.StemState, "k"), lanes.putter(stem.StemState, "k")
 
@@ -181,7 +177,9 @@ def _linkage_blocks(
         rubbed = eccentric = bent = False
         for j in range(WIDE):
             q = order[j0 + min(j, last - 1)]
-            b.lx0[j], b.x1[j], b.y1[j], b.le[j] = p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q]
+            _put_crank(
+                b, j, linkage_lanes.crank_numbers(p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q])
+            )
             b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
             b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
             bent |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
@@ -190,6 +188,7 @@ def _linkage_blocks(
                 _put_stem(b, k, j, d)
                 _put_stem_state(b, k, j, stem.taken(s, q, k))
                 b.pot[k, j], b.lever[k, j] = s[POT + k, q], d.ldp / d.length
+                b.span[k, j], b.half[k, j] = linkage_lanes.ring_numbers(d.lc, d.ld)
                 b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
                 rubbed |= d.friction != 0.0
                 eccentric |= d.amplitude != 0.0
@@ -203,10 +202,12 @@ def _linkage_blocks(
                     off = straight_reading(0.0, b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[m])
                     b.stroke[j] = (x_lvdt[m] + b.late[j] * speed[m] - off) / b.lvdt_gain[j]
             for j in range(WIDE):
-                b.c[j], b.d[j] = _crank(b.stroke[j], b.lx0[j], b.x1[j], b.y1[j], b.le[j])
+                b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j], _crank(b, j))
             for k in range(b.pot.shape[0]):
                 for j in range(WIDE):
-                    b.theta[k, j] = _ring(b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.lc[k, j], b.ld[k, j])
+                    b.theta[k, j] = linkage_lanes.ring_angle(
+                        b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.span[k, j], b.half[k, j]
+                    )
                 if eccentric:
                     for j in range(WIDE):
                         b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], True)
@@ -226,7 +227,7 @@ def _linkage_blocks(
                         )
                         _put_stem_state(b, k, j, z)
                 for j in range(WIDE):
-                    vane = stem.reading(_stem(b, k, j), _vane(b.theta[k, j], b.lever[k, j]))
+                    vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]))
                     before = vane if m == 0 else b.before[k, j]
                     slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
                     b.pot[k, j] = b.pot[k, j] if m == 0 else slow
@@ -239,36 +240,3 @@ def _linkage_blocks(
             for k in range(b.pot.shape[0]):
                 stem.stored(s, q, k, _stem_state(b, k, j))
                 s[POT + k, q] = b.pot[k, j]
-
-
-@inlined
-def _crank(stroke: float, lx0: float, x1: float, y1: float, le: float) -> tuple[float, float]:
-    """`plant.linkage.crank` without branches."""
-    lx = lx0 + stroke
-    d2 = x1 * x1 + y1 * y1
-    m = 0.5 * (d2 + le * le - lx * lx)
-    r = d2 * le * le - m * m
-    root = math.sqrt(max(r, 0.0))
-    m = m if r > 0.0 else (math.sqrt(d2) * le if m >= 0.0 else -math.sqrt(d2) * le)
-    f = 1.0 / (d2 * le)
-    return (x1 * m - y1 * root) * f, (x1 * root + y1 * m) * f
-
-
-@inlined
-def _ring(c: float, d: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
-    """`plant.linkage.ring_angle` for angles within +-90 deg, without branches."""
-    qx = ax + lb * c
-    qy = ay + lb * d
-    q2 = qx * qx + qy * qy
-    u = 0.5 * (q2 + ld * ld - lc * lc) / ld
-    r = q2 - u * u
-    v = math.sqrt(max(r, 0.0))
-    u = u if r > 0.0 else (math.sqrt(q2) if u >= 0.0 else -math.sqrt(q2))
-    return arctangent(-(qx * u + qy * v), qy * u - qx * v)
-
-
-@inlined
-def _vane(theta: float, lever: float) -> float:
-    """`plant.linkage.vane_angle` as an arctangent, asin q = atan(q / sqrt(1 - q^2)); ``lever`` = Ld'/L."""
-    q = min(max(lever * tangent(theta), -1.0), 1.0)
-    return arctangent(q, math.sqrt(1.0 - q * q))

@@ -19,7 +19,17 @@ from numba import njit
 
 from vaneloop.base.kept import is_kept, keep, sources_digest
 
-__all__ = ["cache_folder", "compiled", "compiled_free", "in_place", "inlined", "is_cached", "sources_digest"]
+__all__ = [
+    "cache_folder",
+    "compiled",
+    "compiled_free",
+    "fused",
+    "in_place",
+    "in_place_free",
+    "inlined",
+    "is_cached",
+    "sources_digest",
+]
 
 KEPT = 6
 
@@ -76,9 +86,12 @@ compiled_free = _compiler(nogil=True)
 # to those arrays, which took 50 of 340 ns a tick in the plant and 115 of 148 ns in the firmware. A function that makes
 # an array does not compile under it.
 in_place = _compiler(_nrt=False)
+in_place_free = _compiler(nogil=True, _nrt=False)
 # For loop bodies of many scalars, which a call would pass on the stack, and for the parts of the firmware's tick. Its
 # strategies inverse and adaptive are `in_place`: inlined, they would double the time that compiling takes, for all.
 inlined = _compiler(_nrt=False, forceinline=True)
+# The same for what only lanes side by side call: sums of products may be rounded once, where the processor can.
+fused = _compiler(_nrt=False, forceinline=True, fastmath={"contract"})
 
 
 def is_cached(function: Callable[..., Any]) -> bool:
