@@ -68,7 +68,7 @@ EXPORTS: dict[str, list[str]] = {
         *("Calibration", "FAULTS", "INPUTS", "MODES", "OUTPUTS", "SCALARS", "STATE", "STRATEGIES", "flat", "give"),
         *("load_calibration", "new_inputs", "new_outputs", "new_state", "tick"),
     ],
-    "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "read_log", "write_log"],
+    "hil": ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "lockstep_lanes", "read_log", "write_log"],
     "hil.bus": ["Port", "open_bus"],
     "hil.calibrate": ["Attended", "Memory", "Slave"],
     "hil.inject": [

@@ -46,6 +46,7 @@ from vaneloop.base.vanes import VANES
 __all__ = ["Lanes", "lockstep_lanes"]
 
 EIGHT = 8  # lanes of a vector: a block runs a multiple of it
+LINE = 64  # bytes of a line of the cache
 # heard: %, speed in the ECU's frame; n_dem: %; count: of the currents in ``sum``
 _FIELDS = ("n_dem", "heard", "sum", "count", "sigma_lvdt", "sigma_speed")
 BLOCK = np.dtype([*firmware_lanes.fields(), *chain_lanes.fields(), *((name, np.float64, (W,)) for name in _FIELDS)])
@@ -211,7 +212,7 @@ class Lanes:
         self._way, self._stages = way, len(loops[0].angles)
         last = len(loops) - 1
         filled = [loops[min(j, last)] for j in range(n)]
-        self._block = np.zeros(1, BLOCK)
+        self._block = _aligned(BLOCK)
         for j, loop in enumerate(filled):
             firmware_lanes.place(self._block[0], j, loop)
             _place(self._block, j, loop.p, loop.s, self._stages)
@@ -248,6 +249,13 @@ class Lanes:
     def faults(self, lane: int) -> int:
         """Fault bits that stand now."""
         return int(self._block[0]["z_faults"][lane])
+
+
+def _aligned(layout: np.dtype[Any]) -> np.ndarray:
+    """One record of zeros that begins with a line of the cache: a vector that lies across two lines takes longer."""
+    memory = np.zeros(layout.itemsize + LINE, np.uint8)
+    start = -memory.ctypes.data % LINE
+    return memory[start : start + layout.itemsize].view(layout)
 
 
 def _run(lanes: Lanes, ticks: int, seed: int | None) -> list[Run]:
