@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import subprocess
@@ -199,6 +200,19 @@ def test_a_child_that_never_answers_is_ended(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(hil.logs.mdf, "_TIME", (0.01, 1e12))
     with pytest.raises(LogError, match="damaged"):
         read_log(tmp_path / "a.mf4")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no processor time")
+def test_a_reader_that_never_ends_is_stopped_by_the_processor_time_it_takes(tmp_path: Path) -> None:
+    """However busy the machine is: by the clock, a whole file would be called damaged there."""
+    write_log(tmp_path / "a.mf4", run(50))
+    endless = "import asammdf\ndef forever(*_, **__):\n    while True: pass\nasammdf.MDF = forever\n"
+    request = {"path": str(tmp_path / "a.mf4"), "wanted": [], "guess": False, "seconds": 1}
+    code = endless + "from hil.logs.mdf import serve\nserve()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=json.dumps(request).encode() + b"\n", stdout=subprocess.PIPE, check=False
+    )
+    assert done.returncode < 0 and done.stdout == b""
 
 
 def test_no_damage_to_a_database_takes_the_reader_down(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -30,7 +31,8 @@ from vaneloop.base.signals import UNITS
 __all__ = ["Groups", "open_mdf", "read_mdf", "write_bus", "write_groups", "write_mdf"]
 
 _MEMORY = 1 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
-_TIME = 20.0, 1e6  # s, and bytes of file per further second
+_TIME = 20, 1e6  # s of a processor, and bytes of file per further second
+_BUSY = 20  # times as long by the wall clock: others may have the processors, too
 _BUS = "CAN_DataFrame"
 _FRAMES = (
     "CAN_DataFrame",
@@ -96,8 +98,9 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         raise LogError(
             f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else "")
         )
-    request = json.dumps({"path": str(path.absolute()), "wanted": wanted, "guess": guess}) + "\n"
-    answer = _child(request.encode(), _TIME[0] + check_file(path) / _TIME[1])
+    seconds = _TIME[0] + int(check_file(path) / _TIME[1])
+    request = {"path": str(path.absolute()), "wanted": wanted, "guess": guess, "seconds": seconds}
+    answer = _child(json.dumps(request).encode() + b"\n", _BUSY * seconds)
     line, _, body = answer.partition(b"\n")
     try:
         reply = json.loads(line)
@@ -169,6 +172,9 @@ def answer(request: bytes, out: BinaryIO) -> None:
     with contextlib.suppress(ImportError, OSError, ValueError):  # not on Windows
         import resource
 
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        ends = math.ceil(used.ru_utime + used.ru_stime) + int(asked["seconds"])
+        resource.setrlimit(resource.RLIMIT_CPU, (ends, ends))
         now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         limit = now + _MEMORY[0] + _MEMORY[1] * os.path.getsize(path)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
