@@ -246,7 +246,7 @@ class Learner:
             good.sort(key=lambda t: left[t.candidate.name])
             near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
             near += [t for t in good if t not in near and self._plainer(current, t, good[0])]
-            near.sort(key=lambda t: (_strange(t.candidate), t.candidate.how.endswith("times")))
+            near.sort(key=lambda t: self._preferred(t, left[t.candidate.name]))
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
                 out.notes.append(
@@ -325,6 +325,13 @@ class Learner:
         change = self._change(before, tried, self.ground.within(tried.candidate))
         tests = [v for log, v in change.items() if log in self.ground.tests]
         return score(self.judge, tried.fit) + (float(np.mean(tests)) if tests else 0.0)
+
+    def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
+        """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
+        where the held-out error is noise, less in all.
+        """
+        c = tried.candidate
+        return _strange(c), c.how.endswith("times"), round(left, 2), rms_of(tried.judge, tried.fit)
 
     def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
