@@ -58,6 +58,10 @@ class Basis:
         """Where it ends; above, curves stay as here."""
         return float(self.knots[-1])
 
+    def reaches(self, x: Array) -> Array:
+        """Which values are not beyond its ends."""
+        return (x >= self.low) & (x <= self.high)
+
     def zeroed(self) -> Basis:
         """The same functions less what they are at 0."""
         return replace(self, turn=self.turn - self.design(np.zeros(1)) @ self.turn)

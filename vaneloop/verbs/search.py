@@ -424,19 +424,24 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     by_stage: dict[str, list[str]] = {}
     curves: dict[str, list[Any]] = {}
     laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
+
+    def seen_in(places: Sequence[str]) -> str | None:
+        """The first of these stages that the log shows."""
+        return next((s for s in places if any(s == c.name for c in chain.stages)), None)
+
     for name in dict.fromkeys([*before.effects, *wanted]):
         if law := laws.get(name):
             shown = PLACES[f"{law.at} {law.how}"].stages
-            where = next((s for s in shown if any(s == c.name for c in chain.stages)), shown[0])
-            if all(where != c.name for c in chain.stages):
-                why = chain.not_observed.get(where, "not observed")
-                raise InputError(f"{log}: --effect {name}: the log does not show its stage ({where}: {why})")
+            where = seen_in(shown)
+            if where is None:
+                why = chain.not_observed.get(shown[0], "not observed")
+                raise InputError(f"{log}: --effect {name}: the log does not show its stage ({shown[0]}: {why})")
             by_stage.setdefault(where, []).append(name)
             curves.setdefault(where, []).append(curve_effect(name, law))
             continue
         if (kind := chain.plant.kind) not in EFFECTS[name].kinds:
             raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
-        stage = next((s for s in EFFECTS[name].stages if any(s == c.name for c in chain.stages)), None)
+        stage = seen_in(EFFECTS[name].stages)
         if stage is not None:
             by_stage.setdefault(stage, []).append(name)
         elif name in wanted:

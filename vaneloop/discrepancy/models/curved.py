@@ -409,7 +409,7 @@ class OwnGround:
             plain = with_curves(test, (), ())
             own = [p.value for p in plain.stage.parameters[:starts]]
             values = next(o.visited for o in quantities(plain, np.array(own)) if o.name == q.name)
-        inside = (values >= candidate.basis.low) & (values <= candidate.basis.high)
+        inside = candidate.basis.reaches(values)
         return {log: inside[at] for log, at in test.logs.items()}
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:

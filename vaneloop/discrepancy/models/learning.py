@@ -245,7 +245,7 @@ class Learner:
             left = {t.candidate.name: self._left(current, t) for t in good}
             good.sort(key=lambda t: left[t.candidate.name])
             near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
-            near += [t for t in good if t not in near and self._plainer(current, t, good[0])]
+            near += [t for t in good if t not in near and self._plainer(t, good[0], left)]
             near.sort(key=lambda t: self._preferred(t, left[t.candidate.name]))
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
@@ -333,7 +333,7 @@ class Learner:
         c = tried.candidate
         return _strange(c), c.how.endswith("times"), round(left, 2), rms_of(tried.judge, tried.fit)
 
-    def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
+    def _plainer(self, tried: Tried, best: Tried, left: Mapping[str, float]) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
         place before it: a damping times a function of the speed is a force that is one of the speed.
         """
@@ -342,7 +342,7 @@ class Learner:
             return False
         if worth(self.judge, tried.fit, best.fit, self.form.form).good:
             return False
-        mine, its = (self._left(before, t) - score(self.judge, t.fit) for t in (tried, best))
+        mine, its = (left[t.candidate.name] - score(self.judge, t.fit) for t in (tried, best))
         return mine < its + HARM  # on test logs
 
     def _confirmed(self, before: Tried, tried: Tried) -> bool:

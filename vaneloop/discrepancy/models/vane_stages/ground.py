@@ -171,7 +171,7 @@ class VaneGround:
                 assert isinstance(stage.made, Made)
                 values = stage.made.driven.quantity(candidate.quantity.name)
                 if values is not None:
-                    out[name] = (values >= candidate.basis.low) & (values <= candidate.basis.high)
+                    out[name] = candidate.basis.reaches(values)
         return out
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
@@ -228,15 +228,13 @@ class VaneGround:
         own = OWN.get(place.at, place.at.removeprefix("sensors."))
         if q == own and place.how == "times":
             return True
-        if stage == "demand":
-            return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
-        if stage == "engine":
+        if stage in ("demand", "engine"):
             return q not in ("n_r", "n_dem", "t_oil", "p_s", "time")
         if stage == "servo":
             return q in VANES
-        if place.at == "sensors.lvdt" and stage == "actuator":  # a reading's curve of what the drive does is one of it
-            return q not in ("time", "p_s")
         if stage == "actuator":
+            if place.at == "sensors.lvdt":  # a reading's curve of what the drive does is one of the drive
+                return q not in ("time", "p_s")
             return q in VANES or q == "x_dem"
         return q in ("i_cmd", "x_dem", "n_dem")
 
