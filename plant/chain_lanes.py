@@ -31,34 +31,18 @@ from plant.parameters import (
     DECELERATION,
     DRIVE_EFFECTS,
     DRIVE_LOADED,
-    FLOW_GAIN,
     GEOMETRY,
     KIND,
     LAG,
     LVDT_STEP,
-    P_REF,
     POT_SHARE,
     STROKE,
     VANE_EFFECTS,
 )
-from plant.places import (
-    ACCELERATION_LIMIT_ERROR,
-    AERO_LOAD,
-    CURRENT,
-    LVDT_BIAS,
-    LVDT_GAIN,
-    LVDT_NONLINEARITY,
-    LVDT_THERMAL_DRIFT,
-    N_R,
-    OIL_VISCOSITY,
-    POT,
-    ROTOR_LAG_ERROR,
-    VALVE_GAIN_ASYMMETRY,
-    VALVE_HYSTERESIS,
-    VALVE_NULL_BIAS,
-)
+from plant.places import ACCELERATION_LIMIT_ERROR, CURRENT, LVDT_NONLINEARITY, N_R, POT, ROTOR_LAG_ERROR
 from plant.sensors import quantise
 from plant.stages.blocks import elsewhere
+from plant.stages.hydraulic_blocks import Around, around
 from vaneloop.base.compiled import in_place, inlined
 from vaneloop.base.vanes import MOST
 
@@ -81,26 +65,17 @@ EFFECTS_CALLED = (
 _SITES = frozenset(e.site for e in EFFECTS.values())
 
 
-class _Around(NamedTuple):
-    """What a lane needs of its engine, valve and LVDT beside `drive.Drive`."""
+class _EngineAndLvdt(NamedTuple):
+    """What a lane needs of its engine (lag, limits) and of its LVDT (travel, bend, step of the converter), beside
+    `drive.Drive` and `hydraulic_blocks.Around`.
+    """
 
     lag: float
     acceleration: float
     deceleration: float
-    bias: float
-    width: float
-    spread: float
-    flow: float
-    viscosity: float
-    asymmetry: float
-    p_ref: float
-    aero: float
     travel: float
     sine: float
     cubic: float
-    lvdt_gain: float
-    lvdt_drift: float
-    lvdt_bias: float
     lvdt_step: float
 
 
@@ -113,7 +88,7 @@ _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveSta
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
 _share_drive = lanes.getter(drive.Drive, rated=1.0)  # for currents that are shares of the rated one
 _feed, _put_feed = lanes.getter(drive.Feed), lanes.putter(drive.Feed)
-_put_around = lanes.putter(_Around)
+_put_around, _put_others = lanes.putter(Around), lanes.putter(_EngineAndLvdt)
 _crank, _put_crank = lanes.getter(linkage_lanes.Crank), lanes.putter(linkage_lanes.Crank)
 _stem, _put_stem = lanes.getter(stem.Stem, "k", "stem_"), lanes.putter(stem.Stem, "k", "stem_")
 _stem_state = lanes.getter(stem.StemState, "k", "stem_")
@@ -122,7 +97,7 @@ _put_stem_state = lanes.putter(stem.StemState, "k", "stem_")
 
 def fields() -> list[tuple[str, Any, tuple[int, ...]]]:
     """Fields of a block: each a row of `W` lanes, or one for each of `MOST` stages."""
-    kinds: tuple[Any, ...] = (drive.DriveState, drive.Drive, drive.Feed, _Around, linkage_lanes.Crank)
+    kinds: tuple[Any, ...] = (drive.DriveState, drive.Drive, drive.Feed, Around, _EngineAndLvdt, linkage_lanes.Crank)
     once = [*(n for kind in kinds for n in kind._fields), *_MORE]
     of_stage = [*(f"stem_{n}" for n in (*stem.StemState._fields, *stem.Stem._fields)), *_OF_STAGE]
     return [*((n, np.float64, (W,)) for n in once), *((n, np.float64, (MOST, W)) for n in of_stage)]
@@ -144,27 +119,17 @@ def place(b: Any, j: int, p: np.ndarray, s: np.ndarray, stages: int) -> None:
     g = GEOMETRY
     _put_state(b, j, drive.taken(s, 0))
     _put_drive(b, j, drive.prepare(p, 0))
-    around = _Around(
+    others = _EngineAndLvdt(
         rotor_lag_error.step(p[LAG, 0], p[ROTOR_LAG_ERROR, 0]),
         acceleration_limit_error.step(p[ACCELERATION, 0], p[ACCELERATION_LIMIT_ERROR, 0]),
         p[DECELERATION, 0],
-        p[VALVE_NULL_BIAS, 0],
-        p[VALVE_HYSTERESIS, 0],
-        p[VALVE_HYSTERESIS + 1, 0],
-        p[FLOW_GAIN, 0],
-        p[OIL_VISCOSITY, 0],
-        p[VALVE_GAIN_ASYMMETRY, 0],
-        p[P_REF, 0],
-        p[AERO_LOAD, 0],
         p[STROKE, 0],
         p[LVDT_NONLINEARITY, 0],
         p[LVDT_NONLINEARITY + 1, 0],
-        p[LVDT_GAIN, 0],
-        p[LVDT_THERMAL_DRIFT, 0],
-        p[LVDT_BIAS, 0],
         p[LVDT_STEP, 0],
     )
-    _put_around(b, j, around)
+    _put_others(b, j, others)
+    _put_around(b, j, around(p, 0))
     _put_crank(b, j, linkage_lanes.crank_numbers(p[g + G_LX0, 0], p[g + G_X1, 0], p[g + G_Y1, 0], p[g + G_LE, 0]))
     b.n_r[j] = s[N_R, 0]
     b.m1[j], b.m2[j], b.m3[j], b.m4[j] = s[CURRENT, 0], s[CURRENT + 1, 0], s[CURRENT + 2, 0], s[CURRENT + 3, 0]

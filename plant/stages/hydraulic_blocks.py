@@ -47,7 +47,7 @@ from plant.places import (
 from plant.stages.blocks import W, between, put_where_seen
 from vaneloop.base.compiled import compiled_free, inlined
 
-__all__ = ["BLOCK", "CALLED", "run"]
+__all__ = ["BLOCK", "CALLED", "Around", "around", "run"]
 
 # effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
 CALLED = (
@@ -57,7 +57,7 @@ CALLED = (
 )  # fmt: skip
 
 
-class _Around(NamedTuple):
+class Around(NamedTuple):
     """What a block of lanes needs of each beside `drive.Drive`: the valve's hysteresis, flow, load, reading."""
 
     bias: float
@@ -74,16 +74,17 @@ class _Around(NamedTuple):
 
 
 _MEMORY = ("y1", "y2", "y3", "y4")  # A, of the valve's hysteresis
-BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, _Around, more=(*_MEMORY, "logged"))
+BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, Around, more=(*_MEMORY, "logged"))
 _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
 _rated_drive = lanes.getter(drive.Drive, rated=1.0)  # for currents that are shares of the rated one
-_feed, _put_around = lanes.getter(drive.Feed), lanes.putter(_Around)
+_feed, _put_around = lanes.getter(drive.Feed), lanes.putter(Around)
 
 
 @inlined
-def _around(p: np.ndarray, q: int) -> _Around:
-    return _Around(
+def around(p: np.ndarray, q: int) -> Around:
+    """Return it from lane ``q`` of the parameters."""
+    return Around(
         p[VALVE_NULL_BIAS, q],
         p[VALVE_HYSTERESIS, q],
         p[VALVE_HYSTERESIS + 1, q],
@@ -143,7 +144,7 @@ def run(
             curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
             _put_state(b, j, drive.taken(s, q))
             _put_drive(b, j, drive.prepare(p, q))
-            _put_around(b, j, _around(p, q))
+            _put_around(b, j, around(p, q))
             b.y1[j], b.y2[j], b.y3[j], b.y4[j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
         for k in range(n):
             if k > 0:
