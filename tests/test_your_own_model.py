@@ -16,6 +16,7 @@ import pytest
 from tests.browser import open_to_all
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
+from vaneloop.discrepancy.models.data import Data
 from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_model.md"
@@ -168,6 +169,42 @@ def test_springs_may_start_with_the_measured_force() -> None:
         return float(answer.diagnosis.stages[0].error_after[0])
 
     assert left("measured") < 0.5 * left("unloaded")
+
+
+def bent(seed: int, noise_of_position: float) -> tuple[System, Record]:
+    """A drag and a spring that stiffens, both known, moved by five sines up to 3.5 Hz; position and force measured."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 40.0, 0.005)
+    f, start = rng.uniform(0.3, 3.5, 5), rng.uniform(0.0, 6.0, 5)
+    x = np.sum([np.sin(2.0 * np.pi * a * t + b) for a, b in zip(f, start, strict=True)], axis=0)
+    v = np.sum([2.0 * np.pi * a * np.cos(2.0 * np.pi * a * t + b) for a, b in zip(f, start, strict=True)], axis=0)
+    force = 0.05 * v * np.abs(v) + 2.0 * x**3
+    level = 0.002 * float(np.std(force))
+    system = System(
+        "bent", "force", lambda u, p: p.drag * u.velocity * np.abs(u.velocity) + p.cubic * u.position**3,
+        outputs={"force": "N"}, position="x",
+        parameters=[Parameter("drag", 0.05, "N s2/m2"), Parameter("cubic", 2.0, "N/m3")],
+    )  # fmt: skip
+    columns = {
+        "x": x + noise_of_position * rng.standard_normal(len(t)), "force": force + level * rng.standard_normal(len(t)),
+    }  # fmt: skip
+    return system, Record("bent", t, columns)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_force_that_bends_is_that_of_the_whole_motion(seed: int) -> None:
+    system, log = bent(seed, 1e-5)
+    bound = system.bind([log])
+    left = (bound.measured - bound.run(bound.stage.neutral()[None])[0])[0]
+    assert np.sqrt(np.nanmean(left**2)) < 0.002 * np.std(log.columns["force"])  # what noise of the samples is there
+
+
+def test_motion_is_differentiated_no_further_than_its_noise_allows() -> None:
+    data = [Data(system, [log]) for system, log in (bent(1, level) for level in (1e-5, 1e-3, 1e-2, 0.3))]
+    assert len({d.cutoff for d in data}) == 1
+    reach = [float(d.motion_cutoff or 0.0) / float(d.cutoff or 1.0) for d in data]
+    assert reach[0] == pytest.approx(3.0) and reach[-1] == 1.0
+    assert reach == sorted(reach, reverse=True) and len(set(reach)) > 2
 
 
 def test_samples_may_be_missing_and_times_uneven() -> None:

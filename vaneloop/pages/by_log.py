@@ -82,6 +82,8 @@ def curves_by_log(page: Page, by_log: ByLog) -> None:
         if bound is not by_log.logs.fitted:
             thetas = [bound.theta_from(by_log.logs.fitted, v) for v in thetas]
         y = bound.run(np.array(thetas))
+        if bound.data.cutoff:  # at the ends of a log that is differentiated nothing is compared
+            y = np.where(np.isfinite(bound.measured), y, np.nan)
         for name, at in list(bound.logs.items())[:SHOWN]:
             panels = []
             t = bound.t[at] - bound.t[at][0]

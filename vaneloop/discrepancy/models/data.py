@@ -7,7 +7,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass, motion, smoothed, uses
+from vaneloop.discrepancy.models.motion import (
+    MOTION,
+    differentiated_to,
+    highest_frequency,
+    low_pass,
+    motion,
+    smoothed,
+    uses,
+)
 from vaneloop.discrepancy.models.quantities import column_of
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
@@ -29,7 +37,8 @@ class Data:
     u, y      log by log: float64[in_names, samples] and float64[outputs, samples]
     t         s, of all logs, one after the other
     measured  float64[outputs, samples], of all logs
-    cutoff    Hz, up to which motion is differentiated and forces are compared; None: they are as measured
+    cutoff    Hz, up to which forces are compared; None: they are as measured
+    motion_cutoff   Hz, up to which motion is differentiated for it
     window    s, after which the model starts anew from the measured states; None: it does not
     notes     what the user should know
     like      take the cut-off from an earlier one (for test logs)
@@ -38,6 +47,7 @@ class Data:
     def __init__(self, system: System, records: Sequence[Record], like: Data | None = None):
         self.system, self.like = system, like
         self.cutoff: float | None = None
+        self.motion_cutoff: float | None = None
         self.notes: list[str] = []
         if not records:
             raise StageError(f"system {system.name!r}: no log")
@@ -104,10 +114,10 @@ class Data:
             y = np.array([r.columns.get(o, np.full(len(r.t), np.nan)) for o in outs])
             u = [r.columns[c] for c in ins]
             if s.kind == "force":
-                x, v, a = motion(s, r, self.cutoff)
+                x, v, a = motion(s, r, self.motion_cutoff)
                 u = [x, v, a, *u]
-                if self.cutoff:  # twice, as the model's: its motion, then the force that follows from it
-                    y = np.array([low_pass(r.t, low_pass(r.t, row, self.cutoff), self.cutoff) for row in y])
+                if self.cutoff and self.motion_cutoff:  # as the model's: its motion, then the force that follows
+                    y = np.array([low_pass(r.t, low_pass(r.t, row, self.motion_cutoff), self.cutoff) for row in y])
                     edge = EDGE / self.cutoff + SPLINE * float(np.median(np.diff(r.t)))
                     y[:, (r.t < edge) | (r.t > r.t[-1] - edge)] = np.nan
             self.u.append(np.ascontiguousarray(np.array(u, dtype=float).reshape(len(u), len(r.t))))
@@ -121,20 +131,17 @@ class Data:
         self.measured = np.concatenate(self.y, axis=1)
 
     def _choose_cutoff(self) -> None:
-        """Up to which frequency the motion is differentiated."""
+        """Up to which frequency the forces are compared, and the motion is differentiated."""
         s = self.system
         if s.velocity and not uses(s.model, "acceleration"):
             return
         if self.like is not None:
-            self.cutoff = self.like.cutoff
+            self.cutoff, self.motion_cutoff = self.like.cutoff, self.like.motion_cutoff
             return
-        if s.cutoff is not None:
-            self.cutoff = s.cutoff
-            return
-        self.cutoff = highest_frequency(s.outputs, self.records)
-        self.notes.append(
-            f"motion differentiated, and forces compared, up to {self.cutoff:.3g} Hz (cutoff= sets another)"
-        )
+        self.cutoff = s.cutoff or highest_frequency(s.outputs, self.records)
+        self.motion_cutoff = differentiated_to(s, self.records, self.cutoff)
+        if s.cutoff is None:
+            self.notes.append(f"forces compared up to {self.cutoff:.3g} Hz (cutoff= sets another)")
 
     def first_state(self, log: int, state: str, fallback: float, at: int = 0) -> float:
         """A state at the start of a log: given, measured, or else ``fallback``."""

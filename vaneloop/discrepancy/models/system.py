@@ -67,8 +67,8 @@ class System:
     parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
     position, velocity   force: the channel of the displacement, of its rate, or of both: what is missing is
                          differentiated, or integrated from a start that is fitted to each log (``start_position``)
-    cutoff      force: frequency in Hz up to which motion is differentiated and forces are compared; default: from the
-                measured force
+    cutoff      force: frequency in Hz up to which forces are compared, and three times which motion is differentiated
+                where its noise allows; default: from the measured force
     start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force
                 "measured" there
     states      simulate: name -> unit, in the order in which the model returns their derivatives
