@@ -1,6 +1,7 @@
-"""Fleets: a run folder of 100,000 logs, two workers against one, and a report held against what is true.
+"""Fleets: a run folder of 100,000 logs, two workers against one, kills, and a report held against what is true.
 
 python -m benchmarks fleet                          # the folder of 100,000 logs, and the workers; free cores
+python -m benchmarks.fleet kills [SEED]             # fifty kills at moments drawn by chance; two minutes
 python -m benchmarks.fleet judge RUN TRUTH.json     # a run over the logs of `vaneloop fleet demo`
 """
 
@@ -9,11 +10,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ from benchmarks.measure import ROOT, Row
 __all__ = ["MEASUREMENTS", "judged"]
 
 LOGS, ENGINES = 100_000, 200
+KILLS = 50
 RIGHT = 0.1  # of the time axis, by which an onset may be off
 
 
@@ -114,6 +118,81 @@ def workers() -> Iterator[Row]:
 MEASUREMENTS = {"a fleet's run of 100,000 logs": hundred_thousand, "a fleet's workers": workers}
 
 
+# ---- kills -----------------------------------------------------------------------------------------------------------
+
+STARTER = """
+import sys
+from vaneloop.fleet import state
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.rent import rent
+
+if __name__ == "__main__":
+    folder = Folder(sys.argv[1])
+    state.tidy(folder)
+    rent(folder, "local", 2, {}, 0.2, lambda n, of: None)
+"""
+
+
+def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
+    """Run the same logs undisturbed, and with kills: tables of both, byte for byte.
+
+    Killed is one of the processes of the run drawn by chance, after some more logs were begun (0 to 10) and some time
+    (up to 0.3 s), both drawn by chance: the starter (with Dask's scheduler), a worker, its nanny or a reader of logs. A
+    starter that was killed or has ended is started again. The logs are a stand-in's (tests/fleet_jobs.py), 0.1 s each.
+    """
+    import psutil
+
+    from vaneloop.fleet import sources, state, tables
+    from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.journal import lines
+    from vaneloop.fleet.worker import work
+
+    draw = random.Random(seed)
+    for k in range(logs):
+        path = place / "logs" / f"e{k % 10}" / f"2026-01-{1 + k % 28:02d}_{k:05d}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"log {k}", encoding="utf-8")
+    runs = [Folder.begin(place / name, "tests.fleet_jobs:diagnosed", {}, {}) for name in ("calm", "killed")]
+    for run in runs:
+        run.add(sources.find([str(place / "logs")]))
+    script = place / "starter.py"
+    script.write_text(STARTER, encoding="utf-8")
+    begin = partial(
+        subprocess.Popen, [sys.executable, str(script), str(runs[1].path)], stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    chunks, dead, starts, due = len(runs[1].chunks()), dict.fromkeys(("starter", "worker", "reader"), 0), 0, 1
+    begun = lambda: sum(line["what"] == "begin" for line in lines(runs[1].path))  # noqa: E731
+    starter = None
+    while len(runs[1].finished()) < chunks:
+        if starter is None or starter.poll() is not None:
+            starter, starts = begin(), starts + 1
+        time.sleep(draw.uniform(0.0, 0.3))
+        if sum(dead.values()) >= kills or begun() < due:
+            continue
+        try:
+            family = psutil.Process(starter.pid)
+            who = draw.choice([family, *family.children(recursive=True)])
+            kind = "starter" if who == family else "reader" if "serve()" in " ".join(who.cmdline()) else "worker"
+            who.kill()
+        except psutil.NoSuchProcess:  # it has ended by itself meanwhile
+            continue
+        dead[kind] += 1
+        due = begun() + draw.randint(0, 10)
+    if starter is not None:
+        starter.wait()
+    state.tidy(runs[1])
+    work(runs[0].path)
+    same = True
+    for run in runs:
+        tables.write_tables(tables.roll_up(run), run.path / "tables")
+    for name in tables.TABLES:
+        calm, other = (sorted((run.path / "tables" / f"{name}.csv").read_bytes().splitlines()) for run in runs)
+        same = same and calm == other and len(calm) == logs + 1
+    left = [f for folder in ("leases", "results", "workers") for f in (runs[1].path / folder).iterdir()]
+    return {"killed": dead, "starts": starts, "logs": logs, "again": begun() - logs, "same": same, "left": len(left)}
+
+
 # ---- a report against the truth --------------------------------------------------------------------------------------
 
 
@@ -188,8 +267,20 @@ def _show(said: dict[str, Any]) -> None:
     print(f"healthy engines accused: {len(said['accused'])} of {said['healthy']}")
 
 
+def _kills(seed: int) -> int:
+    with tempfile.TemporaryDirectory() as place:
+        said = killed(Path(place), KILLS, 600, seed)
+    who = ", ".join(f"{n} {kind}s" for kind, n in said["killed"].items())
+    print(f"seed {seed}: {sum(said['killed'].values())} kills ({who}); started {said['starts']} times")
+    print(f"{said['logs']} logs, {said['again']} of them begun again; files left behind: {said['left']}")
+    print(f"tables equal those of an undisturbed run, byte for byte after sorting: {'yes' if said['same'] else 'NO'}")
+    return 0 if said["same"] and sum(said["killed"].values()) == KILLS else 1
+
+
 if __name__ == "__main__":
     words = sys.argv[1:]
+    if words[:1] == ["kills"] and len(words) <= 2:
+        raise SystemExit(_kills(int(words[1]) if len(words) == 2 else 1))
     if len(words) != 3 or words[0] != "judge":
         raise SystemExit(__doc__)
     _show(judged(words[1], words[2]))

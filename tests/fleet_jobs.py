@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
 from pathlib import Path
@@ -28,6 +29,21 @@ def read(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
     if "pause" in text:
         time.sleep(0.05)
     return {"verdict": "none", "answer": {"letters": len(text), "first": text[:12]}}
+
+
+def diagnosed(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
+    """An answer with a row in every table, drawn by the log's text, after a tenth of a second."""
+    draw = random.Random(Path(path).read_text(encoding="utf-8"))
+    time.sleep(0.1)
+    value = draw.gauss(1.0, 0.1)
+    row = {"stage": "linkage", "unit": "deg", "value": value, "low": value - 0.1, "high": value + 0.1}
+    blind = {"effect": "coil_heating", "stage": "actuator", "needs": "an oil temperature that changes by 20 K"}
+    answer = {
+        "nominal": [{**row, "parameter": "linkage.vigv_play", "table": 1.6, "tolerance": 0.3}],
+        "sizes": [{**row, "effect": "pot_bias", "parameter": "vigv", "probability": draw.random(), "neutral": 0.0}],
+        "not_observable": [blind], "stages": [], "duration_s": 60.0,
+    }  # fmt: skip
+    return {"verdict": "missing", "answer": answer}
 
 
 def read_cold(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
