@@ -189,8 +189,8 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
     for name in tables.TABLES:
         calm, other = (sorted((run.path / "tables" / f"{name}.csv").read_bytes().splitlines()) for run in runs)
         same = same and calm == other and len(calm) == logs + 1
-    left = [f for folder in ("leases", "results", "workers") for f in (runs[1].path / folder).iterdir()]
-    return {"killed": dead, "starts": starts, "logs": logs, "again": begun() - logs, "same": same, "left": len(left)}
+    left = [f.name for folder in ("leases", "results", "workers") for f in (runs[1].path / folder).iterdir()]
+    return {"killed": dead, "starts": starts, "logs": logs, "again": begun() - logs, "same": same, "left": left}
 
 
 # ---- a report against the truth --------------------------------------------------------------------------------------
@@ -272,7 +272,7 @@ def _kills(seed: int) -> int:
         said = killed(Path(place), KILLS, 600, seed)
     who = ", ".join(f"{n} {kind}s" for kind, n in said["killed"].items())
     print(f"seed {seed}: {sum(said['killed'].values())} kills ({who}); started {said['starts']} times")
-    print(f"{said['logs']} logs, {said['again']} of them begun again; files left behind: {said['left']}")
+    print(f"{said['logs']} logs, {said['again']} of them begun again; left behind: {', '.join(said['left']) or 'nothing'}")
     print(f"tables equal those of an undisturbed run, byte for byte after sorting: {'yes' if said['same'] else 'NO'}")
     return 0 if said["same"] and sum(said["killed"].values()) == KILLS else 1
 

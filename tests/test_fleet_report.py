@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import subprocess
@@ -416,3 +417,69 @@ def test_healthy_engines_are_hardly_said_to_change() -> None:
         t, s = np.sort(rng.uniform(0.0, 2.0, 50)), np.full(50, 0.3)
         accused += any(trend(t, rng.normal(0.0, 1.0, 50), s, 0.01 / 20).kind != "none" for _ in range(20))
     assert accused <= 5
+
+
+# ---- a user's own system ---------------------------------------------------------------------------------------------
+
+BENCH = """
+from vaneloop import System, unknown
+
+system = System(
+    "bench", "static", lambda u, p: p.gain * u.current, inputs={"current": "A"}, outputs={"flow": "l/min"},
+    parameters=[unknown("gain", 1.0, "l/(min A)")], places=["output"],
+)
+"""
+
+
+def test_logs_of_a_system_of_ones_own_are_followed_over_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two benches with a flow of 3 l/(min A), the flow meter of one drifts by 6 l/min a year from May on."""
+    from vaneloop.cli import fleet
+    from vaneloop.fleet import sources
+    from vaneloop.fleet.worker import work
+
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    (tmp_path / "bench.py").write_text(BENCH)
+    rng, t = np.random.default_rng(1), np.arange(0.0, 30.0, 0.05)
+    for engine in ("a", "b"):
+        (tmp_path / "logs" / engine).mkdir(parents=True)
+        for month in range(1, 13):
+            current = np.interp(t, np.arange(0.0, 31.0, 2.0), rng.uniform(-2.0, 2.0, 16))
+            flow = 3.0 * current + rng.normal(0.0, 0.05, len(t)) + (engine == "b") * 0.5 * max(month - 5, 0)
+            rows = np.column_stack([t, current, flow])
+            log = tmp_path / "logs" / engine / f"2026-{month:02d}-01.csv"
+            np.savetxt(log, rows, delimiter=",", header="t,current,flow", comments="")
+    words = ["run", str(tmp_path / "logs"), "--out", str(tmp_path / "run"), "--system", str(tmp_path / "bench.py")]
+    parser = argparse.ArgumentParser()
+    fleet.add_options(parser)
+    run = Folder.begin(tmp_path / "run", "vaneloop.fleet.diagnosis:diagnose_log", *fleet._job(parser.parse_args(words)))
+    run.add(sources.find([str(tmp_path / "logs")]))
+    assert work(run.path) == {"done": 24}
+    view = view_of(roll_up(run), {"flow.bias.offset": 12.0})
+    assert [(r["engine"], r["effect"]) for r in view.lacking] == [("b", "flow.bias")]
+    (drift,) = view.changed
+    assert (drift.engine, drift.quantity, drift.trend["kind"]) == ("b", "flow.bias.offset", "growth")
+    assert abs(drift.trend["onset"] - (moment("2026-05-01") or 0.0)) < 0.1 * YEAR
+    assert drift.trend["rate"] == pytest.approx(6.0, rel=0.05) and drift.trend["limit_time"] is not None
+    gain = [s for s in view.series if s.quantity == "gain"]
+    assert len(gain) == 2 and all(abs(s.trend["now"] - 3.0) < 0.02 and s.tolerance is None for s in gain)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--system", "no.py"], "no.py: no such file"),
+        (["--system", "bench.py", "--plant", "pump.toml"], "--plant does not go with --system"),
+        (["--system", "bench.py", "--model", "m.toml"], "is a model of 'the vane chain'; system 'bench' is asked for"),
+    ],
+)
+def test_a_system_that_cannot_be_asked_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bench.py").write_text(BENCH)
+    Path("m.toml").write_text("[parameters]\n")
+    Path("a.csv").write_text("t,current,flow\n0,0,0\n")
+    assert main(["fleet", "run", "a.csv", "--out", "x", *words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and says in err, err
+    assert not Path("x").exists()

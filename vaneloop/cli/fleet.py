@@ -29,6 +29,7 @@ on it at once. Needs the extra `fleet`: pip install 'vaneloop[fleet]'. See docs/
 examples:
   vaneloop fleet run examples/ --out out/fleet
   vaneloop fleet run LOGS --out out/fleet --engines ENGINES.csv --workers 8
+  vaneloop fleet run LOGS --out out/pumps --system pump.py
   vaneloop fleet run LOGS --out out/fleet --on slurm --workers 200 --queue queue=batch
   vaneloop fleet work out/fleet
   vaneloop fleet status out/fleet --json -
@@ -57,6 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_reading_options(run.add_argument_group("reading the logs (docs/logs.md)"))
     options.add_machine_options(run)
     run.add_argument("--controller", metavar="PATH.so", help="your own controller in place of the firmware")
+    run.add_argument("--system", metavar="MY.py", help="logs of a system of your own (docs/your_own_model.md)")
     work = parts.add_parser("work", help="join a run from this or another machine")
     status = parts.add_parser("status", help="how far a run is")
     report = parts.add_parser("report", help="tables and a page of what the logs say together")
@@ -124,9 +126,9 @@ def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     from vaneloop.base import tables
     from vaneloop.fleet.folder import copies_of
 
-    options.machine_of(args)  # refuses what cannot be read, before anything is begun
+    _known_machine(args)
     files = {"tables": args.tables, "model": args.model, "plant": args.plant, "controller": args.controller,
-             "dbc": args.dbc, "mapping": args.mapping}  # fmt: skip
+             "system": args.system, "dbc": args.dbc, "mapping": args.mapping}  # fmt: skip
     given = {name: str(f) for name, f in files.items() if f is not None}
     if args.plant:
         given["plant"] = str(tables.file_of(args.plant))
@@ -134,6 +136,25 @@ def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     for in_files in ("dbc", "mapping_file", "tables"):
         reading.pop(in_files, None)
     return {"files": copies_of(given), "reading": reading, "limit": args.limit}, given
+
+
+def _known_machine(args: argparse.Namespace) -> None:
+    """Refuse a machine or a system that cannot be read, before anything is begun."""
+    if not args.system:
+        options.machine_of(args)
+        return
+    from vaneloop.discrepancy import StageError, load_system
+    from vaneloop.discrepancy.models.by_log import load_model_of
+
+    for name in ("tables", "plant", "controller"):
+        if getattr(args, name):
+            raise InputError(f"--{name} does not go with --system")
+    try:
+        system = load_system(args.system)
+        if args.model:
+            load_model_of(args.model, system)
+    except StageError as e:
+        raise InputError(str(e)) from None
 
 
 def _work(args: argparse.Namespace) -> int:

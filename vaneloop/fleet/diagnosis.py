@@ -7,9 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vaneloop.base.errors import InputError
+
 if TYPE_CHECKING:
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.search import Diagnosed
+
+    Columns = dict[str, tuple[np.ndarray, np.ndarray]]
 
 __all__ = ["diagnose_log"]
 
@@ -17,27 +21,47 @@ __all__ = ["diagnose_log"]
 def diagnose_log(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
     """Diagnose a log as ``vaneloop diagnose`` does; return verdict and answer, without what differs between two runs.
 
-    options  files (of the machine, within the run's folder), and how logs are read (`hil.logs.read_log`)
+    options  files (of the machine or the user's own system, within the run's folder), and how logs are read
+             (`hil.logs.read_log`)
     """
+    files = {name: str(Path(run) / f) for name, f in options["files"].items()}
+    reading = dict(options["reading"])
+    reading |= {k: files[n] for k, n in (("dbc", "dbc"), ("mapping_file", "mapping")) if n in files}
+    said, columns = (_of_system if "system" in files else _of_machine)(path, files, reading)
+    answer = said.to_dict()
+    answer.pop("elapsed_s")
+    answer["nominal"], answer["sizes"] = _nominal(said), _sizes(said, answer)
+    answer["range"] = {name: [float(np.nanmin(v)), float(np.nanmax(v))] for name, (_, v) in sorted(columns.items())}
+    answer["duration_s"] = float(max(t[-1] for t, _ in columns.values()) - min(t[0] for t, _ in columns.values()))
+    return {"verdict": said.verdict, "answer": answer}
+
+
+def _of_machine(path: str, files: dict[str, str], reading: dict[str, Any]) -> tuple[Diagnosed, Columns]:
+    """The answer to a log of the vane machine, and times and values of its channels."""
     from hil.logs import read_log
     from vaneloop.verbs.machine import files_of
     from vaneloop.verbs.search import diagnose
 
-    files = {name: str(Path(run) / f) for name, f in options["files"].items()}
-    reading = dict(options["reading"])
-    reading |= {k: files[n] for k, n in (("dbc", "dbc"), ("mapping_file", "mapping")) if n in files}
     log = read_log(path, require=(), **reading, tables=files_of(files.get("tables")))
     said = diagnose(log, _machine(files), workers=1)
-    answer = said.to_dict()
-    answer.pop("elapsed_s")
-    answer["nominal"], answer["sizes"] = _nominal(said), _sizes(said, answer)
-    answer["range"] = {
-        name: [float(np.min(c.values)), float(np.max(c.values))] for name, c in sorted(log.channels.items())
-    }
-    answer["duration_s"] = float(
-        max(c.t[-1] for c in log.channels.values()) - min(c.t[0] for c in log.channels.values())
-    )
-    return {"verdict": said.verdict, "answer": answer}
+    return said, {name: (c.t, c.values) for name, c in log.channels.items()}
+
+
+def _of_system(path: str, files: dict[str, str], reading: dict[str, Any]) -> tuple[Diagnosed, Columns]:
+    """The same of a user's own system, with what its model file has learned by now."""
+    from vaneloop.discrepancy import StageError, load_system
+    from vaneloop.discrepancy.models.by_log import load_model_of
+    from vaneloop.verbs.search import diagnose, read_record
+
+    try:
+        system = load_system(files["system"])
+        added = load_model_of(files["model"], system) if "model" in files else None
+        record, _ = read_record(path, system, **({} if system.read else reading))
+        said = diagnose(record, system, added=added)
+    except StageError as e:
+        raise InputError(str(e)) from None
+    measured = {name: v for name, v in record.columns.items() if np.isfinite(v).any()}
+    return said, {name: (record.t, v) for name, v in measured.items()}
 
 
 def _machine(files: dict[str, str]) -> Machine:
@@ -49,18 +73,20 @@ def _machine(files: dict[str, str]) -> Machine:
 
 def _nominal(said: Diagnosed) -> list[dict[str, Any]]:
     """Every nominal parameter that the log could move, as fitted with what was found: value, 90 % interval, and what
-    the tables say of it.
+    the tables say of it. Of a user's own system those that it declares, not where a log starts; an unknown one has no
+    tolerance.
     """
     out, stages = [], {s.name: s for s in said.bound.stages}
+    declared = {p.name: p for p in said.by_log.logs.fitted.system.parameters} if said.by_log else None
     for d in said.diagnosis.stages:
         parameters = stages[d.stage].parameters
         for k, column in enumerate(d.final.free):
-            if column < len(parameters):
-                p = parameters[int(column)]
+            if column < len(parameters) and (declared is None or parameters[int(column)].name in declared):
+                p = parameters[int(column)] if declared is None else declared[parameters[int(column)].name]
                 out.append({
                     "stage": d.stage, "parameter": p.name, "unit": p.unit, "value": float(d.final.theta[column]),
                     "low": float(d.final.low[k]), "high": float(d.final.high[k]), "table": float(p.value),
-                    "tolerance": float(p.tolerance),
+                    "tolerance": float(p.tolerance) if np.isfinite(p.tolerance) else None,
                 })  # fmt: skip
     return out
 
@@ -83,7 +109,9 @@ def _sizes(said: Diagnosed, answer: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _warm_up(options: dict[str, Any], run: str) -> None:
-    """Compile all that a diagnosis needs, on a short simulated run."""
+    """Compile all that a diagnosis needs, on a short simulated run; of a user's own system with its first log."""
+    if "system" in options["files"]:
+        return
     from hil.logs import Channel, Log
     from hil.loop.lockstep import Stimulus, lockstep
     from vaneloop.verbs.search import diagnose

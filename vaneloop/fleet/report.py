@@ -143,8 +143,8 @@ def _nominal(db: duckdb.DuckDBPyConnection) -> list[Series]:
     rows = db.execute(
         'SELECT engine, parameter, unit, any_value("table"), any_value(tolerance), list(time ORDER BY path), '
         "list(value ORDER BY path), list(high - low ORDER BY path), list(key ORDER BY path) FROM nominal "
-        "WHERE time IS NOT NULL AND (tolerance <= 0 OR high - low < $1 * tolerance) GROUP BY engine, parameter, unit "
-        "ORDER BY ALL", [UNTOLD],
+        "WHERE time IS NOT NULL AND (coalesce(tolerance, 0) <= 0 OR high - low < $1 * tolerance) "
+        "GROUP BY engine, parameter, unit ORDER BY ALL", [UNTOLD],
     ).fetchall()  # fmt: skip
     return [
         _series(engine, parameter, unit, times, values, widths, keys, table, tolerance, "nominal")
