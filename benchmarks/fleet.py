@@ -272,7 +272,8 @@ def _kills(seed: int) -> int:
         said = killed(Path(place), KILLS, 600, seed)
     who = ", ".join(f"{n} {kind}s" for kind, n in said["killed"].items())
     print(f"seed {seed}: {sum(said['killed'].values())} kills ({who}); started {said['starts']} times")
-    print(f"{said['logs']} logs, {said['again']} of them begun again; left behind: {', '.join(said['left']) or 'nothing'}")
+    left = ", ".join(said["left"]) or "nothing"
+    print(f"{said['logs']} logs, {said['again']} of them begun again; left behind: {left}")
     print(f"tables equal those of an undisturbed run, byte for byte after sorting: {'yes' if said['same'] else 'NO'}")
     return 0 if said["same"] and sum(said["killed"].values()) == KILLS else 1
 

@@ -30,6 +30,14 @@ SPREAD = 2.0 * 1.6449  # a 90 % interval over a standard deviation
 # of the interval that the tolerance alone gives (a uniform draw's deviation is tolerance / sqrt 3), from which on a log
 # has told nothing of a nominal parameter: it stands where the table has it
 UNTOLD = 0.9 * SPREAD / 3.0**0.5
+# effect -> the nominal parameter of which it is the part beyond the table's value: {} is the effect's parameter. A log
+# has the whole in one or the other, as its size is within the tolerance or beyond it
+SAME = {
+    "linkage_backlash": "linkage.{}_play",
+    "pot_bias": "sensors.{}_bias",
+    "rotor_lag_error": "engine.lag",
+    "screw_friction": "screw.friction",
+}
 
 
 def limits_of(file: str | None) -> dict[str, float]:
@@ -52,7 +60,7 @@ def view_of(db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str =
     engines = [str(r[0]) for r in db.execute("SELECT DISTINCT engine FROM logs ORDER BY engine").fetchall()]
     statuses = dict(db.execute("SELECT status, count(*) FROM logs GROUP BY status ORDER BY status").fetchall())
     lacks = _lacks(db)
-    found: list[Series] = [*_effects(db, lacks), *_nominal(db)]
+    found: list[Series] = [*_effects(db, lacks), *_nominal(db, lacks)]
     wrong = sorted(set(limits) - {s.quantity for s in found} - _known(db))
     if wrong:
         raise InputError(f"--limits: quantity (={wrong[0]!r}) is in no log of the run; a quantity is "
@@ -104,57 +112,109 @@ def _lacks(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
 
 
 def _effects(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> list[Series]:
-    """Sizes over time of every effect that an engine lacks; logs that could show it and did not say it is small.
+    """Sizes over time of every effect that an engine lacks.
 
-    How small: as the smallest size that any log of the fleet tells from nothing.
+    What is the part of a nominal parameter beyond its table (`SAME`) is followed as a whole: what logs say of the one
+    and of the other. Of other effects, logs that could show it and found nothing amiss in its stage say that it is
+    small: as the smallest size that any log of the fleet tells from nothing.
     """
     rows = db.execute(
         "SELECT engine, effect, stage, parameter, unit, neutral, list(time ORDER BY path), list(value ORDER BY path), "
-        "list(high - low ORDER BY path), list(key ORDER BY path) FROM effects WHERE time IS NOT NULL GROUP BY ALL "
-        "ORDER BY ALL"
+        "list(high - low ORDER BY path), list(key ORDER BY path), list(path ORDER BY path) FROM effects "
+        "WHERE time IS NOT NULL GROUP BY ALL ORDER BY ALL"
     ).fetchall()
-    told = db.execute(
+    sizes = db.execute(
         "SELECT effect, parameter, min(abs(value - neutral)) FROM effects WHERE low > neutral OR high < neutral "
         "GROUP BY ALL"
     ).fetchall()
-    smallest = {(effect, parameter): float(size) for effect, parameter, size in told}
+    smallest = {(effect, parameter): float(size) for effect, parameter, size in sizes}
     real = {(r["engine"], r["effect"]) for r in lacks if r["lacks"]}
     out = []
-    for engine, effect, _, parameter, unit, neutral, times, values, widths, keys in rows:
+    for engine, effect, stage, parameter, unit, neutral, times, values, widths, keys, paths in rows:
         if (engine, effect) not in real:
             continue
+        parts = _nominal_parts(db, engine, whole_of(effect, parameter))
         silent = db.execute(
-            "SELECT l.time, l.key FROM logs l WHERE l.engine = $1 AND l.status = 'done' AND l.time IS NOT NULL AND NOT "
-            "EXISTS (SELECT 1 FROM effects e WHERE e.path = l.path AND e.effect = $2) AND NOT EXISTS (SELECT 1 FROM "
-            "coverage c WHERE c.path = l.path AND c.effect = $2) ORDER BY l.path", [engine, effect],
+            "SELECT l.time, l.key, l.path FROM logs l WHERE l.engine = $1 AND l.status = 'done' AND l.time IS NOT NULL "
+            "AND l.verdict <> 'unknown' AND NOT EXISTS (SELECT 1 FROM effects e WHERE e.path = l.path AND e.stage = $3)"
+            " AND NOT EXISTS (SELECT 1 FROM coverage c WHERE c.path = l.path AND (c.effect = $2 OR c.effect = '' AND "
+            "c.stage = $3)) ORDER BY l.path", [engine, effect, stage],
         ).fetchall()  # fmt: skip
-        if (least := smallest.get((effect, parameter))) is None:
+        if parts:
+            values, widths, silent = _whole(values, widths, paths, silent, parts, neutral)
+        elif (least := smallest.get((effect, parameter))) is None:
             continue  # no log tells it from nothing
+        else:
+            silent = [(time, key, neutral, least * SPREAD) for time, key, _ in silent]
+        more = list(zip(*silent, strict=True)) or [(), (), (), ()]
+        told = [True] * len(times) + [bool(parts)] * len(silent)
         out.append(_series(
-            engine, f"{effect}.{parameter}", unit, [*times, *(s[0] for s in silent)],
-            [*values, *[neutral] * len(silent)], [*widths, *[least * SPREAD] * len(silent)],
-            [*keys, *(s[1] for s in silent)], neutral, None, "effect",
+            engine, f"{effect}.{parameter}", unit, [*times, *more[0]], [*values, *more[2]], [*widths, *more[3]],
+            [*keys, *more[1]], neutral, None, "effect", told,
         ))  # fmt: skip
     return out
 
 
-def _nominal(db: duckdb.DuckDBPyConnection) -> list[Series]:
-    """Every nominal parameter of every engine over time, as recalibrated by the logs that tell something of it."""
+def whole_of(effect: str, parameter: str) -> str:
+    """The nominal parameter of which an effect's parameter is the part beyond the table; "": of none."""
+    return SAME.get(effect, "").format(parameter)
+
+
+def _nominal_parts(db: duckdb.DuckDBPyConnection, engine: str, parameter: str) -> dict[str, tuple[float, float, bool]]:
+    """What each log says of a nominal parameter: path -> value beyond the table, width of its interval, and whether it
+    stands at the end of its tolerance, where a log tells only that it is no less.
+    """
+    rows = db.execute(
+        "SELECT path, value - \"table\", high - low, abs(value - \"table\") >= 0.999 * tolerance FROM nominal WHERE "
+        "engine = $1 AND parameter = $2", [engine, parameter],
+    ).fetchall()  # fmt: skip
+    return {path: (float(value), float(width), bool(ends)) for path, value, width, ends in rows}
+
+
+def _whole(
+    values: Sequence[float], widths: Sequence[float], paths: Sequence[str], silent: Sequence[Any],
+    parts: dict[str, tuple[float, float, bool]], neutral: float,
+) -> tuple[list[float], list[float], list[Any]]:  # fmt: skip
+    """Values and widths of an effect with those of its nominal parameter: of the logs that name it, and of the silent.
+
+    Logs that name the effect know the sum of both; that they do not know the share of the nominal one makes the effect
+    as much less sure, and is taken off.
+    """
+    found = [(time, key, neutral + parts[path][0], parts[path][1]) for time, key, path in silent
+             if path in parts and not parts[path][2]]  # fmt: skip
+    sure = float(np.median([width for *_, width in found])) if found else 0.0
+    sums, whole = [], []
+    for value, width, path in zip(values, widths, paths, strict=True):
+        share, unsure, _ = parts.get(path, (0.0, 0.0, False))
+        sums.append(value + share)
+        whole.append(max(float(np.sqrt(max(width**2 - unsure**2, 0.0))), min(sure, width)))
+    return sums, whole, found
+
+
+def _nominal(db: duckdb.DuckDBPyConnection, lacks: Sequence[dict[str, Any]]) -> list[Series]:
+    """Every nominal parameter of every engine over time, as recalibrated by the logs that tell something of it; but for
+    those that are followed as a whole with an effect.
+    """
     rows = db.execute(
         'SELECT engine, parameter, unit, any_value("table"), any_value(tolerance), list(time ORDER BY path), '
         "list(value ORDER BY path), list(high - low ORDER BY path), list(key ORDER BY path) FROM nominal "
         "WHERE time IS NOT NULL AND (coalesce(tolerance, 0) <= 0 OR high - low < $1 * tolerance) "
         "GROUP BY engine, parameter, unit ORDER BY ALL", [UNTOLD],
     ).fetchall()  # fmt: skip
+    named = db.execute("SELECT DISTINCT engine, effect, parameter FROM effects").fetchall()
+    real = {(r["engine"], r["effect"]) for r in lacks if r["lacks"]}
+    followed = {(engine, whole_of(effect, p)) for engine, effect, p in named if (engine, effect) in real}
     return [
         _series(engine, parameter, unit, times, values, widths, keys, table, tolerance, "nominal")
         for engine, parameter, unit, table, tolerance, times, values, widths, keys in rows
+        if (engine, parameter) not in followed
     ]
 
 
 def _series(
     engine: str, quantity: str, unit: str, times: Sequence[float], values: Sequence[float],
     widths: Sequence[float | None], keys: Sequence[str], neutral: float, tolerance: float | None, kind: str,
+    told: Sequence[bool] | None = None,
 ) -> Series:  # fmt: skip
     t, y = np.array(times, dtype=float), np.array(values, dtype=float)
     s = np.array([v if v else np.nan for v in widths], dtype=float) / SPREAD  # of no width: not known
@@ -163,8 +223,8 @@ def _series(
     order = np.argsort(t[good], kind="stable")
     names = np.array(keys, dtype=object)[good][order]
     return Series(
-        engine, quantity, unit, t[good][order], y[good][order], s[good][order], [str(k) for k in names], neutral,
-        tolerance, kind,
+        engine, quantity, unit, t[good][order], y[good][order], s[good][order], [str(k) for k in names],
+        np.array(told or [True] * len(t), dtype=bool)[good][order], neutral, tolerance, kind,
     )  # fmt: skip
 
 
@@ -174,7 +234,7 @@ def _judged(s: Series, limits: dict[str, float], sure: float) -> Series:
         return replace(s, trend={"kind": "too few", "logs": 0})
     zero = float(s.t[0])
     years = (s.t - zero) / YEAR
-    found = trend(years, s.y, s.s, sure)
+    found = trend(years, s.y, s.s, sure, s.told)
     said: dict[str, Any] = {k: v for k, v in asdict(found).items() if k != "lines"}
     for k in ("onset", "onset_low", "onset_high"):
         said[k] = zero + said[k] * YEAR

@@ -2,14 +2,16 @@
 is it unlike that of its sisters?
 
 A quantity is the size of an effect, or a nominal parameter as recalibrated, log by log, at times t (years) with the
-standard deviation s that each log gives. Engines differ from log to log by more than that, so that a scatter b is
-estimated with the curve.
+standard deviation s that each log gives.
 
     step     y = a + c [t >= T]                 something was exchanged at T
     growth   y = a + g max(t - T, 0)            wear sets in at T (T may be the beginning)
 
-A log that could have shown an effect and did not says that its size is below what the fleet's logs show: it is taken as
-size 0 with the smallest named size as its standard deviation.
+The logs of an engine may differ by more than s: then the scatter b beyond it is estimated with the curve. They may
+differ by less: what a log claims beyond the scatter is wrong in all logs of the engine alike. It shifts the level. How
+far it changes as the quantity grows cannot be seen; but from log to log it changes for a like reason, that another
+motion is shown. So it is taken to change by the scatter of a single log, and by no less than claims come to that are
+averaged over the logs.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ Array = NDArray[np.float64]
 Kind = Literal["none", "growth", "step", "too few"]
 LEAST = 8  # logs of an engine, below which nothing is said of change
 LEVEL = 0.9  # of all intervals
+HALF = float(stats.norm.ppf(0.5 + LEVEL / 2))  # of such an interval, over a standard deviation
 SURE = 1e-3  # probability of so good a fit without any change, below which a change is said to be there
 HORIZON = 100.0  # years beyond which nobody asks
 ODD = 0.01  # of the healthy engines that may be accused, at most
@@ -55,8 +58,9 @@ class Trend:
     start, now        level before the change and at the last log
     p                 probability of so good a fit without any change
     scatter           from log to log, beyond what the logs say of themselves
-    lines             curves that fit about as well, a row each: T, a, g, variance of a, covariance, variance of g, and
-                      how many of their deviations still fit; the intervals are what all of them allow together
+    lines             curves that fit about as well, a row each: T, a, g, variance of a, covariance, variance of g, how
+                      many of their deviations still fit, and by how much all logs alike may have a and g wrong; the
+                      intervals are what all of them allow together
     """
 
     kind: Kind
@@ -76,19 +80,21 @@ class Trend:
     lines: Array | None = None
 
 
-def trend(t: Array, y: Array, s: Array, sure: float = SURE) -> Trend:
+def trend(t: Array, y: Array, s: Array, sure: float = SURE, told: NDArray[np.bool_] | None = None) -> Trend:
     """The change of a quantity with time, if there is one.
 
     t     years, any order; y  the quantity; s  standard deviation of each y
     sure  probability of so good a fit without any change, below which a change is said to be there
+    told  which logs tell the value; the others only that it is y within s, and nothing of the scatter (default: all do)
     """
     order = np.argsort(t, kind="stable")
+    told = np.ones(len(t), dtype=bool) if told is None else np.asarray(told)[order]
     t, y, s = (np.asarray(v, dtype=float)[order] for v in (t, y, s))
     n = len(t)
     if n < LEAST or t[-1] <= t[0]:
         return Trend("too few", n)
-    b = _scatter(t, y, s)
-    w = 1.0 / np.maximum(s**2 + b**2, 1e-300)
+    b = _scatter(t[told], y[told], s[told])
+    w = 1.0 / np.maximum(s**2 + np.where(told, b, 0.0) ** 2, 1e-300)
     level = float(np.average(y, weights=w))
     rest = float(np.sum(w * (y - level) ** 2))
     fits = {kind: _fitted(kind, t, y, w, _candidates(t, kind)) for kind in ("growth", "step")}
@@ -100,23 +106,34 @@ def trend(t: Array, y: Array, s: Array, sure: float = SURE) -> Trend:
     if p >= sure or not _by_ruptures(t, y, w):
         half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * np.sqrt(rest / (n - 1) / w.sum()))
         return Trend("none", n, level, level, level - half, level + half, p=p, scatter=b)
-    return _changed(kind, p, b, t, y, w, fits[kind])
+    return _changed(kind, p, b, t, y, w, fits[kind], told)
 
 
-def _changed(kind: str, p: float, b: float, t: Array, y: Array, w: Array, fits: Array) -> Trend:
+def _changed(
+    kind: str, p: float, b: float, t: Array, y: Array, w: Array, fits: Array, told: NDArray[np.bool_]
+) -> Trend:
     """The trend with a change: numbers and intervals."""
     n = len(t)
-    if kind == "growth":  # a finer look around the best
-        near = fits[fits[:, 3] <= fits[:, 3].min() * (1.0 + 12.0 / (n - 3)), 0]
-        fits = np.concatenate([fits, _fitted(kind, t, y, w, np.linspace(near.min(), near.max(), 120))])
+    for _ in range(3 if kind == "growth" else 0):  # a finer look around the best, between the times beside it
+        fits = fits[np.argsort(fits[:, 0], kind="stable")]
+        (near,) = np.nonzero(fits[:, 3] <= fits[:, 3].min() * (1.0 + 12.0 / (n - 3)))
+        ends = fits[[max(near[0] - 1, 0), min(near[-1] + 1, len(fits) - 1)], 0]
+        fits = np.concatenate([fits, _fitted(kind, t, y, w, np.linspace(ends[0], ends[1], 60))])
     T, a, g, left = fits[np.argmin(fits[:, 3]), :4]
-    # the noise follows from what is left, but is no less than what logs say of themselves: errors that they have in
-    # common leave nothing
-    sigma2 = max(left / (n - 3), 1.0)
-    room = float(stats.f.ppf(LEVEL, 1, n - 3)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
+    line = a + g * (np.maximum(t - T, 0.0) if kind == "growth" else (t >= T))
+    # what scatters are the logs that tell a value; beside others, which know the level before, they have g and T to fit
+    freedom = max(int(told.sum()) - (3 if told.all() else 2), 1)
+    squares = float(np.sum((w * (y - line) ** 2)[told]))
+    sigma2 = squares / freedom  # of weight 1: 1 where logs scatter as they say of themselves
+    room = float(stats.f.ppf(LEVEL, 1, freedom)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
     kept, q = fits[room >= 0.0], np.sqrt(room[room >= 0.0])
-    lines = np.column_stack([kept[:, :3], kept[:, 4:] * sigma2, q])
-    rate, half = lines[:, 2], q * np.sqrt(lines[:, 5])
+    most = squares / float(stats.chi2.ppf(1.0 - LEVEL, freedom))  # scatter that chance allows
+    alike, one = np.sqrt(np.maximum([1.0 - most, sigma2], 0.0)) * np.sqrt(told.sum() / w[told].sum())
+    full = np.maximum(t[-1] - kept[:, 0], 1e-9) if kind == "growth" else np.ones(len(kept))
+    moves = np.clip(one, alike / np.sqrt(told.sum()), alike)
+    wrong = np.column_stack([np.full(len(kept), alike), moves / full]) * HALF
+    lines = np.column_stack([kept[:, :3], kept[:, 4:] * sigma2, q, wrong])
+    rate, half = lines[:, 2], np.hypot(q * np.sqrt(lines[:, 5]), lines[:, 8])
     now, now_half = _along(lines, t[-1] - lines[:, 0] if kind == "growth" else np.ones(len(lines)))
     end = float(a + g * (t[-1] - T if kind == "growth" else 1.0))
     return Trend(
@@ -128,8 +145,9 @@ def _changed(kind: str, p: float, b: float, t: Array, y: Array, w: Array, fits: 
 
 def _along(lines: Array, late: Array) -> tuple[Array, Array]:
     """Level of each line at ``late`` years after its beginning, and half its interval."""
-    _, a, g, vaa, vag, vgg, q = lines.T
-    return a + g * late, q * np.sqrt(np.maximum(vaa + 2.0 * late * vag + late**2 * vgg, 0.0))
+    _, a, g, vaa, vag, vgg, q, level, growth = lines.T
+    own = q**2 * np.maximum(vaa + 2.0 * late * vag + late**2 * vgg, 0.0)
+    return a + g * late, np.sqrt(own + level**2 + (late * growth) ** 2)
 
 
 def limit_of(found: Trend, t_last: float, limit: float) -> Limit:
@@ -216,7 +234,7 @@ def _candidates(t: Array, kind: str) -> Array:
     """Times at which a change may have begun: at least three logs stand on each side (a growth may begin at once)."""
     if kind == "step":
         return 0.5 * (t[2:-3] + t[3:-2])
-    return np.concatenate([[t[0]], np.linspace(t[2], t[-4], 120)])
+    return np.concatenate([[t[0]], np.linspace(t[2], t[-3], 120)])
 
 
 def _scatter(t: Array, y: Array, s: Array) -> float:

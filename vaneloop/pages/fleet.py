@@ -29,6 +29,7 @@ class Series:
 
     t, y, s    s since 1970; value; standard deviation that the log gives
     keys       the log of each
+    told       whether the log tells the value; if not, only that it is near neutral, within s
     neutral    value where nothing is amiss; tolerance: half-width about it, None: there is none
     kind       "effect" (its size) or "nominal" (a parameter as recalibrated)
     trend      `vaneloop.fleet.trends.Trend` and its limit, times in s since 1970
@@ -42,6 +43,7 @@ class Series:
     y: np.ndarray
     s: np.ndarray
     keys: list[str]
+    told: np.ndarray
     neutral: float
     tolerance: float | None
     kind: str
