@@ -26,7 +26,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
 from vaneloop.fleet import state
 from vaneloop.fleet.folder import Folder, _schema
-from vaneloop.fleet.report import YEAR, limits_of, view_of, write_pages
+from vaneloop.fleet.report import YEAR, limits_of, view_of, whole_of, write_pages
 from vaneloop.fleet.sources import moment
 from vaneloop.fleet.tables import TABLES, answers, roll_up, write_tables
 from vaneloop.fleet.trends import Trend, limit_of, odd, trend
@@ -243,6 +243,97 @@ def test_a_size_that_no_log_tells_from_nothing_makes_silent_logs_no_surer() -> N
     (wear,) = (s for s in view.changed if s.engine == "worn")
     assert wear.trend["rate_low"] <= rate <= wear.trend["rate_high"]
     assert abs(wear.trend["onset"] - BEGIN - onset * YEAR) < 0.2 * YEAR
+
+
+def grows(effect: str, parameter: str, nominal: str, tolerance: float, sizes: dict[float, tuple[str, float]]) -> Any:
+    """Logs of one engine; ``sizes``: years -> whether its log has the size in the "nominal" parameter or the "effect",
+    names a "rival" or nothing at all ("silent"), and the size.
+    """
+    logs, effects, nominals = logs_of("e", list(sizes)), [], []
+    for log, (where, size) in zip(logs, sizes.values(), strict=True):
+        here, unsure = {n: log[n] for n in OF}, tolerance / 3.0**0.5 * 1.6449
+        value, half = (size, 0.007) if where == "nominal" else (0.0, unsure)
+        row = {"stage": "linkage", "parameter": nominal, "unit": "deg", "value": value, "low": value - half}
+        nominals.append(here | row | {"high": value + half, "table": 0.0, "tolerance": tolerance})
+        if where in ("effect", "rival"):
+            name, half = (effect, parameter) if where == "effect" else ("other", "p"), np.hypot(0.007, unsure)
+            row = {"effect": name[0], "stage": "linkage", "parameter": name[1], "unit": "deg", "value": size}
+            effects.append(here | row | {"low": size - half, "high": size + half, "neutral": 0.0, "probability": 0.9})
+    return view_of(made(logs=logs, effects=effects, nominal=nominals, coverage=NO_COVERAGE), {})
+
+
+def test_play_that_outgrows_its_tolerance_is_followed_as_a_whole() -> None:
+    """Up to its tolerance of 0.08 deg a log has it in the nominal parameter, at its end for a while, then in the
+    effect; the engine was 0.02 deg off from the start. One log names a rival.
+    """
+    rng, sizes = np.random.default_rng(1), {}
+    for k, t in enumerate(np.linspace(0.05, 1.95, 24).tolist()):
+        size = 0.02 + 0.4 * max(t - 0.8, 0.0)
+        where = "nominal" if size < 0.12 else "effect"
+        sizes[t] = ("rival", 0.3) if k == 20 else (where, size + rng.normal(0.0, 0.002))
+    for t in [t for t, (where, size) in sizes.items() if where == "nominal" and size > 0.07]:
+        sizes[t] = ("nominal", 0.08)
+    view = grows("linkage_backlash", "vigv", "linkage.vigv_play", 0.08, sizes)
+    (wear,) = view.changed
+    assert wear.quantity == "linkage_backlash.vigv" and not [s for s in view.series if "play" in s.quantity]
+    assert wear.trend["kind"] == "growth" and wear.trend["start"] == pytest.approx(0.02, abs=0.003)
+    assert abs(wear.trend["onset"] - BEGIN - 0.8 * YEAR) < 0.03 * YEAR
+    assert wear.trend["rate_low"] <= 0.4 <= wear.trend["rate_high"] < 0.42
+
+
+def test_a_log_that_names_a_rival_says_nothing_of_an_effect_s_size() -> None:
+    """A third of the late logs name another effect of the stage: those do not say that the effect is small."""
+    rng, sizes = np.random.default_rng(2), {}
+    for k, t in enumerate(np.linspace(0.05, 1.95, 30).tolist()):
+        size = 1.5 * max(t - 0.7, 0.0)
+        named = ("rival", 1.0) if k % 3 == 0 else ("effect", size + rng.normal(0.0, 1e-3))
+        sizes[t] = ("silent", 0.0) if size < 0.05 else named
+    changed = grows("valve_null_bias", "bias", "x", 0.1, sizes).changed
+    (drift,) = (s for s in changed if s.quantity == "valve_null_bias.bias")
+    assert drift.trend["kind"] == "growth" and abs(drift.trend["onset"] - BEGIN - 0.7 * YEAR) < 0.05 * YEAR
+    assert drift.trend["rate"] == pytest.approx(1.5, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "by"),
+    [("linkage_backlash", "vgv1", 0.1), ("pot_bias", "vigv", 0.2), ("rotor_lag_error", "lag", 0.3),
+     ("screw_friction", "force", 60.0)],
+)  # fmt: skip
+def test_what_is_followed_as_a_whole_is_one_quantity(effect: str, parameter: str, by: float) -> None:
+    """A nominal parameter that is off, and the effect of that size: the same run."""
+    from hil.loop.lockstep import Stimulus, lockstep
+    from plant import Model
+    from plant.parameters import nominal
+    from vaneloop.verbs.machine import Machine
+
+    table = {"table": "plant_electromechanical.toml"} if effect == "screw_friction" else {}
+    name, plant = whole_of(effect, parameter), Machine(**table).plant
+    (known,) = (n for n in nominal(plant.table, plant.geometry) if n.name == name)
+    n_dem = np.repeat([60.0, 90.0, 70.0], 200)
+    runs = [
+        lockstep(Stimulus.of(n_dem), plant=Machine(model=model, **table).plant, seed=1)
+        for model in (Model(parameters={name: known.value + by}), Model(effects={effect: {parameter: by}}), Model())
+    ]
+    for channel, values in runs[0].columns.items():
+        np.testing.assert_allclose(values, runs[1].columns[channel], atol=1e-9, err_msg=channel)
+    assert any(np.abs(v - runs[2].columns[c]).max() > 1e-3 for c, v in runs[0].columns.items())
+
+
+def test_intervals_hold_where_logs_claim_more_than_they_scatter() -> None:
+    """Logs of a standard deviation of 3 that differ by 1, and whose gauge is off in all of them alike: in the growth
+    by about what one log scatters.
+    """
+    rng, inside, onsets = np.random.default_rng(6), [], []
+    for size in (20.0, 100.0):
+        for _ in range(150):
+            t, onset = np.sort(rng.uniform(0.0, 2.0, 50)), float(rng.uniform(0.2, 1.4))
+            rate, gauge = size / (2.0 - onset), size + rng.normal(0.0, 1.0)
+            y = rng.normal(0.0, 3.0) + gauge / (2.0 - onset) * np.maximum(t - onset, 0.0) + rng.normal(0.0, 1.0, 50)
+            f = trend(t, y, np.full(50, 3.0))
+            assert f.kind == "growth"
+            inside.append(f.rate_low <= rate <= f.rate_high)
+            onsets.append(f.onset_low <= onset <= f.onset_high)
+    assert 0.85 <= np.mean(inside) <= 0.97 and 0.85 <= np.mean(onsets) <= 0.96
 
 
 # ---- tables and page -------------------------------------------------------------------------------------------------
