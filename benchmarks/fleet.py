@@ -259,12 +259,18 @@ def _show(said: dict[str, Any]) -> None:
         print(text)
     for h in said["accused"]:
         print("healthy and accused:", h)
-    n, found = len(said["growths"]), said["found"]
+    n, found, right, covered = len(said["growths"]), said["found"], said["right"], said["covered"]
     print(f"logs: {said['logs']}")
     print(f"growths found: {found} of {n}")
-    print(f"onset within a tenth of the time axis: {said['right']} of {found} found")
-    print(f"true growth within the 90 % interval: {said['covered']} of {found} found")
-    print(f"healthy engines accused: {len(said['accused'])} of {said['healthy']}")
+    print(f"onset within a tenth of the time axis: {right} of {n} growths ({_per_cent(right, n)}; goal: 90 %)")
+    share = _per_cent(covered, found)
+    print(f"true growth within the 90 % interval: {covered} of {found} found ({share}; goal: 85 to 95 %)")
+    accused, healthy = len(said["accused"]), said["healthy"]
+    print(f"healthy engines accused: {accused} of {healthy} ({_per_cent(accused, healthy)}; goal: at most 2 %)")
+
+
+def _per_cent(some: int, of: int) -> str:
+    return f"{100.0 * some / of:.0f} %" if of else "none"
 
 
 def _kills(seed: int) -> int:
