@@ -29,7 +29,7 @@ on it at once. Needs the extra `fleet`: pip install 'vaneloop[fleet]'. See docs/
 examples:
   vaneloop fleet run examples/ --out out/fleet
   vaneloop fleet run LOGS --out out/fleet --engines ENGINES.csv --workers 8
-  vaneloop fleet run LOGS --out out/pumps --system pump.py
+  vaneloop fleet run LOGS --out out/fleet --system MY.py
   vaneloop fleet run LOGS --out out/fleet --on slurm --workers 200 --queue queue=batch
   vaneloop fleet work out/fleet
   vaneloop fleet status out/fleet --json -
