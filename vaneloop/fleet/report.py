@@ -166,13 +166,13 @@ def _nominal_parts(db: duckdb.DuckDBPyConnection, engine: str, parameter: str) -
     """
     rows = db.execute(
         "SELECT path, value - \"table\", high - low, abs(value - \"table\") >= 0.999 * tolerance FROM nominal WHERE "
-        "engine = $1 AND parameter = $2", [engine, parameter],
+        "engine = $1 AND parameter = $2 AND high - low IS NOT NULL", [engine, parameter],
     ).fetchall()  # fmt: skip
     return {path: (float(value), float(width), bool(ends)) for path, value, width, ends in rows}
 
 
 def _whole(
-    values: Sequence[float], widths: Sequence[float], paths: Sequence[str], silent: Sequence[Any],
+    values: Sequence[float], widths: Sequence[float | None], paths: Sequence[str], silent: Sequence[Any],
     parts: dict[str, tuple[float, float, bool]], neutral: float,
 ) -> tuple[list[float], list[float], list[Any]]:  # fmt: skip
     """Values and widths of an effect with those of its nominal parameter: of the logs that name it, and of the silent.
@@ -184,7 +184,7 @@ def _whole(
              if path in parts and not parts[path][2]]  # fmt: skip
     sure = float(np.median([width for *_, width in found])) if found else 0.0
     sums, whole = [], []
-    for value, width, path in zip(values, widths, paths, strict=True):
+    for value, width, path in zip(values, (w or 0.0 for w in widths), paths, strict=True):
         share, unsure, _ = parts.get(path, (0.0, 0.0, False))
         sums.append(value + share)
         whole.append(max(float(np.sqrt(max(width**2 - unsure**2, 0.0))), min(sure, width)))
