@@ -201,7 +201,9 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
         when = day(x["limit_time"]) if x["limit_time"] else "–"
         if x["limit_time"]:
             when += f" ({day(x['limit_low'])} to {day(x['limit_high']) if x['limit_high'] else 'no latest time'})"
-        change = f"{x['rate']:.3g} ({x['rate_low']:.3g} to {x['rate_high']:.3g}) {s.unit}{'' if step else '/year'}"
+        n = _digits(x["rate"], x["rate_high"] - x["rate_low"])
+        numbers = f"{x['rate']:.{n}g} ({x['rate_low']:.{n}g} to {x['rate_high']:.{n}g})"
+        change = f"{numbers} {s.unit}{'' if step else '/year'}"
         rows.append([
             s.engine, s.quantity, x["kind"], f"{day(x['onset'])} ({day(x['onset_low'])} to {day(x['onset_high'])})",
             change, f"{x['now']:.4g} {s.unit}", when, x["limit_why"] or "–", _to(s.first(), logs),
@@ -213,6 +215,11 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
         page.text("None.")
     for s in view.changed[:SHOWN]:
         page.plot(_drawn(s), f"{s.engine}: {s.quantity}", half=True)
+
+
+def _digits(value: float, width: float) -> int:
+    """Digits that a value with an interval of this width is worth: two of the interval, three at least."""
+    return 3 if width <= 0.0 or value == 0.0 else int(np.clip(np.ceil(np.log10(abs(value) / width)) + 2, 3, 9))
 
 
 def _drawn(s: Series) -> Figure:
