@@ -99,11 +99,11 @@ def judged(names: list[Name]) -> tuple[list[list[str]], float, float, dict[str, 
 
 def main() -> None:
     """Fit or judge, as the first argument says."""
-    import polars as pl
+    import pyarrow.parquet as pq
 
     if len(sys.argv) < 3 or sys.argv[1] not in ("fit", "judge"):
         raise SystemExit("usage: python -m benchmarks.trust fit|judge RESULT.parquet ...")
-    names = [n for f in sys.argv[2:] for n in names_of(pl.read_parquet(f).to_dicts())]
+    names = [n for f in sys.argv[2:] for n in names_of(pq.read_table(f).to_pylist())]
     for criterion in COEFFICIENTS:
         mine = [n for n in names if n.criterion == criterion]
         print(f"{criterion}: {len(mine)} names, {sum(bool(n.right) for n in mine)} with what was hidden among them")

@@ -669,6 +669,17 @@ def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:
     assert "not numbers" in refused(tmp_path / "b.parquet")
 
 
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_rows_of_a_csv_with_too_few_or_too_many_cells_keep_their_place(tmp_path: Path, quote: str) -> None:
+    """As a logger leaves them that lost its power, or that added a remark: nothing is moved, nothing else is lost."""
+    rows = ["0,1,5", "1,2", "2,3,7,a remark", "", f"4,{quote}5{quote},9", "5,6,1", "6"]
+    log = read_log(csv(tmp_path, "t,n_dem,n_r\n" + "\n".join(rows)))
+    assert log.channels["n_dem"].t.tolist() == [0, 1, 2, 4, 5]
+    assert log.channels["n_dem"].values.tolist() == [1, 2, 3, 5, 6]
+    assert log.channels["n_r"].t.tolist() == [0, 2, 4, 5] and log.channels["n_r"].values.tolist() == [5, 7, 9, 1]
+    assert "row 6: 'x' is not a number" in refused(csv(tmp_path, "t,n_dem\n0,1\n1\n\n2,3\n3,x\n"))
+
+
 # --- times and values -------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""CSV: text with a header line, read and written through polars."""
+"""CSV: text with a header line, read and written through pyarrow."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.logs.source import ABSENT, Channel, LogError, Options, Source, read_bytes
-from hil.logs.table import Table, polars_table, split_unit, time_column
+from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers, read_bytes
+from hil.logs.table import Table, arrow_table, split_unit, time_column
 from hil.logs.times import from_dates
 from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.signals import UNITS
@@ -20,6 +20,7 @@ __all__ = ["open_csv", "write_csv"]
 
 _NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
 _MOST_COLUMNS = 10_000
+_BLOCK = 1 << 23  # bytes read at once; no row may be longer
 
 
 def open_csv(path: Path, options: Options) -> Source:
@@ -92,67 +93,113 @@ class _Csv:
         self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
         self.separator, self.comma, self.first = separator, comma, first
         self.time, self.notes = time, list[str]()
+        self.squared = False
         self.ready: dict[str, np.ndarray] | None = None
 
     def column(self, header: str) -> np.ndarray:
-        import polars as pl
+        import pyarrow as pa
 
         if not self.rows.strip():
             return np.empty(0)
         if self.ready is None:
             try:
-                frame = self._read(self.wanted, pl.Float64)
-                self.ready = {h: _numbers(frame[h]) for h in self.wanted}
-            except pl.exceptions.PolarsError:
+                table = self._read(self.wanted, pa.float64())
+                self.ready = {h: numbers(table.column(h).combine_chunks()) for h in self.wanted}
+            except pa.ArrowException:
                 self.ready = {}  # a cell that is no number: column by column
         if header not in self.ready:
             self.ready[header] = self._numbers(header)
         return self.ready[header]
 
     def _read(self, columns: list[str], kind: Any) -> Any:
-        """The columns of ``columns`` as ``kind``."""
-        import polars as pl
+        """The columns of ``columns`` as ``kind``. Rows with too many or too few cells are squared once, then read
+        again.
+        """
+        import pyarrow as pa
+        from pyarrow import csv as arrow
 
-        places = [f"c{self.headers.index(h)}" for h in columns]  # names of our own: the file's may be empty
-        head = self.separator.join(f"c{i}" for i in range(len(self.headers))).encode() + b"\n"
-        frame = pl.read_csv(
-            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0,
-            schema_overrides=dict.fromkeys(places, kind),
-            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String,
-            null_values=["", *_NO_SAMPLE],
-        )  # fmt: skip
-        return frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
+        places = [f"c{i}" for i in range(len(self.headers))]  # names of our own: the file's may be empty
+        wanted = [places[self.headers.index(h)] for h in columns]
+        ragged = False
+
+        def other_length(row: Any) -> str:
+            nonlocal ragged
+            ragged = True
+            return "error"
+
+        try:
+            table = arrow.read_csv(
+                pa.BufferReader(self.rows),
+                arrow.ReadOptions(column_names=places, block_size=_BLOCK),
+                arrow.ParseOptions(
+                    delimiter=self.separator, newlines_in_values=b'"' in self.rows, ignore_empty_lines=False,
+                    invalid_row_handler=other_length,
+                ),
+                arrow.ConvertOptions(
+                    check_utf8=False,  # it was decoded before
+                    column_types=dict.fromkeys(wanted, kind), include_columns=wanted,
+                    null_values=["", *_NO_SAMPLE], strings_can_be_null=False,
+                    decimal_point="," if self.comma else ".",
+                ),
+            )  # fmt: skip
+        except pa.ArrowException:
+            if not ragged or self.squared:
+                raise
+            self.rows, self.squared = _squared(self.rows, self.separator, len(places)), True
+            return self._read(columns, kind)
+        return table.rename_columns(columns)
 
     def _numbers(self, header: str) -> np.ndarray:
         """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
         named.
         """
-        import polars as pl
+        import pyarrow as pa
 
         try:
-            text = self._read([header], pl.String)[header].str.strip_chars()
-        except pl.exceptions.PolarsError as e:
+            text = [cell.strip() for cell in self._read([header], pa.string()).column(header).to_pylist()]
+        except (pa.ArrowException, csv.Error) as e:
             raise LogError(f"{self.path}: column {header!r}: {str(e)[:160]}") from None
-        text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
-        number = (text.str.replace(",", ".", literal=True) if self.comma else text).cast(pl.Float64, strict=False)
-        bad = (number.is_null() & text.is_not_null()).arg_true()
-        if bad.len() and header == self.time and (dates := from_dates(text)) is not None:
-            self.notes.append(dates[1])
-            return dates[0]
-        if bad.len():
-            raise LogError(
-                f"{self.path}: column {header!r}, row {bad[0] + self.first}: {text[bad[0]][:40]!r} is not a number"
-            )
-        return _numbers(number)
+        values = np.full(len(text), ABSENT)
+        for row, cell in enumerate(text):
+            if cell == "" or cell in _NO_SAMPLE:
+                continue
+            number = cell.replace(",", ".") if self.comma else cell
+            try:
+                if "_" in number:  # Python's own spelling of thousands
+                    raise ValueError
+                values[row] = float(number)
+            except ValueError:
+                if header == self.time:
+                    none = {"", *_NO_SAMPLE}
+                    if (
+                        dates := from_dates(pa.array([None if c in none else c for c in text], pa.string()))
+                    ) is not None:
+                        self.notes.append(dates[1])
+                        return dates[0]
+                raise LogError(
+                    f"{self.path}: column {header!r}, row {row + self.first}: {cell[:40]!r} is not a number"
+                ) from None
+        return values
 
 
-def _numbers(column: Any) -> np.ndarray:
-    """float64 of a polars column; no sample becomes `ABSENT`."""
-    values = column.to_numpy().astype(np.float64, copy=True)
-    values[column.is_null().to_numpy()] = ABSENT
-    return values
+def _squared(rows: bytes, separator: str, cells: int) -> bytes:
+    """Rows of so many cells each: of a row with more the rest is left out, what a shorter one lacks is empty."""
+    if b'"' in rows:
+        out = io.StringIO(newline="")
+        write = csv.writer(out, delimiter=separator, lineterminator="\n").writerow
+        for row in csv.reader(io.StringIO(rows.decode(), newline=""), delimiter=separator):
+            write([*row[:cells], *[""] * (cells - len(row))])
+        return out.getvalue().encode()
+    between = separator.encode()
+    lines = rows.replace(b"\r\n", b"\n").removesuffix(b"\n").split(b"\n")
+    for i, line in enumerate(lines):
+        if missing := cells - 1 - line.count(between):
+            lines[i] = between.join(line.split(between)[:cells]) + between * max(missing, 0)
+    return b"\n".join(lines) + b"\n"
 
 
 def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a CSV: t, then a column a channel on all times of all; an empty cell where a channel has no sample."""
-    polars_table(channels).write_csv(path)
+    from pyarrow import csv as arrow
+
+    arrow.write_csv(arrow_table(channels), path, arrow.WriteOptions(quoting_header="needed", quoting_style="none"))

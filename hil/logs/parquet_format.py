@@ -1,4 +1,4 @@
-"""Parquet, read through pyarrow and written through polars."""
+"""Parquet, read and written through pyarrow."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.logs.source import ABSENT, Channel, LogError, Options, Source, check_file
-from hil.logs.table import Table, polars_table, time_column
+from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers
+from hil.logs.table import Table, arrow_table, time_column
 from hil.logs.times import from_dates
 
 __all__ = ["FRAME_COLUMNS", "open_parquet", "write_parquet"]
@@ -27,22 +27,8 @@ def _chunks(group: Any) -> Iterable[Any]:
     return (group.column(k) for k in range(group.num_columns))
 
 
-def _numbers(column: Any, scale: float) -> np.ndarray:
-    """An array of Arrow's float64 times ``scale``, null as `ABSENT`; from its buffers: ``to_numpy`` imports pandas."""
-    known, numbers = column.buffers()
-    part = slice(column.offset, column.offset + len(column))
-    values = np.zeros(len(column)) if numbers is None else np.frombuffer(numbers, np.float64, part.stop)[part]
-    with np.errstate(invalid="ignore", over="ignore"):  # of a damaged file any bits; what they say is judged later
-        values = values * scale
-    if column.null_count:
-        values[np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")[part] == 0] = ABSENT
-    return values
-
-
 def open_parquet(path: Path, options: Options) -> Source:
-    """Parquet with numeric columns; null = no sample there. Read by pyarrow: polars panics, loudly, on a
-    damaged page.
-    """
+    """Parquet with numeric columns; null = no sample there."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -97,9 +83,7 @@ def open_parquet(path: Path, options: Options) -> Source:
             column = file.read(columns=[key], use_threads=False).column(key).combine_chunks().cast(kind)
             column.validate(full=True)
             if dates:
-                import polars as pl
-
-                found = from_dates(pl.Series(column.to_pylist(), dtype=pl.String))
+                found = from_dates(column.cast(pa.string()))
                 if found is None:
                     raise LogError(f"{path}: column {key!r} holds words that are no dates, not numbers")
                 table.notes.append(found[1])
@@ -108,7 +92,7 @@ def open_parquet(path: Path, options: Options) -> Source:
                 column = column.cast(pa.int64())
             if pa.types.is_boolean(kind):
                 column = column.cast(pa.int8())
-            return _numbers(column.cast(pa.float64(), safe=False), scale)
+            return numbers(column.cast(pa.float64(), safe=False), scale)
         except LogError:
             raise
         except damage as e:
@@ -120,4 +104,6 @@ def open_parquet(path: Path, options: Options) -> Source:
 
 def write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a Parquet file: t, then a column a channel on all times of all; null where a channel has no sample."""
-    polars_table(channels).write_parquet(path, compression="zstd")
+    import pyarrow.parquet as pq
+
+    pq.write_table(arrow_table(channels), path, compression="zstd")

@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from vaneloop.base.errors import InputError
 
 __all__ = [
     "ABSENT", "Channel", "LogError", "Options", "Series", "Source", "check_file", "close_names", "find", "is_absent",
-    "names_held", "read_bytes",
+    "names_held", "numbers", "read_bytes",
 ]  # fmt: skip
 
 MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
@@ -119,6 +119,18 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
             return file.read(most)
     except (OSError, MemoryError) as e:
         raise LogError(f"{path}: cannot be read ({getattr(e, 'strerror', None) or e})") from None
+
+
+def numbers(column: Any, scale: float = 1.0) -> np.ndarray:
+    """An array of Arrow's float64 times ``scale``, null as `ABSENT`; from its buffers: ``to_numpy`` imports pandas."""
+    known, raw = column.buffers()
+    part = slice(column.offset, column.offset + len(column))
+    values = np.zeros(len(column)) if raw is None else np.frombuffer(raw, np.float64, part.stop)[part]
+    with np.errstate(invalid="ignore", over="ignore"):  # of a damaged file any bits; what they say is judged later
+        values = values * scale
+    if column.null_count:
+        values[np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")[part] == 0] = ABSENT
+    return values
 
 
 # --- names ------------------------------------------------------------------------------------------------------------

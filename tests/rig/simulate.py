@@ -336,14 +336,14 @@ def _run_object(
 
 def write(run: Run, path: str | Path) -> None:
     """Write the log as CSV or Parquet, by suffix. The truth is not in it."""
-    import polars as pl
-
-    frame = pl.DataFrame(run.log)
     path = Path(path)
     if path.suffix == ".csv":
-        frame.write_csv(path, float_precision=6)
+        np.savetxt(path, np.column_stack(list(run.log.values())), "%.6f", ",", header=",".join(run.log), comments="")
     elif path.suffix == ".parquet":
-        frame.write_parquet(path)
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        pq.write_table(pa.table(run.log), path)
     else:
         raise ValueError(f"suffix (={path.suffix!r}) must be .csv or .parquet")
 

@@ -14,7 +14,7 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 
-__all__ = ["INSIDE", "as_curve", "from_checkout", "print_shares", "run", "share"]
+__all__ = ["INSIDE", "as_curve", "from_checkout", "print_shares", "read_rows", "run", "share", "write_rows"]
 
 Row = dict[str, Any]
 INSIDE = 0.90  # of the visited values: there the truth must be in the band of a curve that is the law
@@ -46,8 +46,6 @@ def run(
     what   the cases, in words
     judge  function from seed, index and ``more`` to a row
     """
-    import polars as pl
-
     done = {r["index"] for r in rows}
     with (
         terminal.progress_bar(args, f"{many} {what}") as progress,
@@ -56,10 +54,29 @@ def run(
         jobs = [pool.submit(judge, seed, i, *more) for i in range(many) if i not in done]
         for job in as_completed(jobs):
             rows.append(job.result())
-            pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)
+            write_rows(path, rows)
             if progress:
                 progress(len(rows) / max(many, len(rows)))
     rows.sort(key=lambda r: r["index"])
+
+
+def write_rows(path: Path, rows: list[Row]) -> None:
+    """Write rows as a Parquet file; what a row does not say is null."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = dict.fromkeys(name for row in rows for name in row)
+    pq.write_table(pa.table({n: [row.get(n) for row in rows] for n in names}), path)
+
+
+def read_rows(path: Path, what: str) -> list[Row]:
+    """Rows of an earlier run; InputError where the file is no result of ``what``."""
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path).to_pylist()
+    except Exception as e:
+        raise InputError(f"{path}: not a result of {what} ({type(e).__name__})") from None
 
 
 def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row:

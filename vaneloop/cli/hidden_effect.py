@@ -20,7 +20,7 @@ from vaneloop.base import terminal
 from vaneloop.base.durations import within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
+from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -574,8 +574,6 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     import secrets
 
-    import polars as pl
-
     from hil.loop.lockstep import warm_up
 
     _rig()
@@ -588,12 +586,7 @@ def command(args: argparse.Namespace) -> int:
     if args.seed is not None and not 0 <= args.seed < 2**63:
         raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
     machine, path = _machine(args.plant), Path(args.out)
-    rows: list[dict[str, Any]] = []
-    if path.exists():
-        try:
-            rows = pl.read_parquet(path).to_dicts()
-        except Exception as e:
-            raise InputError(f"{path}: not a result of hidden-effect ({type(e).__name__})") from None
+    rows = read_rows(path, "hidden-effect") if path.exists() else []
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
     if rows and "gaps" not in rows[0]:
         raise InputError(f"{path}: written by an older version, with one geometry for all; give another --out")

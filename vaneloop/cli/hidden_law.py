@@ -16,7 +16,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.durations import within_no_period
-from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, run, share
+from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
 
@@ -342,16 +342,11 @@ def misses(rows: list[Row]) -> list[str]:
 
 def _before(path: Path, families: tuple[str, ...]) -> list[Row]:
     """Rows of an earlier run with the same families."""
-    import polars as pl
-
     from vaneloop.base.errors import InputError
 
     if not path.exists():
         return []
-    try:
-        rows = pl.read_parquet(path).to_dicts()
-    except Exception as e:
-        raise InputError(f"{path}: not a result of hidden-law ({type(e).__name__})") from None
+    rows = read_rows(path, "hidden-law")
     if any(not {"left", "variants", "families", "seed", "amounts"} <= set(r) for r in rows):
         raise InputError(f"{path}: not a result of hidden-law (columns left, variants, families, amounts are needed)")
     if any(r["families"] != " ".join(families) for r in rows):

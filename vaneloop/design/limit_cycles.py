@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
+from vaneloop.design.needs import needed
 
 __all__ = ["LimitCycle", "Play", "harmonic_balance", "limit_cycles", "play_describing_function"]
 
@@ -59,7 +60,7 @@ def play_describing_function(amplitude: ArrayLike, gap: float) -> Complex:
 
     From `control.friction_backlash_nonlinearity`, whose argument is the *total* gap. 0 for A <= gap/2.
     """
-    import control as ct
+    ct = needed("control")
 
     f = ct.friction_backlash_nonlinearity(gap)
     a = np.atleast_1d(np.asarray(amplitude, dtype=float))

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
+from vaneloop.design.needs import needed
 
 __all__ = [
     "TrendDesign",
@@ -70,11 +71,11 @@ class TrendModel:
 
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """F, H, Q, R; Q from `filterpy.common.Q_discrete_white_noise`."""
-        from filterpy.common import Q_discrete_white_noise
-
         f = np.array([[1.0, self.step], [0.0, 1.0]])
         h = np.array([[1.0, 0.0]])
-        q = np.asarray(Q_discrete_white_noise(dim=2, dt=self.step, var=self.acceleration**2), dtype=float)
+        q = np.asarray(
+            needed("filterpy.common").Q_discrete_white_noise(dim=2, dt=self.step, var=self.acceleration**2), dtype=float
+        )
         return f, h, q, np.array([[self.sigma**2]])
 
 
@@ -83,9 +84,7 @@ class TrendModel:
 
 def _filter(model: TrendModel, first: float) -> Any:
     """A filterpy KalmanFilter at rest on the demand ``first``."""
-    from filterpy.kalman import KalmanFilter
-
-    kf = KalmanFilter(dim_x=2, dim_z=1)
+    kf = needed("filterpy.kalman").KalmanFilter(dim_x=2, dim_z=1)
     kf.F, kf.H, kf.Q, kf.R = model.matrices()
     kf.x = np.array([[first], [0.0]])
     kf.P = np.diag([model.sigma**2, 1.0])

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from vaneloop.base.errors import InputError
+from vaneloop.fleet.sources import text_table
 from vaneloop.fleet.trends import ODD, SURE, Trend, limit_of, odd, trend
 from vaneloop.pages.fleet import YEAR, FleetView, Series
 
@@ -44,14 +45,12 @@ def limits_of(file: str | None) -> dict[str, float]:
     """Limit of each quantity from a CSV file with the columns quantity, limit. Raises InputError."""
     if file is None:
         return {}
-    import polars as pl
-
+    have, rows = text_table(file, "--limits")
+    if not {"quantity", "limit"} <= set(have):
+        raise InputError(f"--limits {file}: needs the columns quantity, limit; has {', '.join(have)}")
     try:
-        table = pl.read_csv(file, infer_schema=False)
-        return {str(q).strip(): float(x) for q, x in zip(table["quantity"], table["limit"], strict=True)}
-    except (OSError, pl.exceptions.PolarsError) as e:
-        raise InputError(f"--limits {file}: needs the columns quantity, limit ({str(e).splitlines()[0]})") from None
-    except (TypeError, ValueError) as e:
+        return {row["quantity"]: float(row["limit"]) for row in rows}
+    except ValueError as e:
         raise InputError(f"--limits {file}: {str(e).splitlines()[0]}; a limit must be a number") from None
 
 
@@ -305,14 +304,11 @@ def _known(db: duckdb.DuckDBPyConnection) -> set[str]:
 
 def _store(db: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]) -> None:
     """Keep rows as a table of the database, to be written with the others."""
-    import polars as pl
+    import pyarrow as pa
 
-    frame = (
-        pl.DataFrame(rows, infer_schema_length=None)
-        if rows
-        else pl.DataFrame({"engine": []}, schema={"engine": pl.String})
-    )
-    db.register("_rows", frame.to_arrow())
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {n: [row.get(n) for row in rows] for n in names} or {"engine": pa.array([], pa.string())}
+    db.register("_rows", pa.table(columns))
     db.execute(f"CREATE OR REPLACE TABLE {table} AS SELECT * FROM _rows")
     db.unregister("_rows")
 

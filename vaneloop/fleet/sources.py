@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import stat
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from vaneloop.base.errors import InputError
 
-__all__ = ["Source", "find", "moment"]
+__all__ = ["Source", "find", "moment", "text_table"]
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
 # 2026-03-14, 20260314, each with or without T12:30:05, T1230, _12-30-05
@@ -111,24 +112,31 @@ def _metadata(path: str) -> dict[str, str]:
     return {n.decode(): said[n].decode("utf-8", "replace") for n in names if n in said}
 
 
+def text_table(file: str, option: str) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and rows of a small CSV that an ``option`` names, blanks taken off; InputError where it is none."""
+    try:
+        with open(file, encoding="utf-8-sig", newline="") as text:
+            rows = csv.DictReader(text, restval="", strict=True)
+            have = [str(name).strip() for name in rows.fieldnames or []]
+            return have, [
+                dict(zip(have, (v.strip() for v in list(row.values())[: len(have)]), strict=True)) for row in rows
+            ]
+    except (OSError, UnicodeDecodeError, csv.Error) as e:
+        raise InputError(f"{option} {file}: cannot be read as CSV ({str(e).splitlines()[0]})") from None
+
+
 def _table(file: str) -> dict[str, dict[str, str]]:
     """Engine and time by path (as written, and from the table's folder) and by a file's name."""
-    import polars as pl
-
-    try:
-        table = pl.read_csv(file, infer_schema=False)
-    except (OSError, pl.exceptions.PolarsError) as e:
-        raise InputError(f"--engines {file}: cannot be read as CSV ({str(e).splitlines()[0]})") from None
-    if "path" not in table.columns or not {"engine", "time"} & set(table.columns):
-        have = ", ".join(table.columns)
-        raise InputError(f"--engines {file}: has the columns {have}; needed: path and engine, time or both")
+    have, rows = text_table(file, "--engines")
+    if "path" not in have or not {"engine", "time"} & set(have):
+        raise InputError(f"--engines {file}: has the columns {', '.join(have)}; needed: path and engine, time or both")
     out: dict[str, dict[str, str]] = {}
-    for number, row in enumerate(table.to_dicts(), 2):
-        said = {k: (row.get(k) or "").strip() for k in ("engine", "time")}
+    for number, row in enumerate(rows, 2):
+        said = {k: row.get(k, "") for k in ("engine", "time")}
         if said["time"] and moment(said["time"]) is None:
             raise InputError(
                 f"--engines {file}:{number}: time (={said['time']!r}) must be a date such as 2026-03-14T12:30"
             )
-        path = (row["path"] or "").strip()
+        path = row["path"]
         out[path] = out[str((Path(file).parent / path).absolute())] = said
     return out
