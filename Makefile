@@ -33,16 +33,14 @@ test: lint compiled  ## lint, types, and every test but the slow ones
 	@$(SAY) 'pytest'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
-	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
+	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
 
 test-all: lint compiled  ## lint, types, and every test, with the slow campaigns
 	@$(need_chromium)
 	@$(SAY) 'pytest, with the slow campaigns'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
-	@VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run
+	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
 
 test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -96,3 +99,54 @@ def gcc() -> str:
     if found is None:
         pytest.skip("no C compiler: gcc is not installed")
     return found
+
+
+@pytest.fixture(scope="session")
+def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
+    """In place of a fresh interpreter a file: one that has imported asammdf and forks for each file."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    code = (
+        "import os, sys, signal\nimport asammdf\nfrom hil.logs.mdf import answer\n"
+        "for line in sys.stdin.buffer:\n"
+        "    name, _, request = line.partition(b' ')\n"
+        "    pid = os.fork()\n"
+        "    if pid == 0:\n"
+        "        os.dup2(2, 1)\n"
+        "        signal.alarm(20)\n"
+        "        with open(name, 'wb') as out: answer(request, out)\n"
+        "        os._exit(0)\n"
+        "    status = os.waitpid(pid, 0)[1]\n"
+        "    sys.stdout.write(f'{status}\\n'); sys.stdout.flush()\n"
+    )
+    root = str(ROOT)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    assert process.stdin is not None and process.stdout is not None
+    stdin, stdout = process.stdin, process.stdout
+    reply = Path(os.environ.get("TMPDIR", "/tmp")) / f"vaneloop-mdf-{process.pid}"
+
+    def child(request: bytes, seconds: float) -> bytes:
+        stdin.write(str(reply).encode() + b" " + request)
+        stdin.flush()
+        status = int(stdout.readline())
+        return reply.read_bytes() if status == 0 else b""
+
+    yield child
+    stdin.close()
+    process.wait(30)
+    reply.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def quick_mdf(quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read MDF4 files through it: for tests that read many, and ask nothing of the reader's own process."""
+    import hil.logs.mdf
+
+    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -110,70 +108,18 @@ def campaign(folder: Path, suffix: str, seeds: range, dbc: Path | None = None) -
             raise AssertionError(f"seed {seed} of {suffix}: {type(e).__name__}: {e}") from e
 
 
-@pytest.fixture(scope="module")
-def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
-    """In place of a fresh interpreter a file: one that has imported asammdf and forks for each file."""
-    if not hasattr(os, "fork"):
-        pytest.skip("needs fork")
-    code = (
-        "import os, sys, signal\nimport asammdf\nfrom hil.logs.mdf import answer\n"
-        "for line in sys.stdin.buffer:\n"
-        "    name, _, request = line.partition(b' ')\n"
-        "    pid = os.fork()\n"
-        "    if pid == 0:\n"
-        "        os.dup2(2, 1)\n"
-        "        signal.alarm(20)\n"
-        "        with open(name, 'wb') as out: answer(request, out)\n"
-        "        os._exit(0)\n"
-        "    status = os.waitpid(pid, 0)[1]\n"
-        "    sys.stdout.write(f'{status}\\n'); sys.stdout.flush()\n"
-    )
-    root = str(Path(__file__).parents[1])
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": root},
-    )
-    assert process.stdin is not None and process.stdout is not None
-    stdin, stdout = process.stdin, process.stdout
-    reply = Path(os.environ.get("TMPDIR", "/tmp")) / f"vaneloop-fuzz-{process.pid}"
-
-    def child(request: bytes, seconds: float) -> bytes:
-        stdin.write(str(reply).encode() + b" " + request)
-        stdin.flush()
-        status = int(stdout.readline())
-        return reply.read_bytes() if status == 0 else b""
-
-    yield child
-    stdin.close()
-    process.wait(30)
-    reply.unlink(missing_ok=True)
-
-
 @pytest.mark.parametrize("suffix", list(logs.FORMATS))
-def test_no_damage_takes_the_reader_down(
-    tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
+def test_no_damage_takes_the_reader_down(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     campaign(tmp_path, suffix, range(QUICK[suffix]))
 
 
-def test_no_damage_takes_the_reader_of_bus_mdf_down(
-    tmp_path: Path, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
+def test_no_damage_takes_the_reader_of_bus_mdf_down(tmp_path: Path, quick_mdf: None) -> None:
     campaign(tmp_path, ".mf4", range(1000, 1000 + QUICK[".mf4"]), DBC)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs.FORMATS))
-def test_long_campaign(
-    tmp_path: Path, suffix: str, quick_child: Callable[[bytes, float], bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(hil.logs.mdf, "_child", quick_child)
+def test_long_campaign(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
 
 

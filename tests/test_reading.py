@@ -388,7 +388,9 @@ def test_wrong_time_stamps_anywhere_are_left_out(tmp_path: Path, draw: st.DataOb
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("stamp", [0.0, 4e8])
 @pytest.mark.parametrize("at", [0, 1500, 2999])
-def test_one_wrong_time_stamp_is_left_out_of_every_format(tmp_path: Path, form: str, stamp: float, at: int) -> None:
+def test_one_wrong_time_stamp_is_left_out_of_every_format(
+    tmp_path: Path, form: str, stamp: float, at: int, quick_mdf: None
+) -> None:
     t = 100.0 + np.arange(3000) * 0.01
     stamps = t.copy()
     stamps[at] = stamp
@@ -405,7 +407,7 @@ def test_one_wrong_time_stamp_is_left_out_of_every_format(tmp_path: Path, form: 
 @pytest.mark.parametrize(("first", "second"), [(0.0, _T0), (_T0, 0.0), (0.0, 4e5), (4e5, 0.0)])
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_of_a_clock_that_jumps_the_longer_part_is_kept(
-    tmp_path: Path, form: str, first: float, second: float, share: float
+    tmp_path: Path, form: str, first: float, second: float, share: float, quick_mdf: None
 ) -> None:
     n, cut = 1000, int(1000 * share)
     t = np.arange(n) * 0.01

@@ -196,14 +196,70 @@ def test_the_last_thing_make_test_does_is_to_say_what_was_not_tested() -> None:
         words = ["make", "--no-print-directory", "-n", "-o", "lint", target]
         done = subprocess.run(words, cwd=run.ROOT, check=True, capture_output=True, text=True, timeout=60)
         lines = done.stdout.strip().splitlines()
-        assert lines[-1].endswith("-m tests.vcan.run") and "VANELOOP_NOT_TESTED=" in lines[-1]
-        written = lines[-1].split("VANELOOP_NOT_TESTED=")[1].split()[0]
-        assert any(f"VANELOOP_NOT_TESTED={written}" in line and "-m pytest" in line for line in lines), (
-            "pytest writes what is read there"
-        )
+        before, _, other_tests = lines[-1].partition(" -m tests.vcan.run --beside ")
+        assert "-m pytest " in other_tests, "what pytest does is run beside"
+        written = before.split("VANELOOP_NOT_TESTED=")[1].split()[0]  # pytest writes what is read there
         assert any(line.startswith("rm -f") and line.endswith(written) for line in lines), (
             "nothing of an earlier run is told again"
         )
+
+
+INSIDE = """
+import sys
+from tests.vcan import run
+def way(arguments):
+    print("in the kernel")
+    return run.Outcome({code}, untested=("no oil",))
+run.WAYS = {{"host": way}}
+sys.exit(run.main([]))
+"""
+
+
+@pytest.mark.parametrize(("other", "code", "ended"), [(0, 0, 0), (1, 0, 1), (0, 3, 3), (1, 3, 1)])
+def test_what_ran_beside_a_command_is_shown_after_it_and_told_last(
+    other: int,
+    code: int,
+    ended: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The command writes what it skipped as its last deed; that stands below all else, and no exit code is lost."""
+    told = tmp_path / "told"
+    monkeypatch.setenv("VANELOOP_NOT_TESTED", str(told))
+    monkeypatch.setattr(run, "may_go_first", lambda: True)
+    monkeypatch.setattr(run, "ITSELF", [sys.executable, "-c", INSIDE.format(code=code)])
+    command = f"sleep 0.2; echo all other tests; echo a.py: no fuel >{told}; exit {other}"
+    assert run.beside(["sh", "-c", command]) == ended
+    out = capfd.readouterr().out
+    said = [out.index(x) for x in ("all other tests", "in the kernel", "no oil", "a.py: no fuel")]
+    assert said == sorted(said)
+
+
+def test_beside_others_no_kernel_is_booted_that_could_not_go_first(ways, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = ways(host=Outcome(5))
+    monkeypatch.setattr(run, "may_go_first", lambda: False)
+    assert run.beside(["sh", "-c", "exit 4"]) == 4 and tried == []
+    assert run.beside(["true"]) == 5 and tried == ["host"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "up", "user", "first"),
+    [
+        ("", False, 0, True),
+        ("uml", True, 0, True),
+        ("", True, 0, False),
+        ("qemu", False, 0, False),
+        ("", False, 7, False),
+    ],
+)
+def test_only_a_kernel_of_its_own_and_only_root_s_goes_first(
+    asked: str, up: bool, user: int, first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VANELOOP_CAN", asked)
+    monkeypatch.setattr(run, "is_up", lambda: up)
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    assert run.may_go_first() is first
 
 
 # ---- a kernel that is booted -----------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import re
 import shutil
-import subprocess
 import tempfile
 import zipfile
 from dataclasses import dataclass
@@ -14,9 +13,9 @@ from pathlib import Path
 
 from controller import Calibration
 from controller.calibration import CalibrationTable
-from hil.fmu.description import OPTIONS, SOURCES, build_description, model_description
+from hil.fmu.description import SOURCES, build_description, model_description
 from hil.fmu.memory import first
-from hil.fmu.source import SHELL, kept_source, model_source, part_source
+from hil.fmu.source import SHELL, build, kept_source, model_source, part_object, part_source
 from hil.fmu.variables import PARTS, Variable, variables_of
 from plant import Model, Plant
 from vaneloop.base.errors import InputError
@@ -83,7 +82,7 @@ def write_fmu(
         if name not in files:
             files[name] = (SHELL / name).read_text(encoding="utf-8")
     described = model_description(version, f"VaneLoop {part}", identifier, token, variables, release_of("vaneloop"))
-    binary = _built(files, SOURCES[version])
+    binary = _built(files, SOURCES[version], part_object(part, shape))
     where = f"{platform.machine()}-linux" if version == "3.0" else "linux64"
     try:
         with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -105,13 +104,12 @@ def _put(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     archive.writestr(info, data)
 
 
-def _built(files: dict[str, str], sources: tuple[str, ...]) -> bytes:
-    """Compile and link the sources; only FMI's functions can be seen from outside."""
-    with tempfile.TemporaryDirectory(prefix="vaneloop-fmu-") as folder:
-        for name, text in files.items():
-            (Path(folder) / name).write_text(text, encoding="utf-8")
-        words = ["gcc", *OPTIONS.split(), "-fPIC", "-shared", "-fvisibility=hidden", "-o", "fmu.so", *sources, "-lm"]
-        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"gcc could not build the FMU: {done.stderr[-2000:]}")
-        return (Path(folder) / "fmu.so").read_bytes()
+def _built(files: dict[str, str], sources: tuple[str, ...], part: Path) -> bytes:
+    """Compile and link the sources, of which the object file ``part`` is there already."""
+    with tempfile.TemporaryDirectory(prefix="vaneloop-fmu-") as name:
+        folder = Path(name)
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        own = [file for file in sources if file != "part.c"]
+        build(["-shared", *own, str(part), "-lm"], "fmu.so", folder)
+        return (folder / "fmu.so").read_bytes()

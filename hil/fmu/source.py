@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -18,12 +21,13 @@ from typing import Any
 import numba
 import numpy as np
 
+from hil.fmu.description import OPTIONS
 from hil.fmu.memory import Shape, places_of
 from hil.fmu.variables import Variable
 from hil.loop.lockstep import WARM_UP
 from vaneloop.base.compiled import cache_folder
 
-__all__ = ["SHELL", "kept_source", "model_source", "part_source"]
+__all__ = ["SHELL", "build", "kept_source", "model_source", "part_object", "part_source"]
 
 SHELL = Path(__file__).parent / "c"
 _PLAIN = {
@@ -69,6 +73,29 @@ def part_source(part: str, shape: Shape) -> str:
     writing.write_text(done.stdout, encoding="ascii")
     writing.replace(kept)
     return done.stdout
+
+
+def part_object(part: str, shape: Shape) -> Path:
+    """Return the object file of ``part.c``, built once: most of what gcc does for an FMU, and the same for all."""
+    kept = kept_source(part, shape).with_suffix(f".{platform.machine()}.o")
+    if not kept.is_file():
+        text = part_source(part, shape)
+        with tempfile.TemporaryDirectory(prefix="vaneloop-fmu-") as folder:
+            (Path(folder) / "part.c").write_text(text, encoding="ascii")
+            build(["-c", "part.c"], "part.o", Path(folder))
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            writing = kept.with_suffix(f".{os.getpid()}")
+            shutil.copyfile(Path(folder) / "part.o", writing)
+            writing.replace(kept)
+    return kept
+
+
+def build(words: Sequence[str], out: str, folder: Path) -> None:
+    """Let gcc make ``out`` in a folder; only FMI's functions can be seen from outside."""
+    words = ["gcc", *OPTIONS.split(), "-fPIC", "-fvisibility=hidden", "-o", out, *words]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"gcc could not build the FMU: {done.stderr[-2000:]}")
 
 
 def _translated(part: str, shape: Shape) -> str:

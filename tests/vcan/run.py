@@ -10,6 +10,11 @@ back what was printed and the exit code. Nothing of the host's kernel is touched
 allows that way only. Arguments are handed to pytest::
 
     python -m tests.vcan.run [-k EXPRESSION ...]
+    python -m tests.vcan.run --beside COMMAND ...
+
+With ``--beside`` they are run while a command runs, which is `make test`'s other tests: they wait most of the time.
+What they print is shown when the command has ended. That needs a kernel of their own which may go before ordinary work.
+Where none can be had, they are run after the command, if it succeeds.
 
 The last lines say in capitals what was not tested, and why. Exit code: pytest's; 1 where a kernel died or hung after
 the tests had begun; 2 for a wrong ``VANELOOP_CAN``. Where no way leads to a vcan0: 0, or 1 with ``VANELOOP_CAN`` or
@@ -62,6 +67,7 @@ PCI = (
 FILES = (*PCI, "netfs", "fscache", "9pnet", "9pnet_virtio", "9p")
 CAN = ("can", "can-raw", "can-bcm", "can-dev", "vcan")
 APT_LIMIT, DOWNLOAD_LIMIT, WARM_LIMIT = 900.0, 900.0, 900.0  # s
+ITSELF = [sys.executable, "-m", "tests.vcan.run"]
 NUMBA = ("NUMBA_CACHE_DIR", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_JIT")
 HANDED_ON = (*NUMBA, "HOME", "LANG", "LC_ALL", "PYTHONPATH", "TERM", "VANELOOP_DATA", "VIRTUAL_ENV")
 # Python runs, with what takes longest to load, and a socket can be had: from then on what fails is a test's failure,
@@ -525,6 +531,8 @@ def conclude(outcome: Outcome, before: list[str], *, forced: bool) -> int:
     """Say as the last lines what was not tested; return the exit code. ``before``: why the ways tried before did not
     lead there.
     """
+    if os.environ.get("VANELOOP_BESIDE"):
+        sys.stdin.read()  # ends with the command that this ran beside
     earlier = lines_of(
         Path(os.environ.get("VANELOOP_NOT_TESTED") or os.devnull)
     )  # what pytest skipped before, in `make test`
@@ -546,6 +554,41 @@ def conclude(outcome: Outcome, before: list[str], *, forced: bool) -> int:
     if outcome.code is None:
         return 1 if forced or os.environ.get("VANELOOP_NEED_VCAN") else 0
     return outcome.code
+
+
+def may_go_first() -> bool:
+    """Whether a kernel of user-mode Linux would be on time beside other work (`put_first`): as root, where the way is
+    not the host's own ``vcan0``.
+    """
+    asked = os.environ.get("VANELOOP_CAN", "")
+    return (asked or ("host" if is_up() else "uml")) == "uml" and sys.platform.startswith("linux") and os.geteuid() == 0
+
+
+def beside(words: list[str]) -> int:
+    """Run a command, and the marked tests in a process beside it; return the command's exit code, or else theirs.
+
+    That process says last what was not tested, so it waits with that until this one has closed its input.
+    """
+    if not may_go_first():
+        return subprocess.run(words, check=False).returncode or main([])
+    with tempfile.TemporaryFile() as printed:
+        tests = subprocess.Popen(
+            ITSELF, cwd=ROOT, env=os.environ | {"VANELOOP_BESIDE": "1"},
+            stdin=subprocess.PIPE, stdout=printed, stderr=printed,
+        )  # fmt: skip
+        try:
+            code = subprocess.run(words, check=False).returncode
+            if tests.poll() is None:
+                say(f"tests on a {INTERFACE}, which began beside the others")
+            tests.communicate()
+        finally:
+            if tests.poll() is None:
+                tests.terminate()
+                tests.wait()
+        printed.seek(0)
+        sys.stdout.write(printed.read().decode("utf-8", "replace"))
+        sys.stdout.flush()
+    return code or tests.returncode
 
 
 def stopped(number: int, frame: object) -> NoReturn:
@@ -580,7 +623,8 @@ def handled() -> NoReturn:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stopped)
     try:
-        sys.exit(main(sys.argv[1:]))
+        arguments = sys.argv[1:]
+        sys.exit(beside(arguments[1:]) if arguments[:1] == ["--beside"] else main(arguments))
     except KeyboardInterrupt:
         sys.exit(130)
 
