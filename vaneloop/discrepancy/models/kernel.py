@@ -223,7 +223,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
     e_past = np.zeros((len(e_code), n if loop else 1))
     none = np.zeros(MEMORY)
     held = np.zeros(m)
-    k1, k2, k3, k4, z = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
+    dx, total, z = np.zeros(m), np.zeros(m), np.zeros(m)
     {rooms}
     first = True
     for k in range(n):
@@ -271,35 +271,25 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                                  remembered[i])
                     held[w] += f / mass[w]
             first = False
-            if line and not loop:
-                for j in range(len(inputs)):
-                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * q / steps
-                    if len(slopes) > 0:
-                        u[j] += between(inputs[j], slopes[j], t, k, q / steps)
-            rhs x k1
-            if line and not loop:
-                for j in range(len(inputs)):
-                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 0.5) / steps
-                    if len(slopes) > 0:
-                        u[j] += between(inputs[j], slopes[j], t, k, (q + 0.5) / steps)
-            now = t[k] + (q + 0.5) * h
-            for w in range(m):
-                z[w] = x[w] + 0.5 * h * k1[w]
-            rhs z k2
-            for w in range(m):
-                z[w] = x[w] + 0.5 * h * k2[w]
-            rhs z k3
-            if line and not loop:
-                for j in range(len(inputs)):
-                    u[j] = inputs[j, k] + (inputs[j, k + 1] - inputs[j, k]) * (q + 1.0) / steps
-                    if len(slopes) > 0:
-                        u[j] += between(inputs[j], slopes[j], t, k, (q + 1.0) / steps)
-            now = t[k] + (q + 1.0) * h
-            for w in range(m):
-                z[w] = x[w] + h * k3[w]
-            rhs z k4
-            for w in range(m):
-                x[w] += h / 6.0 * (k1[w] + 2.0 * k2[w] + 2.0 * k3[w] + k4[w])
+            # the four slopes of Runge and Kutta; written out four times, they took 2.4 times as long to compile
+            for j in range(4):
+                part = q + 0.5 * ((j + 1) // 2)
+                now = t[k] + part * h
+                if line and not loop:
+                    for i in range(len(inputs)):
+                        u[i] = inputs[i, k] + (inputs[i, k + 1] - inputs[i, k]) * part / steps
+                        if len(slopes) > 0:
+                            u[i] += between(inputs[i], slopes[i], t, k, part / steps)
+                for w in range(m):
+                    z[w] = x[w] + 0.5 * ((j + 1) // 2) * h * dx[w] if j > 0 else x[w]
+                rhs z dx
+                for w in range(m):
+                    if j == 0:
+                        total[w] = dx[w]
+                    elif j < 3:
+                        total[w] += 2.0 * dx[w]
+                    else:
+                        x[w] += h / 6.0 * (total[w] + dx[w])
             for i in range(len(code)):
                 if code[i] == STATE_LIMIT:
                     w = where[i]
