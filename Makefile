@@ -10,6 +10,8 @@ SAY := printf '[vaneloop] %s\n'
 JOBS ?= 2
 # Each of the JOBS has a core: threads of BLAS would wait for each other.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
+# mypy takes one core, and so does the first half of what is compiled ahead
+BOTH = $(MAKE) --no-print-directory -j2 lint compiled
 # Why tests were skipped: pytest writes it there, and the last lines of `make test` say it.
 NOT_TESTED := out/not_tested.txt
 
@@ -28,15 +30,17 @@ help:  ## list the targets
 demo: compiled  ## replay a recorded engine run and the long engine test; writes demo/*.html
 	@$(PY) -m vaneloop.cli.demo
 
-test: lint compiled  ## lint, types, and every test but the slow ones
+test: $(READY)  ## lint, types, and every test but the slow ones
 	@$(need_chromium)
+	@$(BOTH)
 	@$(SAY) 'pytest'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
 	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
 
-test-all: lint compiled  ## lint, types, and every test, with the slow campaigns
+test-all: $(READY)  ## lint, types, and every test, with the slow campaigns
 	@$(need_chromium)
+	@$(BOTH)
 	@$(SAY) 'pytest, with the slow campaigns'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)

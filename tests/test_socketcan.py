@@ -248,9 +248,13 @@ def test_every_frame_is_heard_and_every_wrong_one_counted_however_slow_the_machi
 @pytest.fixture(scope="module")
 def minute(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, dict]:
     """Controller and ECU as two processes for 60 s: candump's log, and what both said at their ends."""
-    folder = tmp_path_factory.mktemp("minute")
+    return heard_run(tmp_path_factory.mktemp("minute"), 60.0)
+
+
+def heard_run(folder: Path, seconds: float) -> tuple[Path, dict, dict]:
+    """Controller and ECU as two processes: candump's log, and what both said at their ends."""
     with candump(folder) as log:
-        result, said = check_run_and_ecu(INTERFACE, 60.0, folder)
+        result, said = check_run_and_ecu(INTERFACE, seconds, folder)
         time.sleep(0.5)
     return log, result, said
 
@@ -271,8 +275,23 @@ def test_the_foreign_log_of_a_run_replays(minute: tuple[Path, dict, dict], tmp_p
     The replay knows neither the lateness of real ticks nor the bus: hence the tolerance, one frame (10 ms) and the
     latest tick at the fastest rise seen.
     """
-    log, result, said = minute
-    replayed = tmp_path / "replay.json"
+    late = replays(minute, tmp_path)
+    for again in range(2):  # other work on this machine has cost the minute frames: ten quiet seconds will do
+        if late > 0.0:
+            (folder := tmp_path / f"{again}").mkdir()
+            late = replays(heard_run(folder, 10.0), folder)
+    if late > 0.0:
+        pytest.skip(
+            f"the log replays; its figures are not judged, because a tick was {late * 1e-3:.0f} ms late and cost frames"
+        )
+
+
+def replays(heard_of: tuple[Path, dict, dict], folder: Path) -> float:
+    """Replay candump's log and judge its figures; 0, or how late (us) the tick was that cost frames: nothing is judged
+    then.
+    """
+    log, result, said = heard_of
+    replayed = folder / "replay.json"
     subprocess.run(
         [sys.executable, "-m", "hil.replay", str(log), "--quiet", "--json", str(replayed)], check=True, timeout=PATIENCE
     )
@@ -287,11 +306,10 @@ def test_the_foreign_log_of_a_run_replays(minute: tuple[Path, dict, dict], tmp_p
     whole = (states[first : last + 1] == RUN).all()
     assert whole or late > ON_TIME_US, "a fault although nobody was late"
     if not whole:
-        pytest.skip(
-            f"the log replays; its figures are not judged, because a tick was {late * 1e-3:.0f} ms late and cost frames"
-        )
+        return late
     fastest = np.abs(np.diff(heard.signal("VGV_STATUS", "x_dem"))).max() * (1.0 + late / 10_000.0)
     assert errors["x_lvdt"] < fastest and errors["x_dem"] < fastest, (errors, fastest)
+    return 0.0
 
 
 def test_wrong_frames_by_cansend_are_refused_and_counted(pair, tmp_path: Path) -> None:

@@ -131,11 +131,12 @@ class Runner:
 
     def _active(self, theta: Array) -> list[tuple[Placed, Array]]:
         out = []
+        numbers = theta.tolist()  # compared as such: arrays of two take ten times as long
         for q in self.placed:
-            values = theta[q.columns]
-            if q.curve is not None and values.any():
-                out.append((q, q.curve.table(values)))
-            elif q.curve is None and not np.array_equal(values, q.neutral):
+            values = numbers[q.columns]
+            if q.curve is not None and any(values):
+                out.append((q, q.curve.table(theta[q.columns])))
+            elif q.curve is None and values != q.neutral.tolist():
                 row = np.zeros(self.dispatch.parameters + 1)
                 row[: len(values)] = values
                 row[len(values)] = q.constant
