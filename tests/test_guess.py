@@ -236,6 +236,27 @@ def test_days_and_months_that_cannot_be_told_apart_are_no_time_beyond_a_day(tmp_
         read_log(table(tmp_path / "a.csv", rows))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    "first, last, span",
+    [
+        ("24/11/26 08:00:00", "24/11/26 09:30:00", 5400.0),  # whichever number is the year, it is one day
+        ("31/12/25 23:59:50", "01/01/26 00:00:10", None),  # 31 is no month: yet it may be day or year
+        ("2026/12/31 23:59:50", "2027/01/01 00:00:10", 20.0),
+        ("31/12/2026 23:59:50", "01/01/2027 00:00:10", 20.0),  # 31 is no month
+    ],
+)
+def test_short_years_after_a_slash_are_read_where_it_does_not_matter_which_they_are(
+    first: str, last: str, span: float | None, tmp_path: Path
+) -> None:
+    rows = {"Datum_Zeit": [first, last], "n_dem": [60.0, 61.0]}
+    file = table(tmp_path / "a.csv", rows)  # type: ignore[arg-type]
+    if span is None:
+        with pytest.raises(LogError, match="is not a number"):
+            read_log(file)
+        return
+    assert read_log(file).channels["n_dem"].t[-1] == pytest.approx(span)
+
+
 def test_milliseconds_from_the_start_are_never_guessed(tmp_path: Path) -> None:
     """A row every 10 may be a row in 10 s: the name has to say it."""
     file = table(tmp_path / "a.csv", {"t": np.arange(200) * 10.0, "n_dem": np.full(200, 60.0)})

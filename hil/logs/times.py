@@ -15,10 +15,12 @@ from hil.logs.source import ABSENT, numbers
 __all__ = ["from_dates", "guess_column", "guess_unit"]
 
 # days as loggers write them, and the clock; a decimal comma has become a point, Z has become +00:00
-_Y, _M, _D = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})"
-_AMBIGUOUS = f"{_D}/{_M}/{_Y}", f"{_M}/{_D}/{_Y}"
+_Y, _M, _D, _SHORT = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})", r"(?P<y>\d{2})"
+_AMBIGUOUS = (
+    f"{_D}/{_M}/{_Y}", f"{_M}/{_D}/{_Y}", f"{_D}/{_M}/{_SHORT}", f"{_M}/{_D}/{_SHORT}", f"{_SHORT}/{_M}/{_D}",
+)  # fmt: skip
 _DAYS = (
-    f"{_Y}-{_M}-{_D}", f"{_Y}/{_M}/{_D}", rf"{_D}\.{_M}\.{_Y}", rf"{_D}\.{_M}\.(?P<y>\d{{2}})", *_AMBIGUOUS,
+    f"{_Y}-{_M}-{_D}", f"{_Y}/{_M}/{_D}", rf"{_D}\.{_M}\.{_Y}", rf"{_D}\.{_M}\.{_SHORT}", *_AMBIGUOUS,
     r"(?P<y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
 )  # fmt: skip
 _CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?"
@@ -65,8 +67,8 @@ def from_dates(text: Any) -> tuple[np.ndarray, str] | None:
     """Seconds of Arrow's strings of dates or times of day (null: no sample), counted from the first, and a note; None
     where they are none.
 
-    A time of day that falls back by more than half a day has passed midnight. Day and month that cannot be told apart
-    do not matter within one day; beyond it such dates are refused (None).
+    A time of day that falls back by more than half a day has passed midnight. Day, month and short year that cannot be
+    told apart do not matter within one day; beyond it such dates are refused (None).
     """
     from pyarrow import compute as pc
 
@@ -81,7 +83,8 @@ def from_dates(text: Any) -> tuple[np.ndarray, str] | None:
         us = _parsed(there, f"{day}(?: +|T){_CLOCK}{_ZONE}")
         if us is None:
             continue
-        if set(_AMBIGUOUS) <= set(fits) and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
+        several = sum(f in _AMBIGUOUS for f in fits) > 1
+        if several and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
             return None
         return _since(us, known), f"time: dates; {there[0]} taken for the start of the log"
     us = _parsed(there, _CLOCK)
