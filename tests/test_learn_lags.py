@@ -32,12 +32,13 @@ CREEP = ("linkage.crank adds", "speed_of_x_lvdt_lagged_by_2_s", "line", -0.2)  #
 
 
 def run_of(model: Model, seconds: float = SECONDS) -> Run:
-    demand = rig.manoeuvre(3, seconds).n_dem[:: round(0.01 / TICK)]
+    demand = rig.manoeuvre(3, seconds).n_dem
     return lockstep(Stimulus.of(demand), plant=build_plant(model=model), seed=1, hashed=False)
 
 
 def chain_of(run: Run, model: Model) -> Chain:
-    channels = {k: Channel(run.t, v) for k, v in run.columns.items() if k != "t" and np.isfinite(v).all()}
+    known = {k: np.isfinite(v) for k, v in run.columns.items()}
+    channels = {k: Channel(run.t[known[k]], v[known[k]]) for k, v in run.columns.items() if k != "t" and known[k].any()}
     return build_chain(Log("loop", channels), build_plant(model=model))
 
 
@@ -82,13 +83,11 @@ def test_a_lag_of_nothing_changes_no_bit() -> None:
 
 def test_a_lag_of_the_speed_in_a_reading_is_a_lag_of_the_reading() -> None:
     """x behind a lag T is x - T (x's speed behind T)."""
-    tau = 0.1
-    ours = curved(law("sensors.lvdt adds", "speed_of_x_lvdt_lagged_by_100_ms", "line", -tau))
-    plain, ours, theirs = (
-        columns(m) for m in (Model(), ours, Model(effects={"lvdt_lag": {"time_constant": tau}}))
-    )
+    tau = 0.01
+    ours = curved(law("sensors.lvdt adds", "speed_of_x_lvdt_lagged_by_10_ms", "line", -tau))
+    plain, ours, theirs = (columns(m) for m in (Model(), ours, Model(effects={"lvdt_lag": {"time_constant": tau}})))
     moved, off = (np.sqrt(np.nanmean((x - theirs) ** 2, axis=0)) for x in (plain, ours))
-    assert moved.max() > 0.0 and np.all(off <= 1e-9 + 0.03 * moved)
+    assert moved.max() > 0.0 and np.all(off <= 1e-9 + 0.1 * moved)
 
 
 def test_loop_and_stage_say_the_same_of_a_crank_that_creeps() -> None:
