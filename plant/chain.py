@@ -378,12 +378,13 @@ def vane_step(s: np.ndarray, p: np.ndarray, j: int, n_r: float, t_oil: float, t:
     How long the step is stands in the derived rows of ``p`` (`plant.parameters.derive`, its tick).
     """
     g, n = GEOMETRY, int(p[VANE_COUNT, j])
-    c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     if p[VANE_EFFECTS, j] != 0.0:
+        c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
         for k in range(n):
             vane = stem_angle(s, p, j, k, c, d, n_r, t_oil, t)
             s[POT + k, j] += p[POT_SHARE + k, j] * (vane - s[POT + k, j])
         return
+    c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     for k in range(n):
         o = g + N_CRANK + k * N_PER_STAGE
         drive = ring_angle(c, d, p[o + G_AX, j], p[o + G_AY, j], p[o + G_LB, j], p[o + G_LC, j], p[o + G_LD, j])
