@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from hil.logs import Channel, Log
 from hil.loop.lockstep import Run, Stimulus, lockstep
-from plant import Model, build_plant
+from plant import Model, build_plant, load_model, write_model
 from plant.curve import CRANK_ADDS, CURRENT_ADDS, S_LATE, begin, bend, follow, quantity_of
 from plant.effects import N_STATE
 from tests import rig
@@ -23,7 +23,7 @@ from tests.test_learn_vanes import WIDE, chain, columns, curved, law
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy.models.memory import lagged
 from vaneloop.discrepancy.models.vane_stages.driven import Made
-from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, VaneGround
+from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, VaneGround, curve_effect, with_laws
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
 
 TICK = 1e-3
@@ -96,6 +96,19 @@ def test_loop_and_stage_say_the_same_of_a_crank_that_creeps() -> None:
     without, with_it = (left(chain_of(run, m), "linkage") for m in (Model(), model))
     clean = left(chain_of(run_of(Model()), Model()), "linkage")
     assert without > 5.0 * clean and with_it < 1.1 * clean
+
+
+def test_its_file_is_taken_and_another_log_confirms_its_scale(tmp_path) -> None:
+    write_model(tmp_path / "law.toml", curved(law(*CREEP)))
+    model = load_model(tmp_path / "law.toml")
+    assert model == curved(law(*CREEP))
+    ((name, creeping),) = model.curves.items()
+    plain = chain_of(run_of(model), Model()).stage("linkage")
+    stage = with_laws(plain, (), [curve_effect(name, creeping)], "loop")
+    theta = np.repeat(stage.neutral()[None], 3, axis=0)
+    theta[:, stage.index()[name]] = np.array([[0.9], [1.0], [1.1]])
+    off = np.nanmean((stage.run(theta) - stage.measured) ** 2, axis=(1, 2))
+    assert off[1] < 0.9 * min(off[0], off[2])
 
 
 def test_loop_and_stage_say_the_same_of_an_engine_that_remembers() -> None:
