@@ -122,6 +122,7 @@ __all__ = [
     "TICK",
     "bent_reading",
     "drive_step",
+    "driven_stroke",
     "measured_stroke",
     "rest",
     "rotor_step",
@@ -252,7 +253,7 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
     if p[KIND, j] != 0.0:
         electromechanical.rest(p, s, j, 0.0, load, t_oil)
     g = GEOMETRY
-    c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+    c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     for k in range(int(p[VANE_COUNT, j])):
         s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
         stage = stem.prepare(p, j, k)
@@ -304,6 +305,14 @@ def true_stroke(reading: float, p: np.ndarray, j: int, t_oil: float) -> float:
                 break
             x -= e / max(lvdt_nonlinearity.slope(x, p[STROKE, j], sine, cubic), 0.2)
     return x
+
+
+@inlined
+def driven_stroke(s: np.ndarray, p: np.ndarray, j: int) -> float:
+    """The stroke (m) to which the piston drives the crank."""
+    if p[CURVES, j] == 0.0:
+        return s[X, j]
+    return s[X, j] + curve.bend(s, p, j, curve.CRANK_ADDS)
 
 
 @inlined
@@ -369,12 +378,13 @@ def vane_step(s: np.ndarray, p: np.ndarray, j: int, n_r: float, t_oil: float, t:
     How long the step is stands in the derived rows of ``p`` (`plant.parameters.derive`, its tick).
     """
     g, n = GEOMETRY, int(p[VANE_COUNT, j])
-    c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     if p[VANE_EFFECTS, j] != 0.0:
+        c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
         for k in range(n):
             vane = stem_angle(s, p, j, k, c, d, n_r, t_oil, t)
             s[POT + k, j] += p[POT_SHARE + k, j] * (vane - s[POT + k, j])
         return
+    c, d = crank(s[X, j], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     for k in range(n):
         o = g + N_CRANK + k * N_PER_STAGE
         drive = ring_angle(c, d, p[o + G_AX, j], p[o + G_AY, j], p[o + G_LB, j], p[o + G_LC, j], p[o + G_LD, j])

@@ -5,7 +5,8 @@ at a `PLACES` of the machine, of one of `plant.layout.SIGNALS`. What adds, adds 
 so with 1 + its value. Beyond the table's range a curve stays as at its end. Rows of a curve: `plant.layout`.
 
 The signals are what the machine itself has at the last tick: a curve of the stroke is one of the true stroke. Where a
-stage is held against a log, they are what the log says (`take`).
+stage is held against a log, they are what the log says (`take`). A curve may have its signal through a first-order lag
+of its own, which starts settled.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from plant.effect import HYDRAULIC, KINDS, UNITS
 from plant.effects import CURVES, N_STATE, SIGNAL_AT
 from plant.layout import (
     C_HIGH,
+    C_LAG,
     C_LOW,
     C_OF,
     C_PERIOD,
@@ -34,20 +36,20 @@ from plant.layout import (
 from plant.places import N_R, POT, SPEED, X
 from vaneloop.base.compiled import compiled, in_place, inlined
 from vaneloop.base.curve import POINTS, between_points
-from vaneloop.base.durations import period_of
+from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
-    "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS", "LVDT_ADDS",
-    "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
+    "CRANK_ADDS", "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS",
+    "LVDT_ADDS", "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
     "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow",
     "quantity_of", "take", "turn", "turns",
 ]  # fmt: skip
 
 (
     DEMAND_ADDS, SERVO_ADDS, SERVO_TIMES, ENGINE_ADDS, LAG_TIMES, RISE_TIMES, CURRENT_ADDS, FLOW_TIMES, LOAD_ADDS,
-    LVDT_ADDS, LVDT_TIMES,
-) = range(1, 12)  # fmt: skip
+    LVDT_ADDS, LVDT_TIMES, CRANK_ADDS,
+) = range(1, 13)  # fmt: skip
 # of all stages; of each stage k: the number behind it and k
 RING_ADDS, PLAY_ADDS, POT_ADDS, POT_TIMES = (100 * n for n in range(1, 5))
 LEAST = 0.05  # a factor 1 + c is not less
@@ -57,12 +59,15 @@ KNOWN = SIGNALS.index(VANES[0]) + MOST  # signals that a curve may be of; behind
     S_CURRENT, S_X, S_SPEED, S_N_R, S_P_S, S_T_OIL, S_TIME, S_N_DEM, S_X_DEM, S_DIRECTION, S_DISTANCE, S_SINCE, S_VANE,
 ) = range(SIGNAL_AT, SIGNAL_AT + 13)  # fmt: skip
 S_FARTHEST = SIGNAL_AT + KNOWN
+S_LATE = S_FARTHEST + 4  # a row a curve
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A signal as a log and a reader have it: name, unit, factor to SI, its number in `SIGNALS`, and the period (SI)
-    after which what is a function of it repeats itself; 0: it does not.
+    """A signal as a log and a reader have it: name, unit, factor to SI, its number in `SIGNALS`.
+
+    period  SI, after which what is a function of it repeats itself; 0: it does not
+    lag     s, time constant of the first-order lag behind which it is seen; 0: none
     """
 
     name: str
@@ -70,6 +75,7 @@ class Quantity:
     si: float
     of: int
     period: float = 0.0
+    lag: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,7 @@ PLACES = {
         Place("actuator.load", "adds", ("actuator",), "N", 1.0, LOAD_ADDS),
         Place("sensors.lvdt", "adds", ("linkage", "actuator"), "mm", 1e-3, LVDT_ADDS),
         Place("sensors.lvdt", "times", ("linkage",), "-", 1.0, LVDT_TIMES),
+        Place("linkage.crank", "adds", ("linkage",), "mm", 1e-3, CRANK_ADDS),
         Place("linkage.ring", "adds", ("linkage",), "deg", _DEG, RING_ADDS),
         Place("linkage.play", "adds", ("linkage",), "deg", _DEG, PLAY_ADDS),
         *(
@@ -144,9 +151,13 @@ PLACES = {
 
 
 def quantity_of(name: str) -> Quantity | None:
-    """The quantity of this name, of those in `QUANTITIES` and ``time_every_TIME``; None: there is none."""
+    """The quantity of this name, of those in `QUANTITIES`, ``time_every_TIME`` and ``SIGNAL_lagged_by_TIME``; None:
+    there is none.
+    """
     if period := period_of(name):
         return replace(QUANTITIES["time"], name=name, period=period)
+    if (lag := named_lag(name)) and lag[0] in QUANTITIES and lag[0] != "time":
+        return replace(QUANTITIES[lag[0]], name=name, lag=lag[1])
     return QUANTITIES.get(name)
 
 
@@ -162,7 +173,7 @@ def at_curve(p: np.ndarray, place: Place, q: Quantity, low: float, high: float, 
     r = CURVES + 1 + c * CURVE_ROWS
     p[CURVES] = c + 1
     p[r + C_SITE], p[r + C_OF], p[r + C_LOW], p[r + C_HIGH] = place.site, q.of, low * q.si, high * q.si
-    p[r + C_PERIOD] = q.period
+    p[r + C_PERIOD], p[r + C_LAG] = q.period, q.lag
     p[r + C_TABLE : r + CURVE_ROWS] = tables * place.si
 
 
@@ -176,6 +187,8 @@ def bend(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
             x, period = s[SIGNAL_AT + int(p[r + C_OF, j]), j], p[r + C_PERIOD, j]
             if period > 0.0:
                 x -= math.floor(x / period) * period
+            if p[r + C_LAG, j] > 0.0:
+                x = s[S_LATE + c, j]
             k, share = between_points(x, p[r + C_LOW, j], p[r + C_HIGH, j], POINTS)
             a = p[r + C_TABLE + k, j]
             total += a + share * (p[r + C_TABLE + k + 1, j] - a)
@@ -235,29 +248,40 @@ def follow(
     t_oil: float, t: float,
 ) -> None:  # fmt: skip
     """Take the machine's own signals at time ``t`` (s): what curves are a function of until the next tick."""
+    since = t - s[S_TIME, j]
     s[S_CURRENT, j], s[S_X, j], s[S_SPEED, j], s[S_N_R, j] = i_cmd, s[X, j], s[SPEED, j], n_r
     s[S_P_S, j], s[S_T_OIL, j], s[S_TIME, j], s[S_N_DEM, j], s[S_X_DEM, j] = p_s, t_oil, t, n_dem, x_dem
     for k in range(int(p[VANE_COUNT, j])):
         s[S_VANE + k, j] = s[POT + k, j]
     turn(s, j, s[X, j], t, TURN * p[STROKE, j])
+    for c in range(int(p[CURVES, j])):
+        r = CURVES + 1 + c * CURVE_ROWS
+        if p[r + C_LAG, j] > 0.0 and since > 0.0:
+            signal = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
+            s[S_LATE + c, j] += (signal - s[S_LATE + c, j]) * -math.expm1(-since / p[r + C_LAG, j])
 
 
 @in_place
 def begin(s: np.ndarray, p: np.ndarray, j: int, t_oil: float) -> None:
-    """The signals of a machine at rest, with oil at ``t_oil`` (degC)."""
+    """The signals of a machine at rest, with oil at ``t_oil`` (degC); lags are settled."""
     s[S_X, j] = s[S_X_DEM, j] = s[S_FARTHEST, j] = s[S_FARTHEST + 1, j] = s[X, j]
     s[S_N_R, j] = s[S_N_DEM, j] = s[N_R, j]
     s[S_P_S, j], s[S_T_OIL, j] = p[P_REF, j], t_oil
     for k in range(int(p[VANE_COUNT, j])):
         s[S_VANE + k, j] = s[POT + k, j]
+    for c in range(int(p[CURVES, j])):
+        s[S_LATE + c, j] = s[SIGNAL_AT + int(p[CURVES + 1 + c * CURVE_ROWS + C_OF, j]), j]
 
 
 @in_place
 def take(s: np.ndarray, p: np.ndarray, j: int, known: np.ndarray, before: int, k: int) -> None:
     """Take the signals that lane ``j``'s curves are of from a log: their mean at samples ``before`` and ``k``.
 
-    known  float64[KNOWN, samples], SI
+    known  float64[KNOWN + curves, samples], SI: signals, and behind them that of each curve with a lag, behind it
     """
     for c in range(int(p[CURVES, j])):
-        q = int(p[CURVES + 1 + c * CURVE_ROWS + C_OF, j])
+        r = CURVES + 1 + c * CURVE_ROWS
+        q = int(p[r + C_OF, j])
         s[SIGNAL_AT + q, j] = 0.5 * (known[q, before] + known[q, k])
+        if p[r + C_LAG, j] > 0.0:
+            s[S_LATE + c, j] = 0.5 * (known[KNOWN + c, before] + known[KNOWN + c, k])

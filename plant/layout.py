@@ -17,6 +17,7 @@ __all__ = [
     "BANDWIDTH",
     "CURVE_ROWS",
     "C_HIGH",
+    "C_LAG",
     "C_LOW",
     "C_OF",
     "C_PERIOD",
@@ -105,8 +106,9 @@ NOMINAL_STATE = (
 
 # ---- curves that were learned (`plant.curve`): behind all others too
 MOST_CURVES = 4
-# rows of one: where, of which signal, its range, the period after which it repeats itself (0: it does not), its table
-(C_SITE, C_OF, C_LOW, C_HIGH, C_PERIOD, C_TABLE) = range(6)
+# rows of one: where, of which signal, its range, the period after which it repeats itself (0: it does not), the time
+# constant of the lag behind which it has its signal (0: none), its table
+(C_SITE, C_OF, C_LOW, C_HIGH, C_PERIOD, C_LAG, C_TABLE) = range(7)
 CURVE_ROWS = C_TABLE + POINTS
 SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature in degC)
     "i_cmd",
@@ -126,6 +128,7 @@ SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature i
     "turned",  # m
     "reached",  # s
     "turned_at",  # s
+    *(f"late_{c}" for c in range(MOST_CURVES)),  # of each curve with a lag, its signal behind that
 )
 
 # ---- electromechanical actuator: its rows stand behind all others (`plant.effects`)

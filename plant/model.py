@@ -44,6 +44,7 @@ from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
 from plant.parameters import Nominal, derive, nominal
 from vaneloop.base.curve import DEGREE, POINTS, splines
+from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import Bound, Finite, Table, read
@@ -187,10 +188,11 @@ class Model(Table):
                     f"{where}: at, how (={curve.at!r}, {curve.how!r}) is {_not(curve.at, plant, ())}; allowed: "
                     f"{', '.join(places)}"
                 )
-            if curve.of not in own and (curve.of in VANES or quantity_of(curve.of) is None):
+            lag = named_lag(curve.of)
+            if (lag[0] if lag else curve.of) not in own and period_of(curve.of) == 0.0 or quantity_of(curve.of) is None:
                 raise InputError(
                     f"{where}: of (={curve.of!r}) is unknown; allowed: {', '.join(own)}, time_every_TIME such as "
-                    f"time_every_20_ms"
+                    f"time_every_20_ms, SIGNAL_lagged_by_TIME such as n_r_lagged_by_20_s"
                 )
             curve.check(where)
             values = self.effects.get(name, {})

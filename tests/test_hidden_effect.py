@@ -8,13 +8,14 @@ import json
 import re
 
 import numpy as np
+import pytest
 
 from plant.curve import PLACES, QUANTITIES
 from plant.effects import EFFECTS
 from tests.rig import CATALOGUE, WITH_MOTOR, Hidden, load_geometry
 from tests.rig.left_out import LEFT_OUT
 from vaneloop.base.tables import path
-from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case
+from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
 
 N = 200
@@ -127,3 +128,20 @@ def test_a_left_out_effect_is_not_looked_for():
 def test_an_effect_that_is_not_looked_for_must_be_one(capsys):
     assert main(["diagnose", "examples/hidden_effect.parquet", "--without", "valve_lags", "--quiet"]) == 2
     assert "--without 'valve_lags' is not in the library; probably 'valve_lag' is meant" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [
+        ("linkage.crank.curve_of_speed_of_x_lvdt_lagged_by_14700_ms", True),
+        ("linkage.ring.curve_of_x_lvdt_lagged_by_16_s", True),
+        ("linkage.crank.curve_of_speed_of_x_lvdt_lagged_by_30_s", False),  # another time
+        ("linkage.crank.curve_of_speed_of_x_lvdt", False),  # no memory
+        ("linkage.vigv_ring.curve_of_speed_of_x_lvdt_lagged_by_15_s", False),  # one ring of three
+        ("linkage.crank.curve_of_t_oil_lagged_by_15_s", False),
+    ],
+)
+def test_a_lag_is_right_at_its_place_of_its_channel_and_with_its_time(name, right):
+    said = {"verdict": "learned", "laws": [{"names": [name]}]}
+    row = {"truth": ["ring_creep"], "sizes": json.dumps([{"share": 0.06, "time": 15.0}]), "learned": json.dumps(said)}
+    assert learned_right(row) == right

@@ -13,7 +13,7 @@ import pytest
 from hil.logs import Channel, Log, read_log, write_log
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, build_plant, load_model, write_model
-from plant.curve import PLACES, QUANTITIES
+from plant.curve import PLACES, quantity_of
 from plant.layout import MOST_CURVES
 from plant.model import Learned
 from tests import rig
@@ -156,7 +156,7 @@ def test_candidates_are_places_times_quantities_that_say_something() -> None:
         some = ground.candidates(stage.neutral()[: len(stage.parameters)])
         assert some and len({c.name for c in some}) == len(some)
         for c in some:
-            assert stage.name in PLACES[f"{c.at} {c.how}"].stages and c.quantity.name in QUANTITIES
+            assert stage.name in PLACES[f"{c.at} {c.how}"].stages and quantity_of(c.quantity.name)
         only = remade(stage, (), [(some[0].placed(), some[0].effect(1.0))])
         assert np.allclose(only.run(only.neutral()[None]), stage.run(stage.neutral()[None]), atol=1e-9)
 

@@ -122,7 +122,7 @@ def _linkage_lanes(
                 seen = straightened(seen, s, p, j)
             x = true_stroke(seen, p, j, t_oil[m])
             s[X, j] = x
-            c, d = crank(x, p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+            c, d = crank(chain.driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
             for k in range(stages):
                 vane = chain.stem_angle(s, p, j, k, c, d, n_r[m], t_oil[m], t[m])
                 if m > 0:

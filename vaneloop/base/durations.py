@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["in_name", "of_name", "period_of", "within_no_period"]
+__all__ = ["in_name", "named_lag", "of_name", "period_of", "within_no_period"]
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -20,6 +20,11 @@ def of_name(name: str, word: str) -> tuple[str, float] | None:
     """Channel and time (s) of a quantity named ``CHANNEL_word_TIME``; None: it is none."""
     found = re.fullmatch(rf"(.+)_{word}_([1-9]\d*)_({'|'.join(UNITS)})", name)
     return (found[1], int(found[2]) * UNITS[found[3]]) if found else None
+
+
+def named_lag(name: str) -> tuple[str, float] | None:
+    """Channel and time constant (s) of a lagged quantity ``CHANNEL_lagged_by_TIME``; None: it is none."""
+    return of_name(name, "lagged_by")
 
 
 def period_of(name: str) -> float:

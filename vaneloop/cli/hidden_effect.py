@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.base.durations import within_no_period
+from vaneloop.base.durations import named_lag, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
@@ -197,7 +197,14 @@ def learned_right(row: dict[str, Any]) -> bool:
     """
     said = json.loads(row["learned"])
     names = {within_no_period(n) for law in said["laws"] for n in law["names"]}
-    return bool(names & CURVES_OF[row["truth"][0]]) or (said["verdict"] == "named" and _told(row))
+    truth = row["truth"][0]
+    late = [lag for n in names if (lag := named_lag(n)) and lag[0] in LAGS_OF.get(truth, ())]
+    (sizes,) = json.loads(row["sizes"])
+    return (
+        bool(names & CURVES_OF[truth])
+        or any(1.0 / LAG_TOLD <= tau / sizes["time"] <= LAG_TOLD for _, tau in late)
+        or (said["verdict"] == "named" and _told(row))
+    )
 
 
 def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -206,7 +213,7 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     if not asked:
         return {}
     outside = [r for r in asked if r["kind"] == "outside" and r["detectable"][0]]
-    plain = [r for r in outside if CURVES_OF[r["truth"][0]]]
+    plain = [r for r in outside if CURVES_OF[r["truth"][0]] or r["truth"][0] in LAGS_OF]
     right = [r for r in outside if learned_right(r)]
     errors = [laws[-1]["after"] for r in right if (laws := json.loads(r["learned"])["laws"])]
     spent = sorted(json.loads(r["learned"])["processor_s"] for r in asked if json.loads(r["learned"])["laws"])
@@ -426,7 +433,12 @@ CURVES_OF: dict[str, set[str]] = {
     "lvdt_ripple": _of("sensors.lvdt", "time"),
     "driver_oscillation": _of("valve.current", "time"),
 }
-# what is no function of one quantity at one place: shaking, resonance, memory, a signal's own clock
+# what is one of a quantity behind a lag, whose time the rig knows: each ring is late by a share of ring - y, where
+# y' = (ring - y) / time, which is that share times the time of the ring's speed behind the lag. All rings turn with the
+# crank. Of the stroke behind the lag, instead of its speed, the share of the ring itself is left to the links' lengths.
+LAGS_OF = {"ring_creep": _of("linkage.crank linkage.ring", "x_lvdt speed_of_x_lvdt")}
+LAG_TOLD = 1.25  # times the true time, or its inverse
+# what is no function of one quantity at one place: shaking, resonance, a spool that sticks, a signal's own clock
 NO_CURVE = (
     "vane_vibration", "valve_silting", "ring_creep", "linkage_resonance", "stall_rumble", "lvdt_lost_bits",
 )  # fmt: skip

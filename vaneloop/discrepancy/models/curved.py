@@ -148,6 +148,14 @@ class Candidate:
         name = self.name.removesuffix(time.name) + q.name
         return replace(self, name=name, quantity=q, basis=waves_of(q.period))
 
+    def slower(self, times: float) -> Candidate | None:
+        """The same with a lag, or a period, so many times as long; None: it has none, or it would not be one."""
+        q = self.quantity.slower(times) if self.quantity.slower is not None else None
+        basis = replace(self, quantity=q).basis_of() if q is not None else None
+        if q is None or basis is None or basis.turn.shape != self.basis.turn.shape:
+            return None
+        return replace(self, name=self.name.replace(self.quantity.name, q.name), quantity=q, basis=basis)
+
     @property
     def turn(self) -> Array:
         """B-spline coefficients of each of its functions."""

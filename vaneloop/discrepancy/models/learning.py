@@ -49,7 +49,7 @@ OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 PLAINER = 2  # more that are fitted to the end, where the best multiplies: of its quantity, that add
 OTHER = 1.5  # times as large: another amplitude
-TIMES, STEP = (1.8, 1.3, 1.1), 0.002  # by which a lag is changed; log error by which a change must help
+TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
 FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
@@ -383,14 +383,10 @@ class Learner:
 
     def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
         """The curve with a lag so many times as long; None where that is no better."""
-        c = best.candidate
-        assert c.quantity.slower is not None
-        q = c.quantity.slower(times)
-        basis = replace(c, quantity=q).basis_of() if q is not None else None
-        if q is None or basis is None or basis.turn.shape != c.basis.turn.shape:
+        slower = best.candidate.slower(times)
+        if slower is None:
             return None
-        name = c.name.replace(c.quantity.name, q.name)
-        more = self._fitted(current, replace(c, name=name, quantity=q, basis=basis), best.wiggle, best.fit.theta, 12)
+        more = self._fitted(current, slower, best.wiggle, best.fit.theta, 12)
         return more if score(self.judge, more.fit) < score(self.judge, best.fit) - STEP else None
 
     def _settled(self, current: Tried, best: Tried) -> Tried:
@@ -482,7 +478,20 @@ class Learner:
         for one in out:  # of several lags of a channel, one
             lag = named_lag(one[1].quantity.name)
             best.setdefault((one[1].how, one[1].at, f"lag of {lag[0]}" if lag else one[1].quantity.name), one)
-        return list(best.values())
+        first = [self._its_lag(current, one, slopes) for one in list(best.values())[:QUICK]]
+        return sorted(first, key=lambda o: o[0])
+
+    def _its_lag(
+        self, current: Tried, one: tuple[float, Candidate, Array], slopes: Slopes
+    ) -> tuple[float, Candidate, Array]:
+        """A candidate with the lag that promises most: those that were tried first are far apart."""
+        for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
+            while (c := one[1].slower(factor)) is not None:
+                other = self._promise(current, c, slopes)
+                if other[0] >= one[0]:
+                    break
+                one = other
+        return one
 
     def _periodic(self, current: Tried) -> list[Candidate]:
         """Every curve over time that may repeat itself, with the periods of the error; none where a shape is known."""

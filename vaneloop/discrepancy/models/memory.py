@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from vaneloop.base.compiled import compiled
-from vaneloop.base.durations import in_name, of_name
+from vaneloop.base.durations import in_name, named_lag
 from vaneloop.discrepancy.stage import Array
 
 __all__ = ["STOPS", "dissipates", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
@@ -25,11 +25,6 @@ NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise mak
 def is_memory(name: str) -> bool:
     """Whether a quantity's name is that of a lag, or of stops."""
     return name.startswith(STOPS) or named_lag(name) is not None
-
-
-def named_lag(name: str) -> tuple[str, float] | None:
-    """Channel and time constant (s) of a lagged quantity; None: it is none."""
-    return of_name(name, "lagged_by")
 
 
 def lagged_name(channel: str, tau: float) -> str:

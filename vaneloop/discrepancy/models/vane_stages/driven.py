@@ -11,9 +11,11 @@ from controller import Calibration
 from plant import Plant
 from plant.curve import KNOWN, QUANTITIES, quantity_of
 from plant.effects import CURVES
-from plant.layout import C_OF, CURVE_ROWS
+from plant.layout import C_LAG, C_OF, CURVE_ROWS
 from plant.stages.blocks import NOTHING
+from vaneloop.base.durations import named_lag
 from vaneloop.base.vanes import VANES
+from vaneloop.discrepancy.models.memory import lagged
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect, Stage
@@ -32,6 +34,7 @@ class Driven(NamedTuple):
     laws                 effects of the library that may be tried; None: all that the stage can have
     curves               what may be tried besides: curves as they run, and as the search has them
     turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
+    part_of              of an excerpt: the whole, and which of its rows these are
     """
 
     t: Array
@@ -44,13 +47,11 @@ class Driven(NamedTuple):
     laws: tuple[str, ...] | None = None
     curves: tuple[tuple[Placed, Effect], ...] = ()
     turns: Callable[[], dict[str, Array]] = dict
+    part_of: tuple[Driven, Array | slice] | None = None
 
     def at(self, rows: Array | slice, columns: dict[str, Array], run: Array) -> Driven:
         """Some of the rows, with their ``columns``, and which of them count."""
-        turns = self.turns
-        return self._replace(
-            t=self.t[rows], columns=columns, run=run, turns=lambda: {k: v[rows] for k, v in turns().items()}
-        )
+        return self._replace(t=self.t[rows], columns=columns, run=run, part_of=(self, rows))
 
     @property
     def curved(self) -> bool:
@@ -64,27 +65,51 @@ class Driven(NamedTuple):
             return self.t
         if q is not None and q.period:
             return self.t % q.period
+        if lag := named_lag(name):
+            return self._late(*lag)
         if name == "x_lvdt":  # with less noise, where it can be had
             return self.columns.get("stroke", self.columns.get(name))
         values = self.columns.get(name)
+        if values is None and self.part_of is not None:  # what follows from all that went before
+            whole, rows = self.part_of
+            values = whole.quantity(name)
+            return values if values is None else values[rows]
         if values is None:
             values = self.turns().get(name)
         return values if values is None or name not in VANES else smoothed(self.t, values)
 
+    def _late(self, name: str, tau: float) -> Array | None:
+        """A quantity behind a lag of ``tau`` (s) that is settled at the start of the log."""
+        whole, rows = self.part_of or (self, slice(None))
+        if whole is not self:
+            values = whole._late(name, tau)
+            return values if values is None else values[rows]
+        values = self.quantity(name)
+        return values if values is None else np.asarray(lagged(self.t, np.ascontiguousarray(values), tau))
+
     def signals(self) -> Array:
-        """What curves are of, as the log has it, float64[KNOWN, samples], SI; NaN: what it has not, and what no curve
-        here is of. Without curves: no samples.
+        """What curves are of, as the log has it, float64[KNOWN + curves, samples], SI (`plant.curve.take`); NaN: what
+        it has not, and what no curve here is of. Without curves: no samples.
         """
         if not self.curved:
             return NOTHING
-        out = np.full((KNOWN, len(self.t)), np.nan)
-        have = {int(of) for of in self.machine.p[CURVES + 1 + C_OF :: CURVE_ROWS, 0]}
-        have |= {q.of for c, _ in self.curves if c.curve is not None and (q := quantity_of(c.curve.quantity))}
+        p = self.machine.p[:, 0]
+        own = CURVES + 1 + CURVE_ROWS * np.arange(int(p[CURVES]))
+        of = [(int(p[r + C_OF]), float(p[r + C_LAG])) for r in own]
+        tried = (quantity_of(c.curve.quantity) for c, _ in self.curves if c.curve is not None)
+        of += [(q.of, q.lag) for q in tried if q is not None]
+        out = np.full((KNOWN + len(of), len(self.t)), np.nan)
         for q in QUANTITIES.values():
-            if q.of in have:
+            if any(q.of == number for number, _ in of):
                 values = self.quantity(q.name)
                 if values is not None:
                     out[q.of] = values * q.si
+        for row, (number, tau) in zip(out[KNOWN:], of, strict=True):
+            if tau > 0.0:
+                name = next(q.name for q in QUANTITIES.values() if q.of == number)
+                values = self._late(name, tau)
+                if values is not None:
+                    row[:] = values * QUANTITIES[name].si
         return out
 
 

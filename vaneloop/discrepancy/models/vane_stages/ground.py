@@ -17,12 +17,13 @@ from vaneloop.discrepancy.diagnose import excerpt_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.curve import COLUMN, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
-from vaneloop.discrepancy.models.curved import IN_TIME, Candidate, Quantity
+from vaneloop.discrepancy.models.curved import IN_TIME, LAGS, LONGEST, SHORTEST, Candidate, Quantity, basis_for
+from vaneloop.discrepancy.models.memory import lagged_name
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
-from vaneloop.discrepancy.models.vane_stages.driven import Made
+from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
 
 __all__ = [
@@ -51,6 +52,11 @@ NEAR = {
     "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
 }  # fmt: skip
 DRIVERS = ("n_dem", "n_r", "x_dem", "p_s", "t_oil")  # channels that move the machine
+LAGGED = {  # what drives a stage, and not what it gives: curves there may have it behind a lag
+    "demand": ("n_dem", "n_r"), "servo": ("x_dem", "x_lvdt"), "engine": ("n_dem",),
+    "actuator": ("i_cmd", "n_r", "p_s", "t_oil"), "linkage": ("x_lvdt", "speed_of_x_lvdt", "n_r", "t_oil"),
+}  # fmt: skip
+CHANGED = 0.01  # of a channel's spread that a lag must change
 OF_STROKE = (  # what `reversals` works out
     "speed_of_x_lvdt", "direction_of_x_lvdt", "distance_since_reversal_of_x_lvdt", "time_since_reversal_of_x_lvdt",
 )  # fmt: skip
@@ -63,6 +69,17 @@ def reversals(t: Array, stroke: Array, full: float) -> dict[str, Array]:
     """
     x = smoothed(t, stroke)
     return dict(zip(OF_STROKE, (np.gradient(x, t), *turns(x, t, TURN * full)), strict=True))
+
+
+def _says_more(place: Place, q: Quantity) -> bool:
+    """Whether a curve of a quantity at a place is not the same as another one that is plainer.
+
+    In the linkage what the crank adds to the stroke is what the LVDT takes off it. A reading has no memory of the
+    machine's, and a crank that gives at once is a reading.
+    """
+    if q.remembers:
+        return place.at != "sensors.lvdt" and not (place.at.startswith("sensors.") and place.how == "times")
+    return place.at != "linkage.crank"
 
 
 def room_for(p: Array) -> int:
@@ -207,14 +224,15 @@ class VaneGround:
             basis = basis_of(values[rows], IN_TIME if signal.name == "time" else COUNT)
             if basis is not None:
                 known.append((Quantity(signal.name, signal.unit, COLUMN, values[rows]), basis))
+        late = [(c, q, b) for c in LAGGED[stage.name] for q in self._late(driven, c, rows) if (b := basis_for(q))]
         out = []
         for number, place in enumerate(ALL_PLACES):
             if stage.name not in place.stages or driven.machine.kind not in place.kinds:
                 continue
             if place.vane and place.vane not in stage.outputs:
                 continue
-            for q, basis in known:
-                if self._idle(place, q.name, stage.name):
+            for channel, q, basis in [*((q.name, q, b) for q, b in known), *late]:
+                if self._idle(place, channel, stage.name) or not _says_more(place, q):
                     continue
                 word = "gain" if place.how == "times" else "curve"
                 name = f"{place.at}.{word}_of_{q.name}"
@@ -222,6 +240,27 @@ class VaneGround:
                 near = q.name in NEAR.get(place.at, ())
                 out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis, near))
         return out
+
+    def _late(self, driven: Driven, channel: str, rows: Array) -> list[Quantity]:
+        """Lags of a channel that change it; ``rows``: those that have an output."""
+        values = driven.quantity(channel)
+        if values is None or not np.ptp(values) > 0.0:
+            return []
+        whole = self.driven.t
+        shortest, longest = SHORTEST * float(whole[1] - whole[0]), LONGEST * float(whole[-1] - whole[0])
+
+        def slow(tau: float) -> Quantity | None:
+            if not 0.5 * shortest < tau < 2.0 * longest:
+                return None
+            name = lagged_name(channel, tau)
+            late = driven.quantity(name)
+            assert late is not None
+            if np.std((late - values)[rows]) < CHANGED * np.std(values[rows]):
+                return None
+            again = lambda times: slow(tau * times)  # noqa: E731
+            return Quantity(name, QUANTITIES[channel].unit, COLUMN, late[rows], (values,), again)
+
+        return [q for z in LAGS if (q := slow(shortest * (longest / shortest) ** z)) is not None]
 
     def _idle(self, place: Place, q: str, stage: str) -> bool:
         """Whether a curve there would say nothing of its own in a stage."""
