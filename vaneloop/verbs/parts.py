@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hil.logs import Log
     from vaneloop.verbs.machine import Machine
 
-__all__ = ["Tested", "bind_parts", "part_of", "records_of", "split", "tested"]
+__all__ = ["Tested", "bind_parts", "carried", "part_of", "records_of", "split", "tested"]
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ def part_of(log: Log, spans: Sequence[Span]) -> Log:
     """A log's samples within these parts; without parts, the log."""
     if not spans:
         return log
-    whole = np.unique(np.concatenate([c.t for c in log.channels.values()]))
+    longest = max((c.t for c in log.channels.values()), key=len)
     for span in spans:
-        _inside(whole, span, log.path)
+        _inside(longest, span, log.path)
     channels = {}
     for name, c in log.channels.items():
         use = np.any([(c.t >= s.low) & (c.t < s.high) for s in spans], axis=0)
@@ -94,16 +94,22 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
             continue
         here = next(s for s in chain.stages if s.name == name)
         judge = Judge(stage, stage.floor)
-        thetas = np.array([_carried(here, f.theta, stage) for f in (before, after)])
-        n = np.maximum(judge.valid.sum(axis=1), 1)
-        rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / n) * judge.floor
+        thetas = np.array([carried(here, f.theta, stage) for f in (before, after)])
+        if test.whole is not None:
+            from vaneloop.verbs.long import held_against
+
+            sums = held_against(test, [(name, list(thetas), judge.floor, np.inf)]).sums[name]
+            n, rms = sums.samples.sum(axis=1), sums.rms() * judge.floor
+        else:
+            n = judge.valid.sum(axis=1)
+            rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / np.maximum(n, 1)) * judge.floor
         for k, signal in enumerate(stage.outputs):
             figures = float(rms[0, k]), float(rms[1, k]), float(judge.floor[k]), int(n[k])
             out.append(Tested(name, signal, stage.units[k], *figures))
     return out
 
 
-def _carried(here: Stage, theta: Array, there: Stage) -> Array:
+def carried(here: Stage, theta: Array, there: Stage) -> Array:
     """Parameters of one stage as another's of the same machine."""
     out = there.neutral()
     names = [p.name for p in here.parameters]
