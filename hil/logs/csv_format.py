@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ __all__ = ["open_csv", "write_csv"]
 
 _NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
 _MOST_COLUMNS = 10_000
+_CHUNK = 32 << 20  # bytes of rows that are parsed at one time
+_INK = re.compile(rb"\S")
 
 
 def open_csv(path: Path, options: Options) -> Source:
@@ -29,19 +32,20 @@ def open_csv(path: Path, options: Options) -> Source:
         raw = raw.decode("utf-16", errors="replace").encode()
     if b"\0" in raw:
         raise LogError(f"{path}: is not a CSV (binary bytes in it)")
-    try:
-        raw.decode("utf-8")
-    except UnicodeDecodeError:
-        raw = raw.decode("cp1252", errors="replace").encode()
-    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if not raw.isascii():
+        try:
+            raw.decode("utf-8")
+        except UnicodeDecodeError:
+            raw = raw.decode("cp1252", errors="replace").encode()
+        raw = raw.removeprefix(b"\xef\xbb\xbf")
     first = 2  # row of the first sample, as an editor counts
-    head, _, rest = raw.partition(b"\n")
-    while rest and (head.startswith(b"#") or not head.strip()):
-        head, _, rest = rest.partition(b"\n")
+    head, at = _line(raw, 0)
+    while at < len(raw) and (head.startswith(b"#") or not head.strip()):
+        head, at = _line(raw, at)
         first += 1
     line = head.decode().strip("\r")
-    if re.fullmatch(r'"?sep=.?"?', line) and rest:  # what Excel writes to be read by Excel
-        head, _, rest = rest.partition(b"\n")
+    if re.fullmatch(r'"?sep=.?"?', line) and at < len(raw):  # what Excel writes to be read by Excel
+        head, at = _line(raw, at)
         line, first = head.decode().strip("\r"), first + 1
     separator = max(",;\t", key=line.count)
     try:
@@ -53,25 +57,32 @@ def open_csv(path: Path, options: Options) -> Source:
     again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
     if again is not None:
         raise LogError(f"{path}: column {again!r} is there more than once")
-    units = _units_row(rest, headers, separator)
+    under, behind = _line(raw, at)
+    units = _units_row(under, headers, separator)
     if units:
-        rest, first = rest.partition(b"\n")[2], first + 1
-    comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
+        at, first = behind, first + 1
+    comma = separator == ";" and re.search(rb"\d,\d", raw[at : at + 4096]) is not None
 
     time = time_column(path, headers, options)
     known = {*UNITS, *options.mapping, time.name}
     wanted = [h for h in headers if h in known or split_unit(h)[0] in known]
-    rows = _Csv(path, rest, headers, wanted, separator, comma, first, time.name)
+    rows = _Csv(path, raw, at, headers, wanted, separator, comma, first, time.name)
     table = Table([h for h in headers if h], rows.column, first, time, units)
     rows.notes = table.notes
     return table
 
 
-def _units_row(rest: bytes, headers: list[str], separator: str) -> dict[str, str]:
-    """Column -> unit, where the row under the header holds units and nothing else; empty where it does not."""
+def _line(raw: bytes, at: int) -> tuple[bytes, int]:
+    """The line that begins at a byte, without its end, and where the next one begins."""
+    end = raw.find(b"\n", at)
+    return (raw[at:], len(raw)) if end < 0 else (raw[at:end], end + 1)
+
+
+def _units_row(row: bytes, headers: list[str], separator: str) -> dict[str, str]:
+    """Column -> unit, where the ``row`` under the header holds units and nothing else; empty where it does not."""
     try:
-        cells = [c.strip().strip("[]()") for c in next(csv.reader([rest.partition(b"\n")[0].decode().strip("\r")],
-                                                                  delimiter=separator), [])]  # fmt: skip
+        line = row.decode().strip("\r")
+        cells = [c.strip().strip("[]()") for c in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:
         return {}
     said = [c for c in cells if c.casefold() not in NO_UNIT]
@@ -83,13 +94,15 @@ def _units_row(rest: bytes, headers: list[str], separator: str) -> dict[str, str
 
 
 class _Csv:
-    """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
+    """Rows of a CSV, from byte ``at`` of ``raw``; ``wanted`` columns are read together on the first call, any other
+    when asked for. A long file is read in chunks: what polars takes beside the numbers is that of one chunk.
+    """
 
     def __init__(
-        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int,
-        time: str,
+        self, path: Path, raw: bytes, at: int, headers: list[str], wanted: list[str], separator: str, comma: bool,
+        first: int, time: str,
     ):  # fmt: skip
-        self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
+        self.path, self.raw, self.at, self.headers, self.wanted = path, raw, at, headers, wanted
         self.separator, self.comma, self.first = separator, comma, first
         self.time, self.notes = time, list[str]()
         self.ready: dict[str, np.ndarray] | None = None
@@ -97,31 +110,35 @@ class _Csv:
     def column(self, header: str) -> np.ndarray:
         import polars as pl
 
-        if not self.rows.strip():
+        if _INK.search(self.raw, self.at) is None:
             return np.empty(0)
         if self.ready is None:
             try:
-                frame = self._read(self.wanted, pl.Float64)
-                self.ready = {h: _numbers(frame[h]) for h in self.wanted}
+                parts = [{h: _numbers(f[h]) for h in self.wanted} for f in self._read(self.wanted, pl.Float64)]
+                self.ready = {h: np.concatenate([part.pop(h) for part in parts]) for h in self.wanted}
             except pl.exceptions.PolarsError:
                 self.ready = {}  # a cell that is no number: column by column
         if header not in self.ready:
             self.ready[header] = self._numbers(header)
         return self.ready[header]
 
-    def _read(self, columns: list[str], kind: Any) -> Any:
-        """The columns of ``columns`` as ``kind``."""
+    def _read(self, columns: list[str], kind: Any) -> Iterator[Any]:
+        """The columns of ``columns`` as ``kind``, chunk by chunk."""
         import polars as pl
 
         places = [f"c{self.headers.index(h)}" for h in columns]  # names of our own: the file's may be empty
         head = self.separator.join(f"c{i}" for i in range(len(self.headers))).encode() + b"\n"
-        frame = pl.read_csv(
-            io.BytesIO(head + self.rows), separator=self.separator, infer_schema_length=0,
-            schema_overrides=dict.fromkeys(places, kind),
-            columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String,
-            null_values=["", *_NO_SAMPLE],
-        )  # fmt: skip
-        return frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
+        at, whole = self.at, b'"' in self.raw  # a quoted cell may go over lines
+        while at < len(self.raw):
+            end = -1 if whole else self.raw.find(b"\n", at + _CHUNK)
+            begin, at = at, len(self.raw) if end < 0 else end + 1
+            frame = pl.read_csv(
+                io.BytesIO(head + self.raw[begin:at]), separator=self.separator, infer_schema_length=0,
+                schema_overrides=dict.fromkeys(places, kind),
+                columns=places, truncate_ragged_lines=True, decimal_comma=self.comma and kind != pl.String,
+                null_values=["", *_NO_SAMPLE],
+            )  # fmt: skip
+            yield frame.select(pl.col(p).alias(h) for p, h in zip(places, columns, strict=True))
 
     def _numbers(self, header: str) -> np.ndarray:
         """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
@@ -130,7 +147,7 @@ class _Csv:
         import polars as pl
 
         try:
-            text = self._read([header], pl.String)[header].str.strip_chars()
+            text = pl.concat([f[header] for f in self._read([header], pl.String)]).str.strip_chars()
         except pl.exceptions.PolarsError as e:
             raise LogError(f"{self.path}: column {header!r}: {str(e)[:160]}") from None
         text = text.set(text.is_in(["", *_NO_SAMPLE]), None)
