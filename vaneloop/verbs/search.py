@@ -29,7 +29,7 @@ from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.long import Held, changed, held_results, searched
 from vaneloop.verbs.long import located as located_of
 from vaneloop.verbs.machine import Machine
-from vaneloop.verbs.parts import Tested, bind_parts, records_of, split, tested
+from vaneloop.verbs.parts import Tested, bind_parts, read_record, records_of, split, tested
 from vaneloop.verbs.replay import log_of
 
 if TYPE_CHECKING:
@@ -515,56 +515,3 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
         chain, name = chain_for(log, model or Machine())
         model = diagnosed(chain, name)
     return Experiment(model, recommend(model.diagnosis, progress, model.bound), model.log)
-
-
-def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:
-    """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
-
-    reading  arguments of `hil.logs.read_log`: dbc, mapping, units, design_rpm
-    """
-    import numpy as np
-
-    name = Path(path).name
-    if system.read is not None:
-        return Record(name, *_by_its_own_reader(str(path), system)), []
-    from hil.logs import read_log
-    from hil.logs.held import held
-
-    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
-        c: "" for c in (system.velocity,) if c
-    }
-    signals = {**motion, **system.inputs, **system.outputs}
-    log = read_log(path, **reading, require=[c for c in signals if c not in system.optional()], signals=signals)
-    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
-    t = reference.t
-    columns = {}
-    for c, channel in log.channels.items():
-        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
-        holds = c in system.inputs and channel.framed and system.holds
-        v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)
-        if c in system.outputs:  # outputs are never made up: far from a sample there is none
-            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
-            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
-        columns[c] = v
-    return Record(name, t, columns), [f"{name}: {note}" for note in log.notes]
-
-
-def _by_its_own_reader(path: str, system: System) -> tuple[Any, dict[str, Any]]:
-    """Time and channels from the system's ``read``."""
-    import numpy as np
-
-    assert system.read is not None
-    if not Path(path).is_file():
-        raise StageError(f"{path}: no such file")
-    said = f"{path}: read() of system {system.name!r}"
-    try:
-        data = dict(system.read(path))
-    except Exception as e:
-        raise StageError(f"{said} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
-    if "t" not in data:
-        raise StageError(f"{said} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed")
-    try:
-        columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
-    except (TypeError, ValueError) as e:
-        raise StageError(f"{said}: not numbers ({e})") from None
-    return columns.pop("t"), columns
