@@ -307,6 +307,7 @@ def searched(
         new = [k for k in held.pieces if k not in chain.whole.chosen][:MORE]
         if again == ROUNDS or not new:
             break
+        gc.collect()
         chain = chain.whole.with_more(new)
     stages = _of_all(held, d.stages)
     for s in stages:
