@@ -5,6 +5,7 @@ python -m benchmarks long    # makes the log with the rig once, in some minutes;
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -65,10 +66,8 @@ def verbs() -> Iterator[Row]:
             pid, status, used = os.wait4(p.pid, os.WNOHANG)
             if pid:
                 break
-            try:
+            with contextlib.suppress(OSError):  # one of them has just ended
                 most = max(most, _memory(p.pid))
-            except OSError:  # one of them has just ended
-                pass
             time.sleep(OFTEN)
         wall, cpu = time.perf_counter() - began, used.ru_utime + used.ru_stime
         p.returncode = os.waitstatus_to_exitcode(status)
