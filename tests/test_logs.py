@@ -19,7 +19,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hil.logs import Channel, Log, LogError, read_log, write_log
+from hil.logs import Channel, Log, LogError, csv_format, read_log, write_log
 from hil.logs import log as logs
 from hil.logs.asc import read_asc
 from hil.logs.blf import read_blf
@@ -881,3 +881,20 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     }.items():  # fmt: skip
         with pytest.raises(LogError, match=re.escape(str(tmp_path / name))):
             write_log(tmp_path / name, channels)
+
+
+@pytest.mark.parametrize("cell", ["1.5", " 1.5", "1,5", '"1.5"'])
+def test_a_csv_read_in_blocks_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cell: str) -> None:
+    path = tmp_path / "long.csv"
+    rows = "".join(f"{0.01 * k:.2f};{cell if k % 7 else ''};{k % 9}\r\n" for k in range(400))
+    path.write_text("# made\nt;n_dem;n_r\ns;%;%\n" + (rows.replace(".", ",") if "," in cell else rows))
+    whole = read_log(path).channels
+    monkeypatch.setattr(csv_format, "_BLOCK", 100)
+    parts = read_log(path).channels
+    assert whole.keys() == parts.keys() == {"n_dem", "n_r"}
+    for name, c in whole.items():
+        assert np.array_equal(c.t, parts[name].t)
+        assert np.array_equal(c.values, parts[name].values)
+    path.write_text(path.read_text().replace("3.99;", "word;").replace("3,99;", "word;"))
+    with pytest.raises(LogError, match="row 403: 'word' is not a number"):
+        read_log(path)

@@ -21,6 +21,7 @@ __all__ = ["open_csv", "write_csv"]
 _NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
 _MOST_COLUMNS = 10_000
 _BLOCK = 1 << 23  # bytes read at once; no row may be longer
+_INK = re.compile(rb"\S")
 
 
 def open_csv(path: Path, options: Options) -> Source:
@@ -30,19 +31,20 @@ def open_csv(path: Path, options: Options) -> Source:
         raw = raw.decode("utf-16", errors="replace").encode()
     if b"\0" in raw:
         raise LogError(f"{path}: is not a CSV (binary bytes in it)")
-    try:
-        raw.decode("utf-8")
-    except UnicodeDecodeError:
-        raw = raw.decode("cp1252", errors="replace").encode()
-    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if not raw.isascii():
+        try:
+            raw.decode("utf-8")
+        except UnicodeDecodeError:
+            raw = raw.decode("cp1252", errors="replace").encode()
+        raw = raw.removeprefix(b"\xef\xbb\xbf")
     first = 2  # row of the first sample, as an editor counts
-    head, _, rest = raw.partition(b"\n")
-    while rest and (head.startswith(b"#") or not head.strip()):
-        head, _, rest = rest.partition(b"\n")
+    head, at = _line(raw, 0)
+    while at < len(raw) and (head.startswith(b"#") or not head.strip()):
+        head, at = _line(raw, at)
         first += 1
     line = head.decode().strip("\r")
-    if re.fullmatch(r'"?sep=.?"?', line) and rest:  # what Excel writes to be read by Excel
-        head, _, rest = rest.partition(b"\n")
+    if re.fullmatch(r'"?sep=.?"?', line) and at < len(raw):  # what Excel writes to be read by Excel
+        head, at = _line(raw, at)
         line, first = head.decode().strip("\r"), first + 1
     separator = max(",;\t", key=line.count)
     try:
@@ -54,25 +56,32 @@ def open_csv(path: Path, options: Options) -> Source:
     again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
     if again is not None:
         raise LogError(f"{path}: column {again!r} is there more than once")
-    units = _units_row(rest, headers, separator)
+    under, behind = _line(raw, at)
+    units = _units_row(under, headers, separator)
     if units:
-        rest, first = rest.partition(b"\n")[2], first + 1
-    comma = separator == ";" and re.search(rb"\d,\d", rest[:4096]) is not None
+        at, first = behind, first + 1
+    comma = separator == ";" and re.search(rb"\d,\d", raw[at : at + 4096]) is not None
 
     time = time_column(path, headers, options)
     known = {*UNITS, *options.mapping, time.name}
     wanted = [h for h in headers if h in known or split_unit(h)[0] in known]
-    rows = _Csv(path, rest, headers, wanted, separator, comma, first, time.name)
+    rows = _Csv(path, raw, at, headers, wanted, separator, comma, first, time.name)
     table = Table([h for h in headers if h], rows.column, first, time, units)
     rows.notes = table.notes
     return table
 
 
-def _units_row(rest: bytes, headers: list[str], separator: str) -> dict[str, str]:
-    """Column -> unit, where the row under the header holds units and nothing else; empty where it does not."""
+def _line(raw: bytes, at: int) -> tuple[bytes, int]:
+    """The line that begins at a byte, without its end, and where the next one begins."""
+    end = raw.find(b"\n", at)
+    return (raw[at:], len(raw)) if end < 0 else (raw[at:end], end + 1)
+
+
+def _units_row(row: bytes, headers: list[str], separator: str) -> dict[str, str]:
+    """Column -> unit, where the ``row`` under the header holds units and nothing else; empty where it does not."""
     try:
-        cells = [c.strip().strip("[]()") for c in next(csv.reader([rest.partition(b"\n")[0].decode().strip("\r")],
-                                                                  delimiter=separator), [])]  # fmt: skip
+        line = row.decode().strip("\r")
+        cells = [c.strip().strip("[]()") for c in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:
         return {}
     said = [c for c in cells if c.casefold() not in NO_UNIT]
@@ -84,13 +93,15 @@ def _units_row(rest: bytes, headers: list[str], separator: str) -> dict[str, str
 
 
 class _Csv:
-    """Rows of a CSV; ``wanted`` columns are read together on the first call, any other when asked for."""
+    """Rows of a CSV, from byte ``at`` of ``raw``; ``wanted`` columns are read together on the first call, any other
+    when asked for.
+    """
 
     def __init__(
-        self, path: Path, rows: bytes, headers: list[str], wanted: list[str], separator: str, comma: bool, first: int,
-        time: str,
+        self, path: Path, raw: bytes, at: int, headers: list[str], wanted: list[str], separator: str, comma: bool,
+        first: int, time: str,
     ):  # fmt: skip
-        self.path, self.rows, self.headers, self.wanted = path, rows, headers, wanted
+        self.path, self.raw, self.at, self.headers, self.wanted = path, raw, at, headers, wanted
         self.separator, self.comma, self.first = separator, comma, first
         self.time, self.notes = time, list[str]()
         self.squared = False
@@ -99,7 +110,7 @@ class _Csv:
     def column(self, header: str) -> np.ndarray:
         import pyarrow as pa
 
-        if not self.rows.strip():
+        if _INK.search(self.raw, self.at) is None:
             return np.empty(0)
         if self.ready is None:
             try:
@@ -129,10 +140,10 @@ class _Csv:
 
         try:
             table = arrow.read_csv(
-                pa.BufferReader(self.rows),
+                pa.BufferReader(pa.py_buffer(self.raw).slice(self.at)),
                 arrow.ReadOptions(column_names=places, block_size=_BLOCK),
                 arrow.ParseOptions(
-                    delimiter=self.separator, newlines_in_values=b'"' in self.rows, ignore_empty_lines=False,
+                    delimiter=self.separator, newlines_in_values=b'"' in self.raw, ignore_empty_lines=False,
                     invalid_row_handler=other_length,
                 ),
                 arrow.ConvertOptions(
@@ -145,7 +156,8 @@ class _Csv:
         except pa.ArrowException:
             if not ragged or self.squared:
                 raise
-            self.rows, self.squared = _squared(self.rows, self.separator, len(places)), True
+            self.raw, self.squared = _squared(self.raw[self.at :], self.separator, len(places)), True
+            self.at = 0
             return self._read(columns, kind)
         return table.rename_columns(columns)
 

@@ -212,6 +212,8 @@ def read_log(
     keys: dict[str, str] = {}
     wrong: list[tuple[str, str, str, np.ndarray]] = []
     known: dict[int, np.ndarray] = {}
+    # channels of a table share its time: that of the file, which lives as long as its id counts, and in s
+    times: dict[tuple[int, str], tuple[np.ndarray, np.ndarray]] = {}
     for signal in signals:
         name = named.get(signal, signal)
         said = len(source.notes), len(notes)
@@ -222,15 +224,12 @@ def read_log(
         if taken is not None:
             key, s = taken
             with np.errstate(all="ignore"):  # what overflows is not finite and left out below
-                t = unit.convert("t", "t", s.t, s.t_unit)
+                if (id(s.t), s.t_unit) not in times:
+                    times[id(s.t), s.t_unit] = s.t, _in_seconds(path, unit, s)
+                t = times[id(s.t), s.t_unit][1]
                 values = unit.convert(signal, key, s.values, s.unit)
             if values is not s.values:
                 values = np.where(is_absent(s.values), ABSENT, values)
-            if not plausible.latest(t[np.isfinite(t)]):
-                raise LogError(
-                    f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if "
-                    f"it is in ms"
-                )
             if not source.sorted:
                 t = _in_time(s, t, known, notes)
             channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
@@ -259,6 +258,16 @@ def read_log(
     notes += [f"{name}: {why}" for name, why in log.guesses.open.items() if name not in log.guesses.rpm]
     made = tuple(g for g in log.guesses.made.values() if g.signal in channels)
     return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made)
+
+
+def _in_seconds(path: Path, unit: Units, s: Series) -> np.ndarray:
+    """The times of a series in s."""
+    t = unit.convert("t", "t", s.t, s.t_unit)
+    if not plausible.latest(t[np.isfinite(t)]):
+        raise LogError(
+            f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if it is in ms"
+        )
+    return t
 
 
 def _inside(
@@ -322,8 +331,9 @@ def _shift(channels: dict[str, Channel], notes: list[str], era: str) -> None:
     if channels and abs(start := min(float(c.t[0]) for c in channels.values())) > plausible.JUMP:
         since = f"counts from {era}" if start > _EPOCH else "does not count from the start"
         notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
+        shifted = {i: t - start for i, t in {id(c.t): c.t for c in channels.values()}.items()}
         for name, c in channels.items():
-            channels[name] = replace(c, t=c.t - start)
+            channels[name] = replace(c, t=shifted[id(c.t)])
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

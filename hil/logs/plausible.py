@@ -275,7 +275,8 @@ def longest_part(times: list[np.ndarray]) -> tuple[float, float, str, str]:
     Where the clock jumped forward (more than `JUMP` without a sample of any channel) only one side belongs to the run:
     the longer.
     """
-    t = np.unique(np.concatenate(times))
+    times = list({id(t): t for t in times}.values())  # channels of a table share one
+    t = np.unique(np.concatenate(times)) if len(times) > 1 else times[0]
     first, last = float(t[0]), float(t[-1])
     if last - first <= JUMP:
         return first, last, "", ""

@@ -36,9 +36,8 @@ def command(args: argparse.Namespace) -> int:
     if own_model.asked(args):
         return _own(args)
     from hil.logs import LogError
-    from vaneloop.discrepancy.workflow import locate_stages
     from vaneloop.pages import story
-    from vaneloop.verbs.search import Stages
+    from vaneloop.verbs.search import compared
 
     extra: dict[str, object] = {}
     report, args.report = args.report, None
@@ -53,7 +52,7 @@ def command(args: argparse.Namespace) -> int:
         extra["not_observed"] = {"all": str(e)}
     else:
         said = chain.notes
-        answer = Stages(chain, locate_stages(chain.stages), args.log)
+        answer = compared(chain, args.log)
         located = answer.located
         figures = [f for x in located for f in x.signals]
         stages = [f.json() for f in figures]
@@ -74,7 +73,7 @@ def command(args: argparse.Namespace) -> int:
             rows,
         )
         options.say_tested(args, answer.tested)
-        extra |= {"tested": answer.to_dict()["tested"]} if answer.tested else {}
+        extra |= {k: v for k, v in answer.to_dict().items() if k in ("tested", "whole")}
         terminal.say(args, answer.sentence())
         extra["not_observed"] = chain.not_observed
         extra["verdict"] = "fails" if answer.fails else "agrees"

@@ -34,18 +34,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.discrepancy.workflow import locate_stages
-    from vaneloop.verbs.search import Stages
+    from vaneloop.verbs.search import compared
 
     if own_model.asked(args):
         answer = own_model.ask(args, "locate")
         own_model.show(args, answer.by_log)
     else:
         chain = chain_of(args)
-        answer = Stages(chain, locate_stages(chain.stages), args.log, verb="locate")
+        answer = compared(chain, args.log, "locate")
     options.say_tested(args, answer.tested)
     for x in answer.located:
         say_located(args, x)
+    for f in answer.held.failing if answer.held else ():
+        terminal.say(args, str(f))
     terminal.write_json(args, answer.to_dict())
     if args.report:
         words = " ".join(["vaneloop locate", *sys.argv[2:]])

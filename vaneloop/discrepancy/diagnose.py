@@ -7,7 +7,7 @@ The fits are those of `vaneloop.discrepancy.search`. What earns an effect its pl
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from vaneloop.discrepancy.search import Criterion, Search
 from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
 from vaneloop.discrepancy.stage_answer import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
 
-__all__ = ["Judged", "diagnose_stage", "excerpt_of", "extend_stage", "floor_of"]
+__all__ = ["Judged", "diagnose_stage", "excerpt_of", "extend_stage", "floor_of", "spread"]
 
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
@@ -89,13 +89,21 @@ def excerpt_of(judge: Judge, fit: Fit, piece: int, searched: int) -> Array:
     pieces = n // length
     squares = np.sum(judge.errors(fit.theta[None])[0] ** 2, axis=0)
     cost = squares[: pieces * length].reshape(pieces, length).sum(axis=1)
-    many = min(max(2, searched // length), pieces)
+    chosen = spread(pieces, max(2, searched // length), np.argsort(-cost).tolist())
+    return (np.array(chosen)[:, None] * length + np.arange(length)).reshape(-1)
+
+
+def spread(pieces: int, many: int, wanted: Iterable[int]) -> list[int]:
+    """Some of the pieces of a log, ascending: half of them evenly spaced, the others as they are ``wanted``, the first
+    before the next.
+    """
+    many = min(many, pieces)
     chosen = set(np.linspace(0, pieces - 1, many - many // 2).round().astype(int).tolist())
-    for k in np.argsort(-cost):
+    for k in wanted:
         if len(chosen) >= many:
             break
         chosen.add(int(k))
-    return (np.array(sorted(chosen))[:, None] * length + np.arange(length)).reshape(-1)
+    return sorted(chosen)
 
 
 def _confirm(

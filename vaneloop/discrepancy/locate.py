@@ -15,7 +15,10 @@ from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.stage import KNOWN_TO, Array, without_jumps
 from vaneloop.discrepancy.stage_answer import rms_per_output
 
-__all__ = ["AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape"]
+__all__ = [
+    "AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape",
+    "stands_out",
+]  # fmt: skip
 
 # noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
 AGREES = 1.1
@@ -206,8 +209,6 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
     A bin is significant where what is left of it without its worst block of the log is too: one slam that the equations
     do not hold to a micrometre is no condition.
     """
-    from scipy.special import ndtri
-
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
     known = (1.0 + KNOWN_TO) ** 2 if stage.lost is not None else 1.0  # drawn floors are as uneven as that is known
@@ -227,27 +228,12 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
                 np.bincount(cell, x, minlength=many * blocks).reshape(many, blocks)
                 for x in (np.ones(len(cell)), e[k, use] ** 2, lost[k, use])
             )
-            worst = (np.arange(many), np.argmax(square - floor, axis=1))
             looks += many
-            others = [x.sum(axis=1) - x[worst] for x in (n, square, floor)]
             moments = _greatest(bin_of, np.abs(e[k, use]), stage.t[use], many)
-            raw.append(
-                (
-                    k,
-                    output,
-                    name,
-                    edges,
-                    *_mean(n.sum(axis=1), square.sum(axis=1), floor.sum(axis=1)),
-                    *_mean(*others),
-                    moments,
-                )
-            )
+            raw.append((k, output, name, edges, (n, square, floor), moments))
     out = []
-    z_limit = -ndtri(LEVEL / max(looks, 1))
-    for k, output, name, edges, n, ms, other, rest, moments in raw:
-        z, confirmed = (
-            (x / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, x in ((n, ms), (other, rest))
-        )
+    for k, output, name, edges, sums, moments in raw:
+        hot, n, ms = stands_out(*sums, known, looks, correlation)
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)
         share = excess / excess.sum() if excess.sum() > 0 else np.full(len(n), 1.0 / len(n))
@@ -256,12 +242,29 @@ def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
         out.append(
             Regime(
                 output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * floor, ratio, n,
-                (z > z_limit) & (confirmed > -ndtri(LEVEL)) & (n > 20) & (ratio > 1.05), contrast,
-                moments,
+                hot & (ratio > 1.05), contrast, moments,
             )
         )  # fmt: skip
     out.sort(key=lambda r: (-float(r.significant.any()), -r.contrast))
     return out
+
+
+def stands_out(
+    n: Array, square: Array, floor: Array, known: float, looks: int, correlation: float = CORRELATION
+) -> tuple[Array, Array, Array]:
+    """Bins whose error exceeds the noise, corrected for the number of ``looks``, with and without their worst block;
+    samples of each bin, and their mean square error over what is to be expected.
+
+    n, square, floor  samples, sum of squares in noise floors, and the sum to be expected, each float64[bins, blocks]
+    known             mean square up to which an error may be noise, in squared noise floors
+    """
+    from scipy.special import ndtri
+
+    worst = (np.arange(len(n)), np.argmax(square - floor, axis=1))
+    whole = _mean(*(x.sum(axis=1) for x in (n, square, floor)))
+    rest = _mean(*(x.sum(axis=1) - x[worst] for x in (n, square, floor)))
+    z, confirmed = ((ms / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, ms in (whole, rest))
+    return (z > -ndtri(LEVEL / max(looks, 1))) & (confirmed > -ndtri(LEVEL)) & (whole[0] > 20), *whole
 
 
 def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:

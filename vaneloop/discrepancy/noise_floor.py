@@ -35,7 +35,10 @@ from vaneloop.discrepancy.stage_answer import (
 if TYPE_CHECKING:
     from vaneloop.discrepancy.search import Search
 
-__all__ = ["NATS", "RIVAL_SPREADS", "NoiseFloor", "as_close", "correlation_of", "gain", "significant", "with_rivals"]
+__all__ = [
+    "EXPLAINED", "NATS", "RIVAL_SPREADS", "NoiseFloor", "as_close", "correlation_of", "gain", "leaves_too_much",
+    "significant", "with_rivals",
+]  # fmt: skip
 
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
 SPREADS = 3.0  # the definition of detectable
@@ -249,14 +252,10 @@ class NoiseFloor:
             why = f"explains {max(gained, 0.0) / excess:.0%} of what exceeds the noise"
             refused = dict.fromkeys(current.effects, why)
             effects, current = [], base
-        rms_before, rms_after = (rms_of(judge, f) for f in (base, current))
-        excess_before, excess_after = rms_before**2 - 1.0, rms_after**2 - 1.0
-        limit = max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n)))
-        # each further effect is one more chance to imitate what the library does not have
-        left = 1.0 + (LEFT_FLOORS - 1.0) / max(len(current.effects), 1)
-        # no output is made up for by the others
-        worst = max(rms_after, float(np.max(rms_per_output(judge, current) / judge.floor)))
-        too_much = rms_after > limit and (excess_after > LEAST_SHARE * max(excess_before, 1e-12) or worst > left)
+        worst = float(np.max(rms_per_output(judge, current) / judge.floor))
+        too_much = leaves_too_much(
+            rms_of(judge, base), rms_of(judge, current), worst, len(current.effects), n, correlation
+        )
         if too_much or (refused and current.effects):
             verdict, effects = "unknown", []
         elif current.effects:
@@ -269,6 +268,20 @@ class NoiseFloor:
             out.nearest = list(dict.fromkeys([*refused, *current.effects, *leading]))[:3]
             out.refused = [f"{name} {why}" for name, why in refused.items()]
         return out
+
+
+def leaves_too_much(before: float, after: float, worst: float, effects: int, n: int, correlation: float) -> bool:
+    """Whether a model is no answer, by what it leaves.
+
+    before, after  RMS error without and with its ``effects``, in noise floors; ``worst``: after, of the worst output
+    n, correlation samples, and how many of them count as one
+    """
+    if after <= max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n))):
+        return False
+    # each further effect is one more chance to imitate what the library does not have
+    left = 1.0 + (LEFT_FLOORS - 1.0) / max(effects, 1)
+    # no output is made up for by the others
+    return after**2 - 1.0 > LEAST_SHARE * max(before**2 - 1.0, 1e-12) or max(after, worst) > left
 
 
 def as_close(judge: Judge, d: StageDiagnosis, fit: Fit) -> bool:

@@ -21,7 +21,7 @@ from vaneloop.discrepancy.stage_answer import StageDiagnosis, parameters_of, rec
 
 __all__ = [
     "Diagnosis", "News", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
-    "extend_stage", "floor_of", "locate_stages", "no_better",
+    "extend_stage", "floor_of", "locate_stages", "no_better", "verdict_of",
 ]  # fmt: skip
 
 
@@ -166,9 +166,13 @@ def diagnose(
     for d in results:
         weigh(d)
     shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
+    return Diagnosis(verdict_of(results), results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def verdict_of(results: Sequence[StageDiagnosis]) -> str:
+    """What all stages say together."""
     verdicts = {d.verdict for d in results}
-    verdict = "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
-    return Diagnosis(verdict, results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+    return "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
 
 
 def _order(stages: Sequence[Stage]) -> list[int]:

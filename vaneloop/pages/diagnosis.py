@@ -67,10 +67,18 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
     return f"{capital(text)}.{untold(d.not_observed)}"
 
 
-def located_sentence(located: Sequence[Located], not_observed: Iterable[str] = ()) -> str:
-    """What all stages say together, in one sentence; in a second one those of which the log says nothing."""
+def located_sentence(
+    located: Sequence[Located], not_observed: Iterable[str] = (), at_times: Sequence[object] = ()
+) -> str:
+    """What all stages say together, in one sentence; in a second one those of which the log says nothing.
+
+    at_times  when a stage fails though the part of a very long log that was fitted does not, in words
+    """
     failing = [x for x in located if x.fails]
     silent = untold(not_observed)
+    if not failing and at_times:
+        more = f" So it is in {len(at_times) - 1} stretches more." if len(at_times) > 1 else ""
+        return f"Most of the log fits its measurements, but the {at_times[0]}.{more}{silent}"
     if not failing:
         which = "that the log tells of " if silent else ""
         return f"Every stage {which}fits its measurements to within the noise.{silent}"

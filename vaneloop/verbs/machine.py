@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from controller import Calibration
     from hil.logs import Log
     from plant import Model, Plant
+    from vaneloop.discrepancy.models.vane_stages.raster import Grid
     from vaneloop.discrepancy.models.vanes import Chain
 
 __all__ = ["TABLES", "Machine", "files_of"]
@@ -103,14 +105,24 @@ class Machine:
         return build_plant(self.files["plant"], self.files["geometry"], self.files["schedules"], model)
 
     def bind(self, log: Log) -> Chain:
-        """Put a log into the stages of this machine, each to be driven by its own logged inputs.
+        """Put a log into the stages of this machine, each to be driven by its own logged inputs; of a very long log an
+        excerpt (`vaneloop.verbs.long`).
 
         Raises LogError for a log that shows none of them.
         """
+        from vaneloop.discrepancy.models.vane_stages.raster import grid_of
+        from vaneloop.verbs.long import LONG, excerpted
+
+        grid = grid_of(log)
+        return excerpted(log, grid, self) if grid.rows > LONG else self.stages_of(log, grid)
+
+    def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: int) -> Chain:
+        """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
         from hil.logs import LogError
         from vaneloop.discrepancy.models.vanes import build_chain
 
-        chain = build_chain(log, self.plant, self.calibration, present=tuple(self.added.effects))
+        present = tuple(self.added.effects)
+        chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, **few)
         if not chain.stages:
             why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
             raise LogError(f"{log.path}: no stage can be judged ({why})")

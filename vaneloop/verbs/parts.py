@@ -1,17 +1,18 @@
-"""One log in parts: what is fitted, and what only tests what the fit has found."""
+"""Logs as verbs take them: one log in parts, what is fitted and what only tests that; the record of a system."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span, apart, is_span, spans_of
-from vaneloop.discrepancy import Record
+from vaneloop.discrepancy import Record, StageError, System
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.stage import Array, Stage
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from hil.logs import Log
     from vaneloop.verbs.machine import Machine
 
-__all__ = ["Tested", "bind_parts", "part_of", "records_of", "split", "tested"]
+__all__ = ["Tested", "bind_parts", "carried", "part_of", "read_record", "records_of", "split", "tested"]
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ def part_of(log: Log, spans: Sequence[Span]) -> Log:
     """A log's samples within these parts; without parts, the log."""
     if not spans:
         return log
-    whole = np.unique(np.concatenate([c.t for c in log.channels.values()]))
+    longest = max((c.t for c in log.channels.values()), key=len)
     for span in spans:
-        _inside(whole, span, log.path)
+        _inside(longest, span, log.path)
     channels = {}
     for name, c in log.channels.items():
         use = np.any([(c.t >= s.low) & (c.t < s.high) for s in spans], axis=0)
@@ -94,16 +95,22 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
             continue
         here = next(s for s in chain.stages if s.name == name)
         judge = Judge(stage, stage.floor)
-        thetas = np.array([_carried(here, f.theta, stage) for f in (before, after)])
-        n = np.maximum(judge.valid.sum(axis=1), 1)
-        rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / n) * judge.floor
+        thetas = np.array([carried(here, f.theta, stage) for f in (before, after)])
+        if test.whole is not None:
+            from vaneloop.verbs.long import held_against
+
+            sums = held_against(test, [(name, list(thetas), judge.floor, np.inf)]).sums[name]
+            n, rms = sums.samples.sum(axis=1), sums.rms() * judge.floor
+        else:
+            n = judge.valid.sum(axis=1)
+            rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / np.maximum(n, 1)) * judge.floor
         for k, signal in enumerate(stage.outputs):
             figures = float(rms[0, k]), float(rms[1, k]), float(judge.floor[k]), int(n[k])
             out.append(Tested(name, signal, stage.units[k], *figures))
     return out
 
 
-def _carried(here: Stage, theta: Array, there: Stage) -> Array:
+def carried(here: Stage, theta: Array, there: Stage) -> Array:
     """Parameters of one stage as another's of the same machine."""
     out = there.neutral()
     names = [p.name for p in here.parameters]
@@ -129,3 +136,52 @@ def _inside(t: Array, span: Span, name: str) -> Array:
             f"{name}: {np.count_nonzero(use)} samples in '{span}'; the log is from {t[0]:g} to {t[-1]:g} s"
         )
     return np.asarray(use)
+
+
+def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:
+    """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
+
+    reading  arguments of `hil.logs.read_log`: dbc, mapping, units, design_rpm
+    """
+    name = Path(path).name
+    if system.read is not None:
+        return Record(name, *_by_its_own_reader(str(path), system)), []
+    from hil.logs import read_log
+    from hil.logs.held import held
+
+    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
+        c: "" for c in (system.velocity,) if c
+    }
+    signals = {**motion, **system.inputs, **system.outputs}
+    log = read_log(path, **reading, require=[c for c in signals if c not in system.optional()], signals=signals)
+    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
+    t = reference.t
+    columns = {}
+    for c, channel in log.channels.items():
+        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
+        holds = c in system.inputs and channel.framed and system.holds
+        v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)
+        if c in system.outputs:  # outputs are never made up: far from a sample there is none
+            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
+            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
+        columns[c] = v
+    return Record(name, t, columns), [f"{name}: {note}" for note in log.notes]
+
+
+def _by_its_own_reader(path: str, system: System) -> tuple[Any, dict[str, Any]]:
+    """Time and channels from the system's ``read``."""
+    assert system.read is not None
+    if not Path(path).is_file():
+        raise StageError(f"{path}: no such file")
+    said = f"{path}: read() of system {system.name!r}"
+    try:
+        data = dict(system.read(path))
+    except Exception as e:
+        raise StageError(f"{said} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
+    if "t" not in data:
+        raise StageError(f"{said} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed")
+    try:
+        columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
+    except (TypeError, ValueError) as e:
+        raise StageError(f"{said}: not numbers ({e})") from None
+    return columns.pop("t"), columns

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -26,8 +26,10 @@ from vaneloop.discrepancy.workflow import (
 )
 from vaneloop.discrepancy.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
+from vaneloop.verbs.long import Held, changed, held_results, searched
+from vaneloop.verbs.long import located as located_of
 from vaneloop.verbs.machine import Machine
-from vaneloop.verbs.parts import Tested, bind_parts, records_of, split, tested
+from vaneloop.verbs.parts import Tested, bind_parts, read_record, records_of, split, tested
 from vaneloop.verbs.replay import log_of
 
 if TYPE_CHECKING:
@@ -54,6 +56,7 @@ class Stages(Answer):
     bound   the model held against the log
     by_log  of a `System`, what that means log by log
     verb    what was asked: compare, locate
+    held    of a very long log: what all of it says of a fit to an excerpt
     """
 
     bound: Bound
@@ -61,6 +64,7 @@ class Stages(Answer):
     log: str = ""
     by_log: ByLog | None = None
     verb: str = "compare"
+    held: Held | None = None
 
     @cached_property
     def tested(self) -> list[Tested]:
@@ -70,18 +74,19 @@ class Stages(Answer):
     @property
     def fails(self) -> bool:
         """Whether any stage's error is more than noise."""
-        return any(x.fails for x in self.located)
+        return any(x.fails for x in self.located) or bool(self.held and self.held.failing)
 
     def sentence(self) -> str:
         """The answer in one sentence."""
         from vaneloop.pages.diagnosis import located_sentence
 
-        return located_sentence(self.located, self.bound.not_observed)
+        return located_sentence(self.located, self.bound.not_observed, self.held.failing if self.held else ())
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop locate``."""
         out: dict[str, Any] = {"schema": 1, "log": self.log, "stages": [x.json() for x in self.located]}
         out |= {"not_observed": self.bound.not_observed, "notes": self.bound.notes} | _tested_json(self.tested)
+        out |= {"whole": self.held.json()} if self.held else {}
         if self.by_log is not None:
             signals = [{**f.json(), "reference": "measured"} for x in self.located for f in x.signals]
             out |= {"signals": signals, **self.by_log.json(), "verdict": "fails" if self.fails else "agrees"}
@@ -101,12 +106,14 @@ class Diagnosed(Answer):
 
     bound   the model held against the log
     by_log  of a `System`, what that means log by log
+    held    of a very long log: what all of it says of what was found on an excerpt
     """
 
     bound: Bound
     diagnosis: Diagnosis
     log: str = ""
     by_log: ByLog | None = None
+    held: Held | None = field(default=None, kw_only=True)
 
     @cached_property
     def tested(self) -> list[Tested]:
@@ -132,7 +139,8 @@ class Diagnosed(Answer):
     def to_dict(self) -> dict[str, Any]:
         """The answer as the JSON of ``vaneloop diagnose``."""
         by_log = self.by_log.json() if self.by_log else {}
-        return diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested)
+        whole = {"whole": self.held.json()} if self.held else {}
+        return diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested) | whole
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
@@ -274,7 +282,13 @@ def compare(
         located = locate_stages(logs.fitted.stages)
         return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
     chain, name = chain_for(log, model or Machine(), fit, test)
-    return Stages(chain, locate_stages(chain.stages, (lambda f, _: progress(f)) if progress else None), name)
+    return compared(chain, name, progress=progress)
+
+
+def compared(chain: Chain, log: str, verb: str = "compare", progress: Progress | None = None) -> Stages:
+    """`compare` of a log that has been put into stages."""
+    located, held = located_of(chain, (lambda f, _: progress(f)) if progress else None)
+    return Stages(chain, located, log, None, verb, held)
 
 
 def locate(
@@ -326,8 +340,7 @@ def not_given(chain: Chain, effects: Sequence[str]) -> Chain:
     from vaneloop.discrepancy.models.vane_stages.ground import without_laws
 
     known(effects, "without")
-    test = replace(chain.test, stages=without_laws(chain.test.stages, effects)) if chain.test else None
-    return replace(chain, stages=without_laws(chain.stages, effects), test=test)
+    return changed(chain, lambda c: replace(c, stages=without_laws(c.stages, effects)))
 
 
 def diagnosed(
@@ -338,9 +351,12 @@ def diagnosed(
     news: Callable[[News], None] | None = None,
 ) -> Diagnosed:
     """`diagnose` of a log that has been put into stages; ``news`` takes what is being tried and found meanwhile."""
-    d = search(chain.stages, chain.not_observed, progress, workers, news=news)
-    d.notes = [*chain.notes, *_at_limit(d.stages)]
-    return Diagnosed(chain, d, log)
+    if chain.whole is None:
+        d, held = search(chain.stages, chain.not_observed, progress, workers, news=news), None
+    else:
+        chain, d, held = searched(chain, workers, progress, news)
+    d.notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(d.stages)]
+    return Diagnosed(chain, d, log, held=held)
 
 
 def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
@@ -455,12 +471,16 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             stages, stages=[with_laws(x, parts.get(x.name, ()), curves.get(x.name, ()), log) for x in stages.stages]
         )
 
-    bound = replace(with_curves(chain), test=chain.test and with_curves(chain.test))
+    bound = changed(chain, with_curves)
     results = [as_compared(chain.stage(s), extend_stage(bound.stage(s), tuple(names))) for s, names in by_stage.items()]
     model = with_fits(before, results)
     seconds = time.perf_counter() - started
-    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, [*chain.notes, *_at_limit(results)])
-    return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""))
+    held = None
+    if chain.whole is not None:
+        results, held = held_results(bound, results)
+    notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(results)]
+    d = Diagnosis("missing", results, {}, chain.not_observed, seconds, notes)
+    return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""), held=held)
 
 
 def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
@@ -495,56 +515,3 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
         chain, name = chain_for(log, model or Machine())
         model = diagnosed(chain, name)
     return Experiment(model, recommend(model.diagnosis, progress, model.bound), model.log)
-
-
-def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:
-    """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
-
-    reading  arguments of `hil.logs.read_log`: dbc, mapping, units, design_rpm
-    """
-    import numpy as np
-
-    name = Path(path).name
-    if system.read is not None:
-        return Record(name, *_by_its_own_reader(str(path), system)), []
-    from hil.logs import read_log
-    from hil.logs.held import held
-
-    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
-        c: "" for c in (system.velocity,) if c
-    }
-    signals = {**motion, **system.inputs, **system.outputs}
-    log = read_log(path, **reading, require=[c for c in signals if c not in system.optional()], signals=signals)
-    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
-    t = reference.t
-    columns = {}
-    for c, channel in log.channels.items():
-        step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
-        holds = c in system.inputs and channel.framed and system.holds
-        v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)
-        if c in system.outputs:  # outputs are never made up: far from a sample there is none
-            i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
-            v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
-        columns[c] = v
-    return Record(name, t, columns), [f"{name}: {note}" for note in log.notes]
-
-
-def _by_its_own_reader(path: str, system: System) -> tuple[Any, dict[str, Any]]:
-    """Time and channels from the system's ``read``."""
-    import numpy as np
-
-    assert system.read is not None
-    if not Path(path).is_file():
-        raise StageError(f"{path}: no such file")
-    said = f"{path}: read() of system {system.name!r}"
-    try:
-        data = dict(system.read(path))
-    except Exception as e:
-        raise StageError(f"{said} failed: {type(e).__name__}: {' '.join(str(e).split())}") from None
-    if "t" not in data:
-        raise StageError(f"{said} returned {', '.join(map(str, data)) or 'nothing'}; a time 't' is needed")
-    try:
-        columns = {str(k): np.asarray(v, dtype=float) for k, v in data.items()}
-    except (TypeError, ValueError) as e:
-        raise StageError(f"{said}: not numbers ({e})") from None
-    return columns.pop("t"), columns

@@ -15,9 +15,10 @@ causes is measured and added.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_propagation
@@ -34,7 +35,7 @@ from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.discrepancy.models.vane_stages.actuator import actuator_stage
-from vaneloop.discrepancy.models.vane_stages.current import SAMPLED, between_rows, other_current, servo_law
+from vaneloop.discrepancy.models.vane_stages.current import DRAWS, SAMPLED, between_rows, other_current, servo_law
 from vaneloop.discrepancy.models.vane_stages.demand import demand_stage
 from vaneloop.discrepancy.models.vane_stages.driven import Driven
 from vaneloop.discrepancy.models.vane_stages.engine import engine_stage
@@ -44,7 +45,9 @@ from vaneloop.discrepancy.models.vane_stages.own_controller import own_demand_st
 from vaneloop.discrepancy.models.vane_stages.raster import (
     RASTER,
     SETTLE,
+    Grid,
     every_other,
+    grid_of,
     no_gap_in_window,
     on_raster,
     regimes_of,
@@ -77,6 +80,7 @@ class Chain:
     not_observed  stage -> what the log lacks
     columns       channel -> values on the common raster ``t`` (border units), for plots
     test          the stages on a part of the log that nothing is fitted to; None: there is none
+    whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
     plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
     """
 
@@ -89,6 +93,7 @@ class Chain:
     calibration: Calibration
     notes: list[str] = field(default_factory=list)
     test: Chain | None = None
+    whole: Any = None
 
     def stage(self, name: str) -> Stage:
         """Return a stage by name."""
@@ -96,18 +101,27 @@ class Chain:
 
 
 def build_chain(
-    log: Log, plant: Plant | None = None, calibration: Calibration | None = None, present: tuple[str, ...] = ()
+    log: Log,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
+    present: tuple[str, ...] = (),
+    grid: Grid | None = None,
+    pieces: Sequence[tuple[int, int]] = (),
+    draws: int = DRAWS,
 ) -> Chain:
     """Put ``log`` on one raster and make every stage that its channels allow.
 
     present  effects that the model already has: they are part of ``plant`` and not tried again
+    grid     of the log, where it is known
+    pieces   rows of it, as `on_raster` takes them: the stages of these only
+    draws    of what the log hides from the servo
     """
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
-    t, columns, fresh, lacking, notes = on_raster(log)
+    t, columns, fresh, lacking, notes = on_raster(log, grid or grid_of(log), pieces)
     if len(t) < 500:
         raise LogError(
             f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
@@ -158,7 +172,7 @@ def build_chain(
         smooth = without_noise(t, have, machine)
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs:
-            law, *off = servo_law(t, have, cal, smooth)
+            law, *off = servo_law(t, have, cal, smooth, draws)
             what = other_current(t, have, law, run, cal)
             if what:
                 notes.append(
@@ -167,7 +181,7 @@ def build_chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, machine)
-                law, *off = servo_law(t, have, cal, smooth)
+                law, *off = servo_law(t, have, cal, smooth, draws)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
             unknown = off[0][:, 0] - off[1][:, 0] if sampled else None

@@ -15,14 +15,16 @@ from vaneloop.discrepancy.models.vane_stages.raster import RASTER, WINDOW
 from vaneloop.discrepancy.models.vane_stages.stroke import SMOOTH, Smooth
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["BEFORE", "SAMPLED", "between_rows", "other_current", "servo_law"]
+__all__ = ["BEFORE", "DRAWS", "SAMPLED", "between_rows", "other_current", "servo_law"]
 
 SAMPLED = "the current of the tick at each row"
 DRAWS = 8  # of what the log hides: the integral wanders, so that one draw says little of a stretch of the log
 BEFORE = "the mean of the ten ticks before the row"
 
 
-def servo_law(t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth) -> tuple[Array, Array, Array]:
+def servo_law(
+    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = DRAWS
+) -> tuple[Array, Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
@@ -30,7 +32,7 @@ def servo_law(t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth) -
 
     Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
     how much their mean, and the last of them, are off because not all of stroke and demand is logged, each
-    float64[rows, DRAWS].
+    float64[rows, draws].
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
     kp, ki, kff = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
@@ -55,8 +57,8 @@ def servo_law(t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth) -
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
     draw, step = np.random.default_rng(0), resolution(x_dem)
-    of_mean, of_last = np.empty((len(t), DRAWS)), np.empty((len(t), DRAWS))
-    for k in range(DRAWS):
+    of_mean, of_last = np.empty((len(t), draws)), np.empty((len(t), draws))
+    for k in range(draws):
         off = _between(smooth.left(draw) + smooth.distortion) + between
         off -= smooth.noise * draw.standard_normal(off.shape)
         off[:, -1] = 0.0

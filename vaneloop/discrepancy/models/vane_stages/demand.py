@@ -39,11 +39,12 @@ def _demand_run(
     frame. ``offset`` (m) is added to the tables' stroke.
     """
     dt = t[1] - t[0]
+    skipped = round(t[first] / dt) - first  # rows of the log's raster before this one that are not here
     for i in range(first, last):
         at = t[i]
         if hold > 0.0:
             at = np.floor((at - phase) / hold + 1e-9) * hold + phase
-        at = (at - delay) / dt
+        at = (at - delay) / dt - skipped
         j = min(max(int(np.floor(at + 1e-9)), first), last - 1)
         w = min(max(at - j, 0.0), 1.0)
         if w < 1e-6 or j == last - 1:

@@ -5,12 +5,14 @@ count; and the conditions under which a stage may fail.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, answers, held, taken
+from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = [
@@ -18,7 +20,9 @@ __all__ = [
     "SETTLE",
     "SUBSTEPS",
     "WINDOW",
+    "Grid",
     "every_other",
+    "grid_of",
     "lately",
     "no_gap_in_window",
     "on_raster",
@@ -35,25 +39,79 @@ SUBSTEPS = 5  # of the actuator between two samples of 10 ms
 SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
 
 
-def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
+class Grid(NamedTuple):
+    """The raster of a log.
+
+    start, dt, rows  s of the log's own time, s, number of rows
+    steps            usual time between two samples of each channel, s
+    """
+
+    start: float
+    dt: float
+    rows: int
+    steps: Mapping[str, float]
+
+    @property
+    def window(self) -> int:
+        """Rows of a window of the stages that integrate."""
+        return max(1, round(WINDOW / self.dt))
+
+
+def grid_of(log: Log) -> Grid:
+    """The raster of a log: from where all channels have begun to where the first of them ends."""
+    channels = log.channels
+    times = {id(c.t): c.t for c in channels.values()}  # channels of a table share one
+    known = {i: float(np.median(np.diff(t))) if len(t) > 1 else np.inf for i, t in times.items()}
+    steps = {name: known[id(c.t)] for name, c in channels.items()}
+    usual = [steps[name] for name, c in channels.items() if len(c.t) > 10]
+    if not usual:
+        raise LogError(f"{log.path}: no channel has more than 10 samples")
+    dt = max(RASTER, round(float(np.median(usual)) / RASTER) * RASTER)
+    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
+    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    start += _to_frame(channels, steps, start, dt)
+    return Grid(start, dt, max(1, int((end - start) / dt + 1e-6) + 1), steps)
+
+
+def on_raster(
+    log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = ()
+) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
     """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
     its own; notes.
 
+    pieces  (first row, row behind the last), ascending, in whole windows: only these rows of a long log, each piece as
+            behind a gap; all on the raster of the whole log. Default: all rows
+
     Where commands came in frames, a row is a tick of the controller: what it sent then, with the commands that it had.
     """
-    channels = log.channels
-    steps = [float(np.median(np.diff(c.t))) for c in channels.values() if len(c.t) > 10]
-    if not steps:
-        raise LogError(f"{log.path}: no channel has more than 10 samples")
-    dt = max(RASTER, round(float(np.median(steps)) / RASTER) * RASTER)
-    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
-    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
-    start += _to_frame(channels, start, dt)
+    if not pieces:
+        t = np.arange(grid.rows) * grid.dt
+        return t, *_columns(log.channels, grid, t), list(log.notes)
+    parts = []
+    for first, behind in pieces:
+        t = np.arange(first, behind) * grid.dt
+        low, high = (grid.start + k * grid.dt for k in (first - grid.window, behind + grid.window))
+        parts.append((t, *_columns({k: _between(c, low, high) for k, c in log.channels.items()}, grid, t)))
+    times, columns, fresh, missing = zip(*parts, strict=True)
+    for before, after in itertools.pairwise(fresh):  # a smoothing filter, or a spline, looks across the border
+        before[-1] = after[0] = False
+    joined = {name: np.concatenate([c[name] for c in columns]) for name in log.channels}
+    return np.concatenate(times), joined, np.concatenate(fresh), np.concatenate(missing), list(log.notes)
+
+
+def _between(c: Channel, low: float, high: float) -> Channel:
+    """The samples between two times, and the next one on either side."""
+    use = slice(max(int(np.searchsorted(c.t, low)) - 1, 0), int(np.searchsorted(c.t, high)) + 1)
+    return Channel(c.t[use], c.values[use], c.framed)
+
+
+def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dict[str, Array], Array, Array]:
+    """`on_raster` at rows ``t`` (s from its start): channels, which rows are fresh, at which one is missing."""
+    dt, first = grid.dt, grid.start
     reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
     own = float(np.median(np.diff(reference.t)))
-    phase = float(np.median((reference.t - start + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
-    t = np.arange(max(1, int((end - start) / dt + 1e-6) + 1)) * dt
-    when = t + start + phase
+    phase = float(np.median((reference.t - first + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
+    when = t + first + phase
     had = taken(channels, when, 0.5 * dt)
     fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
     columns = {}
@@ -61,7 +119,7 @@ def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str
         if len(c.t) < 2:
             columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
             continue
-        step = float(np.median(np.diff(c.t)))
+        step = grid.steps[name]
         if name in COMMANDS and c.framed:
             i = held(c, had)
             columns[name], age = c.values[i], had - c.t[i]
@@ -76,8 +134,9 @@ def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str
             count = np.maximum(np.diff(edge), 1)
             columns[name] = np.diff(total[edge]) / count
         elif (
-            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state") or _held(c, dt)
-        ):
+            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state")
+            or _held(c, step, dt)
+        ):  # fmt: skip
             # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
             # hold their value
             i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
@@ -88,21 +147,20 @@ def on_raster(log: Log) -> tuple[Array, dict[str, Array], Array, Array, list[str
         away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
         fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
         missing |= away > 0.75 * max(step, dt)
-    return t, columns, fresh, missing, list(log.notes)
+    return columns, fresh, missing
 
 
-def _held(c: Channel, dt: float) -> bool:
+def _held(c: Channel, step: float, dt: float) -> bool:
     """Whether the channel is logged faster than the raster and yet holds its value for rows: it came in frames."""
-    step = float(np.median(np.diff(c.t))) if len(c.t) > 1 else np.inf
     return bool(step < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t))
 
 
-def _to_frame(channels: Mapping[str, Channel], start: float, dt: float) -> float:
+def _to_frame(channels: Mapping[str, Channel], steps: Mapping[str, float], start: float, dt: float) -> float:
     """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames
     show it; else 0.
     """
     for name in ("x_dem", "n_dem"):
-        if name in channels and _held(channels[name], dt):
+        if name in channels and _held(channels[name], steps[name], dt):
             c = channels[name]
             turn = np.exp(2j * np.pi * (c.t[1:][np.diff(c.values) != 0.0] - start) / dt)
             if len(turn) > 20 and abs(turn.mean()) > 0.5:
@@ -174,13 +232,7 @@ def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], d
         v = np.gradient(smooth, dt)
         out |= {"stroke": x, "stroke speed": v, "direction": np.sign(np.where(np.abs(v) > 0.2, v, 0.0))}
         units |= {"stroke": "mm", "stroke speed": "mm/s", "direction": ""}
-        turns = np.zeros(len(t))
-        last, sign = smooth[0], 0.0
-        for i in range(1, len(t)):
-            if abs(v[i]) > 0.2 and np.sign(v[i]) != sign:
-                sign, last = float(np.sign(v[i])), smooth[i]
-            turns[i] = abs(smooth[i] - last)
-        out["distance since reversal"], units["distance since reversal"] = turns, "mm"
+        out["distance since reversal"], units["distance since reversal"] = _since_reversal(smooth, v), "mm"
     for name, label, unit in (
         ("n_r", "rotor speed", "%"),
         ("t_oil", "oil temperature", "degC"),
@@ -191,3 +243,15 @@ def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], d
     if "i_cmd" in columns:
         out["current"], units["current"] = columns["i_cmd"], "mA"
     return out, units
+
+
+@compiled
+def _since_reversal(x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Way since the stroke ``x`` (mm) turned, mm; ``v``: its speed, which below 0.2 mm/s turns nothing."""
+    out = np.zeros(len(x))
+    last, sign = x[0], 0.0
+    for i in range(1, len(x)):
+        if abs(v[i]) > 0.2 and np.sign(v[i]) != sign:
+            sign, last = np.sign(v[i]), x[i]
+        out[i] = abs(x[i] - last)
+    return out
