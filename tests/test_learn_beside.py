@@ -71,3 +71,21 @@ def test_a_size_that_changes_nothing_is_no_beginning() -> None:
         theta[at] = -100.0, high
         left.append(search._left(rest, search.judge.errors(theta[None])[0]))
     assert left[0] == np.inf and np.isfinite(left[1])
+
+
+def test_a_cube_is_told_whose_slope_the_gain_takes() -> None:
+    """A gain takes a line through 0, which leaves the curve a mean that is none of the cube's."""
+    rng = np.random.default_rng(4)
+    t = np.arange(1200) * 0.1
+    opening = 50.0 + 30.0 * np.sin(0.4 * t) + 15.0 * np.sin(1.7 * t)  # %
+    flow = 0.2 * (opening + 8e-6 * opening**3) + 0.02 * rng.standard_normal(len(t))
+    trim = System(
+        "trim", "static", lambda u, p: p.gain * u.opening, inputs={"opening": "%"}, outputs={"flow": "l/s"},
+        parameters=[unknown("gain", 0.1, "l/(s %)")], places=["opening"],
+    )  # fmt: skip
+    record = Record("log", t, {"opening": opening, "flow": flow})
+    others = [f"opening.{law}" for law in ("cubic", "square_root", "smooth_saturation", "dead_zone", "saturation")]
+    (law,) = learn([record], trim, without=others).laws
+    assert law.name == "opening.curve_of_opening"
+    cubes = [f.numbers["a"] for f in law.formulas if f.form == "cube"]
+    assert cubes == [pytest.approx(8e-6, rel=0.05)], [f.text for f in law.formulas]
