@@ -85,7 +85,8 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
                 raise InputError(f"--effect {path}: has no table curves; allowed: a law file of vaneloop learn")
             before = added or Model(meta=law.meta)
             added = before.model_copy(update={"curves": {**before.curves, **law.curves}})
-            more["effects"] = [n for e in more["effects"] for n in (law.curves if e == path else [e])]
+            own = [n for n in law.effects if n not in before.effects]  # and the laws of the library beside them
+            more["effects"] = [n for e in more["effects"] for n in (own if e == path else [e])]
         logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
         fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
         test = [*parts, *(_record(args, system, p) for p in others)]

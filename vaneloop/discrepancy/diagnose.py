@@ -23,6 +23,7 @@ __all__ = ["Judged", "diagnose_stage", "excerpt_of", "extend_stage", "floor_of",
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
+WAYS = 2  # leading effects from which else pairs are tried, where those found leave more than noise
 
 Judged = Callable[[Judge], Criterion]  # makes the criterion of a stage
 Said = tuple[Search, Fit, list[Candidate], list[tuple[str, float]]]
@@ -232,6 +233,8 @@ def _grown(
             if options and not alone and min(rms_of(search.judge, f) for f in options) > TOLERATED:
                 options += search.best_of(list(itertools.combinations(leaders, 2)))
         ok = [f for f in options if criterion.earns(current, f)]
+        if not ok and (other := _on_another_way(search, current, singles)) is not None:
+            ok = [other]
         if not ok:
             break
         # fewest effects first: a pair must be significantly better than the best single, and that above the floor
@@ -246,6 +249,24 @@ def _grown(
         current = best
         steps.append((" + ".join(current.effects), rms_of(search.judge, current)))
     return current
+
+
+def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fit | None:
+    """A pair with another leading effect than those of a model that grows no more, where that does better; None: none.
+
+    What leads alone may make up for two effects at once: an upper tank that cannot rise, for its overflow and for the
+    limit of the lower one.
+    """
+    criterion = search.criterion
+    if not criterion.roams or not current.effects or len(current.effects) > 2:
+        return None
+    others = [m for m, f in singles.items() if criterion.earns(search.base, f)]
+    others = [m for m in others if m not in (*current.effects, *criterion.left_out)]
+    others.sort(key=lambda m: criterion.order(singles[m]))
+    names = [e.name for e in search.stage.effects if e.name not in criterion.left_out]
+    pairs = [f for o in others[:WAYS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
+    pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.earns(current, f)]
+    return min(pairs, key=criterion.order, default=None)
 
 
 def extend_stage(

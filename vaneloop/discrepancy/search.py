@@ -95,6 +95,7 @@ class Search:
         self.passed: set[frozenset[str]] = set()  # what the screening left out
         # of fits: effect that could be added -> what the best of its starts would leave, and that start
         self.promises: dict[frozenset[str], dict[str, tuple[float, Array]]] = {}
+        self.sloped: dict[frozenset[str], tuple[Fit, Slopes]] = {}
         begins = [self.stage.neutral()]
         if self.stage.begins is not None:
             begins += list(self.stage.begins)
@@ -377,18 +378,36 @@ class Search:
                 theta[index[other]] = single.get(other, self.starts[other][0])[index[other]]
             begins.append(((), theta))
         thetas = np.array([theta for _, theta in begins])
-        costs = judge.totals((yield thetas), thetas)
+        errors = yield thetas
+        costs = judge.totals(errors, thetas)
         if not self.criterion.roams:
             k = int(np.argmin(costs))
             return [(float(costs[k]), begins[k][1])]
+        left = [self._left(frozenset(rest), e) for (rest, _), e in zip(begins, errors, strict=True)]
         out = []
-        for k in np.argsort(costs, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
+        for k in np.argsort(left, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
             rest, theta = begins[k]
             fit = yield from judge.fitting(rest, theta, 2)
+            fit = yield from judge.fitting(effects, fit.theta, 2)
             out.append((judge.total_of(fit), fit.theta))
-        out.sort(key=lambda c: c[0])
-        fit = yield from judge.fitting(effects, out[0][1], 2)
-        return [(judge.total_of(fit), fit.theta), *out[1:]]
+        return sorted(out, key=lambda c: c[0])
+
+    def _left(self, rest: frozenset[str], errors: Array) -> float:
+        """What is left of a set's errors when the parameters of the fit with one effect fewer have followed; without
+        end where they are that fit's own: an effect at a size that changes nothing, a limit that nothing reaches, does
+        best before the others follow, and no fit leads on from there.
+        """
+        slopes = self._slopes(rest)
+        if np.allclose(errors, slopes.error, rtol=1e-9, atol=1e-9):
+            return np.inf
+        return slopes.left(errors)[0]
+
+    def _slopes(self, key: frozenset[str]) -> Slopes:
+        """The slopes of a fit that is known."""
+        fit = self.fits[key]
+        if key not in self.sloped or self.sloped[key][0] is not fit:
+            self.sloped[key] = fit, Slopes(self.judge, fit.theta, fit.free, fit.prior)
+        return self.sloped[key][1]
 
     def _joined(self, effects: tuple[str, ...], finished: bool) -> Task[Fit]:
         """``finished`` False: a few iterations, enough to rank it."""
@@ -470,7 +489,7 @@ class Search:
             return self.level[last]
         if key not in self.promises:
             fit, index = self.fits[key], self.stage.index()
-            slopes = Slopes(self.judge, fit.theta, fit.free, fit.prior)
+            slopes = self._slopes(key)
             thetas, owner = [], []
             for e in self.stage.effects:
                 for start in e.starts if e.name not in rest else ():

@@ -178,7 +178,10 @@ def learn(
         return learned(not_given(chain, without), name, machine.added, workers, tell, shape=shape)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
-        return _learned(diagnosed, added, lambda f: tell(0.5 + 0.5 * f), shape)
+        alone = _learned(diagnosed, added, lambda f: tell(0.5 + 0.25 * f), shape)
+        beside = _beside_named(diagnosed, alone, lambda f: tell(0.75 + 0.25 * f), shape)
+        tell(1.0)
+        return beside or alone
     except StageError as e:
         raise InputError(str(e)) from None
 
@@ -302,6 +305,48 @@ def _learned(
     model = _as_model(by_log.model, outcome, laws)
     progress(1.0)
     return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log)
+
+
+def _beside_named(
+    diagnosed: Diagnosed, alone: Learned, progress: Callable[[float], None], shape: Sequence[str]
+) -> Learned | None:
+    """Curves beside the laws of the library that `diagnose` names, where these leave more than noise, and curves alone
+    do too; None where that is not better: a valve's flow is a curve, and its dead time is none.
+    """
+    import numpy as np
+
+    from vaneloop.discrepancy.error_share import HARM, LEAST_FALL, UNKNOWN
+    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.models.by_log import ByLog, as_given, bind
+    from vaneloop.discrepancy.stage_answer import rms_of
+
+    assert diagnosed.by_log is not None
+    by, d = diagnosed.by_log, diagnosed.diagnosis.stages[0]
+    last = alone.outcome.tried[-1] if alone.laws else None
+    left = rms_of(last.judge, last.fit) if last else d.excess
+    if not d.effects or min(d.excess, left) <= UNKNOWN:
+        return None
+    test = by.logs.test.data.records if by.logs.test is not None else ()
+    logs = bind(by.logs.fitted.system, by.logs.fitted.data.records, test, by.model)
+    judge = Judge(logs.fitted.thinned, logs.fitted.floor)
+    given = as_given(logs, judge.fit((), judge.stage.neutral(), 12))
+    given.verdict = "unknown"  # what is left is more than noise
+    again = replace(diagnosed, bound=logs.fitted, diagnosis=replace(diagnosed.diagnosis, stages=[given]),
+                    by_log=ByLog(logs, given))  # fmt: skip
+    said = _learned(again, by.model, progress, shape)
+    if not said.laws or said.by_log is None:
+        return None
+    now = said.outcome.tried[-1]
+    if max(rms_of(now.judge, now.fit) ** 2 - 1.0, 0.0) > (1.0 - LEAST_FALL) * (left**2 - 1.0):
+        return None
+    before = (alone.by_log if alone.by_log is not None and last else by).tested()
+    if any(np.log(v / before[log]) > HARM for log, v in said.by_log.tested().items()):
+        return None
+    named = " + ".join(d.final.effects)
+    steps = list(said.by_log.steps.items())[1:]
+    said.by_log.steps = {**by.steps, **{f"{named} + {name}": step for name, step in steps}}
+    said.outcome.notes.append(f"learned beside {named.replace(' + ', ' and ')} of the library: the law file has both")
+    return replace(said, diagnosed=diagnosed)
 
 
 def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit | None:

@@ -181,6 +181,12 @@ class ByLog:
                 out.append((f"all {len(bound.logs)} together", what, k, errors, _size(bound.measured[k])))
         return out
 
+    def tested(self) -> dict[str, float]:
+        """What the last step leaves of each test log, in noise floors, not below one."""
+        last, floor = list(self.steps.values())[-1], self.logs.fitted.floor
+        levels = {log: np.maximum(v / floor, 1.0) for log, v in last.items() if log not in self.logs.fitted.logs}
+        return {log: float(np.exp(np.nanmean(np.log(v)))) for log, v in levels.items() if np.isfinite(v).any()}
+
     def sentence(self) -> str:
         """What is left, in words."""
         d = self.d

@@ -28,7 +28,9 @@ REFITTED = 5  # formulas that are fitted in the simulation
 NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
 POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
 SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
+STRAIGHT = ("constant", "line", "straight line")
 DEGREES = ("degC", "°C", "C")
+FAR = 100.0  # times the curve's range that a formula's may be
 SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 BINS = 24
 MEANT = 2_000  # values of a quantity of which a formula's mean is taken
@@ -201,7 +203,11 @@ def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
             continue
         if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
             continue
-        got = begin(form, visited, at_visited, c.lent)
+        # a gain takes a line through 0, and leaves another mean than a line about the middle: only the bends tell
+        free = {*c.lent, 0} if 1 in c.lent and form.name not in STRAIGHT else c.lent
+        got = begin(form, visited, at_visited, free)
+        if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
+            continue  # nearly a straight line, of which the parameters would have to take all but the bend
         if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
             shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])

@@ -47,7 +47,8 @@ QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of th
 SURE = 3  # of the latter that are chosen by data left out
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
-PLAINER = 2  # more that are fitted to the end, where the best multiplies: of its quantity, that add
+PLAINER = 2  # more that are fitted to the end, where they are plainer than the best
+NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
@@ -142,6 +143,13 @@ def _strange(candidate: Candidate) -> int:
     if name.startswith((WAY, DISTANCE, SINCE)) or candidate.quantity.period:
         return 3
     return 2 if name == TIME else 1
+
+
+def _plain(candidate: Candidate) -> tuple[int, bool]:
+    """What orders candidates that do as well, whatever they leave: the less, the plainer; what adds before what
+    multiplies.
+    """
+    return _strange(candidate), candidate.how.endswith("times")
 
 
 def held_out(cost: Array, gradients: Array, normals: Array, mine: Array, prior: Array, deviation: Array) -> Array:
@@ -330,8 +338,7 @@ class Learner:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
         where the held-out error is noise, less in all.
         """
-        c = tried.candidate
-        return _strange(c), c.how.endswith("times"), round(left, 2), rms_of(tried.judge, tried.fit)
+        return *_plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
 
     def _plainer(self, tried: Tried, best: Tried, left: Mapping[str, float]) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
@@ -428,10 +435,14 @@ class Learner:
             done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
         done.sort(key=lambda t: score(self.judge, t.fit))
-        if done and done[0].candidate.how.endswith("times"):  # what adds may say the same, and is plainer
-            of, have = done[0].candidate.quantity.name, {t.candidate.name for t in done}
-            adds = [t for t in quick if t.candidate.quantity.name == of and not t.candidate.how.endswith("times")]
-            done += [self._finished(current, t) for t in adds[:PLAINER] if t.candidate.name not in have]
+        if done:  # what is plainer may say the same
+            leader, have = done[0].candidate, {t.candidate.name for t in done}
+            reach = min(score(t.judge, t.fit) for t in quick) + NEAR
+            plainer = [t for t in quick if t.candidate.name not in have and _plain(t.candidate) < _plain(leader)]
+            alike = {t.candidate.name for t in plainer if t.candidate.quantity.name == leader.quantity.name}
+            plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
+            plainer.sort(key=lambda t: t.candidate.name not in alike)
+            done += [self._finished(current, t) for t in plainer[:PLAINER]]
             done.sort(key=lambda t: score(self.judge, t.fit))
         if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
             finer = [f for t in done[:FINER] if (f := self._finer(current, t)) is not None]
