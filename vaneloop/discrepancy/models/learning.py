@@ -152,6 +152,12 @@ def _plain(candidate: Candidate) -> tuple[int, bool]:
     return _strange(candidate), candidate.how.endswith("times")
 
 
+def _channel(candidate: Candidate) -> str:
+    """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
+    lag = named_lag(candidate.quantity.name)
+    return lag[0] if lag else candidate.quantity.name
+
+
 def held_out(cost: Array, gradients: Array, normals: Array, mine: Array, prior: Array, deviation: Array) -> Array:
     """Cost of each block with a curve's parameters (``mine``, of all free ones) fitted to the other blocks, within its
     prior. All in the parameters' scales.
@@ -439,9 +445,9 @@ class Learner:
             leader, have = done[0].candidate, {t.candidate.name for t in done}
             reach = min(score(t.judge, t.fit) for t in quick) + NEAR
             plainer = [t for t in quick if t.candidate.name not in have and _plain(t.candidate) < _plain(leader)]
-            alike = {t.candidate.name for t in plainer if t.candidate.quantity.name == leader.quantity.name}
+            alike = {t.candidate.name for t in plainer if _channel(t.candidate) == _channel(leader)}
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
-            plainer.sort(key=lambda t: t.candidate.name not in alike)
+            plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
             done += [self._finished(current, t) for t in plainer[:PLAINER]]
             done.sort(key=lambda t: score(self.judge, t.fit))
         if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
