@@ -48,7 +48,22 @@ _FLAGS = re.compile(r"\b(nuw|nsw|exact|disjoint|nneg|samesign|inbounds|tail|must
 _NAME = r'(?:"[^"]*"|[\w.$-]+)'
 _VALUE = rf"%{_NAME}|@{_NAME}|[-+\w.]+"
 _MATHS = {"fabs", "floor", "ceil", "trunc", "rint", "sqrt", "sin", "cos", "tan", "exp", "log", "pow", "copysign"}
-_MATHS |= {"atan2", "asin", "acos", "atan", "sinh", "cosh", "tanh", "log10", "exp2", "log2", "fmod", "hypot", "round"}
+_MATHS |= {
+    "atan2",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "log10",
+    "exp2",
+    "log2",
+    "fmod",
+    "hypot",
+    "round",
+    "expm1",
+}
 _CHOICES = {"smin": "<", "smax": ">", "umin": "<", "umax": ">"}
 HEAD = """#include <math.h>
 #include <stdint.h>

@@ -214,4 +214,7 @@ def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> Non
     """Write a CSV: t, then a column a channel on all times of all; an empty cell where a channel has no sample."""
     from pyarrow import csv as arrow
 
-    arrow.write_csv(arrow_table(channels), path, arrow.WriteOptions(quoting_header="needed", quoting_style="none"))
+    table = arrow_table(channels)
+    with path.open("wb") as file:
+        file.write(",".join(table.column_names).encode() + b"\n")  # Arrow would put quotes around every name
+        arrow.write_csv(table, file, arrow.WriteOptions(include_header=False, quoting_style="none"))
