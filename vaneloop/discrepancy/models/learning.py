@@ -427,7 +427,7 @@ class Learner:
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
         quick = []
-        for k, (_, candidate, theta) in enumerate(self._screened(current)[:QUICK]):
+        for k, (_, candidate, theta) in enumerate(self._screened(current)):
             quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
@@ -485,16 +485,16 @@ class Learner:
         return Tried(candidate, wiggle, judge, fit, curves)
 
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
-        """Each candidate with what it would leave, and parameters to begin from; best first."""
+        """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
         quick = self._judge((), current.curves, True)
         slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
         have = {q.effect for q, _ in current.curves}
         every = [c for c in (*self.candidates, *self._periodic(current)) if c.name not in have]
         out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
-        best: dict[tuple[str, str, str], tuple[float, Candidate, Array]] = {}
+        best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
-            lag = named_lag(one[1].quantity.name)
-            best.setdefault((one[1].how, one[1].at, f"lag of {lag[0]}" if lag else one[1].quantity.name), one)
+            c = one[1]
+            best.setdefault((c.how, c.at, _channel(c), _channel(c) == c.quantity.name), one)
         first = [self._its_lag(current, one, slopes) for one in list(best.values())[:QUICK]]
         return sorted(first, key=lambda o: o[0])
 
