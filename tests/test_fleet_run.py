@@ -294,7 +294,13 @@ def test_a_kill_at_any_point_loses_nothing(tmp_path: Path, point: str, undisturb
     state.tidy(folder)
     work(folder.path)
     assert [tuple(r.values()) for r in rows(folder)] == undisturbed
-    assert not [f for f in folder.path.rglob("*.part") if "parts" in f.parts]
+    (young := folder.path / "results" / ".young.json.part").write_text("{", encoding="utf-8")
+    for file in folder.path.rglob("*.part"):
+        if file != young:
+            os.utime(file, times=(time.time() - 2 * 3600,) * 2)  # left an hour ago and more
+    state.tidy(folder)
+    assert list(folder.path.rglob("*.part")) == [young], "a file that may be written to now stays"
+    young.unlink()
     assert not list((folder.path / "results").iterdir()) and not list((folder.path / "leases").iterdir())
 
 

@@ -19,6 +19,7 @@ import json
 import os
 import shutil
 import stat
+import time
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -35,6 +36,7 @@ __all__ = ["Entry", "Folder", "copies_of", "key_of", "sources_version"]
 
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
 _ROOT = Path(__file__).parents[2]
+LEFT_BEHIND = 3600.0  # s since it was last written to, after which nobody is at work on a temporary file
 # what a result follows from: how it is found and written, and the tables of a machine that nobody gave
 _SOURCES = (
     "controller", "plant", "hil", "vaneloop/base", "vaneloop/discrepancy", "vaneloop/verbs", "vaneloop/fleet"
@@ -241,7 +243,13 @@ class Folder:
             lease.unlink(missing_ok=True)
 
     def tidy(self) -> None:
-        """Clear up after processes that were killed between a part and its clearing."""
+        """Clear up after processes that were killed between a part and its clearing, or while they wrote a file."""
+        for file in self.path.rglob(".*.part"):
+            try:
+                if time.time() - file.stat().st_mtime > LEFT_BEHIND:
+                    file.unlink()
+            except FileNotFoundError:  # it has become whole meanwhile
+                continue
         done = self.finished()
         for folder in (self.path / "results").glob("*"):
             if folder.name in done:

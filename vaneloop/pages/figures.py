@@ -449,7 +449,7 @@ def heat(
         "xgap": 2,
         "ygap": 2,
         "showlegend": False,
-        "colorbar": {"title": {"text": _label(unit)}, "thickness": 12, "outlinewidth": 0},
+        "colorbar": {"title": {"text": _label(unit), "side": "right"}, "thickness": 12, "outlinewidth": 0},
         "hovertemplate": f"%{{y}}, %{{x}}: %{{z:.3g}} {_label(unit)}<extra></extra>",
     }
     if places is not None:
