@@ -26,11 +26,11 @@ from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import waves_of
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.learning import Learner
+from vaneloop.discrepancy.models.learning import Learner, Tried
 from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import every
 from vaneloop.verbs.learn import learn, learned
-from vaneloop.verbs.search import diagnosed
+from vaneloop.verbs.search import diagnose, diagnosed
 
 Array = np.ndarray
 
@@ -177,21 +177,54 @@ def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
         from_file(name, wrong, data)
 
 
-def test_a_hum_beside_a_gain_that_drifts_is_the_second_law() -> None:
-    answer = learn([hummed(1, "one", 1.0, 0.4)], HELD, test=[hummed(2, "two", 1.0, 0.4)])
+def step_of(learner: Learner, current: Tried) -> tuple[str | int, ...]:
+    """Which step of the search it is: numbers that the model has to begin with, and the curves that were learned."""
+    return len(learner.base.theta), *(q.effect for q, _ in current.curves)
+
+
+def learned_where_the_gain_drifts():
+    return learn([hummed(1, "one", 1.0, 0.4)], HELD, test=[hummed(2, "two", 1.0, 0.4)])
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """What is learned beside a gain that drifts, its diagnosis, and the candidates that each step found."""
+    found: dict[tuple[str | int, ...], list[Tried]] = {}
+    diagnoses = []
+
+    def finalists(self, current: Tried) -> list[Tried]:
+        return found.setdefault(step_of(self, current), search(self, current))
+
+    def diagnosed_once(*words, **options):
+        diagnoses.append(diagnose(*words, **options))
+        return diagnoses[-1]
+
+    search = Learner._finalists
+    with pytest.MonkeyPatch.context() as m:
+        m.setattr(Learner, "_finalists", finalists)
+        m.setattr("vaneloop.verbs.learn.diagnose", diagnosed_once)
+        return learned_where_the_gain_drifts(), *diagnoses, found
+
+
+def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
+    answer, *_ = drifting
     first, second = answer.laws
     assert first.of == "time" and first.how.endswith("times")
     assert period_of(second.of) == pytest.approx(1.0 / 0.11, rel=1e-3)
 
 
-def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(monkeypatch) -> None:
+def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting, monkeypatch) -> None:
+    """The same logs, with the candidates that were found for them."""
+    _, diagnosis, found = drifting
     harmful = Learner._harmful
 
     def second_harms(self, current, best) -> str:
         return "makes two worse" if current.curves else harmful(self, current, best)
 
     monkeypatch.setattr(Learner, "_harmful", second_harms)
-    answer = learn([hummed(1, "one", 1.0, 0.4)], HELD, test=[hummed(2, "two", 1.0, 0.4)])
+    monkeypatch.setattr(Learner, "_finalists", lambda self, current: found[step_of(self, current)])
+    monkeypatch.setattr("vaneloop.verbs.learn.diagnose", lambda *_, **__: diagnosis)
+    answer = learned_where_the_gain_drifts()
     (first,) = answer.laws
     assert first.of == "time" and any("is not learned: makes two worse" in note for note in answer.notes)
 

@@ -24,6 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller import new_state
+from controller.records import SCALAR_FIELDS, as_state, record
+from controller.trend import trend_step
+from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
 from vaneloop.design.needs import needed
 
@@ -153,10 +157,6 @@ def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Ar
     """Demand, rate (%, %/s) and direction (+1, -1) as the firmware's `trend_step` finds them; one sample every
     10 ms.
     """
-    from controller import new_state
-    from controller.records import SCALAR_FIELDS, as_state, record
-    from controller.trend import trend_step
-
     y = np.asarray(n_dem, dtype=float)
     z, k = as_state(new_state()), record(SCALAR_FIELDS)
     k.trend_alpha, k.trend_beta = design.alpha, design.beta
@@ -164,10 +164,15 @@ def firmware_estimates(n_dem: ArrayLike, design: TrendDesign) -> tuple[Array, Ar
     z.trend_n = z.trend_turn = z.trend_last = y[0]
     z.direction = 1.0
     out = np.empty((3, y.size))
-    for i, v in enumerate(y):
-        trend_step(z, k, v)
-        out[:, i] = z.trend_n, z.trend_rate, z.direction
+    _followed(z, k, y, out)
     return out[0], out[1], out[2]
+
+
+@in_place
+def _followed(z: Any, k: Any, y: Array, out: Array) -> None:
+    for i in range(len(y)):
+        trend_step(z, k, y[i])
+        out[0, i], out[1, i], out[2, i] = z.trend_n, z.trend_rate, z.direction
 
 
 def direction(n_dem: ArrayLike, design: TrendDesign) -> Array:

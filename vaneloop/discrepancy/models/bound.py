@@ -198,7 +198,7 @@ class Bound:
         stride = max(1, len(self.t) // MOST_SAMPLES)
         self.thinned = Stage(
             s.name, self.stage.outputs, self.stage.units, self.stage.parameters, self.stage.effects,
-            lambda thetas: self.run(thetas)[:, :, ::stride], self.t[::stride], self.measured[:, ::stride],
+            lambda thetas: self.run(thetas, stride), self.t[::stride], self.measured[:, ::stride],
             regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units, floor=self.stage.floor,
             begins=self.stage.begins, quick=s.kind in ("static", "force"),
         )  # fmt: skip

@@ -143,31 +143,40 @@ class Runner:
                 out.append((q, row))
         return out
 
-    def run(self, thetas: Array) -> Array:
-        """Outputs float64[sets, outputs, samples] of parameter sets; what is not finite is far off."""
+    def run(self, thetas: Array, every: int = 1) -> Array:
+        """Outputs float64[sets, outputs, samples] of parameter sets; what is not finite is far off.
+
+        every  return only each so many-th sample
+        """
         s = self.system
-        out = np.empty((len(thetas), len(s.outputs), len(self.data.t)))
+        n = len(self.data.t)
+        out = np.empty((len(thetas), len(s.outputs), len(range(0, n, every))))
         n_p = len(s.parameters)
 
         def one(i: int) -> None:
             theta = thetas[i]
             active = self._active(theta)
+            y = np.empty((len(s.outputs), n))
             for log, at in enumerate(self.data.logs.values()):
                 if s.kind in ("static", "force"):
                     try:
                         starts = [theta[n_p + k] for k, (which, _) in enumerate(self.free_starts) if which == log]
-                        out[i, :, at] = self._algebraic(theta[:n_p], log, active, sum(starts))
+                        y[:, at] = self._algebraic(theta[:n_p], log, active, sum(starts))
                     except StageError:
                         if not self.ready:
                             raise
-                        out[i, :, at] = np.nan
+                        y[:, at] = np.nan
                 else:
                     x0 = np.array([self.data.first_state(log, m, 0.0) for m in s.states])
                     for k, (which, m) in enumerate(self.free_starts):
                         if which == log:
                             x0[m] = theta[n_p + k]
                     self._read_back(x0, log, active)
-                    out[i, :, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
+                    y[:, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
+            bad = ~np.isfinite(y)
+            if bad.any():
+                y[bad] = self.far
+            np.clip(y[:, ::every], -self.far, self.far, out=out[i])
 
         if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
             with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
@@ -175,10 +184,7 @@ class Runner:
         else:
             for i in range(len(thetas)):
                 one(i)
-        bad = ~np.isfinite(out)
-        if bad.any():
-            out[bad] = self.far
-        return np.clip(out, -self.far, self.far)
+        return out
 
     def _read_back(self, x0: Array, log: int, active: list[tuple[Placed, Array]]) -> None:
         """Put a state that starts at its sensor's reading to where the sensor, with its law, reads that."""
