@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import ROOT
-
 CHROMIUM = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
-SHOTS = Path(os.environ.get("VANELOOP_SHOTS", ROOT / "out" / "web"))
+# Where pictures are kept, "": nowhere. Each costs a second, and no check needs them.
+SHOTS = os.environ.get("VANELOOP_SHOTS", "")
 # axe describes every element that a rule passes, unless it is told that nobody asks. All rules are held all the same;
 # of 29 s on the page of a replay 4 s are left.
 AXE = "axe.run(document, {resultTypes: ['violations']})"
@@ -24,9 +23,10 @@ WHY_NOT = "no Chromium: apt-get install chromium (make test does, where it may)"
 
 
 def shot(page: Any, name: str) -> None:
-    """Keep a picture of the whole page."""
-    SHOTS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=str(SHOTS / f"{name}.png"), full_page=True)
+    """Keep a picture of the whole page, where pictures are wanted."""
+    if SHOTS:
+        Path(SHOTS).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=str(Path(SHOTS) / f"{name}.png"), full_page=True)
 
 
 def violations(page: Any, run: str = AXE) -> dict[str, str]:
@@ -41,10 +41,7 @@ def violations(page: Any, run: str = AXE) -> dict[str, str]:
 
 
 def look_at(browser: Any, file: Path, name: str) -> None:
-    """Hold a report against axe-core in light and dark, on a laptop and on a phone of 360 px; nothing sticks out.
-
-    Pictures of it are taken where VANELOOP_SHOTS says a folder: each costs some seconds, and no check needs them.
-    """
+    """Hold a report against axe-core in light and dark, on a laptop and on a phone of 360 px; nothing sticks out."""
     for width, schemes in ((1280, ("light", "dark")), (360, ("dark", "light"))):
         context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=schemes[0])
         page = context.new_page()
@@ -55,8 +52,7 @@ def look_at(browser: Any, file: Path, name: str) -> None:
         page.wait_for_function(drawn, timeout=LONG)
         for scheme in schemes:
             page.emulate_media(color_scheme=scheme)
-            if "VANELOOP_SHOTS" in os.environ:
-                shot(page, f"report_{name}_{width}_{scheme}")
+            shot(page, f"report_{name}_{width}_{scheme}")
             assert not violations(page, AXE if scheme == schemes[0] else COLOURS), f"{name} at {width}, {scheme}"
         wide = page.evaluate("document.documentElement.scrollWidth")
         assert wide <= width, f"{name}: {wide} px of {width}"

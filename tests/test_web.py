@@ -1,7 +1,7 @@
 """The workbench in a real browser: headless Chromium, driven by Playwright. Skips, saying so, where there is no
 Chromium.
 
-Screenshots are kept in ``out/web`` (or VANELOOP_SHOTS).
+Pictures are kept in the folder VANELOOP_SHOTS, where it is set.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hil.logs.survey import survey
-from tests.browser import CHROMIUM, LONG, SHOTS, WHY_NOT, look_at, shot, violations
+from tests.browser import AXE, CHROMIUM, COLOURS, LONG, WHY_NOT, look_at, shot, violations
 from tests.conftest import ROOT
 from tests.test_realtime import ON_TIME_US
 
@@ -136,7 +136,6 @@ def browser() -> Iterator[Any]:
         pytest.skip("no Chromium")
     from playwright.sync_api import sync_playwright
 
-    SHOTS.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as p:
         b = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield b
@@ -184,8 +183,8 @@ def holds_focus(page: Any, selector: str) -> None:
 
 
 def looks(page: Any, name: str) -> None:
-    """Pictures: a laptop, a wide screen, a phone, in light and dark. Nothing sticks out, axe-core is content."""
-    for width, dark in ((1280, False), (360, False), (360, True), (1920, True)):
+    """A laptop, a wide screen, a phone, in light and dark: nothing sticks out, axe-core is content."""
+    for width, dark, rules in ((1280, False, AXE), (360, False, AXE), (360, True, COLOURS), (1920, True, AXE)):
         page.set_viewport_size({"width": width, "height": 900})
         if dark != ("body--dark" in (page.locator("body").get_attribute("class") or "")):
             page.get_by_label("light or dark").click()
@@ -195,7 +194,7 @@ def looks(page: Any, name: str) -> None:
             f"{name} at {width}"
         )
         shot(page, f"{name}_{width}_{'dark' if dark else 'light'}")
-        assert not violations(page), f"{name} at {width}"
+        assert not violations(page, rules), f"{name} at {width}"
     page.get_by_label("light or dark").click()
     page.set_viewport_size({"width": 1280, "height": 800})
 

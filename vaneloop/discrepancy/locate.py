@@ -283,8 +283,6 @@ def _greatest(bin_of: Array, size: Array, t: Array, bins: int) -> Array:
 
 def onset(judge: Judge, fit: Fit) -> float | None:
     """Time (s) at which the error rises for good; None if it has no onset inside the log."""
-    import ruptures
-
     e = judge.errors(fit.theta[None])[0]
     t = judge.stage.t
     width = max(1, int(round(0.2 * judge.memory / (t[1] - t[0]))))
@@ -296,7 +294,7 @@ def onset(judge: Judge, fit: Fit) -> float | None:
         return None
     level = np.log(np.maximum(power[use] / counts[use], 1e-3))
     when = t[:n:width][use]
-    k = ruptures.Binseg(model="l2", min_size=4).fit(level[:, None]).predict(n_bkps=1)[0]
+    k = step_in(level)
     before, after = level[:k], level[k:]
     if len(before) < 4 or len(after) < 4:
         return None
@@ -305,6 +303,16 @@ def onset(judge: Judge, fit: Fit) -> float | None:
     if after.mean() - before.mean() > max(6.0 * spread, 0.5) and quiet:
         return float(when[k])
     return None
+
+
+def step_in(level: Array) -> int:
+    """Index at which a level steps, least squares, each fifth tried: what the step explains is
+    k (n - k) / n times the square of its size. As `ruptures.Binseg` finds it, whose import takes a second.
+    """
+    n = len(level)
+    k = np.arange(5, n - 3, 5)
+    explained = np.cumsum(level - level.mean())[k - 1] ** 2 / (k * (n - k))
+    return int(k[np.argmax(explained)])
 
 
 @dataclass(frozen=True)

@@ -371,9 +371,7 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     effects = tuple(out.effects[n_present:])
     stride = max(1, len(bound.t) // MOST_SAMPLES)
     out.stage = replace(bound.stage, effects=effects, run=runner.run, begins=None)
-    out.thinned = replace(
-        bound.thinned, effects=effects, run=lambda thetas: runner.run(thetas, stride), begins=None
-    )
+    out.thinned = replace(bound.thinned, effects=effects, run=lambda thetas: runner.run(thetas, stride), begins=None)
     out.stages = [out.thinned]
     return out
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from vaneloop.base.curve import on_table
+from vaneloop.base.kept import kept_njit
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
 from vaneloop.discrepancy.models.dispatch import Dispatch, compiled_code
@@ -18,6 +20,7 @@ from vaneloop.discrepancy.models.user_code import UserCode
 __all__ = ["Kernel", "build_kernels"]
 
 Kernel = Callable[..., Any]
+Compile = Callable[[Any], Any]
 
 
 def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> tuple[Kernel, Kernel]:
@@ -48,21 +51,28 @@ def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> t
     source = source.replace("shown(x, u, p, y)", f"shown(x, u, p, k, {_CURVED}, ub, pb, add, y)" if curved else _PLAIN)
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
-    def build(jit: Callable[[Any], Any]) -> Kernel:
+    def build(jit: Compile, inline: Compile, inline_own: Compile) -> Kernel:
         space: dict[str, Any] = {
-            "np": np, "jit": jit, "X": code.X, "U": code.U, "P": code.P, "Y": code.Y, "R": code.R,
+            "np": np, "jit": jit, "inline": inline, "inline_own": inline_own,
+            "X": code.X, "U": code.U, "P": code.P, "Y": code.Y, "R": code.R,
             "model": jit(s.model),
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
             "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table,
-            "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
+            "LOOP": s.kind == "closed_loop", "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
         }  # fmt: skip
         exec(compile(source, f"<{s.name}>", "exec"), space)
         return space["run"]
 
-    return build(compiled_code), build(lambda f: getattr(f, "py_func", f))
+    def uncompiled(f: Any) -> Any:
+        return getattr(f, "py_func", f)
+
+    # Parts of the kernel are compiled into what calls them: a call that hands over a dozen arrays and counts who refers
+    # to them takes 0.3 us. What calls the user's functions counts: they may return arrays.
+    own = partial(kept_njit, error_model="numpy", nogil=True, forceinline=True)
+    return build(compiled_code, partial(own, _nrt=False), own), build(uncompiled, uncompiled, uncompiled)
 
 
 def _output_source(code: UserCode) -> str:
@@ -131,7 +141,7 @@ _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
 _BENT = "for w in range(m):\n    dx[w] -= add[w] / mass[w]\n"
 _ROOMS = "ub, pb, add, bent = np.zeros(len(u)), np.zeros(len(p)), np.zeros(m), np.zeros(len(out))"
 _CURVED_FUNCTIONS = f"""
-@jit
+@inline
 def quantity(of, x, u, y, columns, k):
     if of < INPUT:
         return x[of]
@@ -142,7 +152,7 @@ def quantity(of, x, u, y, columns, k):
     return columns[of - COLUMN, k]
 
 
-@jit
+@inline
 def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(u)):
         ub[j] = u[j]
@@ -166,7 +176,7 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
             add[c_at[i]] += c
 
 
-@jit
+@inline
 def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     bend(x, u, p, k, {_CURVED}, ub, pb, add, y)
     outputs(x, ub, pb, y)
@@ -192,17 +202,17 @@ _OWN_HELD = """if memory[i] and code[i] > 100:
                 el"""
 
 _SOURCE = """
-@jit
+@inline_own
 def outputs(x, u, p, y):
     {outs}
 
 
-@jit
+@inline_own
 def controls(r, y, p, u):
     {control}
 
 
-@jit
+@inline
 def between(u, slope, t, k, part):
     h, rise = t[k + 1] - t[k], u[k + 1] - u[k]
     return part * (1.0 - part) * ((1.0 - part) * (h * slope[k] - rise) - part * (h * slope[k + 1] - rise))
@@ -210,17 +220,16 @@ def between(u, slope, t, k, part):
 
 {curved}@jit
 def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps,
-        line, slopes, loop,
-        n_commands, e_code, e_at, e_out, e_rows, out{more}):
+        line, slopes, n_commands, e_code, e_at, e_out, e_rows, out{more}):
     n, m = len(t), len(x0)
     x = x0.copy()
-    u = np.zeros(max(n_commands if loop else len(inputs), 1))
+    u = np.zeros(max(n_commands if LOOP else len(inputs), 1))
     r = np.zeros(max(len(inputs), 1))
     y = np.zeros(len(out))
     seen = np.zeros(len(out))
     remembered = np.zeros((len(code), MEMORY))
     e_memory = np.zeros((len(e_code), MEMORY))
-    e_past = np.zeros((len(e_code), n if loop else 1))
+    e_past = np.zeros((len(e_code), n if LOOP else 1))
     none = np.zeros(MEMORY)
     held = np.zeros(m)
     dx, total, z = np.zeros(m), np.zeros(m), np.zeros(m)
@@ -231,7 +240,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             for j in range(m):
                 x[j] = at_restart[j, k]
             first = True
-        if loop:
+        if LOOP:
             for j in range(len(inputs)):
                 r[j] = inputs[j, k]
             shown(x, u, p, y)
@@ -275,7 +284,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             for j in range(4):
                 part = q + 0.5 * ((j + 1) // 2)
                 now = t[k] + part * h
-                if line and not loop:
+                if line and not LOOP:
                     for i in range(len(inputs)):
                         u[i] = inputs[i, k] + (inputs[i, k + 1] - inputs[i, k]) * part / steps
                         if len(slopes) > 0:

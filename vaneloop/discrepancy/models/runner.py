@@ -22,6 +22,7 @@ from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["STARTS_LOADED", "Placed", "Runner"]
 
+SHORT = 10_000  # steps of a simulation below which a thread of its own costs more than it gains
 SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
 FEW = 4  # samples that a cubic spline needs
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
@@ -178,7 +179,7 @@ class Runner:
                 y[bad] = self.far
             np.clip(y[:, ::every], -self.far, self.far, out=out[i])
 
-        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1:
+        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1 and n * self.steps > SHORT:
             with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
                 list(pool.map(one, range(len(thetas))))
         else:
@@ -325,8 +326,7 @@ class Runner:
         arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
             rows, position, gap,
-            asymmetry, self.smalls, mass, steps, s.between != "hold", self._slopes(log, t, u), loop,
-            len(s.commands),
+            asymmetry, self.smalls, mass, steps, s.between != "hold", self._slopes(log, t, u), len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         if curves:
