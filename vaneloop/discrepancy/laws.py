@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from vaneloop.base.compiled import compiled_free, in_place_free
+from vaneloop.base.compiled import compiled_free, inlined
 from vaneloop.discrepancy.stage import Array
 
 __all__ = [
@@ -41,7 +41,7 @@ BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION
 PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME, STICTION, STICK_SLIP = range(11, 18)
 
 
-@in_place_free
+@inlined
 def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> float:
     """Law ``code`` on sample ``k`` of the signal ``u`` at times ``t`` (s), with parameters ``p`` and memory ``s``
     (changed in place).
@@ -132,7 +132,7 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
     return x
 
 
-@in_place_free
+@inlined
 def _stuck(code: int, x: float, dx: float, first: bool, p: Array, s: Array) -> float:
     """Position of a valve's stem that sticks, for its command ``x`` that has just changed by ``dx``.
 
@@ -206,13 +206,13 @@ MODIFIERS = (
 )  # add no force of their own: they change what the friction and spring laws add
 
 
-@in_place_free
+@inlined
 def _slip(v: float, small: float) -> float:
     """Direction of motion; a straight line within ``small``, so that a simulation can come to rest."""
     return min(max(v / small, -1.0), 1.0) if small > 0.0 else (1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0)
 
 
-@in_place_free
+@inlined
 def force_of(
     code: int, v: float, x: float, first: bool, p: Array, gap: float, asymmetry: float, small: float, s: Array
 ) -> float:
@@ -295,7 +295,7 @@ def force_of(
     return 0.0
 
 
-@in_place_free
+@inlined
 def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: float, s: Array) -> float:
     """Set up the memory of a hysteretic law so that at displacement ``x`` it carries the force ``held``, or its
     friction; return that.
@@ -316,7 +316,7 @@ STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT
 )
 
 
-@in_place_free
+@inlined
 def state_rate(code: int, x: float, p: Array) -> float:
     """What law ``code`` takes off the derivative of the state ``x``. Limits take nothing off; the simulation applies
     them.
