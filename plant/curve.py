@@ -6,7 +6,8 @@ so with 1 + its value. Beyond the table's range a curve stays as at its end. Row
 
 The signals are what the machine itself has at the last tick: a curve of the stroke is one of the true stroke. Where a
 stage is held against a log, they are what the log says (`take`). A curve may have its signal through a first-order lag
-of its own, which starts settled.
+of its own, which starts settled. Or it is the virgin curve of a hysteresis (`vaneloop.base.hysteresis`) of its signal,
+which starts at rest.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from plant.layout import (
     C_OF,
     C_PERIOD,
     C_SITE,
+    C_STOPS,
     C_TABLE,
     CURVE_ROWS,
     MOST_CURVES,
@@ -37,6 +39,7 @@ from plant.places import N_R, POT, SPEED, X
 from vaneloop.base.compiled import compiled, in_place, inlined
 from vaneloop.base.curve import POINTS, between_points
 from vaneloop.base.durations import named_lag, period_of
+from vaneloop.base.hysteresis import RADII, slip, stops_of, weights_of
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
@@ -60,6 +63,8 @@ KNOWN = SIGNALS.index(VANES[0]) + MOST  # signals that a curve may be of; behind
 ) = range(SIGNAL_AT, SIGNAL_AT + 13)  # fmt: skip
 S_FARTHEST = SIGNAL_AT + KNOWN
 S_LATE = S_FARTHEST + 4  # a row a curve
+S_LAST = S_LATE + MOST_CURVES  # and here
+S_STOP = S_LAST + MOST_CURVES  # `RADII` rows a curve
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Quantity:
 
     period  SI, after which what is a function of it repeats itself; 0: it does not
     lag     s, time constant of the first-order lag behind which it is seen; 0: none
+    stops   whether a curve is the virgin curve of a hysteresis of it
     """
 
     name: str
@@ -76,6 +82,7 @@ class Quantity:
     of: int
     period: float = 0.0
     lag: float = 0.0
+    stops: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,13 +158,15 @@ PLACES = {
 
 
 def quantity_of(name: str) -> Quantity | None:
-    """The quantity of this name, of those in `QUANTITIES`, ``time_every_TIME`` and ``SIGNAL_lagged_by_TIME``; None:
-    there is none.
+    """The quantity of this name, of those in `QUANTITIES`, ``time_every_TIME``, ``SIGNAL_lagged_by_TIME`` and
+    ``stops_of_SIGNAL``; None: there is none.
     """
     if period := period_of(name):
         return replace(QUANTITIES["time"], name=name, period=period)
     if (lag := named_lag(name)) and lag[0] in QUANTITIES and lag[0] != "time":
         return replace(QUANTITIES[lag[0]], name=name, lag=lag[1])
+    if (of := stops_of(name)) in QUANTITIES and of != "time":
+        return replace(QUANTITIES[of], name=name, stops=True)
     return QUANTITIES.get(name)
 
 
@@ -173,7 +182,10 @@ def at_curve(p: np.ndarray, place: Place, q: Quantity, low: float, high: float, 
     r = CURVES + 1 + c * CURVE_ROWS
     p[CURVES] = c + 1
     p[r + C_SITE], p[r + C_OF], p[r + C_LOW], p[r + C_HIGH] = place.site, q.of, low * q.si, high * q.si
-    p[r + C_PERIOD], p[r + C_LAG] = q.period, q.lag
+    p[r + C_PERIOD], p[r + C_LAG], p[r + C_STOPS] = q.period, q.lag, q.stops
+    if q.stops:
+        p[r + C_TABLE : r + C_TABLE + RADII] = weights_of(low, high, tables) * (place.si / q.si)
+        return
     p[r + C_TABLE : r + CURVE_ROWS] = tables * place.si
 
 
@@ -183,7 +195,9 @@ def bend(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
     total = 0.0
     for c in range(int(p[CURVES, j])):
         r = CURVES + 1 + c * CURVE_ROWS
-        if p[r + C_SITE, j] == site:
+        if p[r + C_SITE, j] == site and p[r + C_STOPS, j] != 0.0:
+            total += s[S_LATE + c, j]
+        elif p[r + C_SITE, j] == site:
             x, period = s[SIGNAL_AT + int(p[r + C_OF, j]), j], p[r + C_PERIOD, j]
             if period > 0.0:
                 x -= math.floor(x / period) * period
@@ -259,29 +273,41 @@ def follow(
         if p[r + C_LAG, j] > 0.0 and since > 0.0:
             signal = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
             s[S_LATE + c, j] += (signal - s[S_LATE + c, j]) * -math.expm1(-since / p[r + C_LAG, j])
+        if p[r + C_STOPS, j] != 0.0:
+            signal = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
+            first, move = S_STOP + c * RADII, signal - s[S_LAST + c, j]
+            s[S_LAST + c, j] = signal
+            s[S_LATE + c, j] = slip(s, first, j, move, p, r + C_TABLE, p[r + C_HIGH, j])
 
 
 @in_place
 def begin(s: np.ndarray, p: np.ndarray, j: int, t_oil: float) -> None:
-    """The signals of a machine at rest, with oil at ``t_oil`` (degC); lags are settled."""
+    """The signals of a machine at rest, with oil at ``t_oil`` (degC); lags are settled, and no stop is bent."""
     s[S_X, j] = s[S_X_DEM, j] = s[S_FARTHEST, j] = s[S_FARTHEST + 1, j] = s[X, j]
     s[S_N_R, j] = s[S_N_DEM, j] = s[N_R, j]
     s[S_P_S, j], s[S_T_OIL, j] = p[P_REF, j], t_oil
     for k in range(int(p[VANE_COUNT, j])):
         s[S_VANE + k, j] = s[POT + k, j]
     for c in range(int(p[CURVES, j])):
-        s[S_LATE + c, j] = s[SIGNAL_AT + int(p[CURVES + 1 + c * CURVE_ROWS + C_OF, j]), j]
+        r = CURVES + 1 + c * CURVE_ROWS
+        s[S_LAST + c, j] = s[SIGNAL_AT + int(p[r + C_OF, j]), j]
+        s[S_LATE + c, j] = 0.0 if p[r + C_STOPS, j] != 0.0 else s[S_LAST + c, j]
 
 
 @in_place
 def take(s: np.ndarray, p: np.ndarray, j: int, known: np.ndarray, before: int, k: int) -> None:
     """Take the signals that lane ``j``'s curves are of from a log: their mean at samples ``before`` and ``k``.
 
-    known  float64[KNOWN + curves, samples], SI: signals, and behind them that of each curve with a lag, behind it
+    known  float64[KNOWN + curves, samples], SI: signals, and behind them that of each curve with a lag, behind it; or
+           float64[KNOWN + lanes * curves, samples], with what each lane's hystereses give in the step to a sample
     """
-    for c in range(int(p[CURVES, j])):
+    n = int(p[CURVES, j])
+    own = KNOWN + (j * n if len(known) > KNOWN + n else 0)
+    for c in range(n):
         r = CURVES + 1 + c * CURVE_ROWS
         q = int(p[r + C_OF, j])
         s[SIGNAL_AT + q, j] = 0.5 * (known[q, before] + known[q, k])
         if p[r + C_LAG, j] > 0.0:
-            s[S_LATE + c, j] = 0.5 * (known[KNOWN + c, before] + known[KNOWN + c, k])
+            s[S_LATE + c, j] = 0.5 * (known[own + c, before] + known[own + c, k])
+        if p[r + C_STOPS, j] != 0.0:
+            s[S_LATE + c, j] = known[own + c, k]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from plant.linkage import N_GEOMETRY
 from vaneloop.base.curve import POINTS
+from vaneloop.base.hysteresis import RADII
 from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "C_OF",
     "C_PERIOD",
     "C_SITE",
+    "C_STOPS",
     "C_TABLE",
     "DAMPING",
     "DECELERATION",
@@ -107,8 +109,9 @@ NOMINAL_STATE = (
 # ---- curves that were learned (`plant.curve`): behind all others too
 MOST_CURVES = 4
 # rows of one: where, of which signal, its range, the period after which it repeats itself (0: it does not), the time
-# constant of the lag behind which it has its signal (0: none), its table
-(C_SITE, C_OF, C_LOW, C_HIGH, C_PERIOD, C_LAG, C_TABLE) = range(7)
+# constant of the lag behind which it has its signal (0: none), whether it is a hysteresis (1; 0: no), its table; of a
+# hysteresis the first rows are the weights of its stops, and the others are not used
+(C_SITE, C_OF, C_LOW, C_HIGH, C_PERIOD, C_LAG, C_STOPS, C_TABLE) = range(8)
 CURVE_ROWS = C_TABLE + POINTS
 SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature in degC)
     "i_cmd",
@@ -128,7 +131,10 @@ SIGNALS = (  # what a curve may be a function of, SI (speeds in %, temperature i
     "turned",  # m
     "reached",  # s
     "turned_at",  # s
-    *(f"late_{c}" for c in range(MOST_CURVES)),  # of each curve with a lag, its signal behind that
+    *(f"late_{c}" for c in range(MOST_CURVES)),  # of each curve with a lag, its signal behind that; of a hysteresis,
+    # what it gives
+    *(f"last_{c}" for c in range(MOST_CURVES)),  # of each hysteresis, its signal at the last tick
+    *(f"stop_{c}_{i}" for c in range(MOST_CURVES) for i in range(RADII)),  # and how far each of its stops is bent
 )
 
 # ---- electromechanical actuator: its rows stand behind all others (`plant.effects`)

@@ -47,6 +47,7 @@ from vaneloop.base.curve import DEGREE, POINTS, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
+from vaneloop.base.hysteresis import stops_of
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, VANES, vane_in
 
@@ -189,10 +190,12 @@ class Model(Table):
                     f"{', '.join(places)}"
                 )
             lag = named_lag(curve.of)
-            if (lag[0] if lag else curve.of) not in own and period_of(curve.of) == 0.0 or quantity_of(curve.of) is None:
+            channel = lag[0] if lag else stops_of(curve.of) or curve.of
+            if channel not in own and period_of(curve.of) == 0.0 or quantity_of(curve.of) is None:
                 raise InputError(
                     f"{where}: of (={curve.of!r}) is unknown; allowed: {', '.join(own)}, time_every_TIME such as "
-                    f"time_every_20_ms, SIGNAL_lagged_by_TIME such as n_r_lagged_by_20_s"
+                    f"time_every_20_ms, SIGNAL_lagged_by_TIME such as n_r_lagged_by_20_s, "
+                    f"stops_of_SIGNAL"
                 )
             curve.check(where)
             values = self.effects.get(name, {})

@@ -22,6 +22,7 @@ from hil.fmu.plant_fmu import PlantFmu, PlantNode
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.node import Node
 from plant import Model, build_plant
+from plant.model import Learned
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
@@ -147,6 +148,20 @@ def test_a_model_file_s_machine_is_in_the_fmu_and_so_are_its_parameters(
     changed = followed(Driven(fmus["loop3"], tmp_path / "plain", n_dem=n[0], **values), n)
     assert not differing(changed, run.columns)
     assert differing(changed, lockstep(Stimulus.of(n), every=1).columns)
+
+
+def test_laws_that_remember_are_in_the_fmu(tmp_path: Path, gcc: str) -> None:
+    """A lag and a hysteresis that were learned."""
+    n, of = demand(20, seed=3), "speed_of_x_lvdt_lagged_by_2_s"
+    late = Learned(how="adds", at="linkage.crank", of=of, low=-50.0, high=50.0, form="line", values=[-0.2])
+    slips = Learned(how="adds", at="valve.current", of="stops_of_i_cmd", low=0.0, high=2.0, form="line", values=[-0.2])
+    model = Model(effects={"late": {}, "slips": {}}, curves={"late": late, "slips": slips})
+    run = lockstep(Stimulus.of(n), plant=build_plant(model=model), every=1)
+    got = followed(Driven(written(tmp_path / "remembers.fmu", "loop", model=model), tmp_path, n_dem=n[0]), n)
+    assert not differing(got, run.columns)
+    for name in model.curves:
+        one = Model(effects={name: {}}, curves={name: model.curves[name]})
+        assert differing(got, lockstep(Stimulus.of(n), plant=build_plant(model=one), every=1).columns)
 
 
 def test_plant_and_controller_joined_are_the_loop(fmus: dict[str, Path], tmp_path: Path) -> None:

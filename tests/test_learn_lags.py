@@ -148,7 +148,9 @@ def test_lags_are_of_what_drives_a_stage() -> None:
     _, whole = chain()
     for stage in whole.stages:
         late = [
-            c for c in VaneGround(stage).candidates(stage.neutral()[: len(stage.parameters)]) if c.quantity.remembers
+            c
+            for c in VaneGround(stage).candidates(stage.neutral()[: len(stage.parameters)])
+            if c.quantity.remembers and not c.quantity.stops
         ]
         assert late
         for c in late:

@@ -273,6 +273,8 @@ OUTSIDE = _table(
          signed=True),
     _one("schedule_bent", "demand", "demand", "amplitude", P.schedule_bend, "m", 0.0,
          "bend of the stroke table round 75 % speed", (5e-7, 5e-6, 5e-5, 3e-4, 1.5e-3), signed=True),
+    _one("crank_bushing", "linkage", "linkage", "give", P.bushing, "m", 0.0,
+         "stroke that a bushing at the crank takes once all of it has slipped", (1e-6, 1e-5, 2e-4, 6e-4, 2e-3)),
 )
 # fmt: on
 

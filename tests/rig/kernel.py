@@ -21,6 +21,7 @@ MOST = 8  # vane stages that the arrays have room for; a run has as many as its 
 PINS = 4  # pins in parallel a stage, each with its own gap
 PLAYS = 4  # Preisach elements of the torque motor's hysteresis
 PIN_OFFSET = np.array([-1.3416, -0.4472, 0.4472, 1.3416])  # zero mean, unit variance
+BUSHING = np.array([2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3])  # m: half-widths after which parts of a bushing slip
 MOTOR_GAP = np.array([0.4, 0.8, 1.2, 1.6])  # mean 1
 X_LOW, X_HIGH, X_STEP = -1e-3, 49e-3, 1e-5  # m: the ring-angle tables run 1 mm beyond both stops in 10 um steps
 X_LAST = round((X_HIGH - X_LOW) / X_STEP)
@@ -239,6 +240,7 @@ class P(IntEnum):
     rise_slope = 196  # 1/% relative change of the acceleration limit with speed
     gain_thermal = 197  # 1/K of the controller's current
     schedule_bend = 198  # m at 75 % speed
+    bushing = 199  # m of the stroke that the crank's bushing takes when all of it has slipped
 
 
 N_P = len(P)
@@ -281,9 +283,10 @@ class S(IntEnum):
     turn_speed = 114  # rad/s
     turn_bristle = 115  # rad, LuGre deflection of the motor's friction
     demanded = 116  # A behind the amplifier's lag
+    bushing_0 = 117  # m, as many as `BUSHING` has widths
 
 
-N_S = 117
+N_S = 123
 
 
 @njit(cache=True, error_model="numpy")
@@ -550,7 +553,11 @@ def linkage(s, p, ring_table, n, t_oil, t, h):
     """Rings, vanes and potentiometers over one step ``h`` (s): kinematics, then what bends or loosens the way to the
     vane.
     """
-    place = clip((s[S.x] - X_LOW) / X_STEP, 0.0, X_LAST - 1e-6)
+    stroke = s[S.x]
+    for j in range(len(BUSHING)):
+        s[S.bushing_0 + j] += dead_zone(s[S.x] - s[S.bushing_0 + j], BUSHING[j])
+        stroke -= p[P.bushing] / len(BUSHING) * (s[S.x] - s[S.bushing_0 + j]) / BUSHING[j]
+    place = clip((stroke - X_LOW) / X_STEP, 0.0, X_LAST - 1e-6)
     cell = int(place)
     part = place - cell
     load = (n * 0.01) ** 2
@@ -674,6 +681,7 @@ def start(s, p, ring_table, x, n, p_s):
     s[:] = 0.0
     s[S.n] = n
     s[S.x] = s[S.x_sensor] = s[S.x_sensor_2] = x
+    s[S.bushing_0 : S.bushing_0 + len(BUSHING)] = x
     s[S.p1] = s[S.p2] = 0.5 * p_s
     s[S.p_valve] = p_s
     if p[P.motor] != 0.0:

@@ -432,6 +432,7 @@ CURVES_OF: dict[str, set[str]] = {
     "acceleration_by_speed": _of("engine.acceleration", "n_r n_dem"),
     "lvdt_ripple": _of("sensors.lvdt", "time"),
     "driver_oscillation": _of("valve.current", "time"),
+    "crank_bushing": _of("linkage.crank linkage.ring", "stops_of_x_lvdt"),
 }
 # what is one of a quantity behind a lag, whose time the rig knows: each ring is late by a share of ring - y, where
 # y' = (ring - y) / time, which is that share times the time of the ring's speed behind the lag. All rings turn with the

@@ -426,8 +426,8 @@ class Learner:
 
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
-        quick = []
-        for k, (_, candidate, theta) in enumerate(self._screened(current)):
+        quick, screened = [], self._screened(current)
+        for k, (_, candidate, theta) in enumerate(screened):
             quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
@@ -437,9 +437,13 @@ class Learner:
         # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit
         first, others = quick[:SURE], quick[SURE:]
         others.sort(key=lambda t: float(t.fit.cost.sum()))
-        for k, t in enumerate([*first, *others[: FINISHED - SURE]]):
+        chosen = [*first, *others[: FINISHED - SURE]]
+        # a short excerpt has too few turns for what slips: of hystereses that which promised most goes on, too
+        slipping = next((c.name for _, c, _ in screened if c.quantity.stops), "")
+        chosen += [t for t in quick if t.candidate.name == slipping and t not in chosen]
+        for k, t in enumerate(chosen):
             done.append(self._finished(current, t))
-            self.progress((QUICK + k + 1.0) / (QUICK + FINISHED + 1.0))
+            self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
         done.sort(key=lambda t: score(self.judge, t.fit))
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}

@@ -1,9 +1,8 @@
 """Quantities that remember: what a channel was a while ago, and how far it has gone since each of its turns.
 
-A lag is one of first order. A hysteresis is a sum of stops (elastic-plastic elements; Prandtl 1928, Ishlinskii 1944):
-each follows its channel up to its radius and then slips. Radii are fixed, so that the sum is known by its virgin curve
-alone: what it makes of a channel that first leaves rest. A curve that bends down has stops of positive
-weight. It can then be learned, drawn, stored and put into a formula as every other curve.
+A lag is one of first order. A hysteresis is a sum of stops (`vaneloop.base.hysteresis`), known by its virgin curve
+alone. A curve that bends down has stops of positive weight. It can then be learned, drawn, stored and put into a
+formula as every other curve.
 """
 
 from __future__ import annotations
@@ -12,12 +11,11 @@ import numpy as np
 
 from vaneloop.base.compiled import compiled
 from vaneloop.base.durations import in_name, named_lag
+from vaneloop.base.hysteresis import STOPS, slipped, weights_of
 from vaneloop.discrepancy.stage import Array
 
 __all__ = ["STOPS", "dissipates", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
 
-STOPS = "stops_of_"
-RADII = 64  # of the stops of a hysteresis, closer the smaller: most of it slips early
 COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
 NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
 
@@ -45,32 +43,13 @@ def lagged(t: np.ndarray, q: np.ndarray, tau: float) -> np.ndarray:
     return out
 
 
-@compiled
-def _slipped(q: np.ndarray, radii: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    out, at = np.zeros(len(q)), np.zeros(len(radii))
-    for k in range(1, len(q)):
-        move, total = q[k] - q[k - 1], 0.0
-        for i in range(len(radii)):
-            at[i] = min(max(at[i] + move, -radii[i]), radii[i])
-            total += weights[i] * at[i]
-        out[k] = total
-    return out
-
-
-def _stops(low: float, high: float, table: Array, count: int = RADII) -> tuple[Array, Array]:
-    """Radii and weights of the stops that a virgin curve, even points from ``low`` to ``high``, is made of."""
-    radii = high * np.linspace(0.0, 1.0, count + 1) ** 2
-    slopes = np.diff(np.interp(radii, np.linspace(low, high, len(table)), table)) / np.diff(radii)
-    return radii[1:], slopes - np.append(slopes[1:], 0.0)
-
-
 def of_stops(q: Array, low: float, high: float, table: Array) -> Array:
     """What the hysteresis with this virgin curve makes of a channel ``q``, which starts at rest; float64[samples]."""
-    return np.asarray(_slipped(np.ascontiguousarray(q, dtype=float), *_stops(low, high, table)))
+    return np.asarray(slipped(np.ascontiguousarray(q, dtype=float), high, weights_of(low, high, table)))
 
 
 def dissipates(low: float, high: float, table: Array) -> bool:
     """Whether the stops of a virgin curve, seen coarsely, have weights of one sign: then they only take energy."""
-    weights = _stops(low, high, table, COARSE)[1][:-1]  # the last one stands for all that is wider
+    weights = weights_of(low, high, table, COARSE)[:-1]  # the last one stands for all that is wider
     size = float(np.abs(weights).sum())
     return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE * size

@@ -45,7 +45,8 @@ def actuator_stage(driven: Driven) -> Stage:
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[places.X] = s[places.X_LVDT] = x[0]
         out = np.empty((len(thetas), 1, len(t)))
-        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), signals)
+        known = driven.slipping(signals, p)
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), known)
         out *= 1e3
         return out
 

@@ -170,6 +170,7 @@ def bends(driven: Driven, thetas: Array, known: Array, *sites: int) -> Iterator[
     """
     p = lanes(driven, thetas, np.zeros(0, dtype=int), np.zeros(0))
     s = np.zeros((chain.N_STATE, len(thetas)))
+    known = driven.slipping(known, p)
     for site in sites:
         out = np.zeros((len(thetas), len(driven.t)))
         run_bends(known, p, s, site, out)

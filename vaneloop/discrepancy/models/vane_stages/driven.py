@@ -11,9 +11,10 @@ from controller import Calibration
 from plant import Plant
 from plant.curve import KNOWN, QUANTITIES, quantity_of
 from plant.effects import CURVES
-from plant.layout import C_LAG, C_OF, CURVE_ROWS
+from plant.layout import C_HIGH, C_LAG, C_OF, C_STOPS, C_TABLE, CURVE_ROWS
 from plant.stages.blocks import NOTHING
 from vaneloop.base.durations import named_lag
+from vaneloop.base.hysteresis import RADII, slipped, stops_of
 from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.models.memory import lagged
 from vaneloop.discrepancy.models.motion import smoothed
@@ -67,6 +68,8 @@ class Driven(NamedTuple):
             return self.t % q.period
         if lag := named_lag(name):
             return self._late(*lag)
+        if channel := stops_of(name):  # how they slip is a matter of the curve
+            return self.quantity(channel)
         if name == "x_lvdt":  # with less noise, where it can be had
             return self.columns.get("stroke", self.columns.get(name))
         values = self.columns.get(name)
@@ -110,6 +113,30 @@ class Driven(NamedTuple):
                 values = self._late(name, tau)
                 if values is not None:
                     row[:] = values * QUANTITIES[name].si
+        return out
+
+    def slipping(self, signals: Array, p: Array) -> Array:
+        """`signals` with what the hystereses of each lane of the plant's parameters ``p`` give, which rest at the start
+        of the log: float64[KNOWN + lanes * curves, samples]; of a current, whose noise is dither to it, the mean over
+        each row's ticks. Where no lane has one: as they are.
+        """
+        n = int(p[CURVES].max())
+        own = CURVES + 1 + CURVE_ROWS * np.arange(n)
+        stops = [(c, int(r)) for c, r in enumerate(own) if p[r + C_STOPS].any()]
+        if not stops:
+            return signals
+        lanes = p.shape[1]
+        out = np.concatenate([signals[:KNOWN], *[signals[KNOWN : KNOWN + n]] * lanes])
+        whole, rows = self.part_of or (self, slice(None))
+        for c, r in stops:
+            q = next(q for q in QUANTITIES.values() if q.of == int(p[r + C_OF, 0]))
+            values = whole.columns.get("ticks") if q.name == "i_cmd" else None
+            values = whole.quantity(q.name) if values is None else values
+            assert values is not None
+            course, weights = values.reshape(-1) * q.si, np.ascontiguousarray(p[r + C_TABLE : r + C_TABLE + RADII].T)
+            for j in range(lanes):
+                gives = slipped(course, p[r + C_HIGH, j], weights[j])
+                out[KNOWN + j * n + c] = gives.reshape(len(values), -1).mean(axis=1)[rows]
         return out
 
 

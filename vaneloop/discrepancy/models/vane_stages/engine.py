@@ -24,7 +24,7 @@ def engine_stage(driven: Driven) -> Stage:
     if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
         inner = int(round(dt / RASTER))
         n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
-    signals = np.repeat(driven.signals(), inner, axis=1)
+    signals = driven.signals()
     pieces = pieces_of(c["stretch"])
     second = max(1, int(round(1.0 / dt)))
 
@@ -32,6 +32,7 @@ def engine_stage(driven: Driven) -> Stage:
         p = lanes(driven, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
         out = np.empty((len(n_dem), len(thetas)))
+        known = np.repeat(driven.slipping(signals, p), inner, axis=1)
         for piece in pieces:
             head = min(piece.start + second, piece.stop)
             start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
@@ -40,7 +41,7 @@ def engine_stage(driven: Driven) -> Stage:
             for stop in (head, piece.stop):
                 inside = slice(piece.start * inner, stop * inner)
                 s[places.N_R] = start
-                engine_run(n_dem[inside], dt / inner, p, s, out[inside], np.ascontiguousarray(signals[:, inside]))
+                engine_run(n_dem[inside], dt / inner, p, s, out[inside], np.ascontiguousarray(known[:, inside]))
                 start = start + np.mean(
                     c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
                 )

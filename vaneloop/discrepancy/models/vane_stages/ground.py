@@ -11,6 +11,7 @@ from plant.effects import CURVES
 from plant.layout import AREA, MOST_CURVES, P_REF
 from plant.model import Learned
 from vaneloop.base.errors import InputError
+from vaneloop.base.hysteresis import STOPS, stops_of
 from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.curves import COUNT, basis_of
 from vaneloop.discrepancy.diagnose import excerpt_of
@@ -57,6 +58,10 @@ LAGGED = {  # what drives a stage, and not what it gives: curves there may have 
     "actuator": ("i_cmd", "n_r", "p_s", "t_oil"), "linkage": ("x_lvdt", "speed_of_x_lvdt", "n_r", "t_oil"),
 }  # fmt: skip
 CHANGED = 0.01  # of a channel's spread that a lag must change
+SLIPS = {  # what moves a place that may have a hysteresis: a torque motor's iron, joints on the way to the vanes
+    "valve.current": "i_cmd", "linkage.crank": "x_lvdt", "linkage.ring": "x_lvdt",
+    **{f"linkage.{v}_ring": "x_lvdt" for v in VANES},
+}  # fmt: skip
 OF_STROKE = (  # what `reversals` works out
     "speed_of_x_lvdt", "direction_of_x_lvdt", "distance_since_reversal_of_x_lvdt", "time_since_reversal_of_x_lvdt",
 )  # fmt: skip
@@ -77,6 +82,8 @@ def _says_more(place: Place, q: Quantity) -> bool:
     In the linkage what the crank adds to the stroke is what the LVDT takes off it. A reading has no memory of the
     machine's, and a crank that gives at once is a reading.
     """
+    if q.stops:
+        return SLIPS.get(place.at) == stops_of(q.name)
     if q.remembers:
         return place.at != "sensors.lvdt" and not (place.at.startswith("sensors.") and place.how == "times")
     return place.at != "linkage.crank"
@@ -184,7 +191,7 @@ class VaneGround:
         """
         out = {}
         for name, stage in ((REST, self.all), (TEST, self.test)):
-            if name in self.tests and stage is not None:
+            if name in self.tests and stage is not None and not candidate.quantity.stops:
                 assert isinstance(stage.made, Made)
                 values = stage.made.driven.quantity(candidate.quantity.name)
                 if values is not None:
@@ -225,6 +232,8 @@ class VaneGround:
             if basis is not None:
                 known.append((Quantity(signal.name, signal.unit, COLUMN, values[rows]), basis))
         late = [(c, q, b) for c in LAGGED[stage.name] for q in self._late(driven, c, rows) if (b := basis_for(q))]
+        stops = [self._stops(driven, c, rows) for c in sorted({*SLIPS.values()} & {*LAGGED[stage.name]})]
+        late += [(stops_of(q.name), q, b) for q in stops if q is not None and (b := basis_for(q))]
         out = []
         for number, place in enumerate(ALL_PLACES):
             if stage.name not in place.stages or driven.machine.kind not in place.kinds:
@@ -238,8 +247,16 @@ class VaneGround:
                 name = f"{place.at}.{word}_of_{q.name}"
                 size = self._size(place, error)
                 near = q.name in NEAR.get(place.at, ())
-                out.append(Candidate(name, place.how, number, place.at, place.unit, size, True, q, basis, near))
+                out.append(Candidate(name, place.how, number, place.at, place.unit, size, not q.stops, q, basis, near))
         return out
+
+    def _stops(self, driven: Driven, channel: str, rows: Array) -> Quantity | None:
+        """Stops that a channel moves; None: it does not move. ``rows``: those that have an output."""
+        values = driven.quantity(channel)
+        if values is None or not np.ptp(values) > 0.0:
+            return None
+        way = turns(np.ascontiguousarray(smoothed(driven.t, values)), driven.t, TURN * float(np.ptp(values)))[1]
+        return Quantity(f"{STOPS}{channel}", QUANTITIES[channel].unit, COLUMN, 0.5 * way[rows], (values,))
 
     def _late(self, driven: Driven, channel: str, rows: Array) -> list[Quantity]:
         """Lags of a channel that change it; ``rows``: those that have an output."""

@@ -34,7 +34,7 @@ def linkage_stage(driven: Driven) -> Stage:
         machine.place_rings(start, tuple(first))
         s = np.repeat(start, len(thetas), axis=1)
         out = np.empty((len(thetas), len(first), len(t)))
-        linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), signals)
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p))
         out = out if which == list(range(len(first))) else out[:, which]
         return np.asarray(np.rad2deg(out, out=out))
 
