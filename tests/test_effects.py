@@ -83,7 +83,8 @@ from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 
 NAMES = tuple(EFFECTS)
-OWN = {name: tuple(build_plant().parameters_of(name).values()) for name in NAMES}  # of the shipped machine
+MACHINE = build_plant()
+OWN = {name: tuple(MACHINE.parameters_of(name).values()) for name in NAMES}  # of the shipped machine
 # the library that docs and other people's tools count on
 PROMISED = {
     *("can_delay", "frame_hold", "schedule_error", "trend_threshold_error", "controller_gain_error"),

@@ -87,7 +87,7 @@ def test_every_kind_of_frame_comes_back_as_it_was(suffix: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_the_file_is_whole_after_every_append(suffix: str, tmp_path: Path) -> None:
+def test_the_file_is_whole_after_every_append(suffix: str, tmp_path: Path, quick_mdf: None) -> None:
     file, recorder, total = tmp_path / f"run{suffix}", None, 0
     recorder = Recorder(file)
     for k in range(30):  # Parquet merges row groups at the 5th and at the 25th

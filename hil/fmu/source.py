@@ -6,6 +6,7 @@ leaves their results as they are; the C text that comes of it is kept, since it 
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import platform
@@ -158,4 +159,5 @@ def model_source(part: str, shape: Shape, memory: np.ndarray, variables: Sequenc
 
 
 if __name__ == "__main__":
+    gc.disable()  # for some seconds of compiling: a collection finds nothing to free
     sys.stdout.write(_translated(sys.argv[1], Shape(*map(int, sys.argv[2:]))))

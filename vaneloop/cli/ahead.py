@@ -7,6 +7,7 @@ were none.
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -80,6 +81,7 @@ def main(words: list[str]) -> int:
     """
     if words:
         job, folder = words
+        gc.disable()  # a collection finds nothing to free of what numba makes
         {**JOBS[0], **JOBS[1]}[job](Path(folder))
         return 0
     done = AHEAD / "done.txt"
