@@ -10,12 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vaneloop.base.terminal import plain
 from vaneloop.discrepancy import Effect, Parameter, Stage, StageError
 from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
 from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import locate, onset, regimes, shape
+from vaneloop.discrepancy.locate import locate, onset, regimes, shape, step_in
 from vaneloop.discrepancy.stage import noise_of, reach_of
 from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
 from vaneloop.discrepancy.workflow import compare_stages, diagnose, diagnosis_json, locate_stages
@@ -333,6 +335,14 @@ def test_the_onset_is_found_within_seconds() -> None:
     judge = Judge(stage, FLOOR)
     start = onset(judge, judge.fit((), stage.neutral()))
     assert start is not None and abs(start - 62.0) <= 4.0
+
+
+@given(st.integers(16, 200), st.floats(0.0, 1.0), st.floats(0.0, 3.0), st.integers(0, 10_000))
+def test_a_step_is_where_ruptures_finds_it(n: int, at: float, size: float, seed: int) -> None:
+    import ruptures
+
+    y = np.random.default_rng(seed).standard_normal(n) + size * (np.arange(n) > at * n)
+    assert step_in(y) == ruptures.Binseg(model="l2", min_size=4).fit(y[:, None]).predict(n_bkps=1)[0]
 
 
 @pytest.mark.parametrize("hidden", [{}, {"null_bias": 0.4}])
