@@ -7,8 +7,9 @@ SHELL := /bin/bash
 VENV := .venv
 PY := $(VENV)/bin/python
 SAY := printf '[vaneloop] %s\n'
-JOBS ?= 2
-# Each of the JOBS has a core: threads of BLAS would wait for each other.
+# Tests of real time, of fleets and of pages wait for much of their time: three workers keep two cores busy.
+JOBS ?= 3
+# Threads of BLAS would wait for each other.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 # mypy takes one core, and so does the first half of what is compiled ahead
 BOTH = $(MAKE) --no-print-directory -j2 lint compiled
