@@ -33,7 +33,7 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
-from vaneloop.discrepancy.models.learning import held_out
+from vaneloop.discrepancy.models.held_out import held_out
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
 from vaneloop.verbs.learn import learn

@@ -7,13 +7,33 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 
-from vaneloop.base.forms import Form
+from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["begin", "text_of"]
+__all__ = ["Formula", "begin", "text_of", "values_of"]
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula fitted inside the simulation.
+
+    text     with its numbers
+    numbers  name -> value; ``error``: held-out RMS, in noise floors, with it in the curve's place
+    law      name of the law of the library that it is; "": none
+    level    added to it: less its mean, where a parameter of the model has that
+    """
+
+    form: str
+    text: str
+    numbers: dict[str, float]
+    error: float
+    complexity: int
+    law: str = ""
+    level: float = 0.0
 
 
 def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array, float] | None:
@@ -75,3 +95,9 @@ def text_of(form: Form, numbers: Array, quantity: str, above_zero: bool = False,
     if mean:
         text = f"{text} + {-mean:.4g}"
     return re.sub(r"\bq\b", quantity, text).replace("+ -", "- ").replace("- -", "+ ").replace("(--", "(")
+
+
+def values_of(formula: Formula, q: Array) -> Array:
+    """A formula at values of its quantity."""
+    form = next(f for f in FORMS if f.name == formula.form)
+    return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)

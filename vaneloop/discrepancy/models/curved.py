@@ -171,8 +171,10 @@ class Candidate:
         design = self.basis.design(self.grid) @ self.turn
         return self.placed_as(design.__matmul__, design.shape[1])
 
-    def placed_as(self, table: Callable[[Array], Array], parameters: int) -> Placed:
-        """The same with another function from so many parameters to its table."""
+    def placed_as(
+        self, table: Callable[[Array], Array], parameters: int, reach: tuple[float, float] | None = None
+    ) -> Placed:
+        """The same with another function from so many parameters to its table, over another range."""
         q = self.quantity
         if q.stops:  # where they have not moved they make nothing
             whole = table
@@ -181,7 +183,8 @@ class Candidate:
                 y = whole(values)
                 return y - y[0]
 
-        curve = Curve(self.how, self.place, q.of, q.name, self.basis.low, self.basis.high, table)
+        low, high = reach or (self.basis.low, self.basis.high)
+        curve = Curve(self.how, self.place, q.of, q.name, low, high, table)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
     def effect(self, wiggle: float) -> Effect:
@@ -303,7 +306,10 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
     known = [(q, b) for q in quantities(bound, values) if (b := basis_for(q)) is not None]
     out: list[Candidate] = []
 
-    def put(how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True) -> None:
+    def put(
+        how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True,
+        near: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         for q, basis in known:
             if q.name == but or (not moves and q.of // 100 * 100 == OUTPUT and not how.startswith("output")):
                 continue
@@ -312,7 +318,7 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
             if q.stops and not _slips(how, at, q, s):
                 continue
             name = f"{at}.{'gain' if how.endswith('times') else 'curve'}_of_{q.name}"
-            out.append(Candidate(name, how, place, at, unit, size, mean and not q.stops, q, basis))
+            out.append(Candidate(name, how, place, at, unit, size, mean and not q.stops, q, basis, q.name in near))
 
     def half(rows: Array) -> float:
         good = rows[np.isfinite(rows)]
@@ -332,10 +338,12 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
                     float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300
                 )
                 mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
-                put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass)
+                own = [s.rates[name]] if name in s.rates else []  # a force on what moves is one of its position, too
+                put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass, near=own)
     if s.kind == "force" and s.allows("force", "force"):
         y = bound.measured[0]
-        put("force adds", 0, "force", next(iter(s.outputs.values())), 0.5 * float(np.sqrt(np.nanmean(y**2))))
+        size = 0.5 * float(np.sqrt(np.nanmean(y**2)))
+        put("force adds", 0, "force", next(iter(s.outputs.values())), size, near=("position", "velocity"))
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
         if s.allows("input", name):
@@ -389,6 +397,7 @@ class OwnGround:
         self.logs, self.floor = logs, logs.fitted.floor
         self.whole = logs.fitted.stage
         self.tests = frozenset(logs.test.logs if logs.test else ())
+        self._in_tests: dict[str, Array] = {}  # values of quantities there, by name
 
     def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
         """The same with only these laws of the library, and these curves, as effects."""
@@ -405,18 +414,37 @@ class OwnGround:
 
     def within(self, candidate: Candidate) -> dict[str, Array]:
         """Of test logs, the samples where a candidate's quantity is where its curve was learned."""
-        test, q = self.logs.test, candidate.quantity
-        if test is None or q.stops:
+        test = self.logs.test
+        if test is None or candidate.quantity.stops:
             return {}
-        if q.of == COLUMN:
-            values = np.concatenate([test.data.column(k, q.name) for k in range(len(test.data.records))])
-        else:
-            starts = len(test.system.parameters) + len(test.runner.free_starts)
-            plain = with_curves(test, (), ())
-            own = [p.value for p in plain.stage.parameters[:starts]]
-            values = next(o.visited for o in quantities(plain, np.array(own)) if o.name == q.name)
-        inside = candidate.basis.reaches(values)
+        inside = candidate.basis.reaches(self._tested(candidate.quantity))
         return {log: inside[at] for log, at in test.logs.items()}
+
+    def reach(self, candidate: Candidate) -> tuple[float, float]:
+        """The range of a candidate's curve, and as much of that of the test logs as is no further away than it is wide:
+        there a formula goes on.
+        """
+        low, high = candidate.basis.low, candidate.basis.high
+        if self.logs.test is None or candidate.quantity.stops or candidate.quantity.period:
+            return low, high
+        values = self._tested(candidate.quantity)
+        values = values[(values >= 2.0 * low - high) & (values <= 2.0 * high - low)]
+        return min(low, float(values.min(initial=low))), max(high, float(values.max(initial=high)))
+
+    def _tested(self, q: Quantity) -> Array:
+        """Values of a quantity in the test logs."""
+        test = self.logs.test
+        assert test is not None
+        if q.name not in self._in_tests:
+            if q.of == COLUMN:
+                values = np.concatenate([test.data.column(k, q.name) for k in range(len(test.data.records))])
+                self._in_tests[q.name] = values
+            else:
+                starts = len(test.system.parameters) + len(test.runner.free_starts)
+                plain = with_curves(test, (), ())
+                own = [p.value for p in plain.stage.parameters[:starts]]
+                self._in_tests |= {o.name: o.visited for o in quantities(plain, np.array(own)) if o.of != COLUMN}
+        return self._in_tests[q.name]
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""

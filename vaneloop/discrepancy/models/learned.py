@@ -10,50 +10,20 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.base.durations import period_of, within_no_period
-from vaneloop.base.forms import FORMS, Form
-from vaneloop.discrepancy.error_share import score
 from vaneloop.discrepancy.fit import Fit, Judge
-from vaneloop.discrepancy.formulas import begin, text_of
+from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.learning import Ground, Tried, with_held_out
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas, likely
+from vaneloop.discrepancy.models.learning import Ground, Tried
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
-from vaneloop.discrepancy.stage import Array, Effect, Parameter
+from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
 
 __all__ = ["Formula", "LearnedLaw", "law_of"]
 
 DRAWS = 400
 BAND = 0.90
-REFITTED = 5  # formulas that are fitted in the simulation
-NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
-POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
-SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
-STRAIGHT = ("constant", "line", "straight line")
-DEGREES = ("degC", "°C", "C")
-FAR = 100.0  # times the curve's range that a formula's may be
-SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 BINS = 24
-MEANT = 2_000  # values of a quantity of which a formula's mean is taken
-PER_NUMBER = 0.005  # log error that a number of a formula costs
-
-
-@dataclass(frozen=True)
-class Formula:
-    """A formula fitted inside the simulation.
-
-    text     with its numbers
-    numbers  name -> value; ``error``: held-out RMS, in noise floors, with it in the curve's place
-    law      name of the law of the library that it is; "": none
-    level    added to it: less its mean, where a parameter of the model has that
-    """
-
-    form: str
-    text: str
-    numbers: dict[str, float]
-    error: float
-    complexity: int
-    law: str = ""
-    level: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -123,7 +93,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     table, amplitudes = tried.table()
     grid, y = c.grid, table(amplitudes)
-    formulas = _formulas(ground, tried, y)
+    formulas = likely(tried, tried.formulas if tried.formulas is not None else fitted_formulas(ground, tried))
     low, high = _with_formulas(c, y, *_band(tried), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
@@ -184,133 +154,3 @@ def _trades(tried: Tried) -> list[str]:
         if column < len(names) and not told.low[k] <= now.theta[column] <= told.high[k]:
             out.append(names[column])
     return out
-
-
-# ---- formulas --------------------------------------------------------------------------------------------------------
-
-
-def _formulas(ground: Ground, tried: Tried, y: Array) -> list[Formula]:
-    """Formulas that come within `NEAR` of the best, simplest first, each fitted in the simulation."""
-    c = tried.candidate
-    x = c.grid
-    visited = np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
-    at_visited = np.interp(visited, x, y)
-    shaped = []
-    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line, or a constant
-    warm = c.quantity.unit in DEGREES
-    for form in FORMS:
-        if (few and form.name not in ("constant", "line")) or (not warm and form.name == "Arrhenius"):
-            continue
-        if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
-            continue
-        # a gain takes a line through 0, and leaves another mean than a line about the middle: only the bends tell
-        free = {*c.lent, 0} if 1 in c.lent and form.name not in STRAIGHT else c.lent
-        got = begin(form, visited, at_visited, free)
-        if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
-            continue  # nearly a straight line, of which the parameters would have to take all but the bend
-        if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
-            shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
-    shaped.sort(key=lambda s: s[0])
-    fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
-    own = max(rms_of(tried.judge, tried.fit), 1.0)
-    fitted = [f for f in fitted if f.error <= POOR * own]
-    if not fitted:
-        return []
-    fitted.sort(key=lambda f: np.log(f.error) + PER_NUMBER * len(f.numbers))
-    limit = min(f.error for f in fitted) * (1.0 + NEAR)
-    limit = max(limit, min(rms_of(tried.judge, tried.fit), 1.0) * (1.0 + NEAR))
-    out: list[Formula] = []
-    for f in sorted((f for f in fitted if f.error <= limit), key=lambda f: (f.complexity, f.error)):
-        y = values_of(f, visited)
-        if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):
-            out.append(f)
-    return out
-
-
-def _is_shaped(form: Form, numbers: Array, c: Candidate) -> bool:
-    """Whether a formula has the shape that its curve is known to have."""
-    x = c.grid
-    y, other, none = (np.broadcast_to(form.value(q, numbers), q.shape) for q in (x, -x, np.zeros(1)))
-    little = 1e-6 * float(np.max(np.abs(y)))
-    steps = np.diff(y) * (("rising" in c.shape) - ("falling" in c.shape))
-    return bool(
-        ("zero" not in c.shape or abs(none[0]) <= little)
-        and ("odd" not in c.shape or np.max(np.abs(y + other)) <= little)
-        and steps.min() >= -little
-    )
-
-
-def values_of(formula: Formula, q: Array) -> Array:
-    """A formula at values of its quantity."""
-    form = next(f for f in FORMS if f.name == formula.form)
-    return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)
-
-
-def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> Formula | None:
-    """A formula in the curve's place, fitted with the model's own parameters."""
-    c = tried.candidate
-    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
-    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
-    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
-    grid = c.grid
-    been = c.quantity.visited[np.isfinite(c.quantity.visited)]
-    been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
-
-    def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
-        if c.quantity.stops:
-            return float(form.value(grid[:1], n)[0])
-        return 0.0 if c.mean else float(np.mean(form.value(been, n)))
-
-    def table(n: Array) -> Array:
-        return np.broadcast_to(form.value(grid, n) - mean(n), grid.shape).astype(float)
-
-    placed = c.placed_as(table, len(numbers))
-    judge = Judge(ground.stage((), (*tried.curves[:-1], (placed, effect))), ground.floor)
-    theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
-    if not np.all(np.isfinite(judge.stage.run(theta[None]))):
-        return None
-    names = tuple(e.name for e in judge.stage.effects)
-    theta = judge.fit(names[:-1], theta, 8).theta  # first the rest of the model with the formula as it stands
-    fit = with_held_out(judge, judge.fit(names, theta, 12))
-    if not np.isfinite(score(judge, fit)):
-        return None
-    values = form.plain(fit.theta[-len(numbers) :])
-    said = dict(zip(form.numbers, (float(v) for v in values), strict=True))
-    law = library_name(c, form)
-    return Formula(
-        form.name,
-        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0), mean(values)),
-        said,
-        rms_of(judge, fit),
-        form.complexity,
-        law,
-        -mean(values),
-    )
-
-
-# forms that are laws of the library, where the curve is of what is at its own place
-OF_STATE = {
-    "constant": "offset",
-    "line": "leak",
-    "root": "square_root",
-    "signed square": "quadratic_drag",
-    "cube": "cubic",
-}
-OF_FORCE = {"constant": "force_offset", "line": "viscous", "signed square": "quadratic_drag", "sign": "coulomb"}
-OF_POSITION = {"line": "spring", "cube": "cubic_spring"}
-OF_SIGNAL = {"constant": "bias", "line": "gain", "cube": "cubic", "magnitude": "asymmetric_gain"}
-
-
-def library_name(c: Candidate, form: Form) -> str:
-    """Name of the law of the library that a form is at this place; "": none."""
-    where, own = c.how.split()[0], c.quantity.name == c.at.removesuffix("_sensor")
-    if c.how.endswith("times"):
-        return ""
-    if where == "state":
-        table = OF_STATE if own and "/s" in c.unit else OF_FORCE if own else {}
-    elif where == "force":
-        table = OF_FORCE if c.quantity.name == "velocity" else OF_POSITION if c.quantity.name == "position" else {}
-    else:
-        table = OF_SIGNAL if own else {}
-    name = table.get(form.name, "")
-    return f"{c.at}.{name}" if name else ""

@@ -20,6 +20,7 @@ from vaneloop.discrepancy.error_share import (
     HARM,
     LEAST_USE,
     MOST_LEFT,
+    PER_PARAMETER,
     RIVAL,
     UNKNOWN,
     ErrorShare,
@@ -27,9 +28,12 @@ from vaneloop.discrepancy.error_share import (
     worth,
 )
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas
+from vaneloop.discrepancy.models.held_out import Blocks, at_samples, told_by_others, with_held_out
 from vaneloop.discrepancy.models.memory import dissipates, named_lag
 from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
@@ -53,7 +57,8 @@ OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
-FINER, SPLINES = 2, 28  # finalists that are fitted with so many splines where the best still fails
+FORMULAS = 0.5  # log error by which a curve may be worse than the best and may still be told better by a formula
+SPLINES = 28  # of the best finalists where they still fail
 Placings = tuple[tuple[Placed, Effect], ...]
 
 
@@ -82,6 +87,9 @@ class Ground(Protocol):
     def within(self, candidate: Candidate) -> dict[str, Array]:
         """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
 
+    def reach(self, candidate: Candidate) -> tuple[float, float]:
+        """The range of its quantity over which a formula stands in its place."""
+
     def courses(self, curves: Placings, theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""
 
@@ -94,6 +102,8 @@ class Tried:
     told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
     errors  in noise floors, log by log, once they have been simulated
     rivals  names of candidates that do as well in the new one's place
+    rows    whitened error of each sample and its derivatives, once they have been simulated
+    formulas those that were fitted in its place, once they have been
     """
 
     candidate: Candidate
@@ -104,6 +114,14 @@ class Tried:
     told: Fit | None = None
     errors: dict[str, Array] | None = None
     rivals: Sequence[str] = ()
+    rows: tuple[Array, Array] | None = None
+    formulas: list[tuple[Formula, Tried]] | None = None
+
+    def counted(self, known: Array) -> Blocks:
+        """What its blocks hold at samples that count."""
+        if self.rows is None:
+            self.rows = self.judge.linearise(self.fit.theta, self.fit.free)
+        return self.judge._blocks(*(row * known for row in self.rows))
 
     def table(self) -> tuple[Callable[[Array], Array], Array]:
         """From the new curve's amplitudes to its table, and these amplitudes."""
@@ -156,37 +174,6 @@ def _channel(candidate: Candidate) -> str:
     """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
     lag = named_lag(candidate.quantity.name)
     return lag[0] if lag else candidate.quantity.name
-
-
-def held_out(cost: Array, gradients: Array, normals: Array, mine: Array, prior: Array, deviation: Array) -> Array:
-    """Cost of each block with a curve's parameters (``mine``, of all free ones) fitted to the other blocks, within its
-    prior. All in the parameters' scales.
-    """
-    g, a = gradients[:, mine], normals[:, mine][:, :, mine]
-    p = prior[mine]
-    pull = g.sum(axis=0) - p * deviation[mine]
-    total = a.sum(axis=0) + np.diag(p + 1e-9 * np.maximum(np.diag(a.sum(axis=0)), 1e-12))
-    step = np.linalg.solve(total - a, (pull - g)[:, :, None])[:, :, 0]
-    out = cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step)
-    return np.asarray(np.maximum(out, 0.5 * cost))
-
-
-def with_held_out(judge: Judge, fit: Fit) -> Fit:
-    """The fit with the held-out errors of its curves within their priors."""
-    scale = judge.scale[fit.free]
-    mine = fit.free >= len(judge.stage.parameters)
-    if not mine.any():
-        return fit
-    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
-    # what a bound holds stays there, whatever block is left out
-    low, high = (b[fit.free] for b in judge.bounds())
-    pull = fit.gradients.sum(axis=0) - fit.prior * scale**2 * deviation
-    at = fit.theta[fit.free]
-    mine &= ~((at <= low) & (pull < 0.0) | (at >= high) & (pull > 0.0))
-    if not mine.any():
-        return fit
-    held = held_out(fit.cost, fit.gradients, fit.normals, mine, fit.prior * scale**2, deviation)
-    return replace(fit, held_out=held)
 
 
 def _moves(tried: Tried) -> tuple[Array, Array]:
@@ -253,13 +240,14 @@ class Learner:
                 break
             finalists = self._finalists(current)
             out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
-            good = [t for t in finalists if self._earns(fit, t)]
+            good = [t for t in finalists if self._earns(current, t)]
             if not good:
                 break
-            left = {t.candidate.name: self._left(current, t) for t in good}
+            left = {t.candidate.name: self._left(current, t, good) for t in good}
+            self._with_formulas(current, good, left)
             good.sort(key=lambda t: left[t.candidate.name])
             near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
-            near += [t for t in good if t not in near and self._plainer(t, good[0], left)]
+            near += [t for t in good if t not in near and self._plainer(current, t, good[0])]
             near.sort(key=lambda t: self._preferred(t, left[t.candidate.name]))
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
@@ -276,8 +264,12 @@ class Learner:
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
                 break
             best = self._settled(current, best)
-            out.tried.append(replace(best, rivals=rivals))
-            current, fit = best, best.fit
+            current, fit = replace(best, rivals=rivals), best.fit
+            out.tried.append(current)
+            if self.form.fails(fit):  # what splines do not follow is no second law where a formula does
+                current.formulas = fitted_formulas(self.ground, current)
+                if any(not self.form.fails(f.fit) for _, f in current.formulas):
+                    break
         if len(out.tried) > 1:
             self._spare_first(out)
         return self._concluded(out, named)
@@ -290,7 +282,7 @@ class Learner:
         theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
         nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
         alone = self._fitted(nothing, second.candidate, second.wiggle, theta, 16)
-        if score(self.judge, alone.fit) <= score(self.judge, second.fit) + BETTER:
+        if self._score(alone, [alone, first]) <= self._score(second, [alone, first]) + BETTER:
             out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
 
     def _named(self) -> tuple[Judge, Fit] | None:
@@ -319,26 +311,74 @@ class Learner:
         share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
         if left > UNKNOWN and share > MOST_LEFT:
             out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
-        elif named is not None and self.d.effects and not worth(self.judge, named[1], last.fit, self.form.form).good:
+        elif named and self.d.effects and not self._worth(Tried(last.candidate, 0.0, *named, ()), last):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
         else:
             out.verdict = "learned"
         return out
 
-    def _earns(self, before: Fit, tried: Tried) -> bool:
+    def _known(self, among: Sequence[Tried]) -> Array:
+        """Samples where all these curves are told by more than one block."""
+        start, n = self.judge.block_start, len(self.judge.stage.t)
+        known = np.ones(n, dtype=bool)
+        for q in {t.candidate.quantity.name: t.candidate.quantity for t in among}.values():
+            if (values := at_samples(q.visited, n)) is not None:
+                known &= told_by_others(values, start)
+        return known if known.any() else ~known
+
+    def _judged(self, tried: Tried, among: Sequence[Tried]) -> tuple[Judge, Fit]:
+        """A fit with its held-out errors, where all curves of ``among`` know something."""
+        known = self._known(among)
+        if known.all():
+            return self.judge, tried.fit
+        judge = Judge(self.judge.stage, self.ground.floor, keep=known)
+        return judge, with_held_out(tried.judge, tried.fit, tried.counted(known))
+
+    def _score(self, tried: Tried, among: Sequence[Tried] = ()) -> float:
+        """What orders curves: `score`, where all of ``among`` (default: itself) know something."""
+        return score(*self._judged(tried, among or [tried]))
+
+    def _worth(self, before: Tried, tried: Tried) -> bool:
+        """Whether a curve earns its place, where it knows something and what it is held against does."""
+        among = [tried, before] if before.curves else [tried]
+        (judge, was), (_, now) = (self._judged(t, among) for t in (before, tried))
+        return worth(judge, was, now, self.form.form).good
+
+    def _earns(self, before: Tried, tried: Tried) -> bool:
         c = tried.candidate
         if c.quantity.stops:
             table, amplitudes = tried.table()
             if not dissipates(c.basis.low, c.basis.high, table(amplitudes)):
                 return False
-        return worth(self.judge, before, tried.fit, self.form.form).good
+        return self._worth(before, tried)
 
-    def _left(self, before: Tried, tried: Tried) -> float:
-        """Log of the held-out error that a curve leaves, and of what it makes of the test logs' error."""
-        change = self._change(before, tried, self.ground.within(tried.candidate))
-        tests = [v for log, v in change.items() if log in self.ground.tests]
-        return score(self.judge, tried.fit) + (float(np.mean(tests)) if tests else 0.0)
+    def _left(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+        """What orders candidates ``among`` which one is chosen: the score and what each makes of the test logs."""
+        return self._score(tried, among) + self._tested(before, tried, among)
+
+    def _tested(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+        """Log of what a curve makes of the test logs' error, where all of ``among`` know something."""
+        inside = [self.ground.within(t.candidate) for t in among]
+        part = {log: np.logical_and.reduce([i[log] for i in inside if log in i]) for i in inside for log in i}
+        change = self._change(before, tried, part)
+        tests = [c for log, c in change.items() if log in self.ground.tests]
+        return float(np.mean(tests)) if tests else 0.0
+
+    def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
+        """Where the best curve still fails, what each may leave with a formula in its place: a corner or a jump is none
+        for splines. Numbers that a formula spares count for nothing here.
+        """
+        least = min(left.values())
+        if not self.form.fails(min(good, key=lambda t: left[t.candidate.name]).fit):
+            return
+        for t in good:
+            name = t.candidate.name
+            if left[name] > least + FORMULAS:
+                continue
+            for _, f in fitted_formulas(self.ground, t, loose=True):
+                spared = PER_PARAMETER * (len(t.fit.free) - len(f.fit.free))
+                left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
 
     def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
@@ -346,17 +386,17 @@ class Learner:
         """
         return *_plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
 
-    def _plainer(self, tried: Tried, best: Tried, left: Mapping[str, float]) -> bool:
+    def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
         place before it: a damping times a function of the speed is a force that is one of the speed.
         """
         one, other = tried.candidate, best.candidate
         if one.quantity.name != other.quantity.name or one.how.endswith("times") or not other.how.endswith("times"):
             return False
-        if worth(self.judge, tried.fit, best.fit, self.form.form).good:
+        if self._worth(tried, best):
             return False
-        mine, its = (left[t.candidate.name] - score(self.judge, t.fit) for t in (tried, best))
-        return mine < its + HARM  # on test logs
+        mine, its = (self._tested(before, t, [tried, best]) for t in (tried, best))
+        return mine < its + HARM
 
     def _confirmed(self, before: Tried, tried: Tried) -> bool:
         """Whether another log, or another amplitude, says the same of a curve that remembers.
@@ -400,7 +440,7 @@ class Learner:
         if slower is None:
             return None
         more = self._fitted(current, slower, best.wiggle, best.fit.theta, 12)
-        return more if score(self.judge, more.fit) < score(self.judge, best.fit) - STEP else None
+        return more if self._score(more, [more, best]) < self._score(best, [more, best]) - STEP else None
 
     def _settled(self, current: Tried, best: Tried) -> Tried:
         """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
@@ -417,8 +457,8 @@ class Learner:
                 continue
             bends = [found[k] for k in c.kept]
             fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
-            simpler = min(fits, key=lambda t: score(self.judge, t.fit))
-            if score(self.judge, simpler.fit) <= score(self.judge, best.fit) + BETTER:
+            simpler = min(fits, key=self._score)
+            if self._score(simpler) <= self._score(best) + BETTER:
                 return replace(simpler, told=best.fit)
         return best
 
@@ -444,7 +484,7 @@ class Learner:
         for k, t in enumerate(chosen):
             done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
-        done.sort(key=lambda t: score(self.judge, t.fit))
+        done = self._ordered(done)
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}
             reach = min(score(t.judge, t.fit) for t in quick) + NEAR
@@ -452,19 +492,24 @@ class Learner:
             alike = {t.candidate.name for t in plainer if _channel(t.candidate) == _channel(leader)}
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
-            done += [self._finished(current, t) for t in plainer[:PLAINER]]
-            done.sort(key=lambda t: score(self.judge, t.fit))
+            done = self._ordered([*done, *(self._finished(current, t) for t in plainer[:PLAINER])])
         if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
-            finer = [f for t in done[:FINER] if (f := self._finer(current, t)) is not None]
-            done = sorted([*done, *finer], key=lambda t: score(self.judge, t.fit))
-            best = {t.candidate.name: t for t in reversed(done)}
-            done = [t for t in done if best[t.candidate.name] is t]
+            best = self._score(done[0], done)
+            close = [t for t in done if self._score(t, done) < best + NEAR]
+            finer = [f for t in close if (f := self._finer(current, t)) is not None]
+            done = self._ordered([*done, *finer])
+            first_of = {t.candidate.name: t for t in reversed(done)}
+            done = [t for t in done if first_of[t.candidate.name] is t]
         return done
+
+    def _ordered(self, tried: Sequence[Tried]) -> list[Tried]:
+        """The best first."""
+        return sorted(tried, key=lambda t: self._score(t, tried))
 
     def _finished(self, current: Tried, quick: Tried) -> Tried:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         options = [self._fitted(current, quick.candidate, w, quick.fit.theta, 12) for w in WIGGLES]
-        return self._with_its_lag(current, min(options, key=lambda o: score(self.judge, o.fit)), TIMES[:1])
+        return self._with_its_lag(current, min(options, key=self._score), TIMES[:1])
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""

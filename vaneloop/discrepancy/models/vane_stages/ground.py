@@ -198,6 +198,10 @@ class VaneGround:
                     out[name] = candidate.basis.reaches(values)
         return out
 
+    def reach(self, candidate: Candidate) -> tuple[float, float]:
+        """The range of a candidate's curve: formulas stand in its place over no more."""
+        return candidate.basis.low, candidate.basis.high
+
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
         """The error of every sample of the log."""
         stage = remade(self.all, (), curves)
