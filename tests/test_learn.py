@@ -33,7 +33,7 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
-from vaneloop.discrepancy.models.held_out import held_out
+from vaneloop.discrepancy.models.held_out import held_out, told_by_others
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
 from vaneloop.verbs.learn import learn
@@ -197,6 +197,22 @@ def test_what_is_left_out_is_what_a_refit_leaves() -> None:
         rest = np.arange(blocks) != b
         without = np.linalg.solve(normals[rest].sum(axis=0) + np.diag(prior), pulls[rest].sum(axis=0))
         assert held[b] == pytest.approx(np.sum((y[b] - a[b] @ without) ** 2), rel=1e-6)
+    some = np.random.default_rng(1).random(y.shape) < 0.7  # of samples that count
+    some_a, some_e = a * some[..., None], e * some
+    judged = np.sum(some_e**2, axis=1), np.einsum("bni,bn->bi", some_a, e), np.einsum("bni,bnj->bij", some_a, a)
+    held = held_out(cost, gradients, normals, mine, prior, theta, judged)
+    for b in range(blocks):
+        rest = np.arange(blocks) != b
+        without = np.linalg.solve(normals[rest].sum(axis=0) + np.diag(prior), pulls[rest].sum(axis=0))
+        assert held[b] == pytest.approx(np.sum(((y[b] - a[b] @ without) * some[b]) ** 2), rel=1e-6)
+
+
+def test_where_a_block_alone_has_been_the_others_do_not_tell() -> None:
+    start = np.array([0, 3, 6])
+    q = np.array([0.0, 1.0, 2.0, -1.0, 1.0, 3.0, 0.0, 5.0, 4.0])
+    # the second block alone is below 0, the third alone is above 3
+    assert told_by_others(q, start).tolist() == [True, True, True, False, True, True, True, False, False]
+    assert told_by_others(q, np.array([0])).all()
 
 
 # ---- the law file ----------------------------------------------------------------------------------------------------
@@ -560,6 +576,27 @@ def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
             assert np.array_equal(inside, (oil >= c.basis.low) & (oil <= c.basis.high)) and 0.4 < inside.mean() < 0.9
         elif not c.quantity.remembers:
             assert inside.mean() > 0.99, c.name
+
+
+def test_a_formula_goes_on_where_a_test_log_goes_further() -> None:
+    run = run_of_a_tank()
+    for more, beyond in ((15.0, 15.0), (500.0, 0.0)):
+        further = replace(run, name="further", columns={**run.columns, "oil": run.columns["oil"] + more})
+        ground = OwnGround(bind(TANK, [run], [further]))
+        c = next(c for c in ground.candidates(TANK.bind([run]).stage.neutral()[:2]) if c.name == NAME)
+        low, high = ground.reach(c)
+        assert low == c.basis.low and high == pytest.approx(c.basis.high + beyond, abs=0.1)
+
+
+def test_a_force_of_position_or_speed_is_one_at_the_place_itself() -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    boom = System(
+        "boom", "force", lambda u, p: p.mass * u.acceleration, position="angle", outputs={"torque": "Nm"},
+        parameters=[unknown("mass", 2.0, "kg", low=0.0)],
+    )  # fmt: skip
+    bound = boom.bind([Record("run", t, {"angle": np.sin(t), "torque": np.cos(3.0 * t)})])
+    near = {c.quantity.name for c in candidates(bound, bound.stage.neutral()[:1]) if c.near}
+    assert near == {"position", "velocity"}
 
 
 def boom(seed: int, size: float) -> Record:
