@@ -308,10 +308,14 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
 
     def put(
         how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True,
-        near: Sequence[str] = (),
+        near: Sequence[str] = (), only: str = "",
     ) -> None:  # fmt: skip
         for q, basis in known:
-            if q.name == but or (not moves and q.of // 100 * 100 == OUTPUT and not how.startswith("output")):
+            if (
+                q.name == but
+                or (only and q.name != only)
+                or (not moves and q.of // 100 * 100 == OUTPUT and not how.startswith("output"))
+            ):
                 continue
             if not mean and len(basis.bend) < 2:
                 continue
@@ -355,8 +359,8 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
         if name in s.commands or not s.allows("output", name) or not np.isfinite(bound.measured[i]).any():
             continue
         at = s.reading_of(name)
-        if s.kind != "force":
-            put("output adds", i, at, unit, 0.3 * half(bound.measured[i]))
+        # what else adds to a measured force is a force
+        put("output adds", i, at, unit, 0.3 * half(bound.measured[i]), only=name if s.kind == "force" else "")
         put("output times", i, at, "-", 0.3, but=name)
     return out
 

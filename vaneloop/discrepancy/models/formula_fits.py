@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["fitted_formulas", "library_name", "likely"]
 
+CLOSE = 1e-4  # share of a curve's variance below which formulas are alike
 REFITTED = 5  # formulas that are fitted in the simulation
 NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
 POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
@@ -39,6 +40,19 @@ def _visited(c: Candidate) -> Array:
     return np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
 
 
+def _doubt(tried: Tried, visited: Array) -> float:
+    """Share of a curve's variance that noise may have made: formulas that come nearer are not told apart by that."""
+    c, judge, fit = tried.candidate, tried.judge, tried.fit
+    table, amplitudes = tried.table()
+    scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
+    mine = np.flatnonzero((fit.free >= own.start) & (fit.free < own.stop))
+    covariance = np.linalg.pinv(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
+    covariance *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
+    rows = np.array([np.interp(visited, c.grid, table(step)) for step in np.diag(scale[mine])])
+    variance = float(np.mean(np.einsum("in,ij,jn->n", rows, covariance, rows)))
+    return variance / max(float(np.var(np.interp(visited, c.grid, table(amplitudes)))), 1e-300)
+
+
 def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
     """The formulas that come nearest to a curve, each fitted in the simulation in its place; best first.
 
@@ -49,6 +63,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     table, amplitudes = tried.table()
     at_visited = np.interp(visited, c.grid, table(amplitudes))
     lent = c.lent | ({0, 1} if loose else set())
+    doubt = max(_doubt(tried, visited), CLOSE)
     shaped = []
     few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line, or a constant
     warm = c.quantity.unit in DEGREES
@@ -63,7 +78,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
         if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
             continue  # nearly a straight line, of which the parameters would have to take all but the bend
         if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
-            shaped.append((np.log(max(got[1], 1e-4)) + 0.3 * form.complexity, form, got[0]))
+            shaped.append((np.log(max(got[1], doubt)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
     return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
