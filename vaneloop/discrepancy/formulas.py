@@ -36,10 +36,13 @@ class Formula:
     level: float = 0.0
 
 
-def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array, float] | None:
+def begin(
+    form: Form, q: Array, y: Array, free: Collection[int], weight: Array | None = None
+) -> tuple[Array, float] | None:
     """Numbers with which a form comes nearest to a curve, and the share of the curve's variance that it leaves.
 
-    free  what may be added, as the model does it with parameters that are fitted: a constant (0), a straight line (1)
+    free    what may be added, as the model does it with parameters that are fitted: a constant (0), a straight line (1)
+    weight  of the curve's values (default: 1)
     """
     from scipy.optimize import least_squares
 
@@ -51,13 +54,12 @@ def begin(form: Form, q: Array, y: Array, free: Collection[int]) -> tuple[Array,
     if straight and straight <= set(free):
         return None
     span, low = float(np.ptp(q)), float(q.min())
-    lines = [np.ones(len(q)), q - q.mean()]
-    lines = [g / np.sqrt(g @ g) for k, g in enumerate(lines) if k in free and g.any()]
+    w = np.ones(len(q)) if weight is None else weight
+    lines = [g for k, g in enumerate((np.ones(len(q)), q - q.mean())) if k in free and g.any()]
+    across = np.linalg.qr(w[:, None] * np.array(lines).T)[0] if lines else np.zeros((len(q), 0))
 
     def told(z: Array) -> Array:
-        for g in lines:
-            z = z - g * (g @ z)
-        return z
+        return np.asarray(w * z - across @ (across.T @ (w * z)))
 
     aim = told(y)
     total = float(aim @ aim)

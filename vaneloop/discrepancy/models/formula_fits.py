@@ -14,6 +14,7 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import with_held_out
+from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
@@ -40,17 +41,16 @@ def _visited(c: Candidate) -> Array:
     return np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
 
 
-def _doubt(tried: Tried, visited: Array) -> float:
-    """Share of a curve's variance that noise may have made: formulas that come nearer are not told apart by that."""
+def _variance(tried: Tried, visited: Array) -> Array:
+    """Variance of a curve at values of its quantity, by the noise of what it was fitted to."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
-    table, amplitudes = tried.table()
+    table, _ = tried.table()
     scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
     mine = np.flatnonzero((fit.free >= own.start) & (fit.free < own.stop))
     covariance = np.linalg.pinv(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
     covariance *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
     rows = np.array([np.interp(visited, c.grid, table(step)) for step in np.diag(scale[mine])])
-    variance = float(np.mean(np.einsum("in,ij,jn->n", rows, covariance, rows)))
-    return variance / max(float(np.var(np.interp(visited, c.grid, table(amplitudes)))), 1e-300)
+    return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, covariance, rows), 0.0))
 
 
 def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
@@ -63,7 +63,10 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     table, amplitudes = tried.table()
     at_visited = np.interp(visited, c.grid, table(amplitudes))
     lent = c.lent | ({0, 1} if loose else set())
-    doubt = max(_doubt(tried, visited), CLOSE)
+    variance, spread = _variance(tried, visited), max(float(np.var(at_visited)), 1e-300)
+    weight = 1.0 / np.sqrt(variance + CLOSE * spread)  # a curve is known where the log tells it
+    middle = np.average(at_visited, weights=weight**2)
+    doubt = float(np.sum(weight**2 * variance) / max(np.sum((weight * (at_visited - middle)) ** 2), 1e-300))
     shaped = []
     few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line, or a constant
     warm = c.quantity.unit in DEGREES
@@ -74,11 +77,11 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
             continue
         # a gain takes a line through 0, and leaves another mean than a line about the middle: only the bends tell
         free = {*lent, 0} if 1 in lent and form.name not in STRAIGHT else lent
-        got = begin(form, visited, at_visited, free)
+        got = begin(form, visited, at_visited, free, weight)
         if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
             continue  # nearly a straight line, of which the parameters would have to take all but the bend
         if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
-            shaped.append((np.log(max(got[1], doubt)) + 0.3 * form.complexity, form, got[0]))
+            shaped.append((np.log(max(got[1], doubt, CLOSE)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
     return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
@@ -119,21 +122,23 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
     size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
     ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
     effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
-    reach = ground.reach(c)
-    grid = np.linspace(*reach, POINTS)
     been = c.quantity.visited[np.isfinite(c.quantity.visited)]
     been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
 
     def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
         if c.quantity.stops:
-            return float(form.value(grid[:1], n)[0])
+            return float(form.value(c.grid[:1], n)[0])
         return 0.0 if c.mean else float(np.mean(form.value(been, n)))
 
-    def table(n: Array) -> Array:
-        return np.broadcast_to(form.value(grid, n) - mean(n), grid.shape).astype(float)
+    def placed(low: float, high: float) -> Placed:
+        grid = np.linspace(low, high, POINTS)
 
-    placed = c.placed_as(table, len(numbers), reach)
-    curves = (*tried.curves[:-1], (placed, effect))
+        def table(n: Array) -> Array:
+            return np.broadcast_to(form.value(grid, n) - mean(n), grid.shape).astype(float)
+
+        return c.placed_as(table, len(numbers), (low, high))
+
+    curves = (*tried.curves[:-1], (placed(c.basis.low, c.basis.high), effect))
     judge = Judge(ground.stage((), curves), ground.floor)
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
@@ -154,7 +159,8 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         library_name(c, form),
         -mean(values),
     )
-    as_it = replace(tried, judge=judge, fit=fit, curves=curves, told=None, errors=None, rows=None, formulas=None)
+    further = (*tried.curves[:-1], (placed(*ground.reach(c)), effect))  # on test logs
+    as_it = replace(tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None)
     return formula, as_it
 
 
