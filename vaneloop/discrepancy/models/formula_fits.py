@@ -9,11 +9,11 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.base.forms import FORMS, Form
-from vaneloop.discrepancy.error_share import score
+from vaneloop.discrepancy.error_share import FORM, score
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
 from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.held_out import with_held_out
+from vaneloop.discrepancy.models.held_out import at_samples, with_held_out
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
@@ -36,9 +36,12 @@ MEANT = 2_000  # values of a quantity of which a formula's mean is taken
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
 
-def _visited(c: Candidate) -> Array:
-    """Values of a candidate's quantity, as often as the logs have them."""
-    return np.quantile(c.quantity.visited[np.isfinite(c.quantity.visited)], np.linspace(0.005, 0.995, POINTS))
+def _visited(tried: Tried) -> Array:
+    """Values of a curve's quantity, as often as the samples that are judged have them."""
+    q, counted = tried.candidate.quantity.visited, tried.judge.valid.any(axis=0)
+    judged = at_samples(q, len(counted))
+    x = q[np.isfinite(q)] if judged is None or not counted.any() else judged[counted]
+    return np.quantile(x, np.linspace(0.005, 0.995, POINTS))
 
 
 def _variance(tried: Tried, visited: Array) -> Array:
@@ -59,7 +62,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     loose  whether only the curve's bends choose them: its mean and slope may be what parameters of the model could have
     """
     c = tried.candidate
-    visited = _visited(c)
+    visited = _visited(tried)
     table, amplitudes = tried.table()
     at_visited = np.interp(visited, c.grid, table(amplitudes))
     lent = c.lent | ({0, 1} if loose else set())
@@ -87,15 +90,19 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
 
 
-def likely(tried: Tried, fitted: list[tuple[Formula, Tried]]) -> list[Formula]:
-    """Of formulas that were fitted those that come within `NEAR` of the best, simplest first."""
+def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> list[Formula]:
+    """Of formulas that were fitted those that come within `NEAR` of the best, simplest first.
+
+    before  held-out error without the curve, in noise floors: no law's form is known better than `FORM` of it
+    """
     own = rms_of(tried.judge, tried.fit)
-    near = [f for f, _ in fitted if f.error <= POOR * max(own, 1.0)]
+    poor = float(np.hypot(POOR * max(own, 1.0), FORM * before))
+    near = [f for f, _ in fitted if f.error <= poor]
     if not near:
         return []
     limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + NEAR)
     out: list[Formula] = []
-    visited = _visited(tried.candidate)
+    visited = _visited(tried)
     for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):
         y = values_of(f, visited)
         if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):

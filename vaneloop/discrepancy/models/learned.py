@@ -93,7 +93,8 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     table, amplitudes = tried.table()
     grid, y = c.grid, table(amplitudes)
-    formulas = likely(tried, tried.formulas if tried.formulas is not None else fitted_formulas(ground, tried))
+    fitted = tried.formulas if tried.formulas is not None else fitted_formulas(ground, tried)
+    formulas = likely(tried, fitted, rms_of(*before))
     low, high = _with_formulas(c, y, *_band(tried), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
