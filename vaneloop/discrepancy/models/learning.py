@@ -170,6 +170,11 @@ def _plain(candidate: Candidate) -> tuple[int, bool]:
     return _strange(candidate), candidate.how.endswith("times")
 
 
+def _adds_what(one: Candidate, other: Candidate) -> bool:
+    """Whether a curve adds, of the same quantity, where another multiplies."""
+    return one.quantity.name == other.quantity.name and not one.how.endswith("times") and other.how.endswith("times")
+
+
 def _channel(candidate: Candidate) -> str:
     """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
     lag = named_lag(candidate.quantity.name)
@@ -245,10 +250,7 @@ class Learner:
                 break
             left = {t.candidate.name: self._left(current, t, good) for t in good}
             self._with_formulas(current, good, left)
-            good.sort(key=lambda t: left[t.candidate.name])
-            near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
-            near += [t for t in good if t not in near and self._plainer(current, t, good[0])]
-            near.sort(key=lambda t: self._preferred(t, left[t.candidate.name]))
+            near = self._near(current, good, left)
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
                 out.notes.append(
@@ -386,12 +388,21 @@ class Learner:
         """
         return *_plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
 
+    def _near(self, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+        """The candidates that do as well as the best, plainest first; ``good`` is put in order."""
+        good.sort(key=lambda t: left[t.candidate.name])
+        near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
+        plainer = [t for t in good if t not in near and self._plainer(before, t, good[0])]
+        limit = max((left[t.candidate.name] for t in plainer), default=-np.inf) + RIVAL  # as good as one of those
+        alike = [t for t in good if t not in near and _adds_what(t.candidate, good[0].candidate)]
+        near += [t for t in alike if t in plainer or left[t.candidate.name] < limit]
+        return sorted(near, key=lambda t: self._preferred(t, left[t.candidate.name]))
+
     def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
         place before it: a damping times a function of the speed is a force that is one of the speed.
         """
-        one, other = tried.candidate, best.candidate
-        if one.quantity.name != other.quantity.name or one.how.endswith("times") or not other.how.endswith("times"):
+        if not _adds_what(tried.candidate, best.candidate):
             return False
         if self._worth(tried, best):
             return False
