@@ -168,8 +168,10 @@ def build_chain(
                 f"{name}: not logged; {value:g} {UNITS[name]} assumed, and effects that need it to change cannot be "
                 f"seen"
             )
+    full = machine.table.actuator.stroke.value
     if {"x_lvdt", "i_cmd"} <= columns.keys():
-        smooth = without_noise(t, have, machine)
+        rough = Driven(t, have, machine, cal, (), usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
+        smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs:
             law, *off = servo_law(t, have, cal, smooth, draws)
@@ -180,7 +182,7 @@ def build_chain(
                     f"demand"
                 )
                 columns["i_cmd"] = have["i_cmd"]
-                smooth = without_noise(t, have, machine)
+                smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
                 law, *off = servo_law(t, have, cal, smooth, draws)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
@@ -193,7 +195,7 @@ def build_chain(
     turns: Callable[[], dict[str, Array]] = dict
     if "x_lvdt" in columns:
         stroke = have.get("stroke", columns["x_lvdt"])
-        turns = lru_cache(partial(reversals, t, stroke, machine.table.actuator.stroke.value))
+        turns = lru_cache(partial(reversals, t, stroke, full))
     regimes, units = regimes_of(t, columns)
     bits = _lost_bits(log, machine)
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {

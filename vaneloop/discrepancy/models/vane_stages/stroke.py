@@ -10,9 +10,9 @@ from scipy.ndimage import convolve1d, uniform_filter1d
 
 from hil.figures import noise_floor
 from plant import Plant, chain, places
-from plant.effects import CURVES
 from plant.parameters import NAMES, derive
 from plant.stages import actuator_run, step_currents
+from plant.stages.blocks import NOTHING
 from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.models.vane_stages.raster import SUBSTEPS
 from vaneloop.discrepancy.stage import Array
@@ -47,15 +47,16 @@ class Smooth(NamedTuple):
         return np.asarray(_smoothed(noise, self.rows) + uneven)
 
 
-def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
+def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = NOTHING) -> Smooth:
     """The logged stroke with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
 
     The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by
     leave-one-out errors.
+
+    known  signals of the machine's curves (`plant.curve.take`)
     """
     dt = float(t[1] - t[0])
     p = machine.p.copy()
-    p[CURVES] = 0.0  # learned ones are of signals that are not worked out yet
     p[NAMES.index("actuator.stroke")] = 2e3  # the stops out of the way: a wrong null runs away in minutes
     derive(p, dt / SUBSTEPS, dt)
     s = np.zeros((chain.N_STATE, 1))
@@ -63,7 +64,8 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant) -> Smooth:
     out = np.empty((len(t), 1))
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
-    actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out)
+    actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out,
+                 known=known)  # fmt: skip
     # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lags, null
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
     bends = [0.0, *np.quantile(np.abs(step), BENDS)]
