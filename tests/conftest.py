@@ -25,9 +25,9 @@ settings.load_profile("vaneloop")
 # The modules with the longest tests, longest first. Each worker of xdist begins with some of them, so that none is left
 # for the end, when the others have nothing more to do.
 LONG = (
-    "web", "docs", "real_data", "realtime", "vcan", "fleet_run", "your_own_model", "own_laws", "learn", "design",
-    "reading", "machines", "doubts", "record", "search_commands", "hidden_law", "xcp", "rig", "notebooks", "verbs",
-    "strategies", "native", "fmu", "loggers", "lockstep", "effects", "readings", "starts",
+    "web", "docs", "real_data", "learn_periods", "realtime", "vcan", "fleet_run", "your_own_model", "own_laws", "learn",
+    "hidden_effect", "design", "reading", "machines", "doubts", "record", "search_commands", "hidden_law", "xcp", "rig",
+    "notebooks", "verbs", "strategies", "native", "fmu", "loggers", "lockstep", "effects", "readings", "starts",
 )  # fmt: skip
 
 
