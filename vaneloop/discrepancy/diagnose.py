@@ -7,18 +7,20 @@ The fits are those of `vaneloop.discrepancy.search`. What earns an effect its pl
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, recalibrate
 from vaneloop.discrepancy.noise_floor import TOLERATED, NoiseFloor
+from vaneloop.discrepancy.scout import excerpt_of, searched
 from vaneloop.discrepancy.search import Criterion, Search
 from vaneloop.discrepancy.stage import Array, Stage, StageError, noise_of, reach_of
 from vaneloop.discrepancy.stage_answer import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
 
-__all__ = ["Judged", "diagnose_stage", "excerpt_of", "extend_stage", "floor_of", "spread"]
+__all__ = ["Judged", "diagnose_stage", "extend_stage", "floor_of"]
 
 LONG = 60_000  # samples; a stage with more is searched on an excerpt
 SEARCHED = 40_000  # samples of an excerpt, about
@@ -57,7 +59,9 @@ def diagnose_stage(
     if stage.excerpt is None or len(stage.t) < LONG:
         return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
     judge = Judge(stage, floor, keep)
-    base = recalibrate(judge)
+    at = excerpt_of(judge, None, PIECE, SEARCHED)
+    even = Judge(stage.excerpt(at), floor, None if keep is None else keep[..., at])
+    base = judge.fit((), recalibrate(even).theta)  # from near it, where few steps are left
     left = base
     for _ in range(2):
         at = excerpt_of(judge, left, PIECE, SEARCHED)
@@ -76,35 +80,6 @@ def _unless_coarse(stage: Stage, said: StageDiagnosis) -> StageDiagnosis:
         nearest = [f.effect for f in said.effects] or said.nearest
         said = replace(said, verdict="unknown", nearest=nearest, effects=[], refused=list(stage.coarse.values()))
     return said
-
-
-def excerpt_of(judge: Judge, fit: Fit, piece: int, searched: int) -> Array:
-    """Samples to search on, about ``searched``: pieces of whole windows, about ``piece`` long, half of them evenly
-    spaced, the others where ``fit`` fails most.
-    """
-    stage = judge.stage
-    n = len(stage.t)
-    dt = float(np.median(np.diff(stage.t)))
-    window = max(1, round((stage.window or dt) / dt))
-    length = max(1, round(piece / window)) * window
-    pieces = n // length
-    squares = np.sum(judge.errors(fit.theta[None])[0] ** 2, axis=0)
-    cost = squares[: pieces * length].reshape(pieces, length).sum(axis=1)
-    chosen = spread(pieces, max(2, searched // length), np.argsort(-cost).tolist())
-    return (np.array(chosen)[:, None] * length + np.arange(length)).reshape(-1)
-
-
-def spread(pieces: int, many: int, wanted: Iterable[int]) -> list[int]:
-    """Some of the pieces of a log, ascending: half of them evenly spaced, the others as they are ``wanted``, the first
-    before the next.
-    """
-    many = min(many, pieces)
-    chosen = set(np.linspace(0, pieces - 1, many - many // 2).round().astype(int).tolist())
-    for k in wanted:
-        if len(chosen) >= many:
-            break
-        chosen.add(int(k))
-    return sorted(chosen)
 
 
 def _confirm(
@@ -172,8 +147,8 @@ def _to_the_floor(
 
     def ask(floor: Array, last: bool) -> tuple[Fit, Said]:
         judge = Judge(stage, floor, keep)
-        criterion = NoiseFloor(judge, TOLERATED - 1.0) if last else judged(judge)
-        said = _search(Search(criterion, tick))
+        begun: Judged = partial(NoiseFloor, known=TOLERATED - 1.0) if last else judged
+        said = _search(searched(begun(judge), begun, tick))
         return said[1], said
 
     search, current, candidates, steps = _down_to(stage, floor, ask)
@@ -228,9 +203,14 @@ def _grown(
         else:
             options += [f for m, f in singles.items() if m in names]
             leaders = [m for m in ranked if m in names][: criterion.leaders]
-            # of a model that roams, pairs are tried where no effect helps alone
-            alone = criterion.roams and any(criterion.earns(current, f) for f in options)
-            if options and not alone and min(rms_of(search.judge, f) for f in options) > TOLERATED:
+            alone = [f for f in options if criterion.earns(current, f)]
+            # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
+            # than noise, and no other makes up for that beside it
+            tried = list(options)
+            if not criterion.roams and alone and _least(search, tried) > TOLERATED:
+                (first,) = min(alone, key=criterion.order).effects
+                tried += search.best_of([(first, m) for m in names if m != first])
+            if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
                 options += search.best_of(list(itertools.combinations(leaders, 2)))
         ok = [f for f in options if criterion.earns(current, f)]
         if not ok and (other := _on_another_way(search, current, singles)) is not None:
@@ -249,6 +229,11 @@ def _grown(
         current = best
         steps.append((" + ".join(current.effects), rms_of(search.judge, current)))
     return current
+
+
+def _least(search: Search, fits: list[Fit]) -> float:
+    """The least that one of these leaves, in noise floors."""
+    return min(rms_of(search.judge, f) for f in fits)
 
 
 def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fit | None:

@@ -76,6 +76,7 @@ class Judge:
         """
         self.stage, self.floor, self._latest = stage, np.asarray(floor, dtype=float), Latest()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
+        self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
             self.valid &= keep
@@ -291,14 +292,21 @@ class Judge:
                 linear = self._blocks(*derivative((yield thetas)))
             cost, gradients, normals = linear
             here = float(total(cost[None], theta[None])[0])
-            if best is not None and best - here < 0.2 * len(free) and best >= here:
+            little = 0.2 * len(free)
+            if self.roughly:
+                little *= 1.0 + max(here - self.n, 0.0) / EVIDENCE
+            if best is not None and best - here < little and best >= here:
                 break
-            best = here
+            first, best = best is None, here
             if len(free) == 0:
                 break
             a = np.tensordot(block_weights, normals, 1) + np.diag(prior * scale**2)
             g = block_weights @ gradients - prior * scale * (theta[free] - nominal[free])
             limits = [(b[free] - theta[free]) / scale for b in (low, high)]
+            if self.roughly and not first:
+                step = bounded_step(a + 1e-9 * np.diag(np.maximum(np.diag(a), 1e-9)), g, *limits)
+                if 2.0 * float(step @ g) - float(step @ a @ step) < little:  # not even the slope promises more
+                    break
             for _ in range(MOST_DAMPED):
                 trials = []
                 for factor in (0.01, 1.0, 300.0):
@@ -314,14 +322,14 @@ class Judge:
                 k = int(np.argmin(costs))
                 # the last step is the shortest: where even it promises much and nothing came of it, the slope is not
                 # to be trusted so far away
-                stalled = not costs[k] < here and 2.0 * float(step @ g) - float(step @ a @ step) > 0.2 * len(free)
+                stalled = not costs[k] < here and 2.0 * float(step @ g) - float(step @ a @ step) > little
                 if not stalled:
                     break
                 damping *= 1e5
             if not costs[k] < here:
                 break
             damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
-            if here - costs[k] < 0.2 * max(1, len(free)):
+            if here - costs[k] < little:
                 break
         if linear is None:
             thetas, derivative = self._differences(theta, free, scale, high, known)

@@ -73,8 +73,9 @@ def correlation_of(judge: Judge, fit: Fit) -> float:
         if power <= 0.0:
             continue
         total = 1.0
-        spectrum = np.fft.rfft(row, 2 * len(row))
-        for rho in np.fft.irfft(np.abs(spectrum) ** 2)[1 : min(400, len(row) // 4)] / power:
+        lags = min(400, len(row) // 4)
+        spectrum = np.fft.rfft(row, 1 << (len(row) + lags).bit_length())  # of two, or a prime length takes ten times
+        for rho in np.fft.irfft(np.abs(spectrum) ** 2)[1:lags] / power:
             if rho <= 0.05:
                 break
             total += 2.0 * rho * rho  # squares of errors are correlated by rho squared
@@ -188,7 +189,7 @@ class NoiseFloor:
                 (f for f in search.beside(rest) if name not in f.effects), key=lambda f: float(f.held_out.sum())
             )[:5]
             near = [*leading, *(m for f in tried for m in f.effects if m not in (*rest, *leading))]
-            for f in search.best_of([(*rest, other) for other in near if other not in rest]):
+            for f in search.rivals(current, [(*rest, other) for other in near if other not in rest], correlation):
                 alternatives[next(e for e in f.effects if e not in rest)] = f
             freedom = {m: _freedom(judge, f, correlation) for m, f in alternatives.items()}
             # differences are softened by what even the closest leaves; the price of freedom is not

@@ -7,6 +7,8 @@ the errors by d for the size tried, and by a d for a times that size: the best a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vaneloop.discrepancy.fit import Judge
@@ -48,6 +50,31 @@ class Slopes:
         left = np.sum(errors * errors, axis=1) - np.sum((2.0 * pull - step @ self._normal) * step, axis=1)
         return step, [float(v) for v in left]
 
+    def follow(self, errors: Array, low: Array, high: Array) -> tuple[Array, Array]:
+        """How far the free parameters can follow one set of errors within ``low`` and ``high``, in their scales, and
+        the errors then.
+        """
+        step = _best_within(self._normal, self._flat @ errors.ravel(), low, high)
+        return step, np.asarray(errors - (step @ self._flat).reshape(errors.shape))
+
+    def towards(self, errors: Array, groups: Sequence[Array | slice]) -> tuple[float, Array, Array]:
+        """What would be left if one could go as far towards a set as is best: how much, the steps of the free
+        parameters, in their scales, and how many times as far as that set. Each of ``groups``, of outputs that nothing
+        else moves, goes its own way.
+        """
+        way = np.zeros((len(groups), *self.error.shape))
+        for column, outputs in zip(way, groups, strict=True):
+            column[outputs] = self.error[outputs] - errors[outputs]
+        flat = way.reshape(len(groups), -1)
+        across = flat @ self._flat.T
+        a = np.block([[self._normal, across.T], [across, flat @ flat.T + 1e-9 * np.eye(len(groups))]])
+        g = np.concatenate([self._flat @ self.error.ravel(), flat @ self.error.ravel()])
+        ends = zip(self._room, (0.0, LINE[1]), strict=True)
+        low, high = (np.concatenate([room, np.full(len(groups), end)]) for room, end in ends)
+        step = _best_within(a, g, low, high)
+        k = len(self._flat)
+        return float(self.error.ravel() @ self.error.ravel() - 2.0 * g @ step + step @ a @ step), step[:k], step[k:]
+
     def line(self, errors: Array) -> tuple[Array, Array]:
         """By how many times the way from the fit to each set of errors the least would be left, and how much that is:
         float64[sets] each. The free parameters follow, without bounds.
@@ -62,6 +89,36 @@ class Slopes:
         good = size > 1e-9 * np.maximum(np.sum(d * d, axis=1), 1e-300)
         share = np.clip(np.where(good, down / np.where(good, size, 1.0), 0.0), *LINE)
         return share, here - 2.0 * share * down + share**2 * size
+
+
+def _best_within(a: Array, g: Array, low: Array, high: Array) -> Array:
+    """The step within bounds, which are not beyond 0, that minimises step a step / 2 - g step (active sets).
+
+    Unlike a fit, which comes again, it may not leave at a bound what the others then draw away from it.
+    """
+    step, free = np.zeros(len(g)), high > low
+    for _ in range(6 * len(g)):
+        here = np.flatnonzero(free)
+        if here.size:
+            fixed = step.copy()
+            fixed[here] = 0.0
+            way = _solved(a[np.ix_(here, here)], (g - a @ fixed)[here]) - step[here]
+            room = np.where(way > 0.0, high[here], low[here]) - step[here]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.where(way == 0.0, np.inf, room / way)
+            k = int(np.argmin(share))
+            step[here] += min(share[k], 1.0) * way
+            if share[k] < 1.0:
+                step[here[k]] = high[here[k]] if way[k] > 0.0 else low[here[k]]
+                free[here[k]] = False
+                continue
+        pull = g - a @ step
+        inward = np.where(free | (high <= low), 0.0, np.where(step >= high, -pull, pull))
+        k = int(np.argmax(inward))
+        if inward[k] <= 1e-9 * max(float(np.abs(g).max()), 1e-300):
+            break
+        free[k] = True
+    return step
 
 
 def _solved(a: Array, b: Array) -> Array:

@@ -505,6 +505,12 @@ class Search:
             self.promises[key] = found
         return self.promises[key][last][0]
 
+    def rivals(self, fit: Fit, sets: Sequence[tuple[str, ...]], correlation: float) -> list[Fit]:
+        """Fits with these sets of effects, among them those that may turn out to do as well as ``fit``, of whose errors
+        so many count as one; best first.
+        """
+        return self.best_of(sets)
+
     def best_of(self, sets: Sequence[tuple[str, ...]]) -> list[Fit]:
         """Rank these sets of effects by quick fits, finish the leading ones, and return all, best first."""
         if self.criterion.roams:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vaneloop.discrepancy.diagnose import spread
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.locate import Located
+from vaneloop.discrepancy.scout import spread
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of, weigh
 from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of

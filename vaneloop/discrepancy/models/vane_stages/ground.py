@@ -14,7 +14,6 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import STOPS, stops_of
 from vaneloop.base.vanes import VANES
 from vaneloop.discrepancy.curves import COUNT, basis_of
-from vaneloop.discrepancy.diagnose import excerpt_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.curve import COLUMN, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
@@ -25,6 +24,7 @@ from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
+from vaneloop.discrepancy.scout import excerpt_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
 
 __all__ = [
