@@ -49,6 +49,7 @@ WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its
 SCREENED = 1.0  # of them, where candidates are screened
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
 SURE = 3  # of the latter that are chosen by data left out
+SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 PLAINER = 2  # more that are fitted to the end, where they are plainer than the best
@@ -489,9 +490,9 @@ class Learner:
         first, others = quick[:SURE], quick[SURE:]
         others.sort(key=lambda t: float(t.fit.cost.sum()))
         chosen = [*first, *others[: FINISHED - SURE]]
-        # a short excerpt has too few turns for what slips: of hystereses that which promised most goes on, too
-        slipping = next((c.name for _, c, _ in screened if c.quantity.stops), "")
-        chosen += [t for t in quick if t.candidate.name == slipping and t not in chosen]
+        # a short excerpt has too few turns for what slips: the hystereses that promised most go on, too
+        slipping = [c.name for _, c, _ in screened if c.quantity.stops][:SLIPPING]
+        chosen += [t for t in quick if t.candidate.name in slipping and t not in chosen]
         for k, t in enumerate(chosen):
             done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
