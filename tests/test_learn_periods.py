@@ -193,7 +193,9 @@ def drifting():
     diagnoses = []
 
     def finalists(self, current: Tried) -> list[Tried]:
-        return found.setdefault(step_of(self, current), search(self, current))
+        now = search(self, current)
+        found.setdefault(step_of(self, current), now)
+        return now
 
     def diagnosed_once(*words, **options):
         diagnoses.append(diagnose(*words, **options))
