@@ -182,6 +182,11 @@ def _channel(candidate: Candidate) -> str:
     return lag[0] if lag else candidate.quantity.name
 
 
+def _stands(current: Tried, candidate: Candidate) -> bool:
+    """Whether a candidate, with just this lag or period, is one of the curves that were learned already."""
+    return any(q.effect == candidate.name for q, _ in current.curves)
+
+
 def _moves(tried: Tried) -> tuple[Array, Array]:
     """How far the channel that a curve remembers goes in each block, and the number of the log that the block is of."""
     courses, judge = tried.candidate.quantity.course, tried.judge
@@ -449,7 +454,7 @@ class Learner:
     def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
         """The curve with a lag so many times as long; None where that is no better."""
         slower = best.candidate.slower(times)
-        if slower is None:
+        if slower is None or _stands(current, slower):
             return None
         more = self._fitted(current, slower, best.wiggle, best.fit.theta, 12)
         return more if self._score(more, [more, best]) < self._score(best, [more, best]) - STEP else None
@@ -549,8 +554,7 @@ class Learner:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
         quick = self._judge((), current.curves, True)
         slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
-        have = {q.effect for q, _ in current.curves}
-        every = [c for c in (*self.candidates, *self._periodic(current)) if c.name not in have]
+        every = [c for c in (*self.candidates, *self._periodic(current)) if not _stands(current, c)]
         out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
@@ -564,7 +568,7 @@ class Learner:
     ) -> tuple[float, Candidate, Array]:
         """A candidate with the lag that promises most: those that were tried first are far apart."""
         for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
-            while (c := one[1].slower(factor)) is not None:
+            while (c := one[1].slower(factor)) is not None and not _stands(current, c):
                 other = self._promise(current, c, slopes)
                 if other[0] >= one[0]:
                     break
