@@ -26,9 +26,10 @@ from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import waves_of
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.learning import Learner, Tried
+from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import every
+from vaneloop.discrepancy.models.tried import Tried
 from vaneloop.verbs.learn import learn, learned
 from vaneloop.verbs.search import diagnose, diagnosed
 

@@ -25,7 +25,8 @@ from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.models.learning import Learner, Tried
+from vaneloop.discrepancy.models.learning import Learner
+from vaneloop.discrepancy.models.tried import Tried
 from vaneloop.discrepancy.models.vane_stages.driven import Made
 from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, SLIPS, VaneGround, curve_effect, with_laws
 from vaneloop.discrepancy.models.vanes import build_chain

@@ -10,7 +10,7 @@ import numpy as np
 from vaneloop.base.signals import heading
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
-from vaneloop.discrepancy.models.learning import Outcome
+from vaneloop.discrepancy.models.tried import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page

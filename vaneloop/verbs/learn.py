@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.fit import Fit, Judge
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.learned import LearnedLaw
-    from vaneloop.discrepancy.models.learning import Outcome
+    from vaneloop.discrepancy.models.tried import Outcome
     from vaneloop.discrepancy.models.vanes import Chain
     from vaneloop.pages.page import Page
 
@@ -201,7 +201,8 @@ def learned(
     found   the diagnosis of this log, where that has been made
     """
     from vaneloop.discrepancy.models.learned import law_of
-    from vaneloop.discrepancy.models.learning import Learner, Outcome
+    from vaneloop.discrepancy.models.learning import Learner
+    from vaneloop.discrepancy.models.tried import Outcome
     from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
 
     tell = progress or (lambda _: None)

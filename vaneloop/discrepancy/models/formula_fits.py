@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +14,9 @@ from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import at_samples, with_held_out
 from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
-
-if TYPE_CHECKING:
-    from vaneloop.discrepancy.models.learning import Ground, Tried
 
 __all__ = ["fitted_formulas", "library_name", "likely"]
 

@@ -14,8 +14,8 @@ from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas, likely
-from vaneloop.discrepancy.models.learning import Ground, Tried
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
+from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
 

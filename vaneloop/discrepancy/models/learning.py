@@ -10,8 +10,7 @@ laws with names it must do clearly better than the best of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,21 +27,31 @@ from vaneloop.discrepancy.error_share import (
     worth,
 )
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
-from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
-from vaneloop.discrepancy.models.held_out import Blocks, at_samples, told_by_others, with_held_out
-from vaneloop.discrepancy.models.memory import dissipates, named_lag
-from vaneloop.discrepancy.models.periods import Course, Lines
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
-from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.held_out import at_samples, told_by_others, with_held_out
+from vaneloop.discrepancy.models.memory import dissipates
+from vaneloop.discrepancy.models.periods import Lines
+from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.tried import (
+    Ground,
+    Outcome,
+    Placings,
+    Tried,
+    adds_what,
+    channel_of,
+    moves,
+    plain,
+    stands,
+    step_without,
+)
 from vaneloop.discrepancy.promise import Slopes
-from vaneloop.discrepancy.stage import Array, Effect, Stage
+from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
-__all__ = ["Ground", "Learner", "Outcome", "Placings", "Tried"]
+__all__ = ["Learner"]
 
 MOST_CURVES = 2
 WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
@@ -60,153 +69,6 @@ PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
 FORMULAS = 0.5  # log error by which a curve may be worse than the best and may still be told better by a formula
 SPLINES = 28  # of the best finalists where they still fail
-Placings = tuple[tuple[Placed, Effect], ...]
-
-
-class Ground(Protocol):
-    """What curves are learned on: one stage of a model, held against logs.
-
-    whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
-    tests  names of the logs that nothing is fitted to
-    """
-
-    whole: Stage
-    floor: Array
-    tests: frozenset[str]
-
-    def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
-        """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
-        samples as tell which candidates to fit.
-        """
-
-    def candidates(self, theta: Array) -> list[Candidate]:
-        """Every curve that may be missing, at parameters ``theta`` of a stage without any."""
-
-    def errors(self, curves: Placings, theta: Array) -> dict[str, Array]:
-        """Error of every sample of each output in noise floors, log by log, test logs too; NaN where none is known."""
-
-    def within(self, candidate: Candidate) -> dict[str, Array]:
-        """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
-
-    def reach(self, candidate: Candidate) -> tuple[float, float]:
-        """The range of its quantity over which a formula stands in its place."""
-
-    def courses(self, curves: Placings, theta: Array) -> list[Course]:
-        """The error of every sample of the logs that are fitted."""
-
-
-@dataclass
-class Tried:
-    """A curve fitted beside the model, and curves before it.
-
-    curves  each as it runs and as the search has it, the new one last
-    told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
-    errors  in noise floors, log by log, once they have been simulated
-    rivals  names of candidates that do as well in the new one's place
-    rows    whitened error of each sample and its derivatives, once they have been simulated
-    formulas those that were fitted in its place, once they have been
-    """
-
-    candidate: Candidate
-    wiggle: float
-    judge: Judge
-    fit: Fit
-    curves: Placings
-    told: Fit | None = None
-    errors: dict[str, Array] | None = None
-    rivals: Sequence[str] = ()
-    rows: tuple[Array, Array] | None = None
-    formulas: list[tuple[Formula, Tried]] | None = None
-
-    def counted(self, known: Array) -> Blocks:
-        """What its blocks hold at samples that count."""
-        if self.rows is None:
-            self.rows = self.judge.linearise(self.fit.theta, self.fit.free)
-        return self.judge._blocks(*(row * known for row in self.rows))
-
-    def table(self) -> tuple[Callable[[Array], Array], Array]:
-        """From the new curve's amplitudes to its table, and these amplitudes."""
-        curve = self.curves[-1][0].curve
-        assert curve is not None
-        return curve.table, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
-
-
-@dataclass
-class Outcome:
-    """What learning says.
-
-    verdict  learned; named: laws of the library do as well; none: nothing is missing; unknown: no honest law is there
-    tried    the model with its curves, curve by curve
-    nearest  the candidates that come nearest, where nothing was learned
-    why      in words, where nothing was learned
-    """
-
-    verdict: str
-    tried: list[Tried] = field(default_factory=list)
-    nearest: list[str] = field(default_factory=list)
-    why: str = ""
-    notes: list[str] = field(default_factory=list)
-
-
-def _strange(candidate: Candidate) -> int:
-    """Which of several candidates that do as well is meant: the lower, the plainer.
-
-    What is at a place itself is plainer than what another signal says of it. Reversals follow from every quantity that
-    turns, and time from every one that drifts. What remembers imitates most.
-    """
-    name = candidate.quantity.name
-    if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or candidate.near:
-        return 0
-    if candidate.quantity.remembers:
-        return 4
-    if name.startswith((WAY, DISTANCE, SINCE)) or candidate.quantity.period:
-        return 3
-    return 2 if name == TIME else 1
-
-
-def _plain(candidate: Candidate) -> tuple[int, bool]:
-    """What orders candidates that do as well, whatever they leave: the less, the plainer; what adds before what
-    multiplies.
-    """
-    return _strange(candidate), candidate.how.endswith("times")
-
-
-def _adds_what(one: Candidate, other: Candidate) -> bool:
-    """Whether a curve adds, of the same quantity, where another multiplies."""
-    return one.quantity.name == other.quantity.name and not one.how.endswith("times") and other.how.endswith("times")
-
-
-def _channel(candidate: Candidate) -> str:
-    """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
-    lag = named_lag(candidate.quantity.name)
-    return lag[0] if lag else candidate.quantity.name
-
-
-def _stands(current: Tried, candidate: Candidate) -> bool:
-    """Whether a candidate, with just this lag or period, is one of the curves that were learned already."""
-    return any(q.effect == candidate.name for q, _ in current.curves)
-
-
-def _moves(tried: Tried) -> tuple[Array, Array]:
-    """How far the channel that a curve remembers goes in each block, and the number of the log that the block is of."""
-    courses, judge = tried.candidate.quantity.course, tried.judge
-    log = np.repeat(np.arange(len(courses)), [len(c) for c in courses])
-    course = np.concatenate(courses)
-    n, start = judge.measured.shape[1], judge.block_start
-    some = slice(None, None, max(1, round(len(course) / n)))
-    course, log = course[some][:n], log[some][:n]
-    return np.maximum.reduceat(course, start) - np.minimum.reduceat(course, start), log[start]
-
-
-def _step_without(tried: Tried, held: Array) -> Array:
-    """Where a fit's parameters move, in their scales, when these blocks are left out."""
-    fit, judge = tried.fit, tried.judge
-    scale = judge.scale[fit.free]
-    prior = fit.prior * scale**2
-    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
-    a = fit.normals[~held].sum(axis=0)
-    a = a + np.diag(prior + 1e-9 * np.maximum(np.diag(a), 1e-12))
-    return np.asarray(np.linalg.solve(a, fit.gradients[~held].sum(axis=0) - prior * deviation))
 
 
 class Learner:
@@ -392,7 +254,7 @@ class Learner:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
         where the held-out error is noise, less in all.
         """
-        return *_plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
+        return *plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
 
     def _near(self, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
         """The candidates that do as well as the best, plainest first; ``good`` is put in order."""
@@ -400,7 +262,7 @@ class Learner:
         near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
         plainer = [t for t in good if t not in near and self._plainer(before, t, good[0])]
         limit = max((left[t.candidate.name] for t in plainer), default=-np.inf) + RIVAL  # as good as one of those
-        alike = [t for t in good if t not in near and _adds_what(t.candidate, good[0].candidate)]
+        alike = [t for t in good if t not in near and adds_what(t.candidate, good[0].candidate)]
         near += [t for t in alike if t in plainer or left[t.candidate.name] < limit]
         return sorted(near, key=lambda t: self._preferred(t, left[t.candidate.name]))
 
@@ -408,7 +270,7 @@ class Learner:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
         place before it: a damping times a function of the speed is a force that is one of the speed.
         """
-        if not _adds_what(tried.candidate, best.candidate):
+        if not adds_what(tried.candidate, best.candidate):
             return False
         if self._worth(tried, best):
             return False
@@ -426,14 +288,14 @@ class Learner:
         change = self._change(before, tried)
         if change and self.ground.tests & set(change):
             return min(change[log] for log in self.ground.tests & set(change)) < -LEAST_USE
-        moves, log = _moves(tried)
-        large = moves > np.median(moves)
+        far, log = moves(tried)
+        large = far > np.median(far)
         parts = [log == k for k in range(log.max() + 1)] if log.any() else [large, ~large]
-        if not large.any() or not log.any() and not np.median(moves[large]) > OTHER * np.median(moves[~large]) > 0.0:
+        if not large.any() or not log.any() and not np.median(far[large]) > OTHER * np.median(far[~large]) > 0.0:
             return False
         fit, now = tried.fit, before.fit.cost
         for held in parts:
-            step = _step_without(tried, held)
+            step = step_without(tried, held)
             left = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
             if not (fit.cost[held] + left).sum() < (1.0 - LEAST_USE) ** 2 * now[held].sum():
                 return False
@@ -454,7 +316,7 @@ class Learner:
     def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
         """The curve with a lag so many times as long; None where that is no better."""
         slower = best.candidate.slower(times)
-        if slower is None or _stands(current, slower):
+        if slower is None or stands(current, slower):
             return None
         more = self._fitted(current, slower, best.wiggle, best.fit.theta, 12)
         return more if self._score(more, [more, best]) < self._score(best, [more, best]) - STEP else None
@@ -505,8 +367,8 @@ class Learner:
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}
             reach = min(score(t.judge, t.fit) for t in quick) + NEAR
-            plainer = [t for t in quick if t.candidate.name not in have and _plain(t.candidate) < _plain(leader)]
-            alike = {t.candidate.name for t in plainer if _channel(t.candidate) == _channel(leader)}
+            plainer = [t for t in quick if t.candidate.name not in have and plain(t.candidate) < plain(leader)]
+            alike = {t.candidate.name for t in plainer if channel_of(t.candidate) == channel_of(leader)}
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
             done = self._ordered([*done, *(self._finished(current, t) for t in plainer[:PLAINER])])
@@ -554,12 +416,12 @@ class Learner:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
         quick = self._judge((), current.curves, True)
         slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
-        every = [c for c in (*self.candidates, *self._periodic(current)) if not _stands(current, c)]
+        every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
         out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
             c = one[1]
-            best.setdefault((c.how, c.at, _channel(c), _channel(c) == c.quantity.name), one)
+            best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
         first = [self._its_lag(current, one, slopes) for one in list(best.values())[:QUICK]]
         return sorted(first, key=lambda o: o[0])
 
@@ -568,7 +430,7 @@ class Learner:
     ) -> tuple[float, Candidate, Array]:
         """A candidate with the lag that promises most: those that were tried first are far apart."""
         for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
-            while (c := one[1].slower(factor)) is not None and not _stands(current, c):
+            while (c := one[1].slower(factor)) is not None and not stands(current, c):
                 other = self._promise(current, c, slopes)
                 if other[0] >= one[0]:
                     break

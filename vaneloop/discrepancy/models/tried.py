@@ -1,0 +1,181 @@
+"""A curve that was fitted in a model, what it is held against, and which of two that do as well is plainer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.formulas import Formula
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.held_out import Blocks
+from vaneloop.discrepancy.models.memory import named_lag
+from vaneloop.discrepancy.models.periods import Course
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.stage import Array, Effect, Stage
+
+__all__ = [
+    "Ground",
+    "Outcome",
+    "Placings",
+    "Tried",
+    "adds_what",
+    "channel_of",
+    "moves",
+    "plain",
+    "stands",
+    "step_without",
+    "strange",
+]
+
+Placings = tuple[tuple[Placed, Effect], ...]
+
+
+class Ground(Protocol):
+    """What curves are learned on: one stage of a model, held against logs.
+
+    whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
+    tests  names of the logs that nothing is fitted to
+    """
+
+    whole: Stage
+    floor: Array
+    tests: frozenset[str]
+
+    def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
+        """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
+        samples as tell which candidates to fit.
+        """
+
+    def candidates(self, theta: Array) -> list[Candidate]:
+        """Every curve that may be missing, at parameters ``theta`` of a stage without any."""
+
+    def errors(self, curves: Placings, theta: Array) -> dict[str, Array]:
+        """Error of every sample of each output in noise floors, log by log, test logs too; NaN where none is known."""
+
+    def within(self, candidate: Candidate) -> dict[str, Array]:
+        """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
+
+    def reach(self, candidate: Candidate) -> tuple[float, float]:
+        """The range of its quantity over which a formula stands in its place."""
+
+    def courses(self, curves: Placings, theta: Array) -> list[Course]:
+        """The error of every sample of the logs that are fitted."""
+
+
+@dataclass
+class Tried:
+    """A curve fitted beside the model, and curves before it.
+
+    curves  each as it runs and as the search has it, the new one last
+    told    the fit of the curve with the mean and slope that it was found with, where the logs do not tell them
+    errors  in noise floors, log by log, once they have been simulated
+    rivals  names of candidates that do as well in the new one's place
+    rows    whitened error of each sample and its derivatives, once they have been simulated
+    formulas those that were fitted in its place, once they have been
+    """
+
+    candidate: Candidate
+    wiggle: float
+    judge: Judge
+    fit: Fit
+    curves: Placings
+    told: Fit | None = None
+    errors: dict[str, Array] | None = None
+    rivals: Sequence[str] = ()
+    rows: tuple[Array, Array] | None = None
+    formulas: list[tuple[Formula, Tried]] | None = None
+
+    def counted(self, known: Array) -> Blocks:
+        """What its blocks hold at samples that count."""
+        if self.rows is None:
+            self.rows = self.judge.linearise(self.fit.theta, self.fit.free)
+        return self.judge._blocks(*(row * known for row in self.rows))
+
+    def table(self) -> tuple[Callable[[Array], Array], Array]:
+        """From the new curve's amplitudes to its table, and these amplitudes."""
+        curve = self.curves[-1][0].curve
+        assert curve is not None
+        return curve.table, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
+
+
+@dataclass
+class Outcome:
+    """What learning says.
+
+    verdict  learned; named: laws of the library do as well; none: nothing is missing; unknown: no honest law is there
+    tried    the model with its curves, curve by curve
+    nearest  the candidates that come nearest, where nothing was learned
+    why      in words, where nothing was learned
+    """
+
+    verdict: str
+    tried: list[Tried] = field(default_factory=list)
+    nearest: list[str] = field(default_factory=list)
+    why: str = ""
+    notes: list[str] = field(default_factory=list)
+
+
+def strange(candidate: Candidate) -> int:
+    """Which of several candidates that do as well is meant: the lower, the plainer.
+
+    What is at a place itself is plainer than what another signal says of it. Reversals follow from every quantity that
+    turns, and time from every one that drifts. What remembers imitates most.
+    """
+    name = candidate.quantity.name
+    if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or candidate.near:
+        return 0
+    if candidate.quantity.remembers:
+        return 4
+    if name.startswith((WAY, DISTANCE, SINCE)) or candidate.quantity.period:
+        return 3
+    return 2 if name == TIME else 1
+
+
+def plain(candidate: Candidate) -> tuple[int, bool]:
+    """What orders candidates that do as well, whatever they leave: the less, the plainer; what adds before what
+    multiplies.
+    """
+    return strange(candidate), candidate.how.endswith("times")
+
+
+def adds_what(one: Candidate, other: Candidate) -> bool:
+    """Whether a curve adds, of the same quantity, where another multiplies."""
+    return one.quantity.name == other.quantity.name and not one.how.endswith("times") and other.how.endswith("times")
+
+
+def channel_of(candidate: Candidate) -> str:
+    """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
+    lag = named_lag(candidate.quantity.name)
+    return lag[0] if lag else candidate.quantity.name
+
+
+def stands(current: Tried, candidate: Candidate) -> bool:
+    """Whether a candidate, with just this lag or period, is one of the curves that were learned already."""
+    return any(q.effect == candidate.name for q, _ in current.curves)
+
+
+def moves(tried: Tried) -> tuple[Array, Array]:
+    """How far the channel that a curve remembers goes in each block, and the number of the log that the block is of."""
+    courses, judge = tried.candidate.quantity.course, tried.judge
+    log = np.repeat(np.arange(len(courses)), [len(c) for c in courses])
+    course = np.concatenate(courses)
+    n, start = judge.measured.shape[1], judge.block_start
+    some = slice(None, None, max(1, round(len(course) / n)))
+    course, log = course[some][:n], log[some][:n]
+    return np.maximum.reduceat(course, start) - np.minimum.reduceat(course, start), log[start]
+
+
+def step_without(tried: Tried, held: Array) -> Array:
+    """Where a fit's parameters move, in their scales, when these blocks are left out."""
+    fit, judge = tried.fit, tried.judge
+    scale = judge.scale[fit.free]
+    prior = fit.prior * scale**2
+    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    a = fit.normals[~held].sum(axis=0)
+    a = a + np.diag(prior + 1e-9 * np.maximum(np.diag(a), 1e-12))
+    return np.asarray(np.linalg.solve(a, fit.gradients[~held].sum(axis=0) - prior * deviation))
