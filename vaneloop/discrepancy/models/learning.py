@@ -237,17 +237,17 @@ class Learner:
 
     def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
         """Where the best curve still fails, what each may leave with a formula in its place: a corner or a jump is none
-        for splines. Numbers that a formula spares count for nothing here.
+        for splines. Every formula counts as many numbers as the sparest of these curves, however many its own has.
         """
         least = min(left.values())
         if not self.form.fails(min(good, key=lambda t: left[t.candidate.name]).fit):
             return
-        for t in good:
+        close = [t for t in good if left[t.candidate.name] <= least + FORMULAS]
+        sparest = min(len(t.fit.free) for t in close)
+        for t in close:
             name = t.candidate.name
-            if left[name] > least + FORMULAS:
-                continue
             for _, f in fitted_formulas(self.ground, t, loose=True):
-                spared = PER_PARAMETER * (len(t.fit.free) - len(f.fit.free))
+                spared = PER_PARAMETER * (sparest - len(f.fit.free))
                 left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
 
     def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
