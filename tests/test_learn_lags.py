@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,17 +99,25 @@ def test_loop_and_stage_say_the_same_of_a_crank_that_creeps() -> None:
     assert without > 5.0 * clean and with_it < 1.1 * clean
 
 
-def test_its_file_is_taken_and_another_log_confirms_its_scale(tmp_path) -> None:
-    write_model(tmp_path / "law.toml", curved(law(*CREEP)))
-    model = load_model(tmp_path / "law.toml")
-    assert model == curved(law(*CREEP))
-    ((name, creeping),) = model.curves.items()
+def confirmed(model: Model, file: Path):
+    """A law's file is taken, and a log of the loop with the law confirms its scale: the linkage's stage with the law
+    and without, the law, and parameters with three scales.
+    """
+    write_model(file, model)
+    assert load_model(file) == model
+    ((name, curve),) = model.curves.items()
+    effect = curve_effect(name, curve)
     plain = chain_of(run_of(model), Model()).stage("linkage")
-    stage = with_laws(plain, (), [curve_effect(name, creeping)], "loop")
+    stage = with_laws(plain, (), [effect], "loop")
     theta = np.repeat(stage.neutral()[None], 3, axis=0)
     theta[:, stage.index()[name]] = np.array([[0.9], [1.0], [1.1]])
     off = np.nanmean((stage.run(theta) - stage.measured) ** 2, axis=(1, 2))
     assert off[1] < 0.9 * min(off[0], off[2])
+    return stage, plain, effect, theta
+
+
+def test_its_file_is_taken_and_another_log_confirms_its_scale(tmp_path) -> None:
+    confirmed(curved(law(*CREEP)), tmp_path / "law.toml")
 
 
 def test_loop_and_stage_say_the_same_of_an_engine_that_remembers() -> None:

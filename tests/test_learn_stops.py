@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.logs import Channel, Log, write_log
-from plant import Model, build_plant, load_model, write_model
+from plant import Model, build_plant
 from plant.curve import CRANK_ADDS, CURRENT_ADDS, begin, bend, follow, quantity_of
 from plant.effects import N_STATE
 from tests import rig
 from tests.firmware_on_rig import firmware
-from tests.test_learn_lags import TICK, chain_of, left, run_of
+from tests.test_learn_lags import TICK, chain_of, confirmed, left, run_of
 from tests.test_learn_vanes import chain, columns, curved, law
 from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
@@ -28,7 +28,7 @@ from vaneloop.cli.main import main
 from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.tried import Tried
 from vaneloop.discrepancy.models.vane_stages.driven import Made
-from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, SLIPS, VaneGround, curve_effect, with_laws
+from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, SLIPS, VaneGround, with_laws
 from vaneloop.discrepancy.models.vanes import build_chain
 from vaneloop.discrepancy.stage_answer import rms_of
 
@@ -118,19 +118,10 @@ def test_loop_and_stage_say_the_same(place: str, of: str, stage: str) -> None:
 
 
 def test_its_file_is_taken_and_another_log_confirms_its_scale(tmp_path) -> None:
-    write_model(tmp_path / "law.toml", curved(law(*BUSHING, **REACH)))
-    model = load_model(tmp_path / "law.toml")
-    assert model == curved(law(*BUSHING, **REACH))
-    ((name, slipping),) = model.curves.items()
-    plain = chain_of(run_of(model), Model()).stage("linkage")
-    stage = with_laws(plain, (), [curve_effect(name, slipping)], "loop")
-    theta = np.repeat(stage.neutral()[None], 3, axis=0)
-    theta[:, stage.index()[name]] = np.array([[0.9], [1.0], [1.1]])
-    off = np.nanmean((stage.run(theta) - stage.measured) ** 2, axis=(1, 2))
-    assert off[1] < 0.9 * min(off[0], off[2])
+    stage, plain, effect, theta = confirmed(curved(law(*BUSHING, **REACH)), tmp_path / "law.toml")
     rows = np.arange(1200, 2400)  # an excerpt knows what went before it
     assert isinstance(plain.made, Made)
-    part = with_laws(plain.excerpt(rows), (), [curve_effect(name, slipping)], "loop")
+    part = with_laws(plain.excerpt(rows), (), [effect], "loop")
     late = slice(600, None)  # where in their play the rings began is forgotten there
     assert part.run(theta)[:, :, late] == pytest.approx(stage.run(theta)[:, :, rows][:, :, late], abs=1e-4)
 

@@ -194,7 +194,7 @@ class NoiseFloor:
             freedom = {m: _freedom(judge, f, correlation) for m, f in alternatives.items()}
             # differences are softened by what even the closest leaves; the price of freedom is not
             closest = min(alternatives.values(), key=lambda f: float(f.held_out.sum()))
-            soft = max(RIVAL_NATS, RIVAL_SHARE * _left(judge, closest, correlation)) / RIVAL_NATS
+            soft = rival_nats(judge, float(closest.held_out.sum()), correlation) / RIVAL_NATS
             score = {m: -0.5 * f.held_out / (correlation * soft) for m, f in alternatives.items()}
             best, *others = sorted(alternatives, key=lambda m: freedom[m] - float(score[m].sum()))
             if at_bound(judge.stage, alternatives[best], best):  # it gives way to one that does as well within
@@ -351,10 +351,13 @@ def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float
     ``freer`` (nats).
     """
     nats, spreads = gain(judge, other, best, correlation)
-    less = nats > max(RIVAL_NATS, RIVAL_SHARE * _left(judge, best, correlation)) and spreads > RIVAL_SPREADS
+    less = nats > rival_nats(judge, float(best.held_out.sum()), correlation) and spreads > RIVAL_SPREADS
     return less or min(nats, 0.0) + freer > RIVAL_NATS
 
 
-def _left(judge: Judge, fit: Fit, correlation: float) -> float:
-    """What the fit leaves above the noise floor, as well as that is known, in nats: its equations are not nature's."""
-    return 0.5 * (float(fit.held_out.sum()) - judge.n * (1.0 + FLOOR_KNOWN) ** 2) / correlation
+def rival_nats(judge: Judge, squares: float, correlation: float) -> float:
+    """Nats by which one of two effects beats the other, where the better one leaves so many ``squares``: the more, the
+    more it leaves above the noise floor, as well as that is known.
+    """
+    left = 0.5 * (squares - judge.n * (1.0 + FLOOR_KNOWN) ** 2) / correlation
+    return max(RIVAL_NATS, RIVAL_SHARE * left)

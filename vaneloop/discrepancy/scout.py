@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, Task
-from vaneloop.discrepancy.noise_floor import NATS, RIVAL_NATS, RIVAL_SHARE, NoiseFloor
+from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, rival_nats
 from vaneloop.discrepancy.search import DIRECTIONS, SCREENED, Criterion, Search
-from vaneloop.discrepancy.stage import FLOOR_KNOWN, Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["Scouted", "excerpt_of", "searched", "spread"]
 
@@ -56,10 +56,7 @@ class _Ahead(Search):
     def _quick(self, name: str) -> Task[Fit]:
         key = frozenset((name,))
         if key not in self.fits:
-            fits = []
-            for start in self.starts[name]:
-                fits.append((yield from self.judge.fitting((name,), start, 3)))
-            self.fits[key] = min(fits, key=self.judge.total_of)
+            self.fits[key] = yield from self._begun(name)
             self.tick()
         return self.fits[key]
 
@@ -67,8 +64,7 @@ class _Ahead(Search):
         key = frozenset((name,))
         fit = yield from self._quick(name)
         if key not in self.finished:
-            turns = any(p.period for p in self.stage.effect(name).parameters)
-            fit = yield from self.judge.fitting((name,), fit, 30 if turns else 8)
+            fit = yield from self.judge.fitting((name,), fit, self._steps((name,)))
             self.fits[key] = yield from self._refine(name, fit)
             self.finished.add(key)
         return self.fits[key]
@@ -209,17 +205,15 @@ class Scouted(Search):
         """The sum of squares up to which a fit may turn out to do as well as the one that leaves ``best``: four times
         what rivals may have between them.
         """
-        left = 0.5 * (best - judge.n * (1.0 + FLOOR_KNOWN) ** 2) / correlation
-        return best + 2.0 * correlation * 4.0 * max(RIVAL_NATS, RIVAL_SHARE * left)
+        return best + 2.0 * correlation * 4.0 * rival_nats(judge, best, correlation)
 
     def _from(self, rough: Fit) -> Task[Fit]:
         """The fit to the whole log, begun where it stands, or where a part of it does if that is better."""
         effects, key = rough.effects, frozenset(rough.effects)
         if key not in self.fits:
-            turns = len(effects) == 1 and any(p.period for p in self.stage.effect(effects[0]).parameters)
             part, there = self._part(rough)
             start = rough.theta if self.judge.total_of(rough) < part else there
-            fit = yield from self.judge.fitting(effects, start, 30 if turns else 8)
+            fit = yield from self.judge.fitting(effects, start, self._steps(effects))
             if len(effects) == 1:
                 fit = yield from self._refine(effects[0], fit)
             self.fits[key] = fit

@@ -258,17 +258,23 @@ class Search:
         self.starts[name] = [quick.theta, *(f.theta for f in fits[1:])]
         return self.judge.total_of(quick)
 
+    def _begun(self, name: str) -> Task[Fit]:
+        """The best of quick fits of an effect, one from each start."""
+        fits = []
+        for start in self.starts[name]:
+            fits.append((yield from self.judge.fitting((name,), start, 3)))
+        return min(fits, key=self.judge.total_of)
+
+    def _steps(self, effects: Sequence[str]) -> int:
+        """How many steps finish a fit; more of one effect with a direction: a curve leads from one to the next."""
+        return 30 if len(effects) == 1 and any(p.period for p in self.stage.effect(effects[0]).parameters) else 8
+
     def _single(self, name: str) -> Task[Fit]:
         key = frozenset((name,))
         if key not in self.fits:
-            fits = []
-            for start in self.starts[name]:
-                fits.append((yield from self.judge.fitting((name,), start, 3)))
-            best = min(fits, key=self.judge.total_of)
+            best = yield from self._begun(name)
             if float(self.base.cost.sum() - best.cost.sum()) > self.criterion.least:  # worth finishing
-                turns = any(p.period for p in self.stage.effect(name).parameters)
-                # along a curve from direction to direction
-                task = self.judge.fitting((name,), best, 30 if turns else 8)
+                task = self.judge.fitting((name,), best, self._steps((name,)))
                 best = yield from self._finished(task, self.criterion.roams)
                 best = yield from self._refine(name, best)
             self.fits[key] = best

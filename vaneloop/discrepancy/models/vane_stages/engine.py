@@ -25,6 +25,7 @@ def engine_stage(driven: Driven) -> Stage:
         inner = int(round(dt / RASTER))
         n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
     signals = driven.signals()
+    between = np.repeat(signals, inner, axis=1)
     pieces = pieces_of(c["stretch"])
     second = max(1, int(round(1.0 / dt)))
 
@@ -32,7 +33,8 @@ def engine_stage(driven: Driven) -> Stage:
         p = lanes(driven, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
         out = np.empty((len(n_dem), len(thetas)))
-        known = np.repeat(driven.slipping(signals, p), inner, axis=1)
+        slipped = driven.slipping(signals, p)
+        known = between if slipped is signals else np.repeat(slipped, inner, axis=1)
         for piece in pieces:
             head = min(piece.start + second, piece.stop)
             start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
