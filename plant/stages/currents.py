@@ -52,12 +52,20 @@ def _currents(mean: np.ndarray, dt: float, substeps: int, behind: float) -> np.n
     return out
 
 
+@compiled_free
 def _late(parts: np.ndarray, dt: float, substeps: int, behind: float) -> np.ndarray:
     """Currents (n, substeps) between the samples, from those of equal ``parts`` of the time between them that act
-    ``behind`` later.
+    ``behind`` later: the mean over each step.
     """
     n, many = parts.shape
-    edges = np.arange(n * many + 1) * (dt / many) + behind - dt
-    charge = np.concatenate([[0.0], np.cumsum(parts.ravel())]) * (dt / many)
-    at = np.arange(n * substeps + 1) * (dt / substeps) - dt
-    return np.diff(np.interp(at, edges, charge)).reshape(n, substeps) / (dt / substeps)
+    out = np.empty((n, substeps))
+    length = many / substeps  # of a step, in parts; nothing flows before the first
+    for k in range(n):
+        for m in range(substeps):
+            begin = max((k * substeps + m) * length - behind / dt * many, 0.0)
+            end = max((k * substeps + m + 1) * length - behind / dt * many, 0.0)
+            charge = 0.0
+            for i in range(int(begin), min(int(end) + 1, n * many)):
+                charge += (min(end, i + 1.0) - max(begin, float(i))) * parts[i // many, i % many]
+            out[k, m] = charge / length
+    return out

@@ -57,23 +57,29 @@ class Slopes:
         step = _best_within(self._normal, self._flat @ errors.ravel(), low, high)
         return step, np.asarray(errors - (step @ self._flat).reshape(errors.shape))
 
-    def towards(self, errors: Array, groups: Sequence[Array | slice]) -> tuple[float, Array, Array]:
-        """What would be left if one could go as far towards a set as is best: how much, the steps of the free
-        parameters, in their scales, and how many times as far as that set. Each of ``groups``, of outputs that nothing
-        else moves, goes its own way.
+    def towards(
+        self, errors: Array, groups: Sequence[Sequence[Sequence[int]]]
+    ) -> list[tuple[float, Array, Array]]:
+        """What would be left if one could go as far towards each set of errors as is best: how much, the steps of the
+        free parameters, in their scales, and how many times as far as that set. Each of its ``groups`` of outputs,
+        which nothing else moves, goes its own way.
         """
-        way = np.zeros((len(groups), *self.error.shape))
-        for column, outputs in zip(way, groups, strict=True):
-            column[outputs] = self.error[outputs] - errors[outputs]
-        flat = way.reshape(len(groups), -1)
-        across = flat @ self._flat.T
-        a = np.block([[self._normal, across.T], [across, flat @ flat.T + 1e-9 * np.eye(len(groups))]])
-        g = np.concatenate([self._flat @ self.error.ravel(), flat @ self.error.ravel()])
-        ends = zip(self._room, (0.0, LINE[1]), strict=True)
-        low, high = (np.concatenate([room, np.full(len(groups), end)]) for room, end in ends)
-        step = _best_within(a, g, low, high)
-        k = len(self._flat)
-        return float(self.error.ravel() @ self.error.ravel() - 2.0 * g @ step + step @ a @ step), step[:k], step[k:]
+        ways = self.error - errors
+        across = np.array([ways[:, o] @ self.jac[:, o].T for o in range(len(self.error))])  # output, set, parameter
+        sizes, pulls = np.einsum("soi,soi->os", ways, ways), np.einsum("soi,oi->os", ways, self.error)
+        here, pull, k = float(np.sum(self.error**2)), self._flat @ self.error.ravel(), len(self._flat)
+        out = []
+        for s, mine in enumerate(groups):
+            of = [list(outputs) for outputs in mine]
+            both = np.array([across[outputs, s].sum(axis=0) for outputs in of])
+            own = np.diag([sizes[outputs, s].sum() + 1e-9 for outputs in of])
+            a = np.block([[self._normal, both.T], [both, own]])
+            g = np.concatenate([pull, [pulls[outputs, s].sum() for outputs in of]])
+            ends = zip(self._room, (0.0, LINE[1]), strict=True)
+            low, high = (np.concatenate([room, np.full(len(of), end)]) for room, end in ends)
+            step = _best_within(a, g, low, high)
+            out.append((here - 2.0 * g @ step + step @ a @ step, step[:k], step[k:]))
+        return out
 
     def line(self, errors: Array) -> tuple[Array, Array]:
         """By how many times the way from the fit to each set of errors the least would be left, and how much that is:

@@ -116,13 +116,12 @@ class Scouted(Search):
             if first:
                 for (e, _), left in zip(part, slopes.left(errors), strict=True):
                     self.reach[e.name] = max(self.reach.get(e.name, 0.0), abs(left - here))
-            for theta, moved, (e, s) in zip(thetas, errors, part, strict=True):
-                of = [judge._moves[c][0] for c in range(index[e.name].start, index[e.name].stop)]
-                own = sorted({o for o in of if o is not None})
-                split = all(o is not None or p.shape for o, p in zip(of, e.parameters, strict=True)) and len(own) > 1
-                left, step, times = slopes.towards(moved, [slice(o, o + 1) for o in own] if split else [slice(None)])
+            moved = [[judge._moves[c][0] for c in range(index[e.name].start, index[e.name].stop)] for e, _ in part]
+            groups = [_ways(e, of, len(slopes.error)) for (e, _), of in zip(part, moved, strict=True)]
+            ways = slopes.towards(errors, groups)
+            for theta, (left, step, times), (e, s), of, own in zip(thetas, ways, part, moved, groups, strict=True):
                 if left < out[e.name][0]:
-                    far = [times[own.index(o)] if split and o is not None else times[0] for o in of]
+                    far = [times[next((k for k, way in enumerate(own) if o in way), 0)] for o in of]
                     size = np.array([not p.shape for p in e.parameters])
                     none = neutral[index[e.name]]
                     theta[free] += step * judge.scale[free]
@@ -250,6 +249,15 @@ class Scouted(Search):
             rough = {"cost": cost, "held_out": cost, "gradients": none, "normals": none[..., None] * none[:, None]}
             tried.append(replace(ahead, theta=theta, **rough))
         return min(tried, key=self.judge.total_of)
+
+
+def _ways(effect: Effect, moves: Sequence[int | None], outputs: int) -> list[list[int]]:
+    """Outputs that go together towards an effect, whose parameters move these (None: all): those of one output each go
+    on their own.
+    """
+    own = sorted({o for o in moves if o is not None})
+    split = all(o is not None or p.shape for o, p in zip(moves, effect.parameters, strict=True)) and len(own) > 1
+    return [[o] for o in own] if split else [list(range(outputs))]
 
 
 def _tried(effect: Effect) -> list[tuple[float, ...]]:

@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 from controller import Calibration
 from hil.figures import resolution
 from plant import chain
+from vaneloop.base.compiled import compiled
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, WINDOW
 from vaneloop.discrepancy.models.vane_stages.stroke import SMOOTH, Smooth
 from vaneloop.discrepancy.stage import Array
@@ -35,57 +36,76 @@ def servo_law(
     float64[rows, draws].
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
-    kp, ki, kff = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
+    gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
-    stroke = _between(smooth.stroke)
+    stroke = np.empty(when.shape)
+    _between(smooth.stroke, _slopes(smooth.stroke), stroke)
     between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
     stroke[:, -1] = x
-
-    def ramp(demand: Array) -> tuple[Array, Array]:
-        # ticks since the last row: nine of the ramp before, the first of the new one (docs/controller.md, timing)
-        before, two = np.roll(demand, 1), np.roll(demand, 2)
-        before[0], two[:2] = demand[0], demand[0]
-        ticks = two[:, None] + (before - two)[:, None] * (np.arange(2, 12) / 10.0)[None]
-        ticks[:, -1] = before + (demand - before) / 10.0
-        rate = np.repeat((before - two)[:, None], 10, axis=1) / RASTER
-        rate[:, -1] = (demand - before) / RASTER
-        return ticks, rate
-
-    def loop(e: Array) -> Array:
-        return np.asarray(kp * e + ki * np.cumsum(e).reshape(e.shape) * chain.TICK)
-
+    law = np.empty(when.shape)
+    _loop(x_dem, stroke, *gains, law)
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
     draw, step = np.random.default_rng(0), resolution(x_dem)
     of_mean, of_last = np.empty((len(t), draws)), np.empty((len(t), draws))
+    off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
-        off = _between(smooth.left(draw) + smooth.distortion) + between
-        off -= smooth.noise * draw.standard_normal(off.shape)
+        left = smooth.left(draw) + smooth.distortion
+        _between(left, _slopes(left), off)
+        off += between
+        draw.standard_normal(out=ticks)
+        ticks *= smooth.noise
+        np.subtract(ticks, off, out=off)
         off[:, -1] = 0.0
-        digit, digit_rate = ramp(step * draw.uniform(-0.5, 0.5, len(t)))
-        error = loop(off - digit) - kff * digit_rate
-        of_mean[:, k], of_last[:, k] = error.mean(axis=1), error[:, -1]
-    demand, rate = ramp(x_dem)
-    return loop(demand - stroke) + kff * rate, of_mean, of_last
+        _loop(-step * draw.uniform(-0.5, 0.5, len(t)), off, *gains, ticks)
+        of_mean[:, k], of_last[:, k] = ticks.mean(axis=1), ticks[:, -1]
+    return law, of_mean, of_last
 
 
-def _between(x: Array) -> Array:
-    """A cubic spline through the rows, not a knot at the second and the last but one, at the ten ticks up to each row:
-    float64[rows, 10]. Before the first row it is the first.
+@compiled
+def _loop(demand: Array, stroke: Array, kp: float, ki: float, kff: float, out: Array) -> None:
+    """The servo loop's current at the ten ticks up to each row: its integral runs through all of them.
+
+    demand  at each row: ticks since the row before are nine of the ramp before it, then the first of the new one
+            (docs/controller.md, timing)
+    stroke  at each tick, float64[rows, 10]
     """
+    total = 0.0
+    two = before = demand[0]
+    for m in range(len(demand)):
+        for i in range(10):
+            ramp, rate = two + (before - two) * ((i + 2) / 10.0), (before - two) / RASTER
+            if i == 9:
+                ramp, rate = before + (demand[m] - before) / 10.0, (demand[m] - before) / RASTER
+            e = ramp - stroke[m, i]
+            total += e
+            out[m, i] = kp * e + ki * total * chain.TICK + kff * rate
+        two, before = before, demand[m]
+
+
+def _slopes(x: Array) -> Array:
+    """Slopes, per row, of a cubic spline through the rows, not a knot at the second and the last but one."""
     step, n = np.diff(x), len(x)
     bands = np.array([np.ones(n), np.full(n, 4.0), np.ones(n)])
     bands[0, 1], bands[1, 0], bands[1, -1], bands[2, -2] = 2.0, 1.0, 1.0, 2.0
     right = np.empty(n)
     right[1:-1] = 3.0 * (step[1:] + step[:-1])
     right[0], right[-1] = 2.5 * step[0] + 0.5 * step[1], 2.5 * step[-1] + 0.5 * step[-2]
-    slope = solve_banded((1, 1), bands, right)
-    u = np.arange(1, 11) / 10.0
-    ways = np.array([u * u * (3.0 - 2.0 * u), u * (1.0 - u) ** 2, u * u * (u - 1.0)])
-    out = np.empty((n, 10))
+    return np.asarray(solve_banded((1, 1), bands, right))
+
+
+@compiled
+def _between(x: Array, slope: Array, out: Array) -> None:
+    """A cubic spline through the rows, of these ``slope``, at the ten ticks up to each row: float64[rows, 10]. Before
+    the first row it is the first.
+    """
     out[0] = x[0]
-    out[1:] = x[:-1, None] + np.column_stack([step, slope[:-1], slope[1:]]) @ ways
-    return out
+    for m in range(1, len(x)):
+        step = x[m] - x[m - 1]
+        for i in range(10):
+            u = (i + 1) / 10.0
+            v = 1.0 - u
+            out[m, i] = x[m - 1] + u * (u * (3.0 - 2.0 * u) * step + v * (v * slope[m - 1] - u * slope[m]))
 
 
 def between_rows(

@@ -21,6 +21,7 @@ __all__ = ["SMOOTH", "Smooth", "without_noise"]
 
 SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
 SMOOTH_ORDER = 3
+PIECE = 4_000  # rows of which one triangle is made at a time
 AROUND = 1.0  # s: over which what smoothing bends is told from noise
 LAGS = (0.01, 0.03, 0.1)  # s: lags of valve and LVDT by which the motion may trail the model's, as a sum of them
 BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
@@ -66,17 +67,10 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
     actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out,
                  known=known)  # fmt: skip
-    # the model's steps, calibrated by least squares: the flow of both directions as a curve, its lags, null
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
-    bends = [0.0, *np.quantile(np.abs(step), BENDS)]
-    sides = [np.maximum(side * step - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
-    shares = [1.0 - np.exp(-dt / lag) for lag in LAGS]
-    late = [_lagged(step, share) for share in shares]
-    parts = np.column_stack([np.roll(side, k) for side in sides for k in (-1, 0, 1)] + [*late, np.ones(len(t))])
     logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
     whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
-    q, r = np.linalg.qr(parts[whole])  # the singular values of r are those of the parts
-    calibrated = parts @ np.linalg.lstsq(r, q.T @ logged[whole], rcond=None)[0]
+    calibrated = _calibrated(step, dt, logged, whole)
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
     off = c["x_lvdt"] - model
     tried = []
@@ -106,6 +100,29 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     uneven = np.sqrt(share * jerky)
     stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
     return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
+    """The model's steps (mm), with the flow of both directions as a curve, its lags and null as suit the ``logged``
+    ones best in the rows that are ``whole``.
+
+    Least squares by triangles of the rows piece by piece, which stay in the processor's cache.
+    """
+    bends = [0.0, *np.quantile(np.abs(step), BENDS)]
+    late = [_lagged(step, 1.0 - np.exp(-dt / lag)) for lag in LAGS]
+    around = np.concatenate([step[-1:], step, step[:1]])
+    pieces, triangles = [], []
+    for i in range(0, len(step), PIECE):
+        at = slice(i, i + PIECE)
+        steps = around[i : i + PIECE + 2]
+        sides = [np.maximum(side * steps - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
+        shifted = [moved for side in sides for moved in (side[2:], side[1:-1], side[:-2])]
+        null = np.ones(len(shifted[0]))
+        pieces.append(np.array([*shifted, *(x[at] for x in late), null, logged[at]]))
+        triangles.append(np.linalg.qr(pieces[-1][:, whole[at]].T, mode="r"))
+    r = np.linalg.qr(np.concatenate(triangles), mode="r")  # its singular values are those of all rows
+    shares = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=None)[0]
+    return np.concatenate([shares @ piece[:-1] for piece in pieces])
 
 
 # The filters of Savitzky and Golay are `scipy.signal`'s, whose import takes half a second of processor time.
