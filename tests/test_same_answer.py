@@ -6,23 +6,25 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import savgol_coeffs
+from scipy.signal import lfilter, savgol_coeffs
 
 from hil import figures
 from hil.logs import Channel, Log
 from plant import build_plant
+from plant.stages import step_currents
 from tests.conftest import ROOT
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import locate as core
 from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
-from vaneloop.discrepancy.models.vane_stages import stroke
+from vaneloop.discrepancy.models.vane_stages import current, stroke
 from vaneloop.discrepancy.models.vane_stages.raster import rms
 from vaneloop.discrepancy.models.vanes import Chain, _lost_bits, build_chain
 from vaneloop.discrepancy.workflow import compare_stages, locate_stages
@@ -262,6 +264,45 @@ def test_a_stroke_at_rest_after_gross_motion_has_finite_errors() -> None:
     smooth = stroke.without_noise(np.arange(n) * 0.01, columns, build_plant())
     for value in (smooth.stroke, smooth.distortion, smooth.uneven, smooth.left(draw)):
         assert np.all(np.isfinite(value))
+
+
+def test_a_stroke_s_steps_are_calibrated_by_least_squares_of_all_whole_rows() -> None:
+    """However many pieces the rows are taken in, of which the last is short and one has no whole row."""
+    draw = np.random.default_rng(5)
+    n = 2 * stroke.PIECE + 7
+    step, logged, whole = draw.standard_normal(n), draw.standard_normal(n), draw.random(n) > 0.1
+    whole[: stroke.PIECE] = False
+    bends = [0.0, *np.quantile(np.abs(step), stroke.BENDS)]
+    sides = [np.maximum(sign * step - bend, 0.0) for sign in (1.0, -1.0) for bend in bends]
+    late = [lfilter([a], [1.0, a - 1.0], step) for a in (1.0 - np.exp(-0.01 / lag) for lag in stroke.LAGS)]
+    parts = np.column_stack([*(np.roll(side, k) for side in sides for k in (-1, 0, 1)), *late, np.ones(n)])
+    best = np.linalg.lstsq(parts[whole], logged[whole])[0]
+    assert np.allclose(stroke._calibrated(step, 0.01, logged, whole), parts @ best, atol=1e-9)
+
+
+@pytest.mark.parametrize(("many", "substeps", "behind"), [(10, 10, 1e-3), (10, 4, 1e-3), (3, 20, 0.0), (10, 7, 3.3e-3)])
+def test_the_current_of_a_step_is_the_mean_of_what_flows_in_it(many: int, substeps: int, behind: float) -> None:
+    """The parts' current, ``behind`` later, looked up a thousand times in each step."""
+    parts, dt, fine = np.random.default_rng(6).standard_normal((6, many)), 0.01, 1000
+    t = dt / substeps * (np.arange(6 * substeps * fine) + 0.5) / fine - behind
+    at = np.floor(t / dt * many).astype(int)
+    flowing = np.where(at < 0, 0.0, parts.ravel()[np.maximum(at, 0)]).reshape(6, substeps, fine).mean(axis=2)
+    assert np.allclose(step_currents(parts, dt, substeps, behind)[1:], flowing[1:], atol=3e-3)
+
+
+def test_the_servo_s_law_is_the_firmware_s_loop_tick_by_tick() -> None:
+    """Written out: the demand's ramp of ten ticks is nine late, the integral adds up every tick's error."""
+    draw = np.random.default_rng(7)
+    demand, seen = draw.standard_normal(30), draw.standard_normal((30, 10))
+    kp, ki, kff = 3.0, 40.0, 0.05
+    # with the last tick of row 1 the ramp to its demand begins
+    ramps = [np.linspace(before, after, 11)[1:] for before, after in pairwise(demand)]
+    now = np.concatenate([np.full(19, demand[0]), *ramps])[:300]
+    rate = np.diff(now, prepend=demand[0]) / 1e-3
+    e = now - seen.ravel()
+    out = np.empty((30, 10))
+    current._loop(demand, seen, kp, ki, kff, out)
+    assert np.allclose(out.ravel(), kp * e + ki * 1e-3 * np.cumsum(e) + kff * rate)
 
 
 @pytest.mark.parametrize(

@@ -57,9 +57,7 @@ class Slopes:
         step = _best_within(self._normal, self._flat @ errors.ravel(), low, high)
         return step, np.asarray(errors - (step @ self._flat).reshape(errors.shape))
 
-    def towards(
-        self, errors: Array, groups: Sequence[Sequence[Sequence[int]]]
-    ) -> list[tuple[float, Array, Array]]:
+    def towards(self, errors: Array, groups: Sequence[Sequence[Sequence[int]]]) -> list[tuple[float, Array, Array]]:
         """What would be left if one could go as far towards each set of errors as is best: how much, the steps of the
         free parameters, in their scales, and how many times as far as that set. Each of its ``groups`` of outputs,
         which nothing else moves, goes its own way.

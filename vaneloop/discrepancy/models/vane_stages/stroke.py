@@ -120,7 +120,7 @@ def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
         null = np.ones(len(shifted[0]))
         pieces.append(np.array([*shifted, *(x[at] for x in late), null, logged[at]]))
         triangles.append(np.linalg.qr(pieces[-1][:, whole[at]].T, mode="r"))
-    r = np.linalg.qr(np.concatenate(triangles), mode="r")  # its singular values are those of all rows
+    r = np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))  # its singular values are those of all rows
     shares = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=None)[0]
     return np.concatenate([shares @ piece[:-1] for piece in pieces])
 
