@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from numba import njit
@@ -17,8 +21,10 @@ from plant import Model, Plant, build_plant, chain_lanes, linkage, linkage_lanes
 from plant.effects import EFFECTS
 from plant.parameters import nominal
 from plant.series import arcsine
+from plant.stages.blocks import on_all_cores
 from tests.machines import machine
 from vaneloop.base.vanes import VANES
+from vaneloop.fleet.reader import _environment
 
 ANGLE = 1e-10  # deg: series stand for the C library's arctangents; all other signals have the same bits
 
@@ -122,3 +128,25 @@ def test_the_crank_is_the_chain_s_also_where_it_cannot_be_assembled(stroke: floa
     g = build_plant().geometry.arrays()[:4]
     found = linkage_lanes.crank(stroke, linkage_lanes.crank_numbers(*g))
     assert found == pytest.approx(linkage.crank(stroke, *g), abs=1e-12)
+
+
+@pytest.mark.parametrize("allowed", [1, 2])
+def test_lanes_take_no_more_threads_than_the_process_may(allowed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker of a fleet may take one: two workers of two threads on two cores wait for each other."""
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", allowed)
+    used: set[int] = set()
+    both = threading.Barrier(allowed)
+
+    def run(part: range) -> None:
+        used.add(threading.get_ident())
+        both.wait(60.0)
+
+    on_all_cores(run, [range(k, k + 1) for k in range(4)])
+    assert len(used) == allowed
+    assert (used == {threading.get_ident()}) == (allowed == 1)
+
+
+def test_the_process_that_reads_a_fleet_s_logs_may_take_one_thread() -> None:
+    words = "from vaneloop.base.compiled import threads; print(threads())"
+    said = subprocess.run([sys.executable, "-c", words], env=_environment(), capture_output=True, text=True, check=True)
+    assert said.stdout == "1\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from plant.effects import EFFECTS, NEUTRAL, ROW
 from plant.layout import N_NOMINAL
-from vaneloop.base.compiled import inlined
+from vaneloop.base.compiled import inlined, threads
 
 __all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
 
@@ -32,18 +31,20 @@ def parts_of(lanes: int, wide: int, width: int) -> list[range]:
     """Lanes, ``wide`` of them in blocks of ``width``, the rest shared out to the cores: what one thread does at a
     time.
     """
-    each = max(1, -(-(lanes - wide) // (os.cpu_count() or 1)))
+    each = max(1, -(-(lanes - wide) // threads()))
     work = [range(j, min(j + width, wide)) for j in range(0, wide, width)]
     return work + [range(j, min(j + each, lanes)) for j in range(wide, lanes, each)]
 
 
 def on_all_cores(run: Callable[[range], None], work: list[range]) -> None:
     """``run`` all parts: compiled code needs no interpreter. The costly ones, which come last, begin first."""
-    if len(work) == 1:
-        run(work[0])
-        return
-    with ThreadPoolExecutor(min(len(work), os.cpu_count() or 1)) as threads:
-        list(threads.map(run, work[::-1]))
+    many = min(len(work), threads())
+    if many > 1:
+        with ThreadPoolExecutor(many) as pool:
+            list(pool.map(run, work[::-1]))
+    else:
+        for part in work:
+            run(part)
 
 
 def elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:

@@ -29,6 +29,7 @@ __all__ = [
     "inlined",
     "is_cached",
     "sources_digest",
+    "threads",
 ]
 
 KEPT = 6
@@ -92,6 +93,11 @@ in_place_free = _compiler(nogil=True, _nrt=False)
 inlined = _compiler(_nrt=False, forceinline=True)
 # The same for what only lanes side by side call: sums of products may be rounded once, where the processor can.
 fused = _compiler(_nrt=False, forceinline=True, fastmath={"contract"})
+
+
+def threads() -> int:
+    """How many threads compiled code may use side by side: NUMBA_NUM_THREADS, else the cores that this process has."""
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 def is_cached(function: Callable[..., Any]) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.base.compiled import compiled_free
+from vaneloop.base.compiled import compiled_free, threads
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, SENSED, Curve, bent, curves_for_kernel
@@ -179,7 +179,7 @@ class Runner:
                 y[bad] = self.far
             np.clip(y[:, ::every], -self.far, self.far, out=out[i])
 
-        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1 and n * self.steps > SHORT:
+        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1 and n * self.steps > SHORT and threads() > 1:
             with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
                 list(pool.map(one, range(len(thetas))))
         else:
