@@ -60,7 +60,8 @@ class Learned(Table):
     """A law that was learned: a function of one quantity at one place.
 
     how, at, of  what it does, where, of what (docs/learn.md)
-    low, high    where its quantity has been; beyond, the function stays as at its end
+    low, high    where its quantity has been; beyond, the function stays as at its end, or
+    reach        from where to where a formula goes on; beyond, it stays as at these ends
     knots        of a cubic B-spline with ``values`` as coefficients; or
     form         name of a formula with ``values`` as numbers
     size         how large such a function is in usual, in ``unit``
@@ -74,6 +75,7 @@ class Learned(Table):
     values: list[Finite] = Field(min_length=1, max_length=100)
     knots: list[Finite] = Field(default_factory=list, max_length=104)
     form: str = ""
+    reach: list[Finite] = Field(default_factory=list, max_length=2)
     unit: str = ""
     size: Finite = 1.0
 
@@ -90,6 +92,11 @@ class Learned(Table):
             update={"values": [values.get(n, v) for n, v in zip(self.numbers, self.values, strict=True)]}
         )
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """From where to where the function is known, or goes on."""
+        return (self.reach[0], self.reach[-1]) if self.reach else (self.low, self.high)
+
     def check(self, name: str) -> None:
         """Refuse a table that is no curve: InputError, one line, with its ``name``."""
         if not self.low < self.high:
@@ -97,15 +104,21 @@ class Learned(Table):
         if self.form and len(self.numbers) != len(self.values):
             allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
             raise InputError(f"{name}: form (={self.form!r}, {len(self.values)} values) must be one of {allowed}")
+        low, high = self.ends
+        if self.reach and not (self.form and len(self.reach) == 2 and low <= self.low and self.high <= high):
+            raise InputError(
+                f"{name}: reach (={self.reach}) must be of a formula: two numbers that hold low (={self.low:g}) and "
+                f"high (={self.high:g})"
+            )
         if not self.form and (len(self.knots) != len(self.values) + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0)):
             raise InputError(
                 f"{name}: knots ({len(self.knots)} of them) must rise, and be {DEGREE + 1} more than the "
                 f"{len(self.values)} values"
             )
 
-    def table(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Function from its values to the curve at `POINTS` points, evenly from low to high."""
-        x = np.linspace(self.low, self.high, POINTS)
+    def table(self, points: int = POINTS) -> Callable[[np.ndarray], np.ndarray]:
+        """Function from its values to the curve at so many points, evenly from one of its `ends` to the other."""
+        x = np.linspace(*self.ends, points)
         if self.form:
             form = next(f for f in FORMS if f.name == self.form)
             return lambda values: np.broadcast_to(form.value(x, values), x.shape).astype(float)
@@ -234,7 +247,7 @@ def put_curve(p: np.ndarray, curve: Learned, values: Mapping[str, float]) -> Non
     numbers = np.array(curve.now(values).values)
     place, of = PLACES[f"{curve.at} {curve.how}"], quantity_of(curve.of)
     assert of is not None  # `Model.check`
-    at_curve(p, place, of, curve.low, curve.high, curve.table()(numbers)[:, None])
+    at_curve(p, place, of, *curve.ends, curve.table()(numbers)[:, None])
 
 
 def load_model(path: str | Path, plant: Plant | None = None) -> Model:

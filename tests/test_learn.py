@@ -32,7 +32,8 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
+from vaneloop.discrepancy.models.curved import OwnGround, candidates, on_logs, with_curves
+from vaneloop.discrepancy.models.formula_fits import goes_on
 from vaneloop.discrepancy.models.held_out import held_out, told_by_others
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
@@ -578,14 +579,61 @@ def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
             assert inside.mean() > 0.99, c.name
 
 
-def test_a_formula_goes_on_where_a_test_log_goes_further() -> None:
-    run = run_of_a_tank()
-    for more, beyond in ((15.0, 15.0), (500.0, 0.0)):
-        further = replace(run, name="further", columns={**run.columns, "oil": run.columns["oil"] + more})
-        ground = OwnGround(bind(TANK, [run], [further]))
-        c = next(c for c in ground.candidates(TANK.bind([run]).stage.neutral()[:2]) if c.name == NAME)
-        low, high = ground.reach(c)
-        assert low == c.basis.low and high == pytest.approx(c.basis.high + beyond, abs=0.1)
+def test_a_formula_goes_on_while_it_is_not_much_steeper_than_where_logs_have_been() -> None:
+    ground = OwnGround(bind(TANK, [run_of_a_tank()]))
+    c = next(c for c in ground.candidates(TANK.bind([run_of_a_tank()]).stage.neutral()[:2]) if c.name == NAME)
+    low, high = c.basis.low, c.basis.high
+    span = high - low
+    form = {f.name: f for f in FORMS}
+    assert goes_on(ground, c, form["line"], np.array([2.0])) == pytest.approx((low - span, high + span))
+    assert goes_on(ground, c, form["cube"], np.array([-1.0])) == pytest.approx((low - span, high + span))
+    rate = 4.0 / span  # its slope is ten times that at the end of the logs log(10) / rate beyond
+    end = goes_on(ground, c, form["exponential"], np.array([1.0, rate]))[1]
+    assert end == pytest.approx(high + np.log(10.0) / rate, abs=0.01 * span)
+    pole = goes_on(ground, c, form["inverse"], np.array([1.0]))[0]
+    assert 0.0 < pole < low and (pole / low) ** 2 == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_law_that_goes_on_or_jumps_is_what_its_file_says(bound) -> None:
+    """A table of a formula is fine enough for three times the range; a jump is one, and not a slope of the table."""
+    file = Learned(how="input adds", at="pump", of="oil", low=20.0, high=60.0, form="step", values=[0.5, 41.3])
+    told = file.model_copy(update={"reach": [-20.0, 100.0]})
+    for law in (file, told):
+        placed, _ = from_file("p.q", law, bound.data)
+        q = np.array([41.2, 41.299, 41.301, 41.4, 99.0])
+        assert placed.curve.at(q, placed.curve.row(np.array(law.values))).tolist() == [0.0, 0.0, 0.5, 0.5, 0.5]
+    for wrong in ({"reach": [30.0, 100.0]}, {"reach": [1.0]}, {"form": "", "knots": [0.0] * 6, "reach": [0.0, 100.0]}):
+        with pytest.raises(StageError, match="reach|knots"):
+            from_file("p.q", told.model_copy(update=wrong), bound.data)
+
+
+def hardening(seed: int, size: float) -> Record:
+    """A slide that is moved, with a spring that nobody listed: 90 position^3."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 30.0, 0.03)
+    way = size * (np.sin(1.1 * t + seed) + 0.4 * np.sin(2.9 * t))
+    speed = np.gradient(way, t)
+    force = 2.0 * np.gradient(speed, t) + 5.0 * speed + 90.0 * way**3
+    return Record(f"slide {seed}", t, {"way": way, "force": force + 0.05 * rng.standard_normal(len(t))})
+
+
+def test_a_formula_that_does_as_well_as_its_curve_is_the_law(tmp_path: Path) -> None:
+    """And holds on a log that goes further, where the curve is off."""
+    system = System(
+        "slide", "force", lambda u, p: p.mass * u.acceleration + p.viscous * u.velocity, position="way",
+        outputs={"force": "N"}, without=["force.cubic_spring", "force.spring", "force.elastic_plastic"],
+        parameters=[unknown("mass", 1.0, "kg", low=0.0), unknown("viscous", 3.0, "N s/m", low=0.0)],
+    )  # fmt: skip
+    logs, test = [hardening(1, 0.3)], [hardening(3, 0.5)]
+    said = learn(logs, system, test=test)
+    (law,), (curve,) = said.laws, said.outcome.tried
+    assert law.name == "force.curve_of_position" and "near" not in law.sentence()
+    assert law.spoken.form == "cube" and law.spoken.numbers["a"] == pytest.approx(90.0, rel=0.01)
+    (left,) = said.by_log.tested().values()
+    worse = on_logs(said.by_log.logs, curve.curves).figures(curve.fit.theta)["slide 3"]
+    assert left < 2.0 and worse[0] > 10.0 * left * curve.judge.floor[0]
+    file = read(said.write(tmp_path / "law.toml"), Model).curves[law.name]
+    assert file.form == "cube" and tuple(file.reach) == law.reach
+    assert law.reach[0] < -0.7 and law.reach[1] > 0.7  # where the test log has been
 
 
 def test_a_force_of_position_or_speed_is_one_at_the_place_itself() -> None:

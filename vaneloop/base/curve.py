@@ -6,10 +6,11 @@ import numpy as np
 
 from vaneloop.base.compiled import inlined
 
-__all__ = ["DEGREE", "POINTS", "between_points", "on_table", "splines"]
+__all__ = ["DEGREE", "FINE", "POINTS", "between_points", "on_table", "splines"]
 
 DEGREE = 3  # of its splines
 POINTS = 257  # of a table, evenly spaced from its lowest to its highest argument
+FINE = 1025  # of that of a formula, which goes on beyond where logs have been
 
 
 @inlined

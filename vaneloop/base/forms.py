@@ -26,6 +26,7 @@ class Form:
               the way from lowest to highest, ``kelvin``: of 10,000 K, ``plain``: as they are)
     positive  only for a quantity that stays above 0; ``signed``: only for one that does not, else it is another form
     magnitudes  which of the numbers have a sign that changes nothing
+    jump      of one that is a level and a jump: from its numbers to the level, half the jump, and where it is
     """
 
     name: str
@@ -38,6 +39,7 @@ class Form:
     positive: bool = False
     signed: bool = False
     magnitudes: tuple[int, ...] = ()
+    jump: Callable[[Array], tuple[float, float, float]] | None = None
 
     def plain(self, numbers: Array) -> Array:
         """The same numbers, without signs that change nothing."""
@@ -63,7 +65,8 @@ FORMS: tuple[Form, ...] = (
     Form("line", "a q", "{a} * q", 2, lambda q, n: n[0] * q),
     Form("straight line", "a (q - b)", "{a} * (q - {b})", 3, lambda q, n: n[0] * (q - n[1]), ("a", "b"), (_AT,)),
     Form("magnitude", "a |q|", "{a} * abs(q)", 3, lambda q, n: n[0] * np.abs(q), signed=True),
-    Form("sign", "a sign(q)", "{a} * ((q > 0.0) - (q < 0.0))", 3, lambda q, n: n[0] * np.sign(q), signed=True),
+    Form("sign", "a sign(q)", "{a} * ((q > 0.0) - (q < 0.0))", 3, lambda q, n: n[0] * np.sign(q), signed=True,
+         jump=lambda n: (0.0, float(n[0]), 0.0)),
     Form("square", "a q^2", "{a} * q * q", 3, lambda q, n: n[0] * q * q),
     Form("signed square", "a q |q|", "{a} * q * abs(q)", 4, lambda q, n: n[0] * q * np.abs(q), signed=True),
     Form("cube", "a q^3", "{a} * q**3", 3, lambda q, n: n[0] * q**3),
@@ -83,7 +86,7 @@ FORMS: tuple[Form, ...] = (
     Form("below", "a min(q - b, 0)", "{a} * min(q - {b}, 0.0)", 4, lambda q, n: n[0] * np.minimum(q - n[1], 0.0),
          ("a", "b"), (_AT,)),
     Form("step", "a (q > b)", "{a} * (q > {b})", 4, lambda q, n: n[0] * (q > n[1]), ("a", "b"),
-         (("at", tuple(np.linspace(0.02, 0.98, 97))),)),
+         (("at", tuple(np.linspace(0.02, 0.98, 97))),), jump=lambda n: (0.5 * n[0], 0.5 * float(n[0]), float(n[1]))),
     Form("gentle step", "a / (1 + exp(-(q - b)/c))", "{a} / (1.0 + math.exp(min(max(({b} - q) / {c}, -50.0), 50.0)))",
          6, lambda q, n: n[0] / (1.0 + np.exp(np.clip(-(q - n[1]) / max(abs(n[2]), 1e-9), -50.0, 50.0))),
          ("a", "b", "c"), (_AT, _WIDTH), magnitudes=(2,)),

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vaneloop.base.durations import period_of
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy import StageError, System
 from vaneloop.verbs.answer import Answer
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.fit import Fit, Judge
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.learned import LearnedLaw
-    from vaneloop.discrepancy.models.tried import Outcome
+    from vaneloop.discrepancy.models.tried import Outcome, Tried
     from vaneloop.discrepancy.models.vanes import Chain
     from vaneloop.pages.page import Page
 
@@ -86,10 +85,7 @@ class Learned(Answer):
                 out.append(f"{law.name}: its {what} cannot be told from these logs{trades}")
             if law.rivals:
                 out.append(f"{law.name}: as good: {', '.join(law.rivals)}")
-            if period_of(law.of):
-                continue
-            reach = f"[{law.x[0]:.4g}, {law.x[-1]:.4g}] {law.of_unit.strip('-')}".strip()
-            out.append(f"{law.name}: {law.of} has been in {reach}; beyond, the curve stays as at its end")
+            out.append(law.range_note())
         return out
 
     def page(self, command: str = "") -> Page:
@@ -159,12 +155,14 @@ def learn(
     added: Model | None = None,
     without: Sequence[str] = (),
     shape: Sequence[str] = (),
+    formulas: bool = True,
     workers: int = 2,
     progress: Callable[[float], None] | None = None,
 ) -> Learned:
     """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`.
 
     shape  what is known of every curve: "zero" where its quantity is 0, "odd", "rising", "falling"
+    formulas  of a model of the user's own: whether a formula that does as well as its curve is the law
 
     The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
     InputError for logs that the system cannot be held against.
@@ -178,8 +176,8 @@ def learn(
         return learned(not_given(chain, without), name, machine.added, workers, tell, shape=shape)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
-        alone = _learned(diagnosed, added, lambda f: tell(0.5 + 0.25 * f), shape)
-        beside = _beside_named(diagnosed, alone, lambda f: tell(0.75 + 0.25 * f), shape)
+        alone = _learned(diagnosed, added, lambda f: tell(0.5 + 0.25 * f), shape, formulas)
+        beside = _beside_named(diagnosed, alone, lambda f: tell(0.75 + 0.25 * f), shape, formulas)
         tell(1.0)
         return beside or alone
     except StageError as e:
@@ -273,12 +271,13 @@ def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
 
 
 def _learned(
-    diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str]
+    diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str], formulas: bool
 ) -> Learned:
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.curved import OwnGround, on_logs
     from vaneloop.discrepancy.models.learned import law_of
     from vaneloop.discrepancy.models.learning import Learner
+    from vaneloop.discrepancy.models.spoken import spoken
     from vaneloop.discrepancy.stage_answer import answer_of, found_of, rms_of
 
     assert diagnosed.by_log is not None
@@ -292,7 +291,7 @@ def _learned(
     for tried in outcome.tried:
         laws.append(law_of(ground, before, tried))
         before = tried.judge, tried.fit
-    last = outcome.tried[-1]
+    last, laws = spoken(learner, outcome.tried, laws) if formulas else (outcome.tried[-1], laws)
     names = tuple(e.name for _, e in last.curves)
     judge, stage = last.judge, last.judge.stage
     theta = stage.neutral()
@@ -303,13 +302,13 @@ def _learned(
     d = answer_of(judge, "missing", base, last.fit, found_of(judge, last.fit, names, without), steps)
     d.criterion = "error_share"
     by_log = ByLog.of(on_logs(logs, last.curves), d, added)
-    model = _as_model(by_log.model, outcome, laws)
+    model = _as_model(by_log.model, outcome, laws, last)
     progress(1.0)
     return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log)
 
 
 def _beside_named(
-    diagnosed: Diagnosed, alone: Learned, progress: Callable[[float], None], shape: Sequence[str]
+    diagnosed: Diagnosed, alone: Learned, progress: Callable[[float], None], shape: Sequence[str], formulas: bool
 ) -> Learned | None:
     """Curves beside the laws of the library that `diagnose` names, where these leave more than noise, and curves alone
     do too; None where that is not better: a valve's flow is a curve, and its dead time is none.
@@ -334,7 +333,7 @@ def _beside_named(
     given.verdict = "unknown"  # what is left is more than noise
     again = replace(diagnosed, bound=logs.fitted, diagnosis=replace(diagnosed.diagnosis, stages=[given]),
                     by_log=ByLog(logs, given))  # fmt: skip
-    said = _learned(again, by.model, progress, shape)
+    said = _learned(again, by.model, progress, shape, formulas)
     if not said.laws or said.by_log is None:
         return None
     now = said.outcome.tried[-1]
@@ -360,13 +359,23 @@ def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit 
     return judge.fit(others, theta)
 
 
-def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw]) -> Model:
-    """The model with the curves as a file has them: coefficients of B-splines."""
+def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Tried | None = None) -> Model:
+    """The model with the laws as a file has them: a formula's numbers, or coefficients of B-splines.
+
+    last  the model with all of them, as it was fitted; None: the curves
+    """
     from plant.model import Learned as Table
 
-    effects, curves, last = dict(model.effects), dict(model.curves), outcome.tried[-1]
+    effects, curves, last = dict(model.effects), dict(model.curves), last or outcome.tried[-1]
     for law, tried in zip(laws, outcome.tried, strict=True):
         c = tried.candidate
+        if f := law.spoken:
+            curves[law.name] = Table(
+                how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), form=f.form,
+                values=list(f.numbers.values()), unit=law.unit, size=float(c.size), reach=list(law.reach),
+            )  # fmt: skip
+            effects[law.name] = dict(f.numbers)
+            continue
         values = [float(v) for v in c.turn @ last.fit.theta[last.judge.stage.index()[c.name]]]
         curves[law.name] = Table(
             how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), values=values,

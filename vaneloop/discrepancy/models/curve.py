@@ -9,7 +9,9 @@
 | output adds, output times  | an output     | y + c(q), y (1 + c(q))                                                |
 
 The quantity q is a simulated state or output, what drives the model, or a column that is known beforehand
-(`vaneloop.discrepancy.models.quantities`). Beyond the values that q has had a curve stays as at its end.
+(`vaneloop.discrepancy.models.quantities`). Beyond the values that q has had a curve stays as at its end. A curve may
+jump: then its table is what is left beside the jump, which runs as friction of the library does: within a small range
+of q it is a straight line.
 """
 
 from __future__ import annotations
@@ -20,21 +22,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.base.curve import POINTS
+from vaneloop.base.curve import FINE, POINTS
+from vaneloop.base.forms import Form
 from vaneloop.discrepancy.models.memory import STOPS, of_stops
 from vaneloop.discrepancy.stage import Array
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.data import Data
 
-__all__ = ["COLUMN", "HOW", "INPUT", "OUTPUT", "SENSED", "Curve", "bent", "curves_for_kernel"]
+__all__ = ["COLUMN", "HOW", "INPUT", "OUTPUT", "SENSED", "Curve", "Jump", "Table", "bent", "curves_for_kernel", "runs"]
 
 INPUT, OUTPUT, COLUMN = 100, 200, 300  # numbers of quantities: states are below
+Table = Callable[[Array], Array]
+Jump = Callable[[Array], tuple[float, float]]
 HOW = {
     "parameter times": 1, "input adds": 2, "input times": 3, "state adds": 4, "output adds": 5, "output times": 6,
     "force adds": 5,
 }  # fmt: skip
 SENSED = ("output adds", "output times")
+AT_ONCE = 1e-3  # of the range of a simulated state that is no speed, within which a jump is a straight line
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,8 @@ class Curve:
     how       see above; ``place``: index of the parameter, input, state or output
     of        number of the quantity (state, INPUT + k, OUTPUT + k, COLUMN: known beforehand); ``quantity``: its name
     low, high the range in which it bends
-    table     from its parameters to the curve at `POINTS` points, evenly from low to high
+    table     from its parameters to the curve, less its jump, at points evenly from low to high
+    jump      from its parameters to half the height of its jump, and where that is; None: it has none
     """
 
     how: str
@@ -53,13 +60,29 @@ class Curve:
     quantity: str
     low: float
     high: float
-    table: Callable[[Array], Array]
+    table: Table
+    jump: Jump | None = None
 
-    def at(self, q: Array, table: Array) -> Array:
+    def row(self, values: Array) -> Array:
+        """What runs with these parameters: its table, behind it the jump that it may have."""
+        return np.append(self.table(values), self.jump(values)) if self.jump else self.table(values)
+
+    def parts(self, row: Array) -> tuple[Array, float, float]:
+        """Of a `row` the table, half the height of the jump, and where it is."""
+        return (row[:-2], float(row[-2]), float(row[-1])) if self.jump else (row, 0.0, 0.0)
+
+    def whole(self, values: Array) -> Array:
+        """The curve with these parameters at the points of its table, its jump with it."""
+        table, half, place = self.parts(self.row(values))
+        return table + half * np.sign(np.linspace(self.low, self.high, len(table)) - place) if half else table
+
+    def at(self, q: Array, row: Array) -> Array:
         """The curve at values of its quantity; of stops, at a course of what they follow."""
+        table, half, place = self.parts(row)
         if self.quantity.startswith(STOPS):
             return of_stops(q, self.low, self.high, table)
-        return np.interp(q, np.linspace(self.low, self.high, POINTS), table)
+        c = np.interp(q, np.linspace(self.low, self.high, len(table)), table)
+        return c + half * np.sign(q - place) if half else c
 
     def values(self, data: Data, log: int, u: Array, y: Array | None = None) -> Array:
         """Its quantity on a log, of a model that is not simulated."""
@@ -68,6 +91,15 @@ class Curve:
         if self.of >= OUTPUT:
             return np.asarray(data.y[log][self.of - OUTPUT] if y is None else y[self.of - OUTPUT])
         return np.asarray(u[self.of - INPUT])
+
+
+def runs(form: Form, low: float, high: float, points: int = FINE) -> tuple[Table, Jump | None]:
+    """What a formula is as a `Curve`: from its numbers to the table from low to high, and to the jump."""
+    grid = np.linspace(low, high, points)
+    jump = form.jump
+    if jump is None:
+        return lambda n: np.broadcast_to(form.value(grid, n), grid.shape).astype(float), None
+    return lambda n: np.full(points, jump(n)[0]), lambda n: jump(n)[1:]
 
 
 Active = Sequence[tuple[Curve, Array]]
@@ -89,15 +121,20 @@ def bent(curves: Active, data: Data, log: int, u: Array, p: Array) -> tuple[Arra
     return u, known  # type: ignore[return-value]  # the model takes both numbers and arrays
 
 
-def curves_for_kernel(curves: Active, data: Data, log: int, n: int) -> tuple[Array, ...]:
-    """The last arguments of a compiled simulation with curves."""
-    of, low, high, tables, columns = [], [], [], [], []
-    for c, table in curves:
+def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Array) -> tuple[Array, ...]:
+    """The last arguments of a compiled simulation with curves; ``smalls``: state by state, range within which a jump is
+    a straight line.
+    """
+    of, low, high, tables, columns, jumps = [], [], [], [], [], []
+    for c, row in curves:
         a, b = c.low, c.high
+        table, half, place = c.parts(row)
+        small = (float(smalls[c.of]) or AT_ONCE * (b - a)) if c.of < INPUT else 0.0
+        jumps.append((half, place, max(small, 1e-300)))
         if c.of >= COLUMN:
             column = data.column(log, c.quantity)[:n]
             if c.quantity.startswith(STOPS):  # what they make of it, as it is
-                column = c.at(column, table)
+                column = c.at(column, row)
                 b = max(float(np.abs(column).max()), 1e-300)
                 a, table = -b, np.linspace(-b, b, POINTS)
             columns.append(column)
@@ -105,8 +142,11 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int) -> tuple[Arr
         low.append(a)
         high.append(b)
         tables.append(table)
+    most = max(len(t) for t in tables)
+    tables = [t if len(t) == most else np.interp(np.linspace(0, 1, most), np.linspace(0, 1, len(t)), t) for t in tables]
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
         np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64),
-        np.array(low), np.array(high), np.ascontiguousarray(tables), np.array(columns).reshape(len(columns), n),
+        np.array(low), np.array(high), np.ascontiguousarray(tables), np.array(jumps),
+        np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

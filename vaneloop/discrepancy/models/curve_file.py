@@ -7,9 +7,10 @@ import numpy as np
 from plant.model import Learned
 from vaneloop.base.durations import period_of
 from vaneloop.base.errors import InputError
+from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.curves import LEVEL
 from vaneloop.discrepancy.library import Law
-from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve
+from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve, runs
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
@@ -54,7 +55,9 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
         law.check(f"curves.{name}")
     except InputError as e:
         raise StageError(str(e)) from None
-    curve = Curve(law.how, named.index(law.at), of, law.of, law.low, law.high, law.table())
+    form = next((f for f in FORMS if f.name == law.form), None)
+    table, jump = (law.table(), None) if form is None else runs(form, *law.ends)
+    curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump)
     names = law.numbers
     sizes = [max(abs(v), 1e-9) for v in law.values] if law.form else [abs(law.size) or 1.0] * len(names)
     wide = np.sqrt(3.0) * LEVEL if not law.form else 0.0  # a curve's values are known to be of its size

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vaneloop.base.curve import POINTS
+from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.durations import period_of
 from vaneloop.discrepancy.curves import COUNT, Basis, basis_of, waves_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
-from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve
+from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve, Jump, Table
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
 from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
 from vaneloop.discrepancy.models.nominal import nominal_course
@@ -172,9 +172,9 @@ class Candidate:
         return self.placed_as(design.__matmul__, design.shape[1])
 
     def placed_as(
-        self, table: Callable[[Array], Array], parameters: int, reach: tuple[float, float] | None = None
+        self, table: Table, parameters: int, reach: tuple[float, float] | None = None, jump: Jump | None = None
     ) -> Placed:
-        """The same with another function from so many parameters to its table, over another range."""
+        """The same with another function from so many parameters to its table, over another range, and with a jump."""
         q = self.quantity
         if q.stops:  # where they have not moved they make nothing
             whole = table
@@ -184,7 +184,7 @@ class Candidate:
                 return y - y[0]
 
         low, high = reach or (self.basis.low, self.basis.high)
-        curve = Curve(self.how, self.place, q.of, q.name, low, high, table)
+        curve = Curve(self.how, self.place, q.of, q.name, low, high, table, jump)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
     def effect(self, wiggle: float) -> Effect:
@@ -397,6 +397,8 @@ def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
 class OwnGround:
     """A user's own model, held against logs (`vaneloop.discrepancy.models.learning.Ground`)."""
 
+    points = FINE
+
     def __init__(self, logs: Logs):
         self.logs, self.floor = logs, logs.fitted.floor
         self.whole = logs.fitted.stage
@@ -425,15 +427,11 @@ class OwnGround:
         return {log: inside[at] for log, at in test.logs.items()}
 
     def reach(self, candidate: Candidate) -> tuple[float, float]:
-        """The range of a candidate's curve, and as much of that of the test logs as is no further away than it is wide:
-        there a formula goes on.
-        """
+        """The range of a candidate's curve, and as much again to each side: no further a formula goes on."""
         low, high = candidate.basis.low, candidate.basis.high
-        if self.logs.test is None or candidate.quantity.stops or candidate.quantity.period:
+        if candidate.quantity.stops or candidate.quantity.period:
             return low, high
-        values = self._tested(candidate.quantity)
-        values = values[(values >= 2.0 * low - high) & (values <= 2.0 * high - low)]
-        return min(low, float(values.min(initial=low))), max(high, float(values.max(initial=high)))
+        return 2.0 * low - high, 2.0 * high - low
 
     def _tested(self, q: Quantity) -> Array:
         """Values of a quantity in the test logs."""

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from vaneloop.base.curve import POINTS
+from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.error_share import FORM, score
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
+from vaneloop.discrepancy.models.curve import runs
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import at_samples, with_held_out
 from vaneloop.discrepancy.models.runner import Placed
@@ -18,7 +19,7 @@ from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
-__all__ = ["fitted_formulas", "library_name", "likely"]
+__all__ = ["fitted_formulas", "goes_on", "library_name", "likely"]
 
 CLOSE = 1e-4  # share of a curve's variance below which formulas are alike
 REFITTED = 5  # formulas that are fitted in the simulation
@@ -30,6 +31,7 @@ DEGREES = ("degC", "°C", "C")
 FAR = 100.0  # times the curve's range that a formula's may be
 SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 MEANT = 2_000  # values of a quantity of which a formula's mean is taken
+STEEPER = 10.0  # times the steepest slope where the logs have been: beyond, a formula runs away
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
 
@@ -120,6 +122,23 @@ def _is_shaped(form: Form, numbers: Array, c: Candidate) -> bool:
     )
 
 
+def goes_on(ground: Ground, c: Candidate, form: Form, numbers: Array) -> tuple[float, float]:
+    """From where to where a formula stands in a curve's place: beyond the curve's range as far as the ground lets it,
+    while it is not much steeper than within.
+    """
+    low, high = ground.reach(c)
+    x = np.linspace(low, high, FINE)
+    middle = 0.5 * (x[1:] + x[:-1])
+    with np.errstate(all="ignore"):
+        slope = np.abs(np.diff(np.broadcast_to(form.value(x, numbers), x.shape)))
+    inside = c.basis.reaches(middle)
+    wild = middle[~(slope <= STEEPER * slope[inside].max(initial=0.0)) & ~inside]
+    return (
+        float(max(wild[wild < c.basis.low].max(initial=low), low)),
+        float(min(wild[wild > c.basis.high].min(initial=high), high)),
+    )
+
+
 def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> tuple[Formula, Tried] | None:
     """A formula in the curve's place, fitted with the model's own parameters."""
     c = tried.candidate
@@ -135,12 +154,8 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         return 0.0 if c.mean else float(np.mean(form.value(been, n)))
 
     def placed(low: float, high: float) -> Placed:
-        grid = np.linspace(low, high, POINTS)
-
-        def table(n: Array) -> Array:
-            return np.broadcast_to(form.value(grid, n) - mean(n), grid.shape).astype(float)
-
-        return c.placed_as(table, len(numbers), (low, high))
+        table, jump = runs(form, low, high, ground.points)
+        return c.placed_as(lambda n: table(n) - mean(n), len(numbers), (low, high), jump)
 
     curves = (*tried.curves[:-1], (placed(c.basis.low, c.basis.high), effect))
     judge = Judge(ground.stage((), curves), ground.floor)
@@ -163,7 +178,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         library_name(c, form),
         -mean(values),
     )
-    further = (*tried.curves[:-1], (placed(*ground.reach(c)), effect))  # on test logs
+    further = (*tried.curves[:-1], (placed(*goes_on(ground, c, form, values)), effect))  # on test logs
     as_it = replace(tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None)
     return formula, as_it
 

@@ -26,7 +26,7 @@ Compile = Callable[[Any], Any]
 def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> tuple[Kernel, Kernel]:
     """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled.
 
-    curved  it takes curves (`vaneloop.discrepancy.models.curved`), too: seven arguments more, `_CURVED`
+    curved  it takes curves (`vaneloop.discrepancy.models.curved`), too: eight arguments more, `_CURVED`
     """
     s = code.system
     rates = "\n".join(f"dx[{i}] = d" if code.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
@@ -134,9 +134,10 @@ if len(code) > 0:
 {bent}"""
 
 # curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of), from
-# low to high, and the other columns that they may be of
+# low to high, the jump of each (half its height, where, within how much of the quantity), and the other columns that
+# they may be of
 _PLAIN = "outputs(x, u, p, y)"
-_CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, columns"
+_CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, c_jump, columns"
 _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
 _BENT = "for w in range(m):\n    dx[w] -= add[w] / mass[w]\n"
 _ROOMS = "ub, pb, add, bent = np.zeros(len(u)), np.zeros(len(p)), np.zeros(m), np.zeros(len(out))"
@@ -153,6 +154,14 @@ def quantity(of, x, u, y, columns, k):
 
 
 @inline
+def on_curve(q, low, high, table, jump):
+    c = on_table(q, low, high, table)
+    if jump[0] != 0.0:
+        c += jump[0] * min(max((q - jump[1]) / jump[2], -1.0), 1.0)
+    return c
+
+
+@inline
 def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(u)):
         ub[j] = u[j]
@@ -165,7 +174,7 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
             continue
         if OUTPUT <= c_of[i] < COLUMN:
             outputs(x, u, p, y)
-        c = on_table(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i])
+        c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
         if c_how[i] == 1:
             pb[c_at[i]] *= 1.0 + c
         elif c_how[i] == 2:
@@ -182,7 +191,7 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     outputs(x, ub, pb, y)
     for i in range(len(c_how)):
         if c_how[i] > 4:
-            c = on_table(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i])
+            c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
             if c_how[i] == 5:
                 y[c_at[i]] += c
             else:

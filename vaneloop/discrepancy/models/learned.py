@@ -36,6 +36,8 @@ class LearnedLaw:
     untold   of its mean (0) and slope (1): what the logs do not tell from the model's parameters; it has none
     trades   parameters that left their intervals when it was given none
     rivals   curves at other places or of other quantities that do as well
+    spoken   the formula that is the law, as it does as well as the curve; None: the curve is. ``reach``: from where to
+             where it goes on
     """
 
     name: str
@@ -57,11 +59,24 @@ class LearnedLaw:
     untold: tuple[int, ...] = ()
     trades: list[str] = field(default_factory=list)
     rivals: list[str] = field(default_factory=list)
+    spoken: Formula | None = None
+    reach: tuple[float, float] = (0.0, 0.0)
 
     def of_the_kind_of(self, other: LearnedLaw) -> bool:
         """Whether it does the same, at the same place and of the same quantity, whatever its curve and its period."""
         mine, its = (within_no_period(law.of) for law in (self, other))
         return (self.how, self.at, mine) == (other.how, other.at, its)
+
+    def range_note(self) -> str:
+        """Where its quantity has been, what it does beyond, and what the law file has of it, in words."""
+        has = "the formula, which does as well as the curve" if self.spoken else "the curve"
+        if period_of(self.of):
+            return f"{self.name}: the law file has {has}"
+        unit = f" {self.of_unit}" if self.of_unit.strip("-") else ""
+        been = f"{self.name}: {self.of} has been in [{self.x[0]:.4g}, {self.x[-1]:.4g}]{unit}; the law file has {has}"
+        if not self.spoken:
+            return f"{been}; beyond, it stays as at its end"
+        return f"{been}; it goes on to [{self.reach[0]:.4g}, {self.reach[1]:.4g}]{unit}, and stays as there beyond"
 
     def sentence(self) -> str:
         """What it is, in words."""
@@ -82,8 +97,9 @@ class LearnedLaw:
             "adds": f"{what} is added to {self.at}",
             "times": f"{self.at} is multiplied by 1 + {what}",
         }[self.how]
-        best = self.formulas[0] if self.formulas else None
-        said = f"{best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
+        best = self.spoken or (self.formulas[0] if self.formulas else None)
+        near = "" if self.spoken else "near "
+        said = f"{near}{best.text}{f' ({best.law} of the library)' if best.law else ''}" if best else ""
         said = f", {'with the virgin curve ' if stops else ''}{said}" if said else ""
         return f"{does}{said}"
 
@@ -93,8 +109,9 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     table, amplitudes = tried.table()
     grid, y = c.grid, table(amplitudes)
-    fitted = tried.formulas if tried.formulas is not None else fitted_formulas(ground, tried)
-    formulas = likely(tried, fitted, rms_of(*before))
+    if tried.formulas is None:
+        tried.formulas = fitted_formulas(ground, tried)
+    formulas = likely(tried, tried.formulas, rms_of(*before))
     low, high = _with_formulas(c, y, *_band(tried), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))

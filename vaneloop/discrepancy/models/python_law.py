@@ -30,7 +30,7 @@ Equation::
     curve = {equation}
 
 Symbols: q is {of} ({of_unit}); the curve is in {unit}.
-Range: learned for q in [{low:.6g}, {high:.6g}]; beyond, it stays as at the ends.
+Range: learned for q in [{been}]{goes}; beyond, it stays as at the ends.
 Error on held-out data: {before:.3g} noise floors without it, {after:.3g} with it.
 """
 
@@ -81,24 +81,25 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
 
     Raises InputError where a `Law` cannot say it: where it is a function of another channel, or multiplies a parameter.
     """
-    low, high = float(law.x[0]), float(law.x[-1])
+    low, high = law.reach if law.spoken else (float(law.x[0]), float(law.x[-1]))
     code, constants, equation = _code(law)
     curve: dict[str, object] = {}
     exec(f"import math\n{constants}\ndef curve(q):\n    return {code}", curve)  # our own text
     held = [(float(q), float(curve["curve"](q))) for q in np.linspace(low, high, HELD)]  # type: ignore[operator]
     parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
     sentence = law.sentence().rstrip(".")
+    been = f"{law.x[0]:.6g}, {law.x[-1]:.6g}"
+    goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
     return FILE.format(
         sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=law.of, of_unit=law.of_unit or "-",
-        unit=law.unit or "-", low=low, high=high, before=law.error_before, after=law.error_after, code=code,
-        constants=constants, held=held, **parts,
+        unit=law.unit or "-", low=low, high=high, been=been, goes=goes, before=law.error_before, after=law.error_after,
+        code=code, constants=constants, held=held, **parts,
     )  # fmt: skip
 
 
 def _code(law: LearnedLaw) -> tuple[str, str, str]:
     """The curve as an expression of q, its constants, and the equation in words."""
-    if law.formulas:
-        f = law.formulas[0]
+    if f := law.spoken or (law.formulas[0] if law.formulas else None):
         form = next(g for g in FORMS if g.name == f.form)
         constants = "".join(f"{k.upper()} = {v!r}\n" for k, v in f.numbers.items())
         code, level = form.code, f.level

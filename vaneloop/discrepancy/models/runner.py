@@ -136,7 +136,7 @@ class Runner:
         for q in self.placed:
             values = numbers[q.columns]
             if q.curve is not None and any(values):
-                out.append((q, q.curve.table(theta[q.columns])))
+                out.append((q, q.curve.row(theta[q.columns])))
             elif q.curve is None and values != q.neutral.tolist():
                 row = np.zeros(self.dispatch.parameters + 1)
                 row[: len(values)] = values
@@ -321,6 +321,8 @@ class Runner:
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
+        if any(c.of < INPUT and c.parts(row)[1] for c, row in curves):
+            steps = max(steps, SWITCHED)
         kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves()
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments: tuple[Any, ...] = (
@@ -330,7 +332,7 @@ class Runner:
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         if curves:
-            arguments += curves_for_kernel(curves, self.data, log, len(t))
+            arguments += curves_for_kernel(curves, self.data, log, len(t), self.smalls)
         try:
             with np.errstate(all="ignore"):
                 kernel(*arguments)

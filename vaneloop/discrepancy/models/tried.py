@@ -40,11 +40,13 @@ class Ground(Protocol):
 
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
     tests  names of the logs that nothing is fitted to
+    points of the table of a formula
     """
 
     whole: Stage
     floor: Array
     tests: frozenset[str]
+    points: int
 
     def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
@@ -61,7 +63,7 @@ class Ground(Protocol):
         """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
 
     def reach(self, candidate: Candidate) -> tuple[float, float]:
-        """The range of its quantity over which a formula stands in its place."""
+        """The range of its quantity beyond which no formula goes on."""
 
     def courses(self, curves: Placings, theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""
@@ -100,7 +102,7 @@ class Tried:
         """From the new curve's amplitudes to its table, and these amplitudes."""
         curve = self.curves[-1][0].curve
         assert curve is not None
-        return curve.table, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
+        return curve.whole, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
 
 
 @dataclass

@@ -159,7 +159,7 @@ def tables_of(driven: Driven, thetas: Array) -> list[tuple[Place, Curve, Array]]
         columns = slice(at, at + len(effect.parameters))
         at = columns.stop
         assert placed.curve is not None
-        tables = np.array([placed.curve.table(theta[columns]) for theta in thetas]).T
+        tables = np.array([placed.curve.whole(theta[columns]) for theta in thetas]).T
         out.append((ALL_PLACES[placed.curve.place], placed.curve, tables))
     return out
 

@@ -10,6 +10,7 @@ from plant.curve import QUANTITIES, TURN, Place, turns
 from plant.effects import CURVES
 from plant.layout import AREA, MOST_CURVES, P_REF
 from plant.model import Learned
+from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import STOPS, stops_of
 from vaneloop.base.vanes import VANES
@@ -101,7 +102,7 @@ def curve_effect(name: str, law: Learned) -> tuple[Placed, Effect]:
     """
     number = next(i for i, p in enumerate(ALL_PLACES) if (p.at, p.how) == (law.at, law.how))
     table = law.table()(np.array(law.values))
-    curve = Curve(law.how, number, COLUMN, law.of, law.low, law.high, lambda scale: scale[0] * table)
+    curve = Curve(law.how, number, COLUMN, law.of, *law.ends, lambda scale: scale[0] * table)
     effect = Effect(name, (Parameter(SCALE, 0.0, "-", scale=1.0),), ((1.0,),), "a function that was learned")
     return Placed(name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(1), curve=curve), effect
 
@@ -147,6 +148,8 @@ class VaneGround:
     floor  noise of its outputs; None: its own
     test   the same stage on a part of the log that nothing is fitted to
     """
+
+    points = POINTS  # as the plant's rows have them
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
         assert isinstance(stage.made, Made) and stage.floor is not None

@@ -1,0 +1,127 @@
+"""The formula is the law where it does as well as the curve: what the answer and the law file then hold.
+
+A curve stays level beyond the values that the logs have visited. A formula goes on, and a log that goes further needs
+that. So a formula speaks for its curve where its error is not larger by what two laws that do equally well differ by
+(`vaneloop.discrepancy.error_share.RIVAL`): held out, and on every test log over all of its samples. Of several the
+simplest that is as near to the best of them. That it has fewer numbers than the curve does not count for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vaneloop.base.forms import FORMS
+from vaneloop.discrepancy.error_share import PER_PARAMETER, RIVAL
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.formulas import Formula, text_of
+from vaneloop.discrepancy.models.curve import runs
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.formula_fits import goes_on
+from vaneloop.discrepancy.models.held_out import with_held_out
+from vaneloop.discrepancy.models.learned import LearnedLaw
+from vaneloop.discrepancy.models.tried import Ground, Tried
+from vaneloop.discrepancy.stage import Array, Effect, Parameter
+from vaneloop.discrepancy.stage_answer import rms_of
+
+if TYPE_CHECKING:
+    from vaneloop.discrepancy.models.learning import Learner
+
+__all__ = ["spoken"]
+
+LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
+
+
+def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]) -> tuple[Tried, list[LearnedLaw]]:
+    """The model with a formula in place of each curve that one does as well as, fitted together; and the laws with
+    these formulas.
+
+    curves  as they were learned, each beside those before it; ``laws``: what is said of them
+    """
+    now, out = curves[-1], list(laws)
+    for k, tried in enumerate(curves):
+        c = tried.candidate
+        if c.quantity.stops:
+            continue
+        fitted = tried.formulas or []
+        options = []  # simplest first
+        for f in laws[k].formulas:
+            alone = next(t for g, t in fitted if g is f)
+            if (one := _in_place(learner.ground, now, k, c, f, alone)) is not None:
+                options.append((f, *one))
+        left = {f.form: _left(learner, now, t, curves) for f, t, _ in options}
+        best = min([0.0, *(sum(v) for v in left.values())])
+        for f, t, said in options:
+            if max(left[f.form]) <= RIVAL and sum(left[f.form]) <= best + RIVAL and _harms_no(learner, now, t):
+                formulas = [said if g is f else g for g in out[k].formulas]
+                form = next(g for g in FORMS if g.name == f.form)
+                reach = goes_on(learner.ground, c, form, np.array(list(said.numbers.values())))
+                out[k], now = replace(out[k], spoken=said, reach=reach, formulas=formulas), t
+                break
+    if now is not curves[-1]:
+        out[-1] = replace(out[-1], error_after=rms_of(now.judge, now.fit))
+    return now, out
+
+
+def _left(learner: Learner, before: Tried, tried: Tried, curves: Sequence[Tried]) -> tuple[float, float]:
+    """Log of what a formula leaves over what stood there before it: held out where all curves know something, and of
+    the test logs.
+    """
+    held = learner._score(tried, curves) - learner._score(before, curves)
+    held -= PER_PARAMETER * (len(tried.fit.free) - len(before.fit.free))
+    tests = [v for log, v in learner._change(before, tried).items() if log in learner.ground.tests]
+    return held, float(np.mean(tests)) if tests else 0.0
+
+
+def _harms_no(learner: Learner, before: Tried, tried: Tried) -> bool:
+    """Whether no test log is worse for a formula."""
+    return all(v <= RIVAL for log, v in learner._change(before, tried).items() if log in learner.ground.tests)
+
+
+def _in_place(
+    ground: Ground, now: Tried, k: int, c: Candidate, formula: Formula, alone: Tried
+) -> tuple[Tried, Formula] | None:
+    """The model with a formula in place of its ``k``-th curve, fitted, and the formula as it then is; None where it is
+    none.
+
+    alone  the formula in the curve's place, without the curves after it
+    """
+    form = next(f for f in FORMS if f.name == formula.form)
+    numbers = np.array(list(formula.numbers.values()))
+    own = alone.fit.theta[: len(alone.judge.stage.parameters)].copy()
+    if formula.level:  # the parameter had its mean: p (1 + f - m) = p (1 - m) (1 + f / (1 - m))
+        kept = 1.0 + formula.level
+        if kept < LEAST:
+            return None
+        numbers[0] /= kept
+        own[c.place] *= kept
+    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
+    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
+    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
+    reach = goes_on(ground, c, form, numbers)
+    table, jump = runs(form, *reach, ground.points)
+    curves = list(now.curves)
+    curves[k] = (c.placed_as(table, len(numbers), reach, jump), effect)
+    judge = Judge(ground.stage((), tuple(curves)), ground.floor)
+    theta, index = judge.stage.neutral(), judge.stage.index()
+    theta[: len(own)] = own
+    for name, at in now.judge.stage.index().items():
+        if name != c.name:
+            theta[index[name]] = now.fit.theta[at]
+    theta[index[c.name]] = numbers
+    names = tuple(e.name for e in judge.stage.effects)
+    theta = judge.fit(tuple(n for n in names if n != c.name), theta, 8).theta
+    fit = with_held_out(judge, judge.fit(names, theta, 12))
+    values: Array = form.plain(fit.theta[index[c.name]])
+    if not np.all(np.isfinite(values)):
+        return None
+    text = text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0))
+    said = replace(
+        formula, text=text, numbers=dict(zip(form.numbers, (float(v) for v in values), strict=True)),
+        error=rms_of(judge, fit), level=0.0,
+    )  # fmt: skip
+    tried = replace(now, judge=judge, fit=fit, curves=tuple(curves), told=None, errors=None, rows=None, formulas=None)
+    return tried, said
