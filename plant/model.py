@@ -63,6 +63,7 @@ class Learned(Table):
     low, high    where its quantity has been; beyond, the function stays as at its end, or
     reach        from where to where a formula goes on; beyond, it stays as at these ends
     knots        of a cubic B-spline with ``values`` as coefficients; or
+    jump         whether the last value of such a spline is half a jump where its quantity is 0
     form         name of a formula with ``values`` as numbers
     size         how large such a function is in usual, in ``unit``
     """
@@ -74,6 +75,7 @@ class Learned(Table):
     high: Finite
     values: list[Finite] = Field(min_length=1, max_length=100)
     knots: list[Finite] = Field(default_factory=list, max_length=104)
+    jump: bool = False
     form: str = ""
     reach: list[Finite] = Field(default_factory=list, max_length=2)
     unit: str = ""
@@ -84,7 +86,8 @@ class Learned(Table):
         """Names of its values: c1, c2, ... of splines, those of its formula."""
         if self.form:
             return next((f.numbers for f in FORMS if f.name == self.form), ())
-        return tuple(f"c{k + 1}" for k in range(len(self.values)))
+        own = tuple(f"c{k + 1}" for k in range(len(self.values) - self.jump))
+        return (*own, "jump") if self.jump else own
 
     def now(self, values: Mapping[str, float]) -> Learned:
         """The law with these values; what is not named stays as learned."""
@@ -110,10 +113,11 @@ class Learned(Table):
                 f"{name}: reach (={self.reach}) must be of a formula: two numbers that hold low (={self.low:g}) and "
                 f"high (={self.high:g})"
             )
-        if not self.form and (len(self.knots) != len(self.values) + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0)):
+        count = len(self.values) - self.jump
+        if not self.form and (len(self.knots) != count + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0)):
             raise InputError(
                 f"{name}: knots ({len(self.knots)} of them) must rise, and be {DEGREE + 1} more than the "
-                f"{len(self.values)} values"
+                f"{count} values{' less the jump' if self.jump else ''}"
             )
 
     def table(self, points: int = POINTS) -> Callable[[np.ndarray], np.ndarray]:
@@ -122,7 +126,8 @@ class Learned(Table):
         if self.form:
             form = next(f for f in FORMS if f.name == self.form)
             return lambda values: np.broadcast_to(form.value(x, values), x.shape).astype(float)
-        return splines(np.asarray(self.knots, dtype=float), x).__matmul__
+        design = splines(np.asarray(self.knots, dtype=float), x)
+        return np.column_stack([design, np.sign(x)]).__matmul__ if self.jump else design.__matmul__
 
 
 class Model(Table):

@@ -17,6 +17,7 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.durations import within_no_period
 from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
+from vaneloop.cli.same_law import same_by_equations
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
 
@@ -80,11 +81,14 @@ def _systems() -> Any:
     return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
 
 
-def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None, truth: Any = None) -> dict[str, Any]:
+def _said(
+    system: Any, records: list[Any], test: list[Any], floors: Any = None, truth: Any = None, true: Any = None
+) -> dict[str, Any]:
     """What `diagnose` answers, or the error that it raised; with its processor seconds.
 
     floors  true noise of every output: `learn` is asked, too, and its errors on the test log are held against it
     truth   a law that is hidden as a curve (`tests.rig_systems.left_out.Truth`): what was learned is held against it
+    true    the system with its true parameters
     """
     from vaneloop.verbs import learn, search
 
@@ -95,7 +99,7 @@ def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None, 
             said = search.diagnose(records, system, test=test)
         else:
             asked = learn.learn(records, system, test=test)
-            said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors, truth)
+            said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors, truth, true)
         answer = terminal.plain(said.to_dict())
         out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
     except Exception as e:  # one system must not end the run; it counts as a miss
@@ -103,7 +107,7 @@ def _said(system: Any, records: list[Any], test: list[Any], floors: Any = None, 
     return {**out, "learned": learned, "seconds": time.process_time() - started}
 
 
-def _as_learned(asked: Any, test: str, floors: Any, truth: Any) -> dict[str, Any]:
+def _as_learned(asked: Any, test: str, floors: Any, truth: Any, true: Any) -> dict[str, Any]:
     """What `learn` answers: each law with its rivals and formulas, and the error on the test log in noise floors."""
     by = list(asked.by_log.steps.values())[-1] if asked.by_log else {}
     error = float(((by[test] / floors) ** 2).mean() ** 0.5) if test in by else None
@@ -112,6 +116,10 @@ def _as_learned(asked: Any, test: str, floors: Any, truth: Any) -> dict[str, Any
         for law, row in zip(asked.laws, laws, strict=True):
             if truth.found(law.name):
                 row |= as_curve(law, truth.value, truth.forms)
+            elif asked.by_log is not None:
+                fitted = asked.by_log.logs.fitted
+                same = same_by_equations(law, fitted, true, truth.at, truth.quantity, truth.value)
+                row |= same if same["inside"] >= INSIDE else {}
     return {"verdict": asked.verdict, "laws": laws, "error": error, "nearest": asked.outcome.nearest}
 
 
@@ -138,12 +146,13 @@ def judge_case(
         system = replace(system, without=sorted(case.family.equivalent(h.name)))
         truth = left_out.truth_of(case.family, h, case.greatest.get(h.place, 1.0))
     floors = case.floors if learn or leave_out else None
-    said = _said(system, records[:-1], records[-1:], floors, truth)
+    true = nominal.nominal(case.family, case.values, {})
+    said = _said(system, records[:-1], records[-1:], floors, truth, true)
     learned, effects, also = said["learned"], said["effects"], set()
     while leave_out and learned.get("verdict") == "named":  # another law says the same: it is left out, too
         also |= {name for e in effects for name in (e["effect"], *e["rivals"])}
         again = _said(
-            replace(system, without=sorted({*system.without, *also})), records[:-1], records[-1:], floors, truth
+            replace(system, without=sorted({*system.without, *also})), records[:-1], records[-1:], floors, truth, true
         )
         learned, effects = again["learned"], again["effects"]
     if leave_out and learned:

@@ -81,11 +81,14 @@ class Basis:
         """`splines` of its knots at ``x``."""
         return splines(self.knots, x)
 
-    def effect(self, name: str, unit: str, size: float, wiggle: float, kept: Sequence[int]) -> Effect:
+    def effect(
+        self, name: str, unit: str, size: float, wiggle: float, kept: Sequence[int], jump: bool = False
+    ) -> Effect:
         """The curve as an effect: amplitudes in ``unit``, ``size`` large in usual, bends known to be within ``wiggle``.
 
         wiggle  standard deviation of the amplitude of function 2, in ``size``; others by how much they bend
         kept    of its functions, rising: where a parameter that is fitted does what the mean does, the curve has none
+        jump    whether half the height of a jump is one more amplitude
         """
         # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
         wide = float(np.sqrt(3.0) * LEVEL * size)
@@ -96,6 +99,8 @@ class Basis:
             own = ("mean", "slope")[k] if plain else bend
             tolerance = wide if plain else float(np.sqrt(3.0) * wiggle * size / np.sqrt(self.bend[k]))
             out.append(Parameter(own, 0.0, unit, 0.0 if step else -np.inf, scale=size, tolerance=tolerance))
+        if jump:
+            out.append(Parameter("jump", 0.0, unit, scale=size, tolerance=wide))
         starts = tuple(tuple(sign * size if i == k else 0.0 for i in range(len(out)))
                        for k in range(len(out)) if k < 3 for sign in (-0.3, 0.3)
                        if sign * size > out[k].low)  # fmt: skip

@@ -376,12 +376,12 @@ def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Trie
             )  # fmt: skip
             effects[law.name] = dict(f.numbers)
             continue
-        values = [float(v) for v in c.turn @ last.fit.theta[last.judge.stage.index()[c.name]]]
-        curves[law.name] = Table(
+        values = [float(v) for v in c.coefficients(last.fit.theta[last.judge.stage.index()[c.name]])]
+        curves[law.name] = now = Table(
             how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), values=values,
-            knots=[float(v) for v in law.knots], unit=law.unit, size=float(c.size),
+            knots=[float(v) for v in law.knots], jump=c.jump, unit=law.unit, size=float(c.size),
         )  # fmt: skip
-        effects[law.name] = {f"c{k + 1}": v for k, v in enumerate(values)}
+        effects[law.name] = dict(zip(now.numbers, values, strict=True))
     return model.model_copy(update={"effects": effects, "curves": curves})
 
 

@@ -56,7 +56,10 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     except InputError as e:
         raise StageError(str(e)) from None
     form = next((f for f in FORMS if f.name == law.form), None)
-    table, jump = (law.table(), None) if form is None else runs(form, *law.ends)
+    table, jump = runs(form, *law.ends) if form else (law.table(), None)
+    if law.jump and not form:
+        smooth = law.model_copy(update={"jump": False}).table()
+        table, jump = (lambda v: smooth(v[:-1])), (lambda v: (float(v[-1]), 0.0))
     curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump)
     names = law.numbers
     sizes = [max(abs(v), 1e-9) for v in law.values] if law.form else [abs(law.size) or 1.0] * len(names)

@@ -31,6 +31,8 @@ __all__ = ["Candidate", "OwnGround", "Quantity", "candidates", "on_logs", "quant
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
 LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the shortest lag tried to the longest
 SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
+JUMP = -1  # of a curve's amplitudes, the one that is of no function of its basis
+CROSSES = 0.05  # share of a quantity's values to each side of 0, where a curve of it may jump
 
 
 SHAPES = {
@@ -84,6 +86,7 @@ class Candidate:
     near   whether the quantity is at the place itself, whatever their names
     untold of its mean (0) and slope (1): what it has not, as the logs do not tell it from fitted parameters
     shape  what is known of it beforehand (`SHAPES`)
+    jump   whether it has a jump, too, where its quantity is 0
     """
 
     name: str
@@ -98,6 +101,7 @@ class Candidate:
     near: bool = False
     untold: tuple[int, ...] = ()
     shape: tuple[str, ...] = ()
+    jump: bool = False
 
     @property
     def lent(self) -> set[int]:
@@ -110,6 +114,24 @@ class Candidate:
         gone = self.lent | ({0} if "zero" in self.shape else set())
         step = 2 if "odd" in self.shape else 1  # of a basis over as much below 0 as above, every other one
         return [k for k in range(step - 1, self.basis.turn.shape[1], step) if k not in gone]
+
+    @property
+    def parts(self) -> list[int]:
+        """What each of its amplitudes is of: a function of its basis, or `JUMP`."""
+        return [*self.kept, JUMP] if self.jump else self.kept
+
+    def coefficients(self, amplitudes: Array) -> Array:
+        """Those of B-splines, behind them half the jump that it may have."""
+        n = len(self.kept)
+        return np.append(self.turn @ amplitudes[:n], amplitudes[n:])
+
+    def jumping(self) -> Candidate | None:
+        """The same with a jump where its quantity is 0; None where that is hardly below, or above, 0."""
+        q, x = self.quantity, self.quantity.visited
+        plain = q.stops or q.period or q.name == TIME or {"rising", "falling"} & set(self.shape)
+        if self.jump or plain or len(self.basis.bend) < 3:
+            return None
+        return replace(self, jump=True) if min(np.mean(x > 0.0), np.mean(x < 0.0)) > CROSSES else None
 
     def shaped(self, shape: Sequence[str]) -> Candidate | None:
         """The same with what is known of its shape; None where its quantity cannot have that."""
@@ -169,7 +191,10 @@ class Candidate:
     def placed(self) -> Placed:
         """What runs."""
         design = self.basis.design(self.grid) @ self.turn
-        return self.placed_as(design.__matmul__, design.shape[1])
+        n = design.shape[1]
+        if self.jump:
+            return self.placed_as(lambda a: design @ a[:n], n + 1, jump=lambda a: (float(a[n]), 0.0))
+        return self.placed_as(design.__matmul__, n)
 
     def placed_as(
         self, table: Table, parameters: int, reach: tuple[float, float] | None = None, jump: Jump | None = None
@@ -189,7 +214,7 @@ class Candidate:
 
     def effect(self, wiggle: float) -> Effect:
         """What the search is told."""
-        return self.basis.effect(self.name, self.unit, self.size, wiggle, self.kept)
+        return self.basis.effect(self.name, self.unit, self.size, wiggle, self.kept, self.jump)
 
 
 def quantities(bound: Bound, values: Array) -> list[Quantity]:
@@ -397,7 +422,7 @@ def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
 class OwnGround:
     """A user's own model, held against logs (`vaneloop.discrepancy.models.learning.Ground`)."""
 
-    points = FINE
+    points, jumps = FINE, True
 
     def __init__(self, logs: Logs):
         self.logs, self.floor = logs, logs.fitted.floor

@@ -46,12 +46,11 @@ def _visited(tried: Tried) -> Array:
 def _variance(tried: Tried, visited: Array) -> Array:
     """Variance of a curve at values of its quantity, by the noise of what it was fitted to."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
-    table, _ = tried.table()
     scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
     mine = np.flatnonzero((fit.free >= own.start) & (fit.free < own.stop))
     covariance = np.linalg.pinv(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
     covariance *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
-    rows = np.array([np.interp(visited, c.grid, table(step)) for step in np.diag(scale[mine])])
+    rows = np.array([tried.at(visited, step) for step in np.diag(scale[mine])])
     return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, covariance, rows), 0.0))
 
 
@@ -62,8 +61,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     """
     c = tried.candidate
     visited = _visited(tried)
-    table, amplitudes = tried.table()
-    at_visited = np.interp(visited, c.grid, table(amplitudes))
+    at_visited = tried.at(visited, tried.table()[1])
     lent = c.lent | ({0, 1} if loose else set())
     variance, spread = _variance(tried, visited), max(float(np.var(at_visited)), 1e-300)
     weight = 1.0 / np.sqrt(variance + CLOSE * spread)  # a curve is known where the log tells it

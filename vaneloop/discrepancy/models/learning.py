@@ -328,13 +328,13 @@ class Learner:
         Along such a valley a fit ends anywhere; here it ends where the parameters say all that they can.
         """
         whole = best.candidate
-        found = dict(zip(whole.kept, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
+        found = dict(zip(whole.parts, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
         nominal = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]]
         for untold in ((0, 1), (1,), (0,)) if whole.basis.straight == 2 else ((0,),):
             c = replace(whole, untold=untold)
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
-            bends = [found[k] for k in c.kept]
+            bends = [found[k] for k in c.parts]
             fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
             simpler = min(fits, key=self._score)
             if self._score(simpler) <= self._score(best) + BETTER:
@@ -376,7 +376,9 @@ class Learner:
             best = self._score(done[0], done)
             close = [t for t in done if self._score(t, done) < best + NEAR]
             finer = [f for t in close if (f := self._finer(current, t)) is not None]
-            done = self._ordered([*done, *finer])
+            close = [t for t in done if self._score(t, done) < best + FORMULAS]
+            jumping = [j for t in close if (j := self._jumping(current, t)) is not None]
+            done = self._ordered([*done, *finer, *jumping])
             first_of = {t.candidate.name: t for t in reversed(done)}
             done = [t for t in done if first_of[t.candidate.name] is t]
         return done
@@ -402,6 +404,14 @@ class Learner:
         amplitudes = np.maximum(amplitudes, [p.low for p in fine.effect(1.0).parameters])
         theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
         return self._fitted(current, fine, WIGGLES[-1], theta, 12)
+
+    def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
+        """The same curve with a jump where its quantity is 0."""
+        c = smooth.candidate.jumping() if self.ground.jumps else None
+        if c is None:
+            return None
+        begun = replace(smooth.fit, theta=np.append(smooth.fit.theta, 0.0))
+        return self._finished(current, replace(smooth, candidate=c, fit=begun))
 
     def _fitted(
         self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int, quick: bool = False

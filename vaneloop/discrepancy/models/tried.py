@@ -40,13 +40,14 @@ class Ground(Protocol):
 
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
     tests  names of the logs that nothing is fitted to
-    points of the table of a formula
+    points of the table of a formula; ``jumps``: whether curves may jump
     """
 
     whole: Stage
     floor: Array
     tests: frozenset[str]
     points: int
+    jumps: bool
 
     def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
@@ -103,6 +104,14 @@ class Tried:
         curve = self.curves[-1][0].curve
         assert curve is not None
         return curve.whole, self.fit.theta[self.judge.stage.index()[self.candidate.name]]
+
+    def at(self, q: Array, amplitudes: Array) -> Array:
+        """The new curve with these amplitudes at values of its quantity; of stops, its virgin curve."""
+        curve = self.curves[-1][0].curve
+        assert curve is not None
+        if self.candidate.quantity.stops:
+            return np.interp(q, self.candidate.grid, curve.whole(amplitudes))
+        return curve.at(q, curve.row(amplitudes))
 
 
 @dataclass

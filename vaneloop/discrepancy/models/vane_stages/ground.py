@@ -149,7 +149,7 @@ class VaneGround:
     test   the same stage on a part of the log that nothing is fitted to
     """
 
-    points = POINTS  # as the plant's rows have them
+    points, jumps = POINTS, False  # as the plant's rows have them
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
         assert isinstance(stage.made, Made) and stage.floor is not None
