@@ -607,6 +607,37 @@ def test_a_law_that_goes_on_or_jumps_is_what_its_file_says(bound) -> None:
             from_file("p.q", told.model_copy(update=wrong), bound.data)
 
 
+def test_a_jump_is_the_friction_of_the_library() -> None:
+    """Bit for bit inside an integration, also of a law file; and the curve of a speed has it where that turns."""
+    cart = System(
+        "cart", "simulate", lambda x, u, p: (x.speed, (u.push - p.damping * x.speed) / p.mass), inputs={"push": "N"},
+        states={"place": "m", "speed": "m/s"}, outputs={"speed": "m/s"}, rates={"speed": "place"},
+        masses={"speed": "mass"}, parameters=[unknown("mass", 4.0, "kg"), unknown("damping", 2.0, "N s/m")],
+    )  # fmt: skip
+    t = np.arange(400.0) * 0.05
+    bound = cart.bind([Record("run", t, {"push": 9.0 * np.sin(t), "speed": np.sin(t - 0.8)})])
+    named = with_curves(bound, ("speed.coulomb",), ())
+    theta = np.append(named.stage.neutral()[:-1], 1.7)
+    friction = named.run(theta[None])[0]
+    speed = next(c for c in candidates(bound, theta[:-1]) if c.name == "speed.curve_of_speed")
+    c = speed.jumping()
+    assert c is not None and c.jumping() is None
+    placed, effect = c.placed(), c.effect(1.0)
+    curve = np.zeros(len(effect.parameters))
+    curve[-1] = 1.7
+    ours = with_curves(bound, (), [(placed, effect)])
+    assert np.allclose(ours.run(np.append(theta[:-1], curve)[None])[0], friction, rtol=1e-12, atol=1e-12)
+    low, high = c.basis.low, c.basis.high
+    plain = Learned(how="state adds", at="speed", of="speed", low=low, high=high, values=[1.7], form="sign")
+    splines = plain.model_copy(
+        update={"form": "", "jump": True, "knots": list(c.basis.knots), "values": [*c.coefficients(curve)]}
+    )
+    for law in (plain, splines):
+        read_back = with_curves(bound, (), [from_file(c.name, law, bound.data)])
+        assert np.allclose(read_back.run(np.append(theta[:-1], law.values)[None])[0], friction, rtol=1e-9, atol=1e-9)
+    assert splines.numbers[-1] == "jump" and np.ptp(splines.table()(np.array(splines.values))) == pytest.approx(3.4)
+
+
 def hardening(seed: int, size: float) -> Record:
     """A slide that is moved, with a spring that nobody listed: 90 position^3."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, 30.0, 0.03)

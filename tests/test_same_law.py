@@ -54,6 +54,7 @@ def test_a_flow_that_is_rectified_is_a_curve_of_the_current_that_makes_it() -> N
         ("input adds", "push", "speed", True),
         ("parameter times", "mass", "speed", False),
         ("parameter times", "damping", "time", False),
+        ("input adds", "push", "push_lagged_by_2_s", False),
     ],
 )
 def test_a_drag_is_a_gain_of_the_damping_and_no_gain_of_the_mass(how: str, at: str, of: str, same: bool) -> None:

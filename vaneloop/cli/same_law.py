@@ -40,6 +40,8 @@ def same_by_equations(law: Any, bound: Any, model: Any, at: str, of: str, value:
     }
     how = own.get(at, "output adds")
     truth = world.change(how, at, value(world.known(of)))
+    if not world.knows(law.of):  # a lag or a period that was fitted: no such law is hidden
+        return {"inside": 0.0, "formula": False}
     q = world.known(law.of)
 
     def learned(y: Array) -> Array:
@@ -82,6 +84,10 @@ class _World:
                 self.values[q.name] = rng.choice(good, DRAWN)
         self.p = np.array([p.value for p in model.parameters])
         self.plain = self._says(self.p)
+
+    def knows(self, of: str) -> bool:
+        """Whether a quantity is one of those."""
+        return of in self.values or of in self.model.outputs
 
     def known(self, of: str) -> Array:
         """Values of a quantity there; of one that is an output, what the model says."""
