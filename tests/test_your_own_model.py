@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from tests.browser import open_to_all
+from vaneloop.base.spline_rates import SplineRates
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
 from vaneloop.discrepancy.models.data import Data
@@ -386,3 +388,14 @@ def test_a_law_that_harms_a_test_log_is_not_named() -> None:
     answer = diagnose([fitted], STRAIGHT, test=[other])
     assert "u.asymmetric_gain" not in named(answer)
     assert any("is not named: makes other worse" in n for n in answer.diagnosis.notes)
+
+
+@pytest.mark.parametrize("samples", [4, 5, 300])
+def test_rates_of_a_spline_are_scipy_s(samples: int) -> None:
+    """On any raster, of one signal or of many."""
+    draw = np.random.default_rng(samples)
+    t = np.cumsum(draw.uniform(0.1, 2.0, samples))
+    u = draw.standard_normal((3, samples))
+    rates = SplineRates(t)
+    assert np.allclose(rates(u), CubicSpline(t, u, axis=1)(t, 1), rtol=1e-9, atol=1e-9)
+    assert np.array_equal(rates(u[1]), rates(u)[1])

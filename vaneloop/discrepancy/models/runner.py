@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from vaneloop.base.compiled import compiled_free, threads
+from vaneloop.base.spline_rates import SplineRates
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, SENSED, Curve, bent, curves_for_kernel
@@ -44,6 +47,11 @@ class Placed:
     neutral: Array = field(default_factory=lambda: np.zeros(0))
     curve: Curve | None = None
 
+    @cached_property
+    def idle(self) -> list[float]:
+        """Its neutral values: arrays of two take ten times as long to compare."""
+        return list(self.neutral.tolist())
+
 
 class Runner:
     """The model on its logs.
@@ -73,7 +81,7 @@ class Runner:
         self.ready = like is not None  # the model ran with the user's own values
         self.placed: list[Placed] = []
         self.free_starts: list[tuple[int, int]] = []
-        self.slopes: dict[int, Array] = {}  # of the inputs as logged, see `_slopes`
+        self.splines: dict[int, tuple[SplineRates, Array]] = {}  # and the rates of the inputs as logged, see `_rates`
         self.steps: int = like.steps if like else 1
         self.small: float = like.small if like else 0.0
         self.smalls: Array = like.smalls if like else np.zeros(len(s.states))
@@ -132,12 +140,12 @@ class Runner:
 
     def _active(self, theta: Array) -> list[tuple[Placed, Array]]:
         out = []
-        numbers = theta.tolist()  # compared as such: arrays of two take ten times as long
+        numbers = theta.tolist()
         for q in self.placed:
             values = numbers[q.columns]
             if q.curve is not None and any(values):
                 out.append((q, q.curve.row(theta[q.columns])))
-            elif q.curve is None and values != q.neutral.tolist():
+            elif q.curve is None and values != q.idle:
                 row = np.zeros(self.dispatch.parameters + 1)
                 row[: len(values)] = values
                 row[len(values)] = q.constant
@@ -262,20 +270,22 @@ class Runner:
                 y[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(y[q.at]), row)
         return y
 
-    def _slopes(self, log: int, t: Array, u: Array) -> Array:
+    def _rates(self, log: int, t: Array, u: Array, changed: Sequence[int]) -> Array:
         """Rates of the inputs at the samples where they run in a smooth curve between them: those of a cubic spline,
-        float64[inputs, samples]; else none.
+        float64[inputs, samples]; else none. Those not ``changed`` are as logged.
         """
-        from scipy.interpolate import CubicSpline
-
         if self.system.between != "smooth" or not len(u) or len(t) < FEW:
             return np.zeros((0, len(t)))
-        as_logged = u.base is self.data.u[log] and len(t) == len(self.data.times[log])
-        if as_logged and log in self.slopes:
-            return self.slopes[log]
-        out = np.ascontiguousarray(CubicSpline(t, u, axis=1)(t, 1))
-        if as_logged:
-            self.slopes[log] = out
+        if len(t) < len(self.data.times[log]):
+            return SplineRates(t)(u)
+        if log not in self.splines:
+            spline = SplineRates(t)
+            self.splines[log] = spline, spline(self.data.u[log])
+        spline, as_logged = self.splines[log]
+        if not changed:
+            return as_logged
+        out = as_logged.copy()
+        out[changed] = spline(u[changed])
         return out
 
     def _kernels_for_curves(self) -> tuple[Kernel, Kernel]:
@@ -307,17 +317,19 @@ class Runner:
         position = np.array([names.index(s.rates[n]) if n in s.rates else -1 for n in names], dtype=np.int64)
         known = [q.name for q in s.parameters]
         mass = np.array([p[known.index(s.masses[n])] if n in s.masses else 1.0 for n in names])
-        if not loop:
+        changed = sorted({q.at for q, _ in active if q.place == "input"}) if not loop else []
+        if changed:
+            u = u.copy()
             for q, row in active:
                 if q.place == "input":
-                    u = u.copy() if u is self.data.u[log] or u.base is not None else u
                     u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
         ends = [(q, row) for q, row in active if q.place in ("input", "output")] if loop else []
         e_code = np.array([q.law.code for q, _ in ends], dtype=np.int64)
         e_at = np.array([q.at for q, _ in ends], dtype=np.int64)
         e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
         e_rows = np.array([row for _, row in ends]).reshape(len(ends), self.dispatch.parameters + 1)
-        if np.isin(code, laws.SWITCHING).any() or np.any((code >= FIRST_CODE["force"]) & (code < FIRST_CODE["state"])):
+        own_forces = range(FIRST_CODE["force"], FIRST_CODE["state"])
+        if any(q.law.code in laws.SWITCHING or q.law.code in own_forces for q, _ in inside):
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
@@ -328,7 +340,7 @@ class Runner:
         arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
             rows, position, gap,
-            asymmetry, self.smalls, mass, steps, s.between != "hold", self._slopes(log, t, u), len(s.commands),
+            asymmetry, self.smalls, mass, steps, s.between != "hold", self._rates(log, t, u, changed), len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         if curves:

@@ -5,13 +5,13 @@ shows.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_banded
 from scipy.ndimage import uniform_filter1d
 
 from controller import Calibration
 from hil.figures import resolution
 from plant import chain
 from vaneloop.base.compiled import compiled
+from vaneloop.base.spline_rates import SplineRates
 from vaneloop.discrepancy.models.vane_stages.raster import RASTER, WINDOW
 from vaneloop.discrepancy.models.vane_stages.stroke import SMOOTH, Smooth
 from vaneloop.discrepancy.stage import Array
@@ -39,7 +39,8 @@ def servo_law(
     gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
     stroke = np.empty(when.shape)
-    _between(smooth.stroke, _slopes(smooth.stroke), stroke)
+    spline = SplineRates(np.arange(float(len(t))))
+    _between(smooth.stroke, spline(smooth.stroke), stroke)
     between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
     stroke[:, -1] = x
     law = np.empty(when.shape)
@@ -51,7 +52,7 @@ def servo_law(
     off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
         left = smooth.left(draw) + smooth.distortion
-        _between(left, _slopes(left), off)
+        _between(left, spline(left), off)
         off += between
         draw.standard_normal(out=ticks)
         ticks *= smooth.noise
@@ -83,21 +84,10 @@ def _loop(demand: Array, stroke: Array, kp: float, ki: float, kff: float, out: A
         two, before = before, demand[m]
 
 
-def _slopes(x: Array) -> Array:
-    """Slopes, per row, of a cubic spline through the rows, not a knot at the second and the last but one."""
-    step, n = np.diff(x), len(x)
-    bands = np.array([np.ones(n), np.full(n, 4.0), np.ones(n)])
-    bands[0, 1], bands[1, 0], bands[1, -1], bands[2, -2] = 2.0, 1.0, 1.0, 2.0
-    right = np.empty(n)
-    right[1:-1] = 3.0 * (step[1:] + step[:-1])
-    right[0], right[-1] = 2.5 * step[0] + 0.5 * step[1], 2.5 * step[-1] + 0.5 * step[-2]
-    return np.asarray(solve_banded((1, 1), bands, right))
-
-
 @compiled
 def _between(x: Array, slope: Array, out: Array) -> None:
-    """A cubic spline through the rows, of these ``slope``, at the ten ticks up to each row: float64[rows, 10]. Before
-    the first row it is the first.
+    """A cubic spline through the rows, of these ``slope`` per row, at the ten ticks up to each row: float64[rows, 10].
+    Before the first row it is the first.
     """
     out[0] = x[0]
     for m in range(1, len(x)):
