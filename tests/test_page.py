@@ -143,6 +143,16 @@ def test_every_colour_role_exists_in_both_schemes():
     assert used <= THEMES["light"].keys() and {"measured", "noise", "error"} <= used
 
 
+def test_a_width_sets_no_colour():
+    """So colours that a wide screen reads are read on a phone, too (`tests/browser.py`)."""
+    pages = ROOT / "vaneloop" / "pages"
+    of_width = re.findall(r"@media \(max-width.*?\}\}", (pages / "page.css").read_text("utf-8"), re.S)
+    script = (pages / "page.js").read_text("utf-8")
+    narrow = re.findall(r"if \(narrow\) \{.*?^    \}|if \(narrow [^{]*;$", script, re.S | re.M)
+    assert len(of_width) >= 2 and len(narrow) >= 2
+    assert not [w for w in (*of_width, *narrow) if re.search(r"colou?r|background|--|opacity", w)]
+
+
 def test_a_plotly_figure_can_be_added():
     page = Page("t", "v")
     page.plot(go.Figure(go.Scatter(x=[1, 2], y=[3, float("nan")])))
