@@ -117,9 +117,9 @@ def test_what_is_left_out_is_an_effect_and_a_curve_that_the_plant_can_have():
 
 
 def test_a_left_out_effect_is_not_looked_for():
-    case = draw_case(4, 0, 60.0, leave_out=True)
+    case = draw_case(4, 0, 20.0, leave_out=True)
     assert case["kind"] == "left out" and case["hidden"][0].name in LEFT_OUT
-    row = judge_case(4, 0, 60.0, 100, leave_out=True)
+    row = judge_case(4, 0, 20.0, 100, leave_out=True)
     assert row["truth"][0] not in row["named"] and row["kind"] == "left out"
     learned = json.loads(row["learned"])  # what says the same in this log is left out, too
     assert learned["verdict"] in ("learned", "unknown", "none") and row["truth"][0] not in learned["also"]

@@ -270,7 +270,7 @@ def test_what_no_machine_has_a_period_of_is_refused() -> None:
 
 def test_an_oscillating_driver_is_learned_from_a_log_of_the_rig(tmp_path) -> None:
     hidden = rig.draw("driver_oscillation", 3, np.random.default_rng(1))
-    run = rig.simulate(rig.manoeuvre(12, 120.0), firmware(), [hidden], seed=12, rate=100, randomised=False)
+    run = rig.simulate(rig.manoeuvre(12, 40.0), firmware(), [hidden], seed=12, rate=100, randomised=False)
     log = Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
     from vaneloop.discrepancy.models.vanes import build_chain
 
