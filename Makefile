@@ -11,8 +11,8 @@ SAY := printf '[vaneloop] %s\n'
 JOBS ?= 3
 # Threads of BLAS would wait for each other.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
-# mypy takes one core, and so does the first half of what is compiled ahead
-BOTH = $(MAKE) --no-print-directory -j2 lint compiled
+# Many tests start Python: what it compiles of a module is kept, wherever this is switched off.
+unexport PYTHONDONTWRITEBYTECODE
 # Why tests were skipped: pytest writes it there, and the last lines of `make test` say it.
 NOT_TESTED := out/not_tested.txt
 
@@ -33,19 +33,15 @@ demo: compiled  ## replay a recorded engine run and the long engine test; writes
 
 test: $(READY)  ## lint, types, and every test but the slow ones
 	@$(need_chromium)
-	@$(BOTH)
-	@$(SAY) 'pytest'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PY) -m pytest -n $(JOBS) --dist worksteal --durations=25 -m 'not slow and not socketcan'
+	@$(call tested,pytest,--durations=25 -m 'not slow and not socketcan')
 
 test-all: $(READY)  ## lint, types, and every test, with the slow campaigns
 	@$(need_chromium)
-	@$(BOTH)
-	@$(SAY) 'pytest, with the slow campaigns'
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PY) -m pytest -n $(JOBS) --dist worksteal -m 'not socketcan'
+	@$(call tested,pytest$(comma) with the slow campaigns,-m 'not socketcan')
 
 test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run
@@ -66,9 +62,7 @@ docs: $(READY)  ## the documentation site, in out/site/index.html; every link an
 	@$(SAY) 'open out/site/index.html'
 
 lint: $(READY)  ## ruff and mypy
-	@$(SAY) 'ruff'
-	@$(PY) -m ruff check --output-format concise .
-	@$(PY) -m ruff format --check --quiet --diff .
+	@$(ruff)
 	@$(SAY) 'mypy'
 	@$(PY) -m mypy
 
@@ -128,6 +122,25 @@ fi; \
 if [ -z "$$found" ]; then $(SAY) 'no Python 3.11 or newer found (looked for python3, python3.11 to python3.14): install one and try again'; exit 1; fi; \
 $(SAY) "making $(VENV) with $$("$$found" --version)"; \
 rm -rf $(VENV); "$$found" -m venv $(VENV)
+endef
+
+comma := ,
+define ruff
+$(SAY) 'ruff'; \
+$(PY) -m ruff check --output-format concise .; \
+$(PY) -m ruff format --check --quiet --diff .
+endef
+
+# mypy takes one core for a minute: it runs beside what is compiled ahead and the first tests. What it found is said
+# when they have ended, and fails as they do. Words of (2) are pytest's.
+define tested
+$(ruff); \
+$(SAY) 'mypy, beside the others'; \
+$(PY) -m mypy >out/mypy.txt 2>&1 & types=$$!; code=0; \
+{ $(PY) -m vaneloop.cli.ahead && $(SAY) '$(1)' && $(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run \
+  --beside $(PY) -m pytest -n $(JOBS) --dist worksteal $(2); } || code=$$?; \
+wait $$types || { code=1; $(SAY) 'mypy:'; cat out/mypy.txt; }; \
+exit $$code
 endef
 
 define need_gcc

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import time
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,7 +19,8 @@ import pytest
 from controller import load_calibration
 from controller.calibration import CalibrationTable
 from hil.bus.lockstep_bus import run_lockstep
-from hil.fmu import write_fmu
+from hil.fmu import source, write_fmu
+from hil.fmu.memory import Shape
 from hil.fmu.plant_fmu import PlantFmu, PlantNode
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.node import Node
@@ -59,6 +62,21 @@ def fmus(gcc: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         for part in ("loop", "plant", "controller")
         for version in ("3.0", "2.0")
     }
+
+
+def test_two_that_export_at_once_make_the_source_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def make(kept: Path, part: str, shape: Shape) -> None:
+        made.append(part)
+        time.sleep(0.2)
+        kept.write_text("the source")
+
+    monkeypatch.setattr(source, "_folder", lambda: tmp_path / "kept")
+    monkeypatch.setattr(source, "_make_source", make)
+    with ThreadPoolExecutor(2) as two:
+        said = list(two.map(source.part_source, ["loop", "loop"], [Shape(3, 66, 49)] * 2))
+    assert made == ["loop"] and said == ["the source"] * 2
 
 
 class Driven:

@@ -6,6 +6,8 @@ leaves their results as they are; the C text that comes of it is kept, since it 
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import gc
 import hashlib
 import os
@@ -14,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -56,12 +58,27 @@ def _folder() -> Path:
     return cache_folder().parent / f"fmu-{h.hexdigest()[:16]}"
 
 
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Who makes the same at the same time waits, and finds it made. The kernel ends the lock with its process."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def part_source(part: str, shape: Shape) -> str:
     """Return ``part.c`` of a part (`hil.fmu.variables.PARTS`) for a machine of this shape."""
     kept = kept_source(part, shape)
+    if not kept.is_file():
+        with _alone(kept.parent):
+            if not kept.is_file():
+                _make_source(kept, part, shape)
+    return kept.read_text(encoding="ascii")
+
+
+def _make_source(kept: Path, part: str, shape: Shape) -> None:
     folder = kept.parent
-    if kept.is_file():
-        return kept.read_text(encoding="ascii")
     root = str(Path(__file__).parents[2])
     environment = {**os.environ, **_PLAIN, "NUMBA_CACHE_DIR": str(folder)}
     environment["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -69,11 +86,9 @@ def part_source(part: str, shape: Shape) -> str:
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"the source of the FMU could not be made: {done.stderr[-2000:]}")
-    folder.mkdir(parents=True, exist_ok=True)
     writing = kept.with_suffix(f".{os.getpid()}")
     writing.write_text(done.stdout, encoding="ascii")
     writing.replace(kept)
-    return done.stdout
 
 
 def part_object(part: str, shape: Shape) -> Path:
