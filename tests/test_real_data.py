@@ -94,15 +94,11 @@ def damper(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     return answer("friction_damper", (files[0],), tuple(files[1:]), tmp_path_factory.getbasetemp())
 
 
-@pytest.fixture(
-    scope="module",
-    params=[((1, 20), (4,)), pytest.param(((1, 9, 20, 21, 23, 24), (4, 22)), marks=WHOLE)],
-    ids=["a part", "whole"],
-)
-def turbine(data_dir: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> dict[str, Any]:
+@pytest.fixture(scope="module")
+def turbine(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The micro gas turbine."""
-    fit, test = (find(data_dir, *(f"micro_gas_turbine/ex_{k}.csv" for k in runs)) for runs in request.param)
-    return answer("micro_gas_turbine", tuple(fit), tuple(test), tmp_path_factory.getbasetemp())
+    files = find(data_dir, *(f"micro_gas_turbine/ex_{k}.csv" for k in (1, 9, 20, 21, 23, 24, 4, 22)))
+    return answer("micro_gas_turbine", tuple(files[:6]), tuple(files[6:]), tmp_path_factory.getbasetemp())
 
 
 def test_coulomb_friction_and_offset_of_the_axis_are_found_at_their_published_sizes(emps: dict[str, Any]) -> None:
@@ -146,8 +142,7 @@ def test_the_turbine_lacks_a_rate_limit_and_no_dead_time(turbine: dict[str, Any]
     assert value(turbine, named[0], "rate") == pytest.approx(5.3, rel=0.05)
     test = [e["rms"] for e in turbine["together"] if e["logs"] == "test"]
     assert test[0] > 350.0
-    assert test[-1] < 0.4 * test[0] or len(turbine["logs"]) > 6
-    assert test[-1] <= 151.0 or len(turbine["logs"]) == 6
+    assert test[-1] <= 151.0
 
 
 def test_the_hardening_spring_of_the_oscillator_is_found(silverbox: dict[str, Any]) -> None:
