@@ -43,10 +43,11 @@ from plant.geometry import Stage
 from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
 from plant.parameters import Nominal, derive, nominal
-from vaneloop.base.curve import DEGREE, POINTS, splines
+from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
-from vaneloop.base.forms import FORMS
+from vaneloop.base.forms import FORMS, product
+from vaneloop.base.hull import nearest_within, within
 from vaneloop.base.hysteresis import stops_of
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, VANES, vane_in
@@ -56,8 +57,24 @@ __all__ = ["Learned", "Model", "allowed_of", "load_model", "write_model"]
 FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
 
 
+class Second(Table):
+    """The other quantity of a law that is a function of two.
+
+    of, low, high, knots, form  as a law has them
+    been   of splines, corners of where both have been, pairs of values; beyond, the surface stays as at the nearest
+           place within. A formula goes on from low to high of either
+    """
+
+    of: str
+    low: Finite
+    high: Finite
+    knots: list[Finite] = Field(default_factory=list, max_length=104)
+    form: str = ""
+    been: list[tuple[Finite, Finite]] = Field(default_factory=list, max_length=1000)
+
+
 class Learned(Table):
-    """A law that was learned: a function of one quantity at one place.
+    """A law that was learned: a function of one quantity at one place, or of two.
 
     how, at, of  what it does, where, of what (docs/learn.md)
     low, high    where its quantity has been; beyond, the function stays as at its end, or
@@ -66,6 +83,8 @@ class Learned(Table):
     jump         whether the last value of such a spline is half a jump where its quantity is 0
     form         name of a formula with ``values`` as numbers
     size         how large such a function is in usual, in ``unit``
+    second       of a surface, its other quantity: ``values`` are those of each of the first one's splines in turn, one
+                 for each spline of this; of formulas the numbers of the first, and of this all but what multiplies it
     """
 
     how: str
@@ -80,12 +99,15 @@ class Learned(Table):
     reach: list[Finite] = Field(default_factory=list, max_length=2)
     unit: str = ""
     size: Finite = 1.0
+    second: Second | None = None
 
     @property
     def numbers(self) -> tuple[str, ...]:
         """Names of its values: c1, c2, ... of splines, those of its formula."""
         if self.form:
-            return next((f.numbers for f in FORMS if f.name == self.form), ())
+            own = next((f.numbers for f in FORMS if f.name == self.form), ())
+            other = next((f.numbers for f in FORMS if self.second and f.name == self.second.form), ())
+            return (*own, *(f"second_{n}" for n in other[1:]))
         own = tuple(f"c{k + 1}" for k in range(len(self.values) - self.jump))
         return (*own, "jump") if self.jump else own
 
@@ -101,33 +123,88 @@ class Learned(Table):
         return (self.reach[0], self.reach[-1]) if self.reach else (self.low, self.high)
 
     def check(self, name: str) -> None:
-        """Refuse a table that is no curve: InputError, one line, with its ``name``."""
-        if not self.low < self.high:
-            raise InputError(f"{name}: low (={self.low:g}) must be below high (={self.high:g})")
+        """Refuse a table that is no curve and no surface: InputError, one line, with its ``name``."""
+        axes: list[tuple[str, Learned | Second]] = [
+            (name, self),
+            *([(f"{name}.second", self.second)] if self.second else []),
+        ]
+        for where, axis in axes:
+            if not self.low < self.high or not axis.low < axis.high:
+                raise InputError(f"{where}: low (={axis.low:g}) must be below high (={axis.high:g})")
+            if bool(axis.form) != bool(self.form) or axis.form and all(f.name != axis.form for f in FORMS):
+                one_of = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
+                allowed = one_of if self.form else "none, as the first quantity has splines"
+                raise InputError(f"{where}: form (={axis.form!r}, {len(self.values)} values) must be one of {allowed}")
         if self.form and len(self.numbers) != len(self.values):
             allowed = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
-            raise InputError(f"{name}: form (={self.form!r}, {len(self.values)} values) must be one of {allowed}")
+            needed = f"; with second, {', '.join(self.numbers)} are needed" if self.second else ""
+            raise InputError(
+                f"{name}: form (={self.form!r}, {len(self.values)} values) must be one of {allowed}{needed}"
+            )
+        if self.second is not None and (self.jump or self.reach):
+            raise InputError(f"{name}: jump and reach are of one quantity; with second they are not allowed")
         low, high = self.ends
         if self.reach and not (self.form and len(self.reach) == 2 and low <= self.low and self.high <= high):
             raise InputError(
                 f"{name}: reach (={self.reach}) must be of a formula: two numbers that hold low (={self.low:g}) and "
                 f"high (={self.high:g})"
             )
-        count = len(self.values) - self.jump
-        if not self.form and (len(self.knots) != count + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0)):
+        if self.form:
+            return
+        if self.second is None:
+            count = len(self.values) - self.jump
+            if len(self.knots) != count + DEGREE + 1 or np.any(np.diff(self.knots) < 0.0):
+                raise InputError(
+                    f"{name}: knots ({len(self.knots)} of them) must rise, and be {DEGREE + 1} more than the "
+                    f"{count} values{' less the jump' if self.jump else ''}"
+                )
+            return
+        for where, axis in axes:
+            if len(axis.knots) < 2 * (DEGREE + 1) or np.any(np.diff(axis.knots) < 0.0):
+                raise InputError(
+                    f"{where}: knots ({len(axis.knots)} of them) must rise, and be {2 * (DEGREE + 1)} at least"
+                )
+        rows, columns = (len(axis.knots) - DEGREE - 1 for _, axis in axes)
+        if len(self.values) != rows * columns:
             raise InputError(
-                f"{name}: knots ({len(self.knots)} of them) must rise, and be {DEGREE + 1} more than the "
-                f"{count} values{' less the jump' if self.jump else ''}"
+                f"{name}: values ({len(self.values)} of them) must be {rows} x {columns}, as the knots have it"
             )
+        if self.second.been:
+            try:
+                within(np.array(self.second.been), *self._ends(), np.zeros(1), np.zeros(1))
+            except ValueError:
+                raise InputError(
+                    f"{name}.second: been ({len(self.second.been)} corners) must be three or more, not along a line"
+                ) from None
+
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest values of both quantities."""
+        assert self.second is not None
+        return np.array([self.low, self.second.low]), np.array([self.high, self.second.high])
 
     def table(self, points: int = POINTS) -> Callable[[np.ndarray], np.ndarray]:
-        """Function from its values to the curve at so many points, evenly from one of its `ends` to the other."""
+        """Function from its values to the curve at so many points, evenly from one of its `ends` to the other; to a
+        surface at `SIDE` points each way, `FINE_SIDE` of a product of formulas.
+        """
+        if self.second is not None:
+            return self._grid(self.second)
         x = np.linspace(*self.ends, points)
         if self.form:
             form = next(f for f in FORMS if f.name == self.form)
             return lambda values: np.broadcast_to(form.value(x, values), x.shape).astype(float)
         design = splines(np.asarray(self.knots, dtype=float), x)
         return np.column_stack([design, np.sign(x)]).__matmul__ if self.jump else design.__matmul__
+
+    def _grid(self, second: Second) -> Callable[[np.ndarray], np.ndarray]:
+        side = FINE_SIDE if self.form else SIDE
+        x, z = np.linspace(self.low, self.high, side), np.linspace(second.low, second.high, side)
+        if self.form:
+            one, other = (next(f for f in FORMS if f.name == name) for name in (self.form, second.form))
+            return lambda values: product(one, other, x, z, values)
+        nearest = nearest_within(np.array(second.been), *self._ends()) if second.been else slice(None)
+        a, b = splines(np.array(self.knots), x), splines(np.array(second.knots), z)
+        shape = a.shape[1], b.shape[1]
+        return lambda values: (a @ np.reshape(values, shape) @ b.T).ravel()[nearest].reshape(SIDE, SIDE)
 
 
 class Model(Table):
@@ -200,6 +277,11 @@ class Model(Table):
             raise InputError(f"{source}: curves (={len(self.curves)}) must be at most {MOST_CURVES}")
         for name, curve in self.curves.items():
             where = f"{source}: curves.{name}"
+            if curve.second is not None:
+                raise InputError(
+                    f"{where}: second (={curve.second.of!r}) makes it a surface; the vane chain takes curves of one "
+                    f"quantity only"
+                )
             places = {k: v for k, v in PLACES.items() if plant.kind in v.kinds and v.vane in ("", *plant.vanes)}
             own = [q for q in QUANTITIES if q not in VANES or q in plant.vanes]
             if f"{curve.at} {curve.how}" not in places:
@@ -282,7 +364,9 @@ def write_model(path: str | Path, model: Model) -> None:
         ]
     for name, curve in model.curves.items():
         of = curve.model_dump(exclude_defaults=True)
-        lines += [f"[curves.{_key(name)}]", *(f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in of.items()), ""]
+        for key, axis in ((_key(name), of), (f"{_key(name)}.second", of.pop("second", {}))):
+            rows = [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in axis.items()]
+            lines += [f"[curves.{key}]", *rows, ""] if rows else []
     try:
         Path(path).write_text("\n".join(lines), encoding="utf-8")
     except OSError as e:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from tests.rig_systems import electric, mechanical, process
-from tests.rig_systems.family import Array, Family, Hidden
+from tests.rig_systems.family import Array, Family, Hidden, Outside
 from tests.rig_systems.laws import Size, draw_values
 from tests.rig_systems.signals import motion, signal
 from tests.rig_systems.simulate import FINE, course, simulate
@@ -186,15 +187,18 @@ def _names(f: Family, kind: str, rng: np.random.Generator) -> list[str]:
 
 
 def draw_case(
-    seed: int, index: int, families: tuple[str, ...] = (), names: list[str] | None = None, samples: int | None = None
-) -> Case:
+    seed: int, index: int, families: tuple[str, ...] = (), names: list[str] | None = None, samples: int | None = None,
+    extra: Mapping[str, Outside] | None = None,
+) -> Case:  # fmt: skip
     """System ``index`` of the series ``seed``, simulated.
 
     families  to draw from (default: all); ``names``: what to hide instead of drawing it; ``samples``: a log's length
+    extra     laws that the library does not have, beside the family's
     """
     rng = np.random.default_rng([seed, index])
     kind = str(rng.choice(KINDS, p=SHARES))
     f = FAMILIES[str(rng.choice(families or list(FAMILIES)))]
+    f = replace(f, outside={**f.outside, **extra}) if extra else f
     p = f.draw(rng)
     factors = {k: float(WRONG ** rng.uniform(-1.0, 1.0)) for k in f.parameters}
     rate = _rate(f, f.timescale(p), rng)

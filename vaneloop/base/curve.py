@@ -1,4 +1,6 @@
-"""A curve of one quantity as a table: what runs in compiled loops of a function that somebody fitted or learned."""
+"""A curve of one quantity as a table, and a surface of two: what runs in compiled loops of a function that somebody
+fitted or learned.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +8,13 @@ import numpy as np
 
 from vaneloop.base.compiled import inlined
 
-__all__ = ["DEGREE", "FINE", "POINTS", "between_points", "on_table", "splines"]
+__all__ = ["DEGREE", "FINE", "FINE_SIDE", "POINTS", "SIDE", "between_points", "on_grid", "on_table", "splines"]
 
 DEGREE = 3  # of its splines
 POINTS = 257  # of a table, evenly spaced from its lowest to its highest argument
 FINE = 1025  # of that of a formula, which goes on beyond where logs have been
+SIDE = 65  # of a surface's, each way
+FINE_SIDE = 257  # the same of a product of formulas, which may have corners and goes on further
 
 
 @inlined
@@ -20,6 +24,18 @@ def on_table(x: float, low: float, high: float, table: np.ndarray) -> float:
     """
     k, share = between_points(x, low, high, len(table))
     return table[k] + share * (table[k + 1] - table[k])
+
+
+@inlined
+def on_grid(x: float, z: float, low: np.ndarray, high: np.ndarray, table: np.ndarray) -> float:
+    """The surface at ``x`` and ``z``: straight each way between the points of ``table`` [x, z], which stand evenly from
+    ``low`` to ``high`` of either; beyond its edges it stays as at them.
+    """
+    k, a = between_points(x, low[0], high[0], table.shape[0])
+    m, b = between_points(z, low[1], high[1], table.shape[1])
+    near = table[k, m] + b * (table[k, m + 1] - table[k, m])
+    far = table[k + 1, m] + b * (table[k + 1, m + 1] - table[k + 1, m])
+    return near + a * (far - near)
 
 
 @inlined

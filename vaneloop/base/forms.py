@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FORMS", "Form"]
+__all__ = ["FORMS", "Form", "product"]
 
 Array = np.ndarray
 KELVIN = 273.15
@@ -106,3 +106,12 @@ FORMS: tuple[Form, ...] = (
     Form("sine", "a sin(b q + c)", "{a} * math.sin({b} * q + {c})", 5, lambda q, n: n[0] * np.sin(n[1] * q + n[2]),
          ("a", "b", "c"), (("per", (3.0, 6.0, 12.0, 25.0)), ("plain", (0.0, 1.6, 3.1)))),
 )  # fmt: skip
+
+
+def product(one: Form, other: Form, x: Array, z: Array, numbers: Array) -> Array:
+    """``one`` of x times ``other`` of z, float64[x, z]; ``numbers`` are those of the first, and of the other all but
+    what multiplies it.
+    """
+    k = len(one.numbers)
+    f, g = one.value(x, numbers[:k]), other.value(z, np.concatenate([[1.0], numbers[k:]]))
+    return np.asarray(np.broadcast_to(f, x.shape)[:, None] * np.broadcast_to(g, z.shape))

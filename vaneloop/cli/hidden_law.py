@@ -64,6 +64,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "vaneloop learn find it?",
     )
     parser.add_argument(
+        "--surface",
+        action="store_true",
+        help="hide a law of two quantities in every other system, and in the others nothing, or a law of one: does "
+        "vaneloop learn find both quantities, and no surface where there is none?",
+    )
+    parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
     )
     parser.add_argument(
@@ -77,7 +83,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _systems() -> Any:
     """Modules of the families, the nominal models and the variants."""
-    names = ("tests.rig_systems", "tests.nominal_systems", "tests.system_variants", "tests.rig_systems.left_out")
+    names = (
+        "tests.rig_systems", "tests.nominal_systems", "tests.system_variants", "tests.rig_systems.left_out",
+        "tests.rig_systems.surfaces",
+    )  # fmt: skip
     return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
 
 
@@ -111,7 +120,10 @@ def _as_learned(asked: Any, test: str, floors: Any, truth: Any, true: Any) -> di
     """What `learn` answers: each law with its rivals and formulas, and the error on the test log in noise floors."""
     by = list(asked.by_log.steps.values())[-1] if asked.by_log else {}
     error = float(((by[test] / floors) ** 2).mean() ** 0.5) if test in by else None
-    laws = [{"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas]} for law in asked.laws]
+    laws: list[dict[str, Any]] = [
+        {"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas], "two": law.axis() is not None}
+        for law in asked.laws
+    ]
     if truth is not None:
         for law, row in zip(asked.laws, laws, strict=True):
             if truth.found(law.name):
@@ -125,19 +137,25 @@ def _as_learned(asked: Any, test: str, floors: Any, truth: Any, true: Any) -> di
 
 def judge_case(
     seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False, learn: bool = False,
-    leave_out: bool = False,
+    leave_out: bool = False, surface: bool = False,
 ) -> Row:  # fmt: skip
     """Draw, simulate and diagnose one system; a flat record.
 
     leave_out  hide a law of the library that is a function of one quantity, and take it out of the library
+    surface    hide a law of two quantities in systems of even number, in the others nothing, or a law of one
     """
     import logging
 
     from vaneloop.discrepancy import Record
 
     logging.getLogger("numba").setLevel(logging.ERROR)
-    rig, nominal, changes, left_out = _systems()
+    rig, nominal, changes, left_out, surfaces = _systems()
     case = _left_out_case(seed, index, families) if leave_out else rig.draw_case(seed, index, families)
+    both: tuple[str, ...] = ()
+    if surface and index % 2 == 0:
+        case, both = surfaces.draw_surface(seed, index, families)
+    elif surface:
+        case = _case_of_one(seed, index, families)
     left = rig.left_over(case)
     records = [Record(f"log {k + 1}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
     system, truth = nominal.nominal(case.family, case.values, case.factors), None
@@ -145,7 +163,7 @@ def judge_case(
         (h,) = case.hidden
         system = replace(system, without=sorted(case.family.equivalent(h.name)))
         truth = left_out.truth_of(case.family, h, case.greatest.get(h.place, 1.0))
-    floors = case.floors if learn or leave_out else None
+    floors = case.floors if learn or leave_out or surface else None
     true = nominal.nominal(case.family, case.values, {})
     said = _said(system, records[:-1], records[-1:], floors, truth, true)
     learned, effects, also = said["learned"], said["effects"], set()
@@ -172,7 +190,7 @@ def judge_case(
     ]  # fmt: skip
     return {
         "seed": seed, "index": index, "families": " ".join(families), "family": case.family.name,
-        "kind": "left out" if leave_out else case.kind,
+        "kind": "left out" if leave_out else "surface" if both else case.kind, "both": list(both),
         "truth": [h.name for h in case.hidden], "sizes": json.dumps([h.values for h in case.hidden]),
         "same": json.dumps({h.name: sorted(case.family.equivalent(h.name)) for h in case.hidden}),
         "amounts": json.dumps(
@@ -189,11 +207,24 @@ def judge_case(
     }  # fmt: skip
 
 
+def _case_of_one(seed: int, index: int, families: tuple[str, ...]) -> Any:
+    """A system with nothing hidden, or a law outside the library that is a function of one quantity."""
+    import numpy as np
+
+    rig, *_ = _systems()
+    rng = np.random.default_rng([seed, index, 3])
+    family = str(rng.choice(families or list(rig.FAMILIES)))
+    laws = [law for law in rig.FAMILIES[family].outside if rig.LEARNED.get((family, law))]
+    names = [] if rng.random() < 0.5 or not laws else [str(rng.choice(laws))]
+    case = rig.draw_case(seed, index, (family,), names)
+    return replace(case, kind="outside" if names else "clean")
+
+
 def _left_out_case(seed: int, index: int, families: tuple[str, ...]) -> Any:
     """A system with a law that can be left out of the library."""
     import numpy as np
 
-    rig, _, _, left_out = _systems()
+    rig, _, _, left_out, _ = _systems()
     rng = np.random.default_rng([seed, index, 1])
     family = str(rng.choice(families or list(rig.FAMILIES)))
     law = str(rng.choice(left_out.laws_of(rig.FAMILIES[family])))
@@ -228,6 +259,8 @@ def _right(row: Row) -> bool:
         return not row["named"]
     if row["kind"] == "left out":
         return any("inside" in law for law in json.loads(row["learned"]).get("laws", ()))
+    if row["kind"] == "surface":
+        return _both(row) or not _seen(row)
     if row["kind"] == "outside":
         if sorted(row["named"]) in json.loads(row["amounts"]):
             return True
@@ -267,11 +300,43 @@ def summary(rows: list[Row]) -> dict[str, Any]:
         "median processor seconds": sorted(r["seconds"] for r in rows)[len(rows) // 2] if rows else None,
         "most processor seconds": max((r["seconds"] for r in rows), default=None),
     }
-    out |= learned_summary(rows)
+    out |= learned_summary(rows) | surface_summary(rows)
     tried = [json.loads(r["variants"]) for r in rows]
     for name in sorted({name for t in tried for name in t}):
         out[f"same answer: {name}"] = share([t[name]["same"] for t in tried if name in t])
     return out
+
+
+def _surfaces(row: Row) -> list[str]:
+    """Names of the surfaces that were learned, with their rivals."""
+    laws = json.loads(row.get("learned") or "{}").get("laws", ())
+    return [name for law in laws if law.get("two") for name in law["names"]]
+
+
+def _both(row: Row) -> bool:
+    """Whether a surface of the right quantities was learned."""
+    one, two = row["both"]
+    return any(name.endswith((f"_of_{one}_and_{two}", f"_of_{two}_and_{one}")) for name in _surfaces(row))
+
+
+def surface_summary(rows: list[Row]) -> dict[str, Any]:
+    """Count the laws of two quantities, of rows where they were hidden."""
+    hidden = [r for r in rows if r["kind"] == "surface" and _seen(r)]
+    if not any(r["kind"] == "surface" for r in rows):
+        return {}
+    said = [json.loads(r["learned"] or "{}") for r in hidden]
+    right = [s for r, s in zip(hidden, said, strict=True) if _both(r)]
+    close = [s.get("error") is not None and s["error"] <= 1.5 for s in said]
+    return {
+        "surface: both quantities": share([_both(r) for r in hidden]),
+        "surface: both quantities, or other laws that leave 1.5 noise floors on the test log": share(
+            [_both(r) or near for r, near in zip(hidden, close, strict=True)]
+        ),
+        "surface: of those with both, error on the test log within 1.5 noise floors": share(
+            [s["error"] is None or s["error"] <= 1.5 for s in right]
+        ),
+        "surface: none hidden, none learned": share([not _surfaces(r) for r in rows if r["kind"] != "surface"]),
+    }
 
 
 def learned_summary(rows: list[Row]) -> dict[str, Any]:
@@ -400,7 +465,18 @@ def command(args: argparse.Namespace) -> int:
     except OSError as e:
         raise InputError(f"{path.parent}: cannot be made ({e.strerror})") from None
     run(
-        args, "systems", args.systems, rows, path, judge_case, seed, families, args.variants, args.learn, args.leave_out
+        args,
+        "systems",
+        args.systems,
+        rows,
+        path,
+        judge_case,
+        seed,
+        families,
+        args.variants,
+        args.learn,
+        args.leave_out,
+        args.surface,
     )
     _print(args, rows)
     tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}

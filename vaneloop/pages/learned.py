@@ -10,26 +10,28 @@ import numpy as np
 from vaneloop.base.signals import heading
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
+from vaneloop.discrepancy.models.learned_surface import LearnedSurface
 from vaneloop.discrepancy.models.tried import Outcome
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import Tone, capital, number
+from vaneloop.pages.surface import BEYOND, map_figure, sections_figure
 
 __all__ = ["ABOUT", "COLUMNS", "HOW", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
 
 TONES: dict[str, Tone] = {
     "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
 }  # fmt: skip
-BEYOND = 0.15  # of the range, drawn beyond its ends
+MORE = 0.15  # of the range, drawn beyond its ends
 
 
 def curve_figure(law: LearnedLaw) -> Figure:
     """The curve with its band; dashed where no log has been."""
     span = float(law.x[-1] - law.x[0])
-    below = np.array([law.x[0] - BEYOND * span, law.x[0]])
-    above = np.array([law.x[-1], law.x[-1] + BEYOND * span])
+    below = np.array([law.x[0] - MORE * span, law.x[0]])
+    above = np.array([law.x[-1], law.x[-1] + MORE * span])
     lines = [
         Line("from", law.x, law.low, "other", 1.0), Line("90 % band", law.x, law.high, "other", 1.0),
         Line("learned", law.x, law.y, "model", 2.0),
@@ -55,9 +57,10 @@ def visited_figure(law: LearnedLaw) -> Figure:
 
 COLUMNS = ["formula", "held-out error, noise floors", "law of the library"]
 HOW = "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first."
+BAND = "The band holds the curve in 90 % of draws of the log's blocks."
 ABOUT = (
-    "The band holds the curve in 90 % of draws of the log's blocks. Dashed: no log has been there, and the curve "
-    "stays as at its end. A formula that is the law goes on; the notes say how far."
+    f"{BAND} Dashed: no log has been there, and the curve stays as at its end. A formula that is the law goes on; the "
+    f"notes say how far."
 )
 
 
@@ -82,6 +85,13 @@ def learned_page(
         figures = f"{floors(law.error_before)} → {floors(law.error_after)}"
         page.tile(law.name, figures, "noise floors", "held-out error before and after", "good")
     for law in laws:
+        if isinstance(law, LearnedSurface):
+            page.section(law.name, f"{capital(law.sentence())}. {BEYOND}")
+            page.plot(map_figure(law), "The surface, inside the simulation, with the model's own parameters refitted.")
+            page.plot(sections_figure(law), f"The same over {law.of}, at values of {law.second}. {BAND}")
+            if law.formulas:
+                page.table(COLUMNS, formula_rows(law), HOW)
+            continue
         page.section(law.name, f"{capital(law.sentence())}. {ABOUT}")
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
         page.plot(visited_figure(law), f"Where the logs have been: {heading(law.of, law.of_unit)}.")

@@ -55,7 +55,7 @@ class Learned(Answer):
             said = {
                 "none": "Nothing is missing",
                 "named": "Laws with names say it",
-                "unknown": "No honest law of one quantity is there",
+                "unknown": "No honest law of one quantity or two is there",
             }[self.verdict]
             return f"{said}: {self.outcome.why}."
         from vaneloop.pages.story import floors
@@ -105,16 +105,21 @@ class Learned(Answer):
     def write_python(self, path: str | Path, system: System | None = None) -> Path:
         """Write the first law as a Python file; return its path.
 
-        system  the user's own model, to whose ``laws`` it can be added; None: of the vane chain, the function alone
+        system  the user's own model, to whose ``laws`` it can be added; None: of the vane chain, the function alone,
+                as always where it is one of two quantities
         """
+        from vaneloop.discrepancy.models.learned_surface import LearnedSurface
         from vaneloop.discrepancy.models.python_law import python_law
+        from vaneloop.discrepancy.models.python_surface import python_surface
 
-        Path(path).write_text(python_law(self.laws[0], system), encoding="utf-8")
+        law = self.laws[0]
+        text = python_surface(law) if isinstance(law, LearnedSurface) else python_law(law, system)
+        Path(path).write_text(text, encoding="utf-8")
         return Path(path)
 
 
 def law_json(law: LearnedLaw) -> dict[str, Any]:
-    """A law as JSON; its curve at 33 places."""
+    """A law as JSON; its curve at 33 places, a surface at 9 each way."""
     k = range(0, len(law.x), 8)
     return {
         "effect": law.name, "how": law.how, "at": law.at, "of": law.of, "unit": law.unit, "of_unit": law.of_unit,
@@ -124,7 +129,7 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
         "formulas": [
             {"form": f.form, "text": f.text, "numbers": f.numbers, "error": f.error, "law": f.law} for f in law.formulas
         ],
-        "untold": law.untold, "trades": law.trades, "rivals": law.rivals,
+        "untold": law.untold, "trades": law.trades, "rivals": law.rivals, **law.more(),
     }  # fmt: skip
 
 
@@ -276,8 +281,11 @@ def _learned(
     from vaneloop.discrepancy.models.by_log import ByLog
     from vaneloop.discrepancy.models.curved import OwnGround, on_logs
     from vaneloop.discrepancy.models.learned import law_of
+    from vaneloop.discrepancy.models.learned_surface import LearnedSurface, surface_law_of
     from vaneloop.discrepancy.models.learning import Learner
     from vaneloop.discrepancy.models.spoken import spoken
+    from vaneloop.discrepancy.models.surface_formulas import as_the_law, reach_of
+    from vaneloop.discrepancy.models.surfaces import SurfaceCandidate
     from vaneloop.discrepancy.stage_answer import answer_of, found_of, rms_of
 
     assert diagnosed.by_log is not None
@@ -289,9 +297,16 @@ def _learned(
         return Learned(diagnosed, outcome, [], log=diagnosed.log)
     laws, before = [], (learner.judge, learner.base)
     for tried in outcome.tried:
-        laws.append(law_of(ground, before, tried))
+        surface = isinstance(tried.candidate, SurfaceCandidate)
+        laws.append(surface_law_of(before, tried) if surface else law_of(ground, before, tried))
         before = tried.judge, tried.fit
-    last, laws = spoken(learner, outcome.tried, laws) if formulas else (outcome.tried[-1], laws)
+    last = outcome.tried[-1]
+    if isinstance(law := laws[-1], LearnedSurface):
+        if formulas and (said := as_the_law(learner, last, law.formulas)):
+            last, formula = said
+            laws = [law.spoken_by(formula, reach_of(ground, last, formula), rms_of(last.judge, last.fit))]
+    elif formulas:
+        last, laws = spoken(learner, outcome.tried, laws)
     names = tuple(e.name for _, e in last.curves)
     judge, stage = last.judge, last.judge.stage
     theta = stage.neutral()
@@ -365,21 +380,25 @@ def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Trie
     last  the model with all of them, as it was fitted; None: the curves
     """
     from plant.model import Learned as Table
+    from vaneloop.discrepancy.models.learned_surface import LearnedSurface
 
     effects, curves, last = dict(model.effects), dict(model.curves), last or outcome.tried[-1]
     for law, tried in zip(laws, outcome.tried, strict=True):
         c = tried.candidate
         if f := law.spoken:
+            (low, high), reach = (float(law.x[0]), float(law.x[-1])), list(law.reach)
+            if isinstance(law, LearnedSurface):  # what goes on is its range
+                (low, high), reach = law.reach, []
             curves[law.name] = Table(
-                how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), form=f.form,
-                values=list(f.numbers.values()), unit=law.unit, size=float(c.size), reach=list(law.reach),
+                how=law.how, at=law.at, of=law.of, low=low, high=high, form=f.form, values=list(f.numbers.values()),
+                unit=law.unit, size=float(c.size), reach=reach, second=law.axis(),
             )  # fmt: skip
             effects[law.name] = dict(f.numbers)
             continue
         values = [float(v) for v in c.coefficients(last.fit.theta[last.judge.stage.index()[c.name]])]
         curves[law.name] = now = Table(
             how=law.how, at=law.at, of=law.of, low=float(law.x[0]), high=float(law.x[-1]), values=values,
-            knots=[float(v) for v in law.knots], jump=c.jump, unit=law.unit, size=float(c.size),
+            knots=[float(v) for v in law.knots], jump=c.jump, unit=law.unit, size=float(c.size), second=law.axis(),
         )  # fmt: skip
         effects[law.name] = dict(zip(now.numbers, values, strict=True))
     return model.model_copy(update={"effects": effects, "curves": curves})

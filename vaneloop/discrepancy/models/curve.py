@@ -84,13 +84,23 @@ class Curve:
         c = np.interp(q, np.linspace(self.low, self.high, len(table)), table)
         return c + half * np.sign(q - place) if half else c
 
+    @property
+    def quantities(self) -> tuple[tuple[int, str], ...]:
+        """Number and name of what it is a function of."""
+        return ((self.of, self.quantity),)
+
     def values(self, data: Data, log: int, u: Array, y: Array | None = None) -> Array:
-        """Its quantity on a log, of a model that is not simulated."""
-        if self.of >= COLUMN:
-            return data.column(log, self.quantity)
-        if self.of >= OUTPUT:
-            return np.asarray(data.y[log][self.of - OUTPUT] if y is None else y[self.of - OUTPUT])
-        return np.asarray(u[self.of - INPUT])
+        """Its quantity on a log, of a model that is not simulated; of two, float64[2, samples]."""
+
+        def one(of: int, name: str) -> Array:
+            if of >= COLUMN:
+                return data.column(log, name)
+            if of >= OUTPUT:
+                return np.asarray(data.y[log][of - OUTPUT] if y is None else y[of - OUTPUT])
+            return np.asarray(u[of - INPUT])
+
+        rows = [one(of, name) for of, name in self.quantities]
+        return rows[0] if len(rows) == 1 else np.array(rows)
 
 
 def runs(form: Form, low: float, high: float, points: int = FINE) -> tuple[Table, Jump | None]:
@@ -142,11 +152,11 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
         low.append(a)
         high.append(b)
         tables.append(table)
-    most = max(len(t) for t in tables)
+    most = max((len(t) for t in tables), default=POINTS)
     tables = [t if len(t) == most else np.interp(np.linspace(0, 1, most), np.linspace(0, 1, len(t)), t) for t in tables]
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
         np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64),
-        np.array(low), np.array(high), np.ascontiguousarray(tables), np.array(jumps),
+        np.array(low), np.array(high), np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 3),
         np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

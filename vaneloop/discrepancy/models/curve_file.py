@@ -15,6 +15,7 @@ from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.surface import Surface
 from vaneloop.discrepancy.stage import Effect, Parameter, StageError
 
 __all__ = ["CURVE_LAW", "from_file"]
@@ -27,8 +28,10 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     """What runs, and what the search is told of it. Raises StageError, one line, for what the system does not have."""
     s = data.system
 
-    def wrong(what: str, value: object, allowed: str) -> StageError:
-        return StageError(f"curves.{name}: {what} (={value!r}) is not one of system {s.name!r}; allowed: {allowed}")
+    def wrong(what: str, value: object, allowed: str, where: str = "") -> StageError:
+        return StageError(
+            f"curves.{name}{where}: {what} (={value!r}) is not one of system {s.name!r}; allowed: {allowed}"
+        )
 
     if law.how not in HOW:
         raise wrong("how", law.how, ", ".join(HOW))
@@ -46,21 +49,32 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     known |= {u: INPUT + i for i, u in enumerate(signals)}
     known |= {x: i for i, x in enumerate(s.states)} if moves else {}
     columns = set.intersection(*(set(r.columns) for r in data.records))
-    shaped = {prefix + c for c in columns for prefix in (WAY, DISTANCE, SINCE, STOPS)}
-    lag = named_lag(law.of)
-    of = known.get(law.of, COLUMN)
-    if of == COLUMN and not (law.of in (TIME, *columns, *shaped) or period_of(law.of) or lag and lag[0] in columns):
-        raise wrong("of", law.of, ", ".join([*known, TIME, *sorted(columns - set(known))]))
+    prefixes = (WAY, DISTANCE, SINCE) if law.second else (WAY, DISTANCE, SINCE, STOPS)  # of two nothing slips
+    shaped = {prefix + c for c in columns for prefix in prefixes}
+
+    def number(of: str, where: str = "") -> int:
+        lag, found = named_lag(of), known.get(of, COLUMN)
+        column = of in (TIME, *columns, *shaped) or period_of(of) or lag and lag[0] in columns
+        if found == COLUMN and not column:
+            raise wrong("of", of, ", ".join([*known, TIME, *sorted(columns - set(known))]), where)
+        return found
+
+    of = number(law.of)
     try:
         law.check(f"curves.{name}")
     except InputError as e:
         raise StageError(str(e)) from None
-    form = next((f for f in FORMS if f.name == law.form), None)
+    form = next((f for f in FORMS if f.name == law.form), None) if law.second is None else None
     table, jump = runs(form, *law.ends) if form else (law.table(), None)
     if law.jump and not form:
         smooth = law.model_copy(update={"jump": False}).table()
         table, jump = (lambda v: smooth(v[:-1])), (lambda v: (float(v[-1]), 0.0))
     curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump)
+    if (two := law.second) is not None:
+        curve = Surface(
+            curve.how, curve.place, of, law.of, law.low, law.high, table, of_second=number(two.of, ".second"),
+            second=two.of, low_second=two.low, high_second=two.high,
+        )  # fmt: skip
     names = law.numbers
     sizes = [max(abs(v), 1e-9) for v in law.values] if law.form else [abs(law.size) or 1.0] * len(names)
     wide = np.sqrt(3.0) * LEVEL if not law.form else 0.0  # a curve's values are known to be of its size

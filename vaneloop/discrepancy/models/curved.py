@@ -109,6 +109,15 @@ class Candidate:
         return {*self.untold, *(() if self.mean else (0,))}
 
     @property
+    def axes(self) -> tuple[tuple[Quantity, Basis], ...]:
+        """What it is a function of, and its functions."""
+        return ((self.quantity, self.basis),)
+
+    def reaches(self, *values: Array) -> Array:
+        """At which values of what it is a function of it was learned."""
+        return self.basis.reaches(values[0])
+
+    @property
     def kept(self) -> list[int]:
         """Its basis' functions that it has."""
         gone = self.lent | ({0} if "zero" in self.shape else set())
@@ -422,7 +431,7 @@ def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
 class OwnGround:
     """A user's own model, held against logs (`vaneloop.discrepancy.models.learning.Ground`)."""
 
-    points, jumps = FINE, True
+    points, jumps, surfaces = FINE, True, True
 
     def __init__(self, logs: Logs):
         self.logs, self.floor = logs, logs.fitted.floor
@@ -448,7 +457,7 @@ class OwnGround:
         test = self.logs.test
         if test is None or candidate.quantity.stops:
             return {}
-        inside = candidate.basis.reaches(self._tested(candidate.quantity))
+        inside = candidate.reaches(*(self._tested(q) for q, _ in candidate.axes))
         return {log: inside[at] for log, at in test.logs.items()}
 
     def reach(self, candidate: Candidate) -> tuple[float, float]:

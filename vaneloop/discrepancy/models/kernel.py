@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.base.curve import on_table
+from vaneloop.base.curve import on_grid, on_table
 from vaneloop.base.kept import kept_njit
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
@@ -23,10 +23,13 @@ Kernel = Callable[..., Any]
 Compile = Callable[[Any], Any]
 
 
-def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> tuple[Kernel, Kernel]:
+def build_kernels(
+    code: UserCode, dispatch: Dispatch, curved: bool = False, surfaces: bool = False
+) -> tuple[Kernel, Kernel]:
     """The function ``run`` of the source below for a system: compiled when it is first called, and not compiled.
 
     curved  it takes curves (`vaneloop.discrepancy.models.curved`), too: eight arguments more, `_CURVED`
+    surfaces  and surfaces (`vaneloop.discrepancy.models.surface`): seven more, `_SURFACES`
     """
     s = code.system
     rates = "\n".join(f"dx[{i}] = d" if code.single else f"dx[{i}] = d[{i}]" for i in range(len(s.states)))
@@ -49,6 +52,9 @@ def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> t
     source = source.replace("{curved}", _CURVED_FUNCTIONS if curved else "")
     source = source.replace("{more}", f", {_CURVED}" if curved else "").replace("{rooms}", _ROOMS if curved else "")
     source = source.replace("shown(x, u, p, y)", f"shown(x, u, p, k, {_CURVED}, ub, pb, add, y)" if curved else _PLAIN)
+    source = source.replace("{bend more}", _BEND_MORE if surfaces else "")
+    source = source.replace("{show more}", _SHOW_MORE if surfaces else "")
+    source = source.replace(_CURVED, f"{_CURVED}, {_SURFACES}") if surfaces else source
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
     def build(jit: Compile, inline: Compile, inline_own: Compile) -> Kernel:
@@ -58,7 +64,7 @@ def build_kernels(code: UserCode, dispatch: Dispatch, curved: bool = False) -> t
             "model": jit(s.model),
             "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
-            "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table,
+            "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table, "on_grid": on_grid,
             "LOOP": s.kind == "closed_loop", "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
@@ -183,7 +189,7 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
             ub[c_at[i]] *= 1.0 + c
         else:
             add[c_at[i]] += c
-
+{{bend more}}
 
 @inline
 def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
@@ -196,8 +202,36 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
                 y[c_at[i]] += c
             else:
                 y[c_at[i]] *= 1.0 + c
+{{show more}}
 
-
+"""
+_SURFACES = "f_how, f_at, f_of, f_low, f_high, f_table, f_columns"
+_BEND_MORE = """
+    for i in range(len(f_how)):
+        if f_how[i] > 4:
+            continue
+        if OUTPUT <= f_of[i, 0] < COLUMN or OUTPUT <= f_of[i, 1] < COLUMN:
+            outputs(x, u, p, y)
+        c = on_grid(quantity(f_of[i, 0], x, u, y, f_columns, k), quantity(f_of[i, 1], x, u, y, f_columns, k), f_low[i],
+                    f_high[i], f_table[i])
+        if f_how[i] == 1:
+            pb[f_at[i]] *= 1.0 + c
+        elif f_how[i] == 2:
+            ub[f_at[i]] += c
+        elif f_how[i] == 3:
+            ub[f_at[i]] *= 1.0 + c
+        else:
+            add[f_at[i]] += c
+"""
+_SHOW_MORE = """
+    for i in range(len(f_how)):
+        if f_how[i] > 4:
+            c = on_grid(quantity(f_of[i, 0], x, u, y, f_columns, k), quantity(f_of[i, 1], x, u, y, f_columns, k),
+                        f_low[i], f_high[i], f_table[i])
+            if f_how[i] == 5:
+                y[f_at[i]] += c
+            else:
+                y[f_at[i]] *= 1.0 + c
 """
 
 _OWN_RATE = """if c > 100:

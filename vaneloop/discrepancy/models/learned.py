@@ -5,6 +5,7 @@ formulas.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +20,10 @@ from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
 
-__all__ = ["Formula", "LearnedLaw", "law_of"]
+if TYPE_CHECKING:
+    from plant.model import Second
+
+__all__ = ["Formula", "LearnedLaw", "band_of", "law_of", "range_of"]
 
 DRAWS = 400
 BAND = 0.90
@@ -67,21 +71,34 @@ class LearnedLaw:
         mine, its = (within_no_period(law.of) for law in (self, other))
         return (self.how, self.at, mine) == (other.how, other.at, its)
 
+    @property
+    def of_what(self) -> str:
+        """Of which quantity it is a function."""
+        return self.of
+
+    def more(self) -> dict[str, Any]:
+        """What the JSON of a surface has beyond that of a curve."""
+        return {}
+
+    def axis(self) -> Second | None:
+        """The other quantity, as a law file has it."""
+        return None
+
     def range_note(self) -> str:
         """Where its quantity has been, what it does beyond, and what the law file has of it, in words."""
         has = "the formula, which does as well as the curve" if self.spoken else "the curve"
         if period_of(self.of):
             return f"{self.name}: the law file has {has}"
-        unit = f" {self.of_unit}" if self.of_unit.strip("-") else ""
-        been = f"{self.name}: {self.of} has been in [{self.x[0]:.4g}, {self.x[-1]:.4g}]{unit}; the law file has {has}"
+        been = f"{self.name}: {self.of} has been in {range_of(self.x, self.of_unit)}; the law file has {has}"
         if not self.spoken:
             return f"{been}; beyond, it stays as at its end"
-        return f"{been}; it goes on to [{self.reach[0]:.4g}, {self.reach[1]:.4g}]{unit}, and stays as there beyond"
+        reach = range_of(np.array(self.reach), self.of_unit)
+        return f"{been}; it goes on to {reach}, and stays as there beyond"
 
     def sentence(self) -> str:
         """What it is, in words."""
         stops, lag = self.of.startswith(STOPS), named_lag(self.of)
-        what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of}"
+        what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of_what}"
         if lag:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
         if period := period_of(self.of):
@@ -104,6 +121,11 @@ class LearnedLaw:
         return f"{does}{said}"
 
 
+def range_of(x: Array, unit: str) -> str:
+    """Where a quantity has been, with its unit."""
+    return f"[{x[0]:.4g}, {x[-1]:.4g}] {unit.strip('-')}".strip()
+
+
 def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLaw:
     """Everything that is said of the last curve of ``tried``."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
@@ -112,7 +134,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     if tried.formulas is None:
         tried.formulas = fitted_formulas(ground, tried)
     formulas = likely(tried, tried.formulas, rms_of(*before))
-    low, high = _with_formulas(c, y, *_band(tried), formulas)
+    low, high = _with_formulas(c, y, *band_of(tried), formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
     counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
     return LearnedLaw(
@@ -122,7 +144,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     )  # fmt: skip
 
 
-def _band(tried: Tried) -> tuple[Array, Array]:
+def band_of(tried: Tried) -> tuple[Array, Array]:
     """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
     the fit. What the log cannot tell apart is as wide as it was known before.
     """

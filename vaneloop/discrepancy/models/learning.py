@@ -35,6 +35,7 @@ from vaneloop.discrepancy.models.held_out import at_samples, told_by_others, wit
 from vaneloop.discrepancy.models.memory import dissipates
 from vaneloop.discrepancy.models.periods import Lines
 from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
     Ground,
     Outcome,
@@ -86,7 +87,8 @@ class Learner:
         self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
         shape: Sequence[str] = (),
     ):  # fmt: skip
-        self.ground, self.d, self.progress = ground, d, progress or (lambda _: None)
+        self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
+        self.ranked: list[list[Tried]] = []  # of each search for a curve, what was fitted, best first
         self.judge = self._judge((), ())
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
         self.form = ErrorShare(self.judge)
@@ -144,6 +146,7 @@ class Learner:
                     break
         if len(out.tried) > 1:
             self._spare_first(out)
+        put_surface(self, out)
         return self._concluded(out, named)
 
     def _spare_first(self, out: Outcome) -> None:
@@ -176,7 +179,9 @@ class Learner:
     def _concluded(self, out: Outcome, named: tuple[Judge, Fit] | None) -> Outcome:
         if not out.tried:
             out.verdict = "named" if self.d.effects else "unknown"
-            out.why = "no curve of one quantity, at any place, explains enough of the error on data left out"
+            out.why = (
+                "no function of one or two quantities, at any place, explains enough of the error on data left out"
+            )
             return out
         last = out.tried[-1]
         left, was = rms_of(last.judge, last.fit), rms_of(self.judge, self.base)
@@ -194,7 +199,7 @@ class Learner:
         """Samples where all these curves are told by more than one block."""
         start, n = self.judge.block_start, len(self.judge.stage.t)
         known = np.ones(n, dtype=bool)
-        for q in {t.candidate.quantity.name: t.candidate.quantity for t in among}.values():
+        for q in {q.name: q for t in among for q, _ in t.candidate.axes}.values():
             if (values := at_samples(q.visited, n)) is not None:
                 known &= told_by_others(values, start)
         return known if known.any() else ~known
@@ -352,6 +357,7 @@ class Learner:
             quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
+        self.ranked.append(list(quick))
         done = []
         over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
         quick = [t for t in quick if t not in over_time]

@@ -20,6 +20,7 @@ from vaneloop.discrepancy.models.dispatch import Dispatch, dispatch_of
 from vaneloop.discrepancy.models.kernel import Kernel, build_kernels
 from vaneloop.discrepancy.models.motion import low_pass
 from vaneloop.discrepancy.models.own_laws import FIRST_CODE
+from vaneloop.discrepancy.models.surface import apart, surfaces_for_kernel
 from vaneloop.discrepancy.models.user_code import UserCode, cannot
 from vaneloop.discrepancy.stage import Array, StageError
 
@@ -76,8 +77,8 @@ class Runner:
         self.trying = False  # whether numba can compile the model
         self.kernel: Kernel
         self.slow: Kernel  # the same, not compiled
-        # both with curves, made when they are first needed; every runner of these logs shares them
-        self.curved: list[tuple[Kernel, Kernel]] = like.curved if like else []
+        # both with curves (and surfaces: True), made when they are first needed; every runner of these logs shares them
+        self.curved: dict[bool, tuple[Kernel, Kernel]] = like.curved if like else {}
         self.ready = like is not None  # the model ran with the user's own values
         self.placed: list[Placed] = []
         self.free_starts: list[tuple[int, int]] = []
@@ -215,16 +216,17 @@ class Runner:
         if name in self.system.start or not np.isfinite(self.data.first_state(log, name, np.nan)):
             return
         reading, u = x0[m], self.data.u[log][:, :1]
+
+        def first(of: int, quantity: str) -> float:
+            if of < INPUT:
+                return float(x0[of])
+            if of < OUTPUT:
+                return float(u[of - INPUT, 0])
+            return float(reading if of < COLUMN else self.data.column(log, quantity)[0])
+
         for _ in range(8):
-            if curve.of < INPUT:
-                q = x0[curve.of]
-            elif curve.of < OUTPUT:
-                q = u[curve.of - INPUT, 0]
-            elif curve.of < COLUMN:
-                q = reading
-            else:
-                q = self.data.column(log, curve.quantity)[0]
-            c = float(curve.at(np.array([q]), row)[0])
+            q = np.array([[first(*of)] for of in curve.quantities])
+            c = float(curve.at(q if len(q) > 1 else q[0], row)[0])
             x0[m] = reading - c if curve.how == "output adds" else reading / max(1.0 + c, 0.1)
 
     def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
@@ -288,12 +290,12 @@ class Runner:
         out[changed] = spline(u[changed])
         return out
 
-    def _kernels_for_curves(self) -> tuple[Kernel, Kernel]:
-        """The kernel that takes curves, as `_tried` has it, and not compiled."""
-        if not self.curved:
-            fast, slow = build_kernels(self.code, self.dispatch, curved=True)
-            self.curved.append((slow if self.kernel is self.slow else fast, slow))
-        return self.curved[0]
+    def _kernels_for_curves(self, surfaces: bool) -> tuple[Kernel, Kernel]:
+        """The kernel that takes curves, and surfaces, as `_tried` has it, and not compiled."""
+        if surfaces not in self.curved:
+            fast, slow = build_kernels(self.code, self.dispatch, curved=True, surfaces=surfaces)
+            self.curved[surfaces] = slow if self.kernel is self.slow else fast, slow
+        return self.curved[surfaces]
 
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
@@ -333,9 +335,10 @@ class Runner:
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
-        if any(c.of < INPUT and c.parts(row)[1] for c, row in curves):
+        plain, surfaces = apart(curves)
+        if any(c.of < INPUT and c.parts(row)[1] for c, row in plain):
             steps = max(steps, SWITCHED)
-        kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves()
+        kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves(bool(surfaces))
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
@@ -344,7 +347,9 @@ class Runner:
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         if curves:
-            arguments += curves_for_kernel(curves, self.data, log, len(t), self.smalls)
+            arguments += curves_for_kernel(plain, self.data, log, len(t), self.smalls)
+        if surfaces:
+            arguments += surfaces_for_kernel(surfaces, self.data, log, len(t))
         try:
             with np.errstate(all="ignore"):
                 kernel(*arguments)

@@ -40,7 +40,8 @@ class Ground(Protocol):
 
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
     tests  names of the logs that nothing is fitted to
-    points of the table of a formula; ``jumps``: whether curves may jump
+    points of the table of a formula; ``jumps``: whether curves may jump; ``surfaces``: whether functions of two
+           quantities can run
     """
 
     whole: Stage
@@ -48,6 +49,7 @@ class Ground(Protocol):
     tests: frozenset[str]
     points: int
     jumps: bool
+    surfaces: bool
 
     def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many

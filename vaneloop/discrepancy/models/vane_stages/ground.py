@@ -150,6 +150,7 @@ class VaneGround:
     """
 
     points, jumps = POINTS, False  # as the plant's rows have them
+    surfaces = False  # a curve is rows of the plant's parameters, of one signal
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
         assert isinstance(stage.made, Made) and stage.floor is not None
