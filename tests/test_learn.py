@@ -607,6 +607,22 @@ def test_a_law_that_goes_on_or_jumps_is_what_its_file_says(bound) -> None:
             from_file("p.q", told.model_copy(update=wrong), bound.data)
 
 
+def test_a_reading_at_its_limit_does_not_hide_where_its_curve_bends() -> None:
+    """A sensor that ends at 3 reads a flow that goes to 8: its curve is one of the flow."""
+    valve = System(
+        "valve", "static", lambda u, p: p.gain * u.current, inputs={"current": "mA"}, outputs={"flow": "l/min"},
+        parameters=[unknown("gain", 2.0, "-")],
+    )  # fmt: skip
+    t = np.arange(400.0) * 0.05
+    current = 4.0 * np.sin(t)
+    bound = valve.bind([Record("run", t, {"current": current, "flow": np.minimum(2.0 * current, 3.0)})])
+    every = {c.name: c.basis for c in candidates(bound, np.array([2.0]))}
+    assert every["flow.curve_of_flow"].high == pytest.approx(8.0, abs=0.1)
+    assert every["flow.curve_of_flow"].low == pytest.approx(-8.0, abs=0.1)
+    far = {c.name: c.basis for c in candidates(bound, np.array([1e6]))}  # a model that is far off says nothing
+    assert far["flow.curve_of_flow"].high < 20.0
+
+
 def test_a_jump_is_the_friction_of_the_library() -> None:
     """Bit for bit inside an integration, also of a law file; and the curve of a speed has it where that turns."""
     cart = System(

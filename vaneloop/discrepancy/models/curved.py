@@ -342,9 +342,11 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
 
     def put(
         how: str, place: int, at: str, unit: str, size: float, but: str = "", mean: bool = True,
-        near: Sequence[str] = (), only: str = "",
+        near: Sequence[str] = (), only: str = "", own: Quantity | None = None,
     ) -> None:  # fmt: skip
         for q, basis in known:
+            if own is not None and own.name == q.name and (wide := basis_for(own)) is not None:
+                q, basis = own, wide
             if (
                 q.name == but
                 or (only and q.name != only)
@@ -389,14 +391,37 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
             rows = next((q.visited for q, _ in known if q.of == INPUT + k), np.array([-1.0, 1.0]))
             put("input adds", k, name, unit, 0.3 * half(rows))
             put("input times", k, name, "-", 0.3, but=name)
+    said = _said(bound, values)
     for i, (name, unit) in enumerate(s.outputs.items()):
         if name in s.commands or not s.allows("output", name) or not np.isfinite(bound.measured[i]).any():
             continue
         at = s.reading_of(name)
         # what else adds to a measured force is a force
-        put("output adds", i, at, unit, 0.3 * half(bound.measured[i]), only=name if s.kind == "force" else "")
+        before = next((replace(q, visited=_further(q.visited, said[i])) for q, _ in known if q.name == name), None)
+        only = name if s.kind == "force" else ""
+        put("output adds", i, at, unit, 0.3 * half(bound.measured[i]), only=only, own=before)
         put("output times", i, at, "-", 0.3, but=name)
     return out
+
+
+def _said(bound: Bound, values: Array) -> Array:
+    """What the model says to the logs without any curve."""
+    plain = with_curves(bound, (), ())
+    theta = plain.stage.neutral()
+    theta[: len(values)] = values
+    return np.asarray(plain.run(theta[None])[0])
+
+
+def _further(measured: Array, said: Array) -> Array:
+    """Of each sample what is further from the middle, a reading or what the model says, if that is not far off: a
+    sensor at its limit does not show where what it reads has been.
+    """
+    good = measured[np.isfinite(measured)]
+    if measured.shape != said.shape or not len(good):
+        return measured
+    low, middle, high = (float(np.quantile(good, p)) for p in (0.0, 0.5, 1.0))
+    near = (said >= 2.0 * low - high) & (said <= 2.0 * high - low)
+    return np.where(near & ~(np.abs(measured - middle) >= np.abs(said - middle)), said, measured)
 
 
 def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]]) -> Bound:
