@@ -342,7 +342,10 @@ def _beside_named(
     if not d.effects or min(d.excess, left) <= UNKNOWN:
         return None
     test = by.logs.test.data.records if by.logs.test is not None else ()
-    logs = bind(by.logs.fitted.system, by.logs.fitted.data.records, test, by.model)
+    try:
+        logs = bind(by.logs.fitted.system, by.logs.fitted.data.records, test, by.model)
+    except StageError:  # with these laws the model does not run through its logs: what was learned alone stands
+        return None
     judge = Judge(logs.fitted.thinned, logs.fitted.floor)
     given = as_given(logs, judge.fit((), judge.stage.neutral(), 12))
     given.verdict = "unknown"  # what is left is more than noise
