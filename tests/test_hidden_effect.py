@@ -10,13 +10,19 @@ import re
 import numpy as np
 import pytest
 
+from hil.logs import Channel, Log
 from plant.curve import PLACES, QUANTITIES
 from plant.effects import EFFECTS
+from tests import rig
+from tests.firmware_on_rig import firmware
 from tests.rig import CATALOGUE, WITH_MOTOR, Hidden, load_geometry
 from tests.rig.left_out import LEFT_OUT
 from vaneloop.base.tables import path
-from vaneloop.cli.hidden_effect import _too_easy, draw_case, judge_case, learned_right
+from vaneloop.cli.hidden_effect import _sizes, _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
+from vaneloop.cli.same_curve import like_it, with_effect
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.vanes import build_chain
 
 N = 200
 
@@ -123,6 +129,40 @@ def test_a_left_out_effect_is_not_looked_for():
     assert row["truth"][0] not in row["named"] and row["kind"] == "left out"
     learned = json.loads(row["learned"])  # what says the same in this log is left out, too
     assert learned["verdict"] in ("learned", "unknown", "none") and row["truth"][0] not in learned["also"]
+
+
+# what is hidden (sizes in SI), the curve that it is with its usual size, another that is it, too, and one that is not
+SAME = {
+    "valve_dead_band": (
+        {"half_width": 3e-4}, "valve.current adds i_cmd", 0.3, "", "actuator.load adds i_cmd",
+    ),
+    "pot_gain": (
+        {"factor": 0.95, "stage": 1.0}, "sensors.vgv1 adds vgv1", 1.0, "linkage.vgv1_ring adds vgv1",
+        "sensors.vigv adds vigv",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_a_curve_is_what_is_hidden_where_the_stage_gives_the_same(name):
+    parameters, named, size, also, wrong = SAME[name]
+    hidden = Hidden(name, parameters)
+    run = rig.simulate(rig.manoeuvre(5, 60.0), firmware(), [hidden], seed=5, rate=100)
+    chain = build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
+    stage = chain.stage(PLACES[named.rpartition(" ")[0]].stages[0])
+    own, aim = with_effect(stage, name, _sizes(hidden))
+    judge = Judge(stage, stage.floor)
+    assert np.sqrt(np.sum(judge._whiten(aim[None]) ** 2) / judge.n) < 1.05  # the library's effect is what the rig hides
+    nearest = {}
+    for told in filter(None, (named, also, wrong)):
+        at, how, of = told.split()
+        nearest[told] = like_it(stage, (how, at, of), size, own, aim)
+    assert [k for k, near in nearest.items() if near[2] < 0.03] == [k for k in (named, also) if k]
+    if name != "valve_dead_band":  # in which splines turn a corner
+        c, amplitudes, _ = nearest[named]
+        x = np.quantile(c.quantity.visited, np.linspace(0.05, 0.95, 40))
+        off = c.basis.design(x) @ (c.turn @ amplitudes) - LEFT_OUT[name].of(hidden)(x)
+        assert np.abs(off - np.mean(off)).max() < 0.02 * np.abs(LEFT_OUT[name].of(hidden)(x)).max()
 
 
 def test_an_effect_that_is_not_looked_for_must_be_one(capsys):

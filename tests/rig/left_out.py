@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -28,17 +28,22 @@ class Truth:
     curves  names of the curves that are it, ``place.curve_of_QUANTITY``, with ``{vane}`` for the stage that it is in
     value   (the hidden effect's sizes in SI, values of the quantity) -> the first curve, all but the sizes as logs have
             them; None: no closed form there
-    forms   formulas that it is, in the product's names
+    forms   formulas that it is, in the product's names; ``also``: those of a curve where they are others
     """
 
     curves: tuple[str, ...]
     value: Callable[[Mapping[str, float], Array], Array] | None = None
     forms: tuple[str, ...] = ()
+    also: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def names(self, hidden: Hidden) -> list[str]:
         """The curves by name."""
         vane = STAGES[int(hidden.parameters["stage"])] if "stage" in hidden.parameters else ""
         return [c.replace("{vane}", vane) for c in self.curves]
+
+    def forms_of(self, curve: str) -> tuple[str, ...]:
+        """The formulas that the effect is as a curve of this name."""
+        return self.also.get(curve, self.forms)
 
     def of(self, hidden: Hidden) -> Callable[[Array], Array] | None:
         """The first curve with the sizes that are hidden."""
@@ -72,6 +77,7 @@ LEFT_OUT: Mapping[str, Truth] = MappingProxyType(
             (*_of("valve.current", ("i_cmd",)), *_of("actuator.flow_gain", ("i_cmd",), "gain")),
             _asymmetry,
             ("magnitude", "above", "below"),
+            {"actuator.flow_gain.gain_of_i_cmd": ("step",)},
         ),
         "oil_viscosity": Truth(
             _of("actuator.flow_gain", ("t_oil",), "gain"), lambda v, t: v["coefficient"] * (t - 40.0), LINE
@@ -80,9 +86,12 @@ LEFT_OUT: Mapping[str, Truth] = MappingProxyType(
             _of("actuator.load", ("n_r",)), lambda v, n: v["force"] * (0.01 * n) ** 2, ("square", "power")
         ),
         "piston_friction": Truth(
-            _of("actuator.load", ("speed_of_x_lvdt", "direction_of_x_lvdt")), None, ("sign", "line", "step", "tanh")
+            _of("actuator.load", ("speed_of_x_lvdt", "direction_of_x_lvdt")),
+            None,
+            ("sign", "step", "tanh"),
+            {"actuator.load.curve_of_direction_of_x_lvdt": ("line",)},
         ),
-        "lvdt_gain": Truth(_of("sensors.lvdt", STROKE), lambda v, x: (v["factor"] - 1.0) * x, LINE),
+        "lvdt_gain": Truth(_of("sensors.lvdt", STROKE), lambda v, x: (1.0 - 1.0 / v["factor"]) * x, LINE),
         "lvdt_nonlinearity": Truth(_of("sensors.lvdt", STROKE), _nonlinearity, ("sine",)),
         "lvdt_thermal_drift": Truth(
             _of("sensors.lvdt", ("t_oil",)), lambda v, t: 1e3 * v["coefficient"] * (t - 40.0), LINE
@@ -98,6 +107,6 @@ LEFT_OUT: Mapping[str, Truth] = MappingProxyType(
         "ring_eccentricity": Truth(
             (*_of("linkage.{vane}_ring", STROKE), *_of("sensors.{vane}", STROKE)), None, ("sine",)
         ),
-        "pot_gain": Truth(_of("sensors.{vane}", ("{vane}", *STROKE)), lambda v, a: (v["factor"] - 1.0) * a, LINE),
+        "pot_gain": Truth(_of("sensors.{vane}", ("{vane}", *STROKE)), lambda v, a: (1.0 - 1.0 / v["factor"]) * a, LINE),
     }
 )

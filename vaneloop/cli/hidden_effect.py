@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -168,27 +169,45 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
     return out
 
 
-def _learned(chain: Any, d: Any, name: str, names: Sequence[str] = (), truth: Any = None) -> dict[str, Any]:
+def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any]:
     """What `learn` answers on the diagnosed log: each law with its rivals, formulas and errors.
 
-    names, truth  curves that are what is hidden, and the first of them (`tests.rig.left_out`)
+    hidden  an effect that was left out: is a law it (`vaneloop.cli.same_curve`)?
     """
+    import numpy as np
+
     from plant import Model
+    from vaneloop.cli.same_curve import as_a_curve
     from vaneloop.verbs.learn import learned
     from vaneloop.verbs.search import Diagnosed
 
     started = time.process_time()
     answer = learned(chain, name, Model(), 1, None, Diagnosed(chain, d, name))
+    spent = time.process_time() - started
+    *_, left_out = _rig()
+    names = left_out.LEFT_OUT[hidden.name].names(hidden) if hidden else []
     laws: list[dict[str, Any]] = [
         {"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas], "before": law.error_before,
          "after": law.error_after, "found": any(n in names for n in (law.name, *law.rivals))}
         for law in answer.laws
     ]  # fmt: skip
-    for law, row in zip(answer.laws, laws, strict=True):
-        if truth is not None and law.name == names[0]:
-            row |= as_curve(law, *truth)
+    for law, row in zip(answer.laws, laws, strict=True) if hidden else ():
+        curve = as_a_curve(chain, law, hidden.name, _sizes(hidden), law.name == names[0])
+        if curve is not None:
+            forms = left_out.LEFT_OUT[hidden.name].forms_of(law.name)
+            row |= {"found": True, **as_curve(law, partial(np.interp, xp=law.x, fp=curve), forms)}
     return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
-            "nearest": answer.outcome.nearest, "processor_s": time.process_time() - started}  # fmt: skip
+            "nearest": answer.outcome.nearest, "processor_s": spent}  # fmt: skip
+
+
+def _sizes(hidden: Any) -> dict[str, float]:
+    """The sizes of what is hidden by the library's names, in its units; of one vane stage, by that stage."""
+    from plant.effects import EFFECTS
+
+    rig, *_ = _rig()
+    main, which = rig.CATALOGUE[hidden.name].main, int(hidden.parameters.get("stage", -1))
+    sizes = {VANES[which] if which >= 0 and k == main else k: v for k, v in hidden.parameters.items() if k != "stage"}
+    return {k: v / EFFECTS[hidden.name][k].si for k, v in sizes.items()}
 
 
 def learned_right(row: dict[str, Any]) -> bool:
@@ -220,8 +239,6 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     clean = [not json.loads(r["learned"])["laws"] for r in asked if r["kind"] == "clean"]
     answers = [json.loads(r["learned"]) for r in asked if r["kind"] == LEAVE_OUT and r["detectable"][0]]
     gone = [said["laws"] for said in answers]
-    curves = [c for laws in gone for c in [next((law for law in laws if "inside" in law), None)] if c is not None]
-    none = [False] * sum(not any(law["found"] for law in laws) for laws in gone)
     return {
         "learned: left out of the library, right place and quantity": share(
             [any(law["found"] for law in laws) for laws in gone]
@@ -230,9 +247,11 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             [any(law["found"] for law in said["laws"]) for said in answers if not said["also"]]
         ),
         "learned: left out, the curve is the law within its band": share(
-            [c["inside"] >= INSIDE for c in curves] + none
+            [any(law.get("inside", 0.0) >= INSIDE for law in laws) for laws in gone]
         ),
-        "learned: left out, the right formula among those given": share([bool(c["formula"]) for c in curves] + none),
+        "learned: left out, the right formula among those given": share(
+            [any(law.get("formula") for law in laws) for laws in gone]
+        ),
         "learned: outside the library, right place and quantity": share([r in right for r in outside]),
         "learned: of those that are a curve at all": share([r in right for r in plain]),
         "learned: of these, held-out error within 1.5 noise floors": share([e <= 1.5 for e in errors]),
@@ -285,7 +304,7 @@ def judge_case(
     from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
     from vaneloop.verbs.search import not_given
 
-    rig, on_rig, left_out = _rig()
+    rig, on_rig, _ = _rig()
     case = draw_case(seed, index, duration, machine, kinds, leave_out)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
@@ -313,14 +332,12 @@ def judge_case(
     said = _learned(chain, d, f"case {index}") if learn else {}
     if leave_out:
         (h,) = case["hidden"]
-        truth = left_out.LEFT_OUT[h.name]
-        value = truth.of(h)
-        said = _learned(chain, d, f"case {index}", truth.names(h), value and (value, truth.forms))
+        said = _learned(chain, d, f"case {index}", h)
         while said["verdict"] == "named":  # another effect says the same in this log: it is left out, too
             gone |= {name for s in d.stages for f in s.effects for name in (f.effect, *f.rivals)}
             chain = not_given(chain, sorted(gone))
             d = diagnose(chain.stages, chain.not_observed, workers=1)
-            said = _learned(chain, d, f"case {index}", truth.names(h), value and (value, truth.forms))
+            said = _learned(chain, d, f"case {index}", h)
         said["also"] = sorted(gone - {h.name})
     truth = [h.name for h in case["hidden"]]
     # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3

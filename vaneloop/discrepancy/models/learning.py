@@ -49,7 +49,7 @@ from vaneloop.discrepancy.models.tried import (
     step_without,
 )
 from vaneloop.discrepancy.promise import Slopes
-from vaneloop.discrepancy.stage import Array
+from vaneloop.discrepancy.stage import Array, Effect
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
 __all__ = ["Learner"]
@@ -432,24 +432,38 @@ class Learner:
 
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
-        quick = self._judge((), current.curves, True)
-        slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
+        starts = self._starts(current)
         every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
-        out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
+        out = sorted((self._promise(current, c, starts) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
             c = one[1]
             best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
-        first = [self._its_lag(current, one, slopes) for one in list(best.values())[:QUICK]]
+        first = [self._its_lag(current, one, starts) for one in list(best.values())[:QUICK]]
         return sorted(first, key=lambda o: o[0])
 
+    def _starts(self, current: Tried) -> list[tuple[Array, Slopes]]:
+        """Parameters from which a candidate's step is taken, with their slopes: those of the fit; and where what is
+        missing has pulled one of the model's own to a bound, those that are nominal, too.
+
+        Far from the truth a model without what it lacks is bent out of shape, and no step brings it back.
+        """
+        quick, fit = self._judge((), current.curves, True), current.fit
+        starts, own, nominal = [fit.theta], len(quick.stage.parameters), fit.theta.copy()
+        nominal[:own] = quick.stage.neutral()[:own]
+        free = fit.free[fit.free < own]
+        room = [np.abs(b - fit.theta)[free] for b in quick.bounds()]
+        if np.any(np.minimum(*room) <= 1e-6 * quick.scale[free]):
+            starts.append(nominal)
+        return [(theta, Slopes(quick, theta, fit.free, fit.prior)) for theta in starts]
+
     def _its_lag(
-        self, current: Tried, one: tuple[float, Candidate, Array], slopes: Slopes
+        self, current: Tried, one: tuple[float, Candidate, Array], starts: Sequence[tuple[Array, Slopes]]
     ) -> tuple[float, Candidate, Array]:
         """A candidate with the lag that promises most: those that were tried first are far apart."""
         for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
             while (c := one[1].slower(factor)) is not None and not stands(current, c):
-                other = self._promise(current, c, slopes)
+                other = self._promise(current, c, starts)
                 if other[0] >= one[0]:
                     break
                 one = other
@@ -476,16 +490,26 @@ class Learner:
             out += [c.every(p) for p in periods]
         return out
 
-    def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, Array]:
-        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best.
+    def _promise(
+        self, current: Tried, candidate: Candidate, starts: Sequence[tuple[Array, Slopes]]
+    ) -> tuple[float, Candidate, Array]:
+        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from
+        where that leaves least.
 
         Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
         """
-        fit = current.fit
         effect = candidate.effect(SCREENED)
         judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
-        theta = np.concatenate([fit.theta, np.zeros(len(effect.parameters))])
-        own = np.arange(len(fit.theta), len(theta))
+        steps = [self._step(current.fit, candidate, effect, judge, *start) for start in starts]
+        left, theta = min(steps, key=lambda s: s[0])
+        return left, candidate, theta
+
+    def _step(
+        self, fit: Fit, candidate: Candidate, effect: Effect, judge: Judge, begin: Array, slopes: Slopes
+    ) -> tuple[float, Array]:
+        """What is left after the best step from ``begin``, and the parameters then."""
+        theta = np.concatenate([begin, np.zeros(len(effect.parameters))])
+        own = np.arange(len(begin), len(theta))
         moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
         rows = np.concatenate([slopes.jac, derivative(judge.errors(moved))[1]])
         _, gradients, normals = judge._blocks(slopes.error, rows)
@@ -506,7 +530,7 @@ class Learner:
             row[free] = np.clip(row[free] + step * scale, low[free], high[free])
         left = judge.totals(judge.errors(trials), trials)
         k = int(np.argmin(left))
-        return float(left[k]), candidate, trials[k]
+        return float(left[k]), trials[k]
 
     # ---- other logs --------------------------------------------------------------------------------------------------
 
