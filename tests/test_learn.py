@@ -11,6 +11,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -34,9 +36,10 @@ from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import OwnGround, candidates, on_logs, with_curves
 from vaneloop.discrepancy.models.formula_fits import goes_on
-from vaneloop.discrepancy.models.held_out import held_out, told_by_others
+from vaneloop.discrepancy.models.held_out import held_out, surely_more, told_by_others
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
+from vaneloop.discrepancy.models.tried import Tried, left_by_its_mean, one_constant
 from vaneloop.verbs.learn import learn
 from vaneloop.verbs.search import diagnose
 
@@ -214,6 +217,50 @@ def test_where_a_block_alone_has_been_the_others_do_not_tell() -> None:
     # the second block alone is below 0, the third alone is above 3
     assert told_by_others(q, start).tolist() == [True, True, True, False, True, True, True, False, False]
     assert told_by_others(q, np.array([0])).all()
+
+
+def test_more_error_is_sure_where_the_blocks_agree() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal((400, 24))
+    assert sum(surely_more(n) for n in noise) <= 4  # 0.3 % of chances, at both ends less
+    assert all(surely_more(n + 2.0) for n in noise[:50]) and not any(surely_more(n - 2.0) for n in noise[:50])
+    one = np.zeros(24)
+    one[3] = 1e6  # one block says nothing of the others
+    assert not surely_more(one) and not surely_more(np.zeros(24))
+
+
+def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
+    """A linear stage whose curve is a mean and a line, beside one parameter of its own."""
+    rng = np.random.default_rng(4)
+    n, x = 600, np.linspace(-1.0, 1.0, 600)
+    rows = np.stack([np.sin(9.0 * x), np.ones(n), x], axis=1)
+
+    def tried(at: str, mean: float, slope: float) -> Tried:
+        y = rows @ np.array([0.3, mean, slope]) + rng.standard_normal(n)
+        theta = np.linalg.lstsq(rows, y, rcond=None)[0]
+        e = y - rows @ theta
+        stage = SimpleNamespace(index=lambda: {"c": slice(1, 3)})
+        judge = SimpleNamespace(stage=stage, scale=np.array([2.0, 1.0, 0.5]), n=n)
+        j = rows * judge.scale
+        fit = SimpleNamespace(
+            free=np.arange(3), theta=theta, prior=np.zeros(3), cost=np.array([e @ e]), gradients=(j.T @ e)[None],
+            normals=(j.T @ j)[None],
+        )  # fmt: skip
+        one = cast(Tried, SimpleNamespace(candidate=SimpleNamespace(how="adds", at=at, name="c", kept=[0, 1]),
+                                          fit=fit, judge=judge))  # fmt: skip
+        only = np.linalg.lstsq(rows[:, :2], y, rcond=None)[0]
+        assert left_by_its_mean(one) == pytest.approx(np.sum((y - rows[:, :2] @ only) ** 2))
+        return one
+
+    flat, again, elsewhere, bent = (
+        tried("a", 9.0, 0.0),
+        tried("a", 9.0, 0.5),
+        tried("b", 9.0, 0.0),
+        tried("a", 9.0, 6.0),
+    )
+    before = 81.0 * n
+    assert one_constant([bent, flat, again, elsewhere], before) == [bent, flat, elsewhere]
+    assert one_constant([again, flat], before) == [again]
 
 
 # ---- the law file ----------------------------------------------------------------------------------------------------

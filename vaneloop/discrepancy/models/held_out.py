@@ -16,8 +16,9 @@ import numpy as np
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["Blocks", "at_samples", "held_out", "told_by_others", "with_held_out"]
+__all__ = ["Blocks", "at_samples", "held_out", "surely_more", "told_by_others", "with_held_out"]
 
+SURELY = 3.0  # standard errors of a sum over blocks
 Blocks = tuple[Array, Array, Array]  # sum of squares, gradient and normal matrix of each block, as `Fit` has them
 
 
@@ -33,6 +34,11 @@ def told_by_others(q: Array, start: Array) -> Array:
     others_low = np.where(np.arange(len(low)) == np.argmin(low), least[1], least[0])
     others_high = np.where(np.arange(len(high)) == np.argmax(high), greatest[0], greatest[1])
     return np.asarray((q >= np.repeat(others_low, many)) & (q <= np.repeat(others_high, many)))
+
+
+def surely_more(by: Array) -> bool:
+    """Whether what the error of a fit is more ``by``, block by block, than another's is no chance of the blocks."""
+    return bool(by.sum() > SURELY * np.sqrt(len(by) * np.var(by, ddof=1)) > 0.0)
 
 
 def at_samples(values: Sequence[float] | Array, n: int) -> Array | None:

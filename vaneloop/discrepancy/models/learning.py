@@ -26,15 +26,16 @@ from vaneloop.discrepancy.error_share import (
     score,
     worth,
 )
-from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
-from vaneloop.discrepancy.models.held_out import at_samples, told_by_others, with_held_out
+from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_by_others, with_held_out
 from vaneloop.discrepancy.models.memory import dissipates
 from vaneloop.discrepancy.models.periods import Lines
 from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.steps import best_step, starts_of
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
     Ground,
@@ -44,12 +45,14 @@ from vaneloop.discrepancy.models.tried import (
     adds_what,
     channel_of,
     moves,
+    one_constant,
     plain,
     stands,
     step_without,
+    strange,
 )
 from vaneloop.discrepancy.promise import Slopes
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
 __all__ = ["Learner"]
@@ -61,7 +64,6 @@ QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of th
 SURE = 3  # of the latter that are chosen by data left out
 SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
-DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 PLAINER = 2  # more that are fitted to the end, where they are plainer than the best
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 OTHER = 1.5  # times as large: another amplitude
@@ -122,6 +124,7 @@ class Learner:
                 break
             left = {t.candidate.name: self._left(current, t, good) for t in good}
             self._with_formulas(current, good, left)
+            self._tell_apart(good, left)
             near = self._near(current, good, left)
             best = next((t for t in near if self._confirmed(current, t)), None)
             if best is None:
@@ -243,19 +246,37 @@ class Learner:
         return float(np.mean(tests)) if tests else 0.0
 
     def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
-        """Where the best curve still fails, what each may leave with a formula in its place: a corner or a jump is none
-        for splines. Every formula counts as many numbers as the sparest of these curves, however many its own has.
+        """Where the best curve still fails, what each may leave with a formula in its place, else those of a plainer
+        quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they go astray. Every
+        formula counts as many numbers as the sparest of these curves, however many its own has.
         """
-        least = min(left.values())
-        if not self.form.fails(min(good, key=lambda t: left[t.candidate.name]).fit):
+        best = min(good, key=lambda t: left[t.candidate.name])
+        costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum())) for t in good}]
+        close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
+        if not self.form.fails(best.fit):
+            close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
+        if not close:
             return
-        close = [t for t in good if left[t.candidate.name] <= least + FORMULAS]
-        sparest = min(len(t.fit.free) for t in close)
+        sparest = min(len(t.fit.free) for t in (*close, best))
         for t in close:
             name = t.candidate.name
             for _, f in fitted_formulas(self.ground, t, loose=True):
                 spared = PER_PARAMETER * (sparest - len(f.fit.free))
                 left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
+
+    def _tell_apart(self, good: Sequence[Tried], left: dict[str, float]) -> None:
+        """Put those behind that are surely worse, block by block, than the best of what neither remembers nor drifts,
+        where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
+        little more.
+        """
+        plain_ones = [t for t in good if strange(t.candidate) <= 1]
+        best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
+        if best is None or self.form.fails(best.fit):
+            return
+        for t in plain_ones:
+            (_, worse), (_, fit) = (self._judged(one, [t, best]) for one in (t, best))
+            if surely_more((worse.held_out - fit.held_out)[self.judge.samples > 0]):
+                left[t.candidate.name] = max(left[t.candidate.name], left[best.candidate.name] + 2.0 * RIVAL)
 
     def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
@@ -358,7 +379,11 @@ class Learner:
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
-        done = []
+        done: list[Tried] = []
+        if quick:
+            first_judge, theta = quick[0].judge, quick[0].judge.stage.neutral()
+            theta[: len(current.fit.theta)] = current.fit.theta
+            quick = one_constant(quick, float(np.sum(first_judge.errors(theta[None]) ** 2)))
         over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
         quick = [t for t in quick if t not in over_time]
         # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit
@@ -432,7 +457,7 @@ class Learner:
 
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
-        starts = self._starts(current)
+        starts = starts_of(self._judge((), current.curves, True), current.fit)
         every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
         out = sorted((self._promise(current, c, starts) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
@@ -441,21 +466,6 @@ class Learner:
             best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
         first = [self._its_lag(current, one, starts) for one in list(best.values())[:QUICK]]
         return sorted(first, key=lambda o: o[0])
-
-    def _starts(self, current: Tried) -> list[tuple[Array, Slopes]]:
-        """Parameters from which a candidate's step is taken, with their slopes: those of the fit; and where what is
-        missing has pulled one of the model's own to a bound, those that are nominal, too.
-
-        Far from the truth a model without what it lacks is bent out of shape, and no step brings it back.
-        """
-        quick, fit = self._judge((), current.curves, True), current.fit
-        starts, own, nominal = [fit.theta], len(quick.stage.parameters), fit.theta.copy()
-        nominal[:own] = quick.stage.neutral()[:own]
-        free = fit.free[fit.free < own]
-        room = [np.abs(b - fit.theta)[free] for b in quick.bounds()]
-        if np.any(np.minimum(*room) <= 1e-6 * quick.scale[free]):
-            starts.append(nominal)
-        return [(theta, Slopes(quick, theta, fit.free, fit.prior)) for theta in starts]
 
     def _its_lag(
         self, current: Tried, one: tuple[float, Candidate, Array], starts: Sequence[tuple[Array, Slopes]]
@@ -500,37 +510,9 @@ class Learner:
         """
         effect = candidate.effect(SCREENED)
         judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
-        steps = [self._step(current.fit, candidate, effect, judge, *start) for start in starts]
+        steps = [best_step(current.fit, candidate, effect, judge, *start) for start in starts]
         left, theta = min(steps, key=lambda s: s[0])
         return left, candidate, theta
-
-    def _step(
-        self, fit: Fit, candidate: Candidate, effect: Effect, judge: Judge, begin: Array, slopes: Slopes
-    ) -> tuple[float, Array]:
-        """What is left after the best step from ``begin``, and the parameters then."""
-        theta = np.concatenate([begin, np.zeros(len(effect.parameters))])
-        own = np.arange(len(begin), len(theta))
-        moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
-        rows = np.concatenate([slopes.jac, derivative(judge.errors(moved))[1]])
-        _, gradients, normals = judge._blocks(slopes.error, rows)
-        free = np.concatenate([fit.free, own])
-        scale = judge.scale[free]
-        tolerance = np.array([p.tolerance for p in effect.parameters])
-        prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
-        deviation = (theta - judge.stage.neutral())[free] / scale
-        a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
-        trials = np.repeat(theta[None], len(DAMPED), axis=0)
-        low, high = judge.bounds()
-        for row, damping in zip(trials, DAMPED, strict=True):
-            stiff = a + damping * np.diag(np.diag(a))
-            if candidate.basis.rises:  # half of what a plain step asks for is beyond bounds
-                step = bounded_step(stiff, g, (low - theta)[free] / scale, (high - theta)[free] / scale)
-            else:
-                step = np.linalg.solve(stiff, g)
-            row[free] = np.clip(row[free] + step * scale, low[free], high[free])
-        left = judge.totals(judge.errors(trials), trials)
-        k = int(np.argmin(left))
-        return float(left[k]), trials[k]
 
     # ---- other logs --------------------------------------------------------------------------------------------------
 

@@ -25,13 +25,16 @@ __all__ = [
     "Tried",
     "adds_what",
     "channel_of",
+    "left_by_its_mean",
     "moves",
+    "one_constant",
     "plain",
     "stands",
     "step_without",
     "strange",
 ]
 
+CONSTANT = 0.1  # of the error: where its mean leaves less, a curve is a constant
 Placings = tuple[tuple[Placed, Effect], ...]
 
 
@@ -165,6 +168,38 @@ def channel_of(candidate: Candidate) -> str:
     """What a candidate's quantity is of: of a lag, the channel behind it, which may say the same without one."""
     lag = named_lag(candidate.quantity.name)
     return lag[0] if lag else candidate.quantity.name
+
+
+def one_constant(tried: Sequence[Tried], before: float) -> list[Tried]:
+    """Of those that are ``tried``, in their order, the first at each place that is no more than a constant there, and
+    all others: a constant is the same law, whatever it is called a function of.
+
+    before  sum of squares without a curve
+    """
+    out, have = [], set()
+    for t in tried:
+        place = t.candidate.how, t.candidate.at
+        if left_by_its_mean(t) - t.judge.n <= CONSTANT**2 * (before - t.judge.n):
+            if place in have:
+                continue
+            have.add(place)
+        out.append(t)
+    return out
+
+
+def left_by_its_mean(tried: Tried) -> float:
+    """Sum of squares with only the mean of the last curve, by the slopes of its fit; infinite where it has no mean."""
+    c, fit, judge = tried.candidate, tried.fit, tried.judge
+    if 0 not in c.kept:
+        return np.inf
+    own = judge.stage.index()[c.name]
+    gone = (fit.free > own.start) & (fit.free < own.stop)
+    step = -fit.theta[fit.free] / judge.scale[fit.free] * gone
+    a = fit.normals.sum(axis=0) + np.diag(fit.prior * judge.scale[fit.free] ** 2 + 1e-9)
+    g = fit.gradients.sum(axis=0)
+    step[~gone] = np.linalg.solve(a[np.ix_(~gone, ~gone)], (g - a @ step)[~gone])
+    n = fit.normals.sum(axis=0)
+    return float(fit.cost.sum() - 2.0 * g @ step + step @ n @ step)
 
 
 def stands(current: Tried, candidate: Candidate) -> bool:
