@@ -510,7 +510,7 @@ class Learner:
         """
         effect = candidate.effect(SCREENED)
         judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
-        steps = [best_step(current.fit, candidate, effect, judge, *start) for start in starts]
+        steps = [best_step(current.fit, effect, judge, *start) for start in starts]
         left, theta = min(steps, key=lambda s: s[0])
         return left, candidate, theta
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
-from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array, Effect
 
@@ -31,10 +30,10 @@ def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
     return [(theta, Slopes(judge, theta, fit.free, fit.prior)) for theta in starts]
 
 
-def best_step(
-    fit: Fit, candidate: Candidate, effect: Effect, judge: Judge, begin: Array, slopes: Slopes
-) -> tuple[float, Array]:
-    """What is left after the best step from ``begin``, and the parameters then."""
+def best_step(fit: Fit, effect: Effect, judge: Judge, begin: Array, slopes: Slopes) -> tuple[float, Array]:
+    """What the best step from ``begin`` with ``effect``, the last of the judge's stage, leaves; and the parameters
+    then.
+    """
     theta = np.concatenate([begin, np.zeros(len(effect.parameters))])
     own = np.arange(len(begin), len(theta))
     moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
@@ -49,11 +48,10 @@ def best_step(
     trials = np.repeat(theta[None], len(DAMPED), axis=0)
     low, high = judge.bounds()
     for row, damping in zip(trials, DAMPED, strict=True):
-        stiff = a + damping * np.diag(np.diag(a))
-        if candidate.basis.rises:  # half of what a plain step asks for is beyond bounds
-            step = bounded_step(stiff, g, (low - theta)[free] / scale, (high - theta)[free] / scale)
-        else:
-            step = np.linalg.solve(stiff, g)
+        stiff, room = a + damping * np.diag(np.diag(a)), [(b - theta)[free] / scale for b in (low, high)]
+        step = np.linalg.solve(stiff, g)
+        if np.any((step < room[0]) | (step > room[1])):  # what a bound stops, others take over
+            step = bounded_step(stiff, g, *room)
         row[free] = np.clip(row[free] + step * scale, low[free], high[free])
     left = judge.totals(judge.errors(trials), trials)
     k = int(np.argmin(left))
