@@ -379,11 +379,7 @@ class Learner:
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
-        done: list[Tried] = []
-        if quick:
-            first_judge, theta = quick[0].judge, quick[0].judge.stage.neutral()
-            theta[: len(current.fit.theta)] = current.fit.theta
-            quick = one_constant(quick, float(np.sum(first_judge.errors(theta[None]) ** 2)))
+        quick, done = one_constant(quick), []
         over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
         quick = [t for t in quick if t not in over_time]
         # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from vaneloop.discrepancy.error_share import LEAST_FALL, LEAST_OF_NOISE
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.models.curved import Candidate
@@ -34,7 +35,6 @@ __all__ = [
     "strange",
 ]
 
-CONSTANT = 0.1  # of the error: where its mean leaves less, a curve is a constant
 Placings = tuple[tuple[Placed, Effect], ...]
 
 
@@ -170,16 +170,17 @@ def channel_of(candidate: Candidate) -> str:
     return lag[0] if lag else candidate.quantity.name
 
 
-def one_constant(tried: Sequence[Tried], before: float) -> list[Tried]:
+def one_constant(tried: Sequence[Tried]) -> list[Tried]:
     """Of those that are ``tried``, in their order, the first at each place that is no more than a constant there, and
     all others: a constant is the same law, whatever it is called a function of.
 
-    before  sum of squares without a curve
+    More than a constant is what explains as much of what that leaves as a second law has to.
     """
     out, have = [], set()
     for t in tried:
-        place = t.candidate.how, t.candidate.at
-        if left_by_its_mean(t) - t.judge.n <= CONSTANT**2 * (before - t.judge.n):
+        place, left = (t.candidate.how, t.candidate.at), left_by_its_mean(t)
+        least = max(LEAST_FALL * (left - t.judge.n), LEAST_OF_NOISE * t.judge.n)
+        if left - float(t.fit.cost.sum()) < least:
             if place in have:
                 continue
             have.add(place)
