@@ -114,6 +114,8 @@ def test_what_is_left_out_is_an_effect_and_a_curve_that_the_plant_can_have():
         stage = {"stage": 1.0} if CATALOGUE[name].stages else {}
         hidden = Hidden(name, {CATALOGUE[name].main: CATALOGUE[name].ladder[3], **stage})
         assert name in EFFECTS and set(truth.names(hidden)) <= names, name
+        told = truth.names(hidden)
+        assert all(truth.forms_of(n, hidden) for n in told) and not truth.forms_of("valve.current.curve_of_p_s", hidden)
         if value := truth.of(hidden):
             q = np.linspace(-40.0, 90.0, 9)
             neutral = Hidden(

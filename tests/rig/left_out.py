@@ -41,9 +41,9 @@ class Truth:
         vane = STAGES[int(hidden.parameters["stage"])] if "stage" in hidden.parameters else ""
         return [c.replace("{vane}", vane) for c in self.curves]
 
-    def forms_of(self, curve: str) -> tuple[str, ...]:
-        """The formulas that the effect is as a curve of this name."""
-        return self.also.get(curve, self.forms)
+    def forms_of(self, curve: str, hidden: Hidden) -> tuple[str, ...]:
+        """The formulas that the effect is as a curve of this name; none where it is no curve of that name."""
+        return self.also.get(curve, self.forms) if curve in self.names(hidden) else ()
 
     def of(self, hidden: Hidden) -> Callable[[Array], Array] | None:
         """The first curve with the sizes that are hidden."""

@@ -194,7 +194,7 @@ def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any
     for law, row in zip(answer.laws, laws, strict=True) if hidden else ():
         curve = as_a_curve(chain, law, hidden.name, _sizes(hidden), law.name == names[0])
         if curve is not None:
-            forms = left_out.LEFT_OUT[hidden.name].forms_of(law.name)
+            forms = left_out.LEFT_OUT[hidden.name].forms_of(law.name, hidden)
             row |= {"found": True, **as_curve(law, partial(np.interp, xp=law.x, fp=curve), forms)}
     return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
             "nearest": answer.outcome.nearest, "processor_s": spent}  # fmt: skip
