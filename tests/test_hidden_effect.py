@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from tests.firmware_on_rig import firmware
 from tests.rig import CATALOGUE, WITH_MOTOR, Hidden, load_geometry
 from tests.rig.left_out import LEFT_OUT
 from vaneloop.base.tables import path
-from vaneloop.cli.hidden_effect import _sizes, _too_easy, draw_case, judge_case, learned_right
+from vaneloop.cli.hidden_effect import _named_where, _sizes, _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
 from vaneloop.cli.same_curve import like_it, with_effect
 from vaneloop.discrepancy.fit import Judge
@@ -131,6 +132,20 @@ def test_a_left_out_effect_is_not_looked_for():
     assert row["truth"][0] not in row["named"] and row["kind"] == "left out"
     learned = json.loads(row["learned"])  # what says the same in this log is left out, too
     assert learned["verdict"] in ("learned", "unknown", "none") and row["truth"][0] not in learned["also"]
+
+
+def test_what_says_the_same_is_told_by_the_stages_where_it_shows():
+    def found(effect, *rivals):
+        return SimpleNamespace(effect=effect, rivals=rivals)
+
+    stages = [
+        SimpleNamespace(stage="actuator", effects=[]),
+        SimpleNamespace(stage="linkage", effects=[found("thermal_growth", "linkage_wear")]),
+        SimpleNamespace(stage="engine", effects=[found("rotor_lag_error")]),
+    ]
+    d = SimpleNamespace(stages=stages)
+    assert _named_where("lvdt_thermal_drift", d) == {"thermal_growth", "linkage_wear"}
+    assert _named_where("valve_dead_band", d) == set()
 
 
 # what is hidden (sizes in SI), the curve that it is with its usual size, another that is it, too, and one that is not

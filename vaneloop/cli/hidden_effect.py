@@ -200,6 +200,14 @@ def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any
             "nearest": answer.outcome.nearest, "processor_s": spent}  # fmt: skip
 
 
+def _named_where(effect: str, d: Any) -> set[str]:
+    """Effects that a diagnosis names, with their rivals, in stages where ``effect`` shows."""
+    from plant.effects import EFFECTS
+
+    shown = [s for s in d.stages if s.stage in EFFECTS[effect].stages]
+    return {name for s in shown for f in s.effects for name in (f.effect, *f.rivals)}
+
+
 def _sizes(hidden: Any) -> dict[str, float]:
     """The sizes of what is hidden by the library's names, in its units; of one vane stage, by that stage."""
     from plant.effects import EFFECTS
@@ -333,8 +341,9 @@ def judge_case(
     if leave_out:
         (h,) = case["hidden"]
         said = _learned(chain, d, f"case {index}", h)
-        while said["verdict"] == "named":  # another effect says the same in this log: it is left out, too
-            gone |= {name for s in d.stages for f in s.effects for name in (f.effect, *f.rivals)}
+        # another effect says the same in this log: it is left out, too, also where another stage is open
+        while not said["laws"] and (same := _named_where(h.name, d)):
+            gone |= same
             chain = not_given(chain, sorted(gone))
             d = diagnose(chain.stages, chain.not_observed, workers=1)
             said = _learned(chain, d, f"case {index}", h)
