@@ -264,9 +264,9 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
     assert one_constant([again, flat, bent]) == [again, bent]
 
 
-@given(st.floats(1.0, 30.0), st.sampled_from([-1.0, 1.0]))
+@given(st.floats(0.2, 30.0), st.sampled_from([-1.0, 1.0]))
 def test_what_a_bound_stops_the_curve_takes_over(size: float, sign: float) -> None:
-    """A gross line is missing; a slope of the model's own, known to 0.1, has gone to its bound to imitate it."""
+    """A line is missing; a slope of the model's own, known to 0.1, has gone to its bound to imitate it."""
     t = np.linspace(0.0, 10.0, 400)
     shapes = np.stack([np.sin(t), t / 10.0, t / 10.0 + 0.3 * np.cos(2.0 * t)])
     own = (Parameter("swing", 1.0, "", tolerance=0.1), Parameter("slope", 0.5, "", tolerance=0.1))
@@ -282,11 +282,11 @@ def test_what_a_bound_stops_the_curve_takes_over(size: float, sign: float) -> No
     fit = before.fit((), before.stage.neutral())
     starts = starts_of(before, fit)
     low, high = before.bounds()
-    at_bound = bool(np.any(np.minimum(fit.theta - low, high - fit.theta) < 1e-9))
+    at_bound = bool(np.any(np.minimum(fit.theta - low, high - fit.theta) <= 1e-7))
     assert len(starts) == 1 + at_bound
     left, theta = min((best_step(fit, curve, judge((curve,)), *s) for s in starts), key=lambda s: s[0])
     assert np.all(np.abs(theta[:2] - (1.0, 0.5)) <= 0.1 + 1e-12)
-    assert left - len(t) < 0.05 * float(np.sum(before.errors(fit.theta[None]) ** 2))
+    assert left - len(t) < 0.01 * float(np.sum(before.errors(fit.theta[None]) ** 2))
 
 
 # ---- the law file ----------------------------------------------------------------------------------------------------
