@@ -48,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--curve", action="store_true",
-        help="of a model of your own: the law is the curve, even where a formula does as well",
+        help="the law is the curve, even where a formula does as well",
     )  # fmt: skip
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
@@ -67,15 +67,14 @@ def command(args: argparse.Namespace) -> int:
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     checked_shape(args.shape)
     own = own_model.asked(args)
-    if args.curve and not own:
-        raise InputError("--curve needs --system MY.py")
     chain: Any = None if own else not_given(options.chain_of(args), args.without)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
         if own:
             asked = {"without": args.without, "shape": args.shape, "formulas": not args.curve}
             answer = own_model.ask(args, "learn", **asked, progress=tell)
         else:
-            answer = learned(chain, args.log, options.machine_of(args).added, progress=tell, shape=args.shape)
+            added, asked = options.machine_of(args).added, {"shape": args.shape, "formulas": not args.curve}
+            answer = learned(chain, args.log, added, progress=tell, **asked)
     if answer.model is not None and args.out:
         answer = with_path(answer, args.out, words)
     if answer.by_log is not None:

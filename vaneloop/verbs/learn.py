@@ -167,7 +167,7 @@ def learn(
     """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`.
 
     shape  what is known of every curve: "zero" where its quantity is 0, "odd", "rising", "falling"
-    formulas  of a model of the user's own: whether a formula that does as well as its curve is the law
+    formulas  whether a formula that does as well as its curve is the law
 
     The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
     InputError for logs that the system cannot be held against.
@@ -178,7 +178,7 @@ def learn(
 
         machine = model or Machine()
         chain, name = chain_for(log, machine, fit, test)
-        return learned(not_given(chain, without), name, machine.added, workers, tell, shape=shape)
+        return learned(not_given(chain, without), name, machine.added, workers, tell, None, shape, formulas)
     diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
     try:
         alone = _learned(diagnosed, added, lambda f: tell(0.5 + 0.25 * f), shape, formulas)
@@ -197,14 +197,17 @@ def learned(
     progress: Callable[[float], None] | None = None,
     found: Diagnosed | None = None,
     shape: Sequence[str] = (),
+    formulas: bool = True,
 ) -> Learned:
     """`learn` of a log that has been put into the stages of the vane chain.
 
-    before  what the machine has by now
-    found   the diagnosis of this log, where that has been made
+    before    what the machine has by now
+    found     the diagnosis of this log, where that has been made
+    formulas  whether a formula that does as well as its curve is the law
     """
     from vaneloop.discrepancy.models.learned import law_of
     from vaneloop.discrepancy.models.learning import Learner
+    from vaneloop.discrepancy.models.spoken import spoken
     from vaneloop.discrepancy.models.tried import Outcome
     from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
 
@@ -231,17 +234,18 @@ def learned(
             said.append(f"{d.stage}: {one.why}")
             out.nearest += [n for n in one.nearest if n not in out.nearest]
             continue
-        last = before_it = learner.judge, learner.base
-        own = []
+        last, before_it, own = one.tried[-1], (learner.judge, learner.base), []
         for tried in one.tried:
             own.append(law_of(ground, before_it, tried))
-            last = before_it = tried.judge, tried.fit
+            before_it = tried.judge, tried.fit
+        if formulas:
+            last, own = spoken(learner, one.tried, own)
         new = [k for k, law in enumerate(own) if not any(law.of_the_kind_of(known) for known in laws)]
         said += [f"{d.stage}: {law.name}: another stage says it, too" for k, law in enumerate(own) if k not in new]
         laws += [own[k] for k in new]
         if new:
             kept = replace(one, tried=[one.tried[k] for k in new])
-            model = _with_stage(_as_model(model, kept, [own[k] for k in new]), *last)
+            model = _with_stage(_as_model(model, kept, [own[k] for k in new], last), last.judge, last.fit)
     verdict = "learned" if laws else "unknown" if open_ones else "named" if found.effects else "none"
     why = {
         "named": f"{', '.join(found.effects)} of the library",

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from vaneloop.discrepancy.error_share import LEAST_FALL, LEAST_OF_NOISE
-from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import Blocks
@@ -220,11 +220,12 @@ def moves(tried: Tried) -> tuple[Array, Array]:
 
 
 def step_without(tried: Tried, held: Array) -> Array:
-    """Where a fit's parameters move, in their scales, when these blocks are left out."""
+    """Where a fit's parameters move within their bounds, in their scales, when these blocks are left out."""
     fit, judge = tried.fit, tried.judge
     scale = judge.scale[fit.free]
     prior = fit.prior * scale**2
     deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
     a = fit.normals[~held].sum(axis=0)
     a = a + np.diag(prior + 1e-9 * np.maximum(np.diag(a), 1e-12))
-    return np.asarray(np.linalg.solve(a, fit.gradients[~held].sum(axis=0) - prior * deviation))
+    low, high = ((b - fit.theta)[fit.free] / scale for b in judge.bounds())
+    return bounded_step(a, fit.gradients[~held].sum(axis=0) - prior * deviation, low, high)
