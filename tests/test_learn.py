@@ -39,7 +39,9 @@ from vaneloop.discrepancy.models.formula_fits import goes_on
 from vaneloop.discrepancy.models.held_out import held_out, surely_more, told_by_others
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
+from vaneloop.discrepancy.models.steps import best_step, starts_of
 from vaneloop.discrepancy.models.tried import Tried, left_by_its_mean, one_constant
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 from vaneloop.verbs.learn import learn
 from vaneloop.verbs.search import diagnose
 
@@ -260,6 +262,31 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
     )
     assert one_constant([bent, flat, again, elsewhere]) == [bent, flat, elsewhere]
     assert one_constant([again, flat, bent]) == [again, bent]
+
+
+@given(st.floats(0.2, 30.0), st.sampled_from([-1.0, 1.0]))
+def test_what_a_bound_stops_the_curve_takes_over(size: float, sign: float) -> None:
+    """A line is missing; a slope of the model's own, known to 0.1, has gone to its bound to imitate it."""
+    t = np.linspace(0.0, 10.0, 400)
+    shapes = np.stack([np.sin(t), t / 10.0, t / 10.0 + 0.3 * np.cos(2.0 * t)])
+    own = (Parameter("swing", 1.0, "", tolerance=0.1), Parameter("slope", 0.5, "", tolerance=0.1))
+    curve = Effect("curve", (Parameter("line", 0.0, "", scale=1.0, tolerance=100.0),), ((0.3,),))
+    measured = np.array([1.02, 0.46, sign * size]) @ shapes + 0.01 * np.random.default_rng(0).standard_normal(len(t))
+
+    def judge(effects: tuple[Effect, ...]) -> Judge:
+        rows = shapes[: 2 + len(effects)]
+        stage = Stage("s", ("y",), ("",), own, effects, lambda p: (p @ rows)[:, None], t, measured[None])
+        return Judge(stage, np.array([0.01]))
+
+    before = judge(())
+    fit = before.fit((), before.stage.neutral())
+    starts = starts_of(before, fit)
+    low, high = before.bounds()
+    at_bound = bool(np.any(np.minimum(fit.theta - low, high - fit.theta) <= 1e-7))
+    assert len(starts) == 1 + at_bound
+    left, theta = min((best_step(fit, curve, judge((curve,)), *s) for s in starts), key=lambda s: s[0])
+    assert np.all(np.abs(theta[:2] - (1.0, 0.5)) <= 0.1 + 1e-12)
+    assert left - len(t) < 0.01 * float(np.sum(before.errors(fit.theta[None]) ** 2))
 
 
 # ---- the law file ----------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from vaneloop.discrepancy.error_share import (
     score,
     worth,
 )
-from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.curved import Candidate
@@ -35,6 +35,7 @@ from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_b
 from vaneloop.discrepancy.models.memory import dissipates
 from vaneloop.discrepancy.models.periods import Lines
 from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.steps import best_step, starts_of
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
     Ground,
@@ -63,7 +64,6 @@ QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of th
 SURE = 3  # of the latter that are chosen by data left out
 SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
-DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 PLAINER = 2  # more that are fitted to the end, where they are plainer than the best
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 OTHER = 1.5  # times as large: another amplitude
@@ -453,24 +453,23 @@ class Learner:
 
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
-        quick = self._judge((), current.curves, True)
-        slopes = Slopes(quick, current.fit.theta, current.fit.free, current.fit.prior)
+        starts = starts_of(self._judge((), current.curves, True), current.fit)
         every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
-        out = sorted((self._promise(current, c, slopes) for c in every), key=lambda o: o[0])
+        out = sorted((self._promise(current, c, starts) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
         for one in out:  # of several lags of a channel, one
             c = one[1]
             best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
-        first = [self._its_lag(current, one, slopes) for one in list(best.values())[:QUICK]]
+        first = [self._its_lag(current, one, starts) for one in list(best.values())[:QUICK]]
         return sorted(first, key=lambda o: o[0])
 
     def _its_lag(
-        self, current: Tried, one: tuple[float, Candidate, Array], slopes: Slopes
+        self, current: Tried, one: tuple[float, Candidate, Array], starts: Sequence[tuple[Array, Slopes]]
     ) -> tuple[float, Candidate, Array]:
         """A candidate with the lag that promises most: those that were tried first are far apart."""
         for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
             while (c := one[1].slower(factor)) is not None and not stands(current, c):
-                other = self._promise(current, c, slopes)
+                other = self._promise(current, c, starts)
                 if other[0] >= one[0]:
                     break
                 one = other
@@ -497,37 +496,20 @@ class Learner:
             out += [c.every(p) for p in periods]
         return out
 
-    def _promise(self, current: Tried, candidate: Candidate, slopes: Slopes) -> tuple[float, Candidate, Array]:
-        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best.
+    def _promise(
+        self, current: Tried, candidate: Candidate, starts: Sequence[tuple[Array, Slopes]]
+    ) -> tuple[float, Candidate, Array]:
+        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from
+        where that leaves least.
 
         Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
         """
-        fit = current.fit
         effect = candidate.effect(SCREENED)
         judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
-        theta = np.concatenate([fit.theta, np.zeros(len(effect.parameters))])
-        own = np.arange(len(fit.theta), len(theta))
-        moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
-        rows = np.concatenate([slopes.jac, derivative(judge.errors(moved))[1]])
-        _, gradients, normals = judge._blocks(slopes.error, rows)
-        free = np.concatenate([fit.free, own])
-        scale = judge.scale[free]
-        tolerance = np.array([p.tolerance for p in effect.parameters])
-        prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
-        deviation = (theta - judge.stage.neutral())[free] / scale
-        a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
-        trials = np.repeat(theta[None], len(DAMPED), axis=0)
-        low, high = judge.bounds()
-        for row, damping in zip(trials, DAMPED, strict=True):
-            stiff = a + damping * np.diag(np.diag(a))
-            if candidate.basis.rises:  # half of what a plain step asks for is beyond bounds
-                step = bounded_step(stiff, g, (low - theta)[free] / scale, (high - theta)[free] / scale)
-            else:
-                step = np.linalg.solve(stiff, g)
-            row[free] = np.clip(row[free] + step * scale, low[free], high[free])
-        left = judge.totals(judge.errors(trials), trials)
-        k = int(np.argmin(left))
-        return float(left[k]), candidate, trials[k]
+        slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
+        steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
+        left, theta = min(steps, key=lambda s: s[0])
+        return left, candidate, theta
 
     # ---- other logs --------------------------------------------------------------------------------------------------
 
