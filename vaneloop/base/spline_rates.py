@@ -12,8 +12,8 @@ Array = np.ndarray
 class SplineRates:
     """Rates at the samples of a cubic spline through them, not a knot at the second and the last but one.
 
-    As those of `scipy.interpolate.CubicSpline`, whose equations are here factored once for all signals on ``t``, and
-    which takes ten times as long.
+    As those of `scipy.interpolate.CubicSpline`, whose equations are here factored once for all signals on ``t``. That
+    takes some eight times as long for 4,000 samples.
 
     t  float64[samples], rising, four or more
     """

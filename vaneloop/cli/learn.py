@@ -66,15 +66,13 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(f"{path}: cannot be written")
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     checked_shape(args.shape)
-    own = own_model.asked(args)
+    own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}
     chain: Any = None if own else not_given(options.chain_of(args), args.without)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
         if own:
-            asked = {"without": args.without, "shape": args.shape, "formulas": not args.curve}
-            answer = own_model.ask(args, "learn", **asked, progress=tell)
+            answer = own_model.ask(args, "learn", without=args.without, **asked, progress=tell)
         else:
-            added, asked = options.machine_of(args).added, {"shape": args.shape, "formulas": not args.curve}
-            answer = learned(chain, args.log, added, progress=tell, **asked)
+            answer = learned(chain, args.log, options.machine_of(args).added, progress=tell, **asked)
     if answer.model is not None and args.out:
         answer = with_path(answer, args.out, words)
     if answer.by_log is not None:

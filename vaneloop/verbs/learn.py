@@ -381,15 +381,15 @@ def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit 
     return judge.fit(others, theta)
 
 
-def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Tried | None = None) -> Model:
+def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Tried) -> Model:
     """The model with the laws as a file has them: a formula's numbers, or coefficients of B-splines.
 
-    last  the model with all of them, as it was fitted; None: the curves
+    last  the model with all of them, as it was fitted
     """
     from plant.model import Learned as Table
     from vaneloop.discrepancy.models.learned_surface import LearnedSurface
 
-    effects, curves, last = dict(model.effects), dict(model.curves), last or outcome.tried[-1]
+    effects, curves = dict(model.effects), dict(model.curves)
     for law, tried in zip(laws, outcome.tried, strict=True):
         c = tried.candidate
         if f := law.spoken:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 from vaneloop.discrepancy.stage_answer import rms_of
 
-__all__ = ["fitted_formulas", "goes_on", "library_name", "likely"]
+__all__ = ["effect_of", "fitted_formulas", "goes_on", "library_name", "likely"]
 
 CLOSE = 1e-4  # share of a curve's variance below which formulas are alike
 REFITTED = 5  # formulas that are fitted in the simulation
@@ -137,12 +138,17 @@ def goes_on(ground: Ground, c: Candidate, form: Form, numbers: Array) -> tuple[f
     )
 
 
+def effect_of(name: str, names: Sequence[str], numbers: Array) -> Effect:
+    """A formula as the search has it: its numbers begin at these, and are in usual as large."""
+    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
+    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(names, size, strict=True))
+    return Effect(name, ps, (tuple(float(v) for v in numbers),))
+
+
 def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> tuple[Formula, Tried] | None:
     """A formula in the curve's place, fitted with the model's own parameters."""
     c = tried.candidate
-    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
-    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
-    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
+    effect = effect_of(c.name, form.numbers, numbers)
     been = c.quantity.visited[np.isfinite(c.quantity.visited)]
     been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
 

@@ -168,6 +168,26 @@ def on_curve(q, low, high, table, jump):
 
 
 @inline
+def put_in(how, at, c, ub, pb, add):
+    if how == 1:
+        pb[at] *= 1.0 + c
+    elif how == 2:
+        ub[at] += c
+    elif how == 3:
+        ub[at] *= 1.0 + c
+    else:
+        add[at] += c
+
+
+@inline
+def put_on(how, at, c, y):
+    if how == 5:
+        y[at] += c
+    else:
+        y[at] *= 1.0 + c
+
+
+@inline
 def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(u)):
         ub[j] = u[j]
@@ -181,14 +201,7 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
         if OUTPUT <= c_of[i] < COLUMN:
             outputs(x, u, p, y)
         c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
-        if c_how[i] == 1:
-            pb[c_at[i]] *= 1.0 + c
-        elif c_how[i] == 2:
-            ub[c_at[i]] += c
-        elif c_how[i] == 3:
-            ub[c_at[i]] *= 1.0 + c
-        else:
-            add[c_at[i]] += c
+        put_in(c_how[i], c_at[i], c, ub, pb, add)
 {{bend more}}
 
 @inline
@@ -198,10 +211,7 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for i in range(len(c_how)):
         if c_how[i] > 4:
             c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
-            if c_how[i] == 5:
-                y[c_at[i]] += c
-            else:
-                y[c_at[i]] *= 1.0 + c
+            put_on(c_how[i], c_at[i], c, y)
 {{show more}}
 
 """
@@ -214,24 +224,14 @@ _BEND_MORE = """
             outputs(x, u, p, y)
         c = on_grid(quantity(f_of[i, 0], x, u, y, f_columns, k), quantity(f_of[i, 1], x, u, y, f_columns, k), f_low[i],
                     f_high[i], f_table[i])
-        if f_how[i] == 1:
-            pb[f_at[i]] *= 1.0 + c
-        elif f_how[i] == 2:
-            ub[f_at[i]] += c
-        elif f_how[i] == 3:
-            ub[f_at[i]] *= 1.0 + c
-        else:
-            add[f_at[i]] += c
+        put_in(f_how[i], f_at[i], c, ub, pb, add)
 """
 _SHOW_MORE = """
     for i in range(len(f_how)):
         if f_how[i] > 4:
             c = on_grid(quantity(f_of[i, 0], x, u, y, f_columns, k), quantity(f_of[i, 1], x, u, y, f_columns, k),
                         f_low[i], f_high[i], f_table[i])
-            if f_how[i] == 5:
-                y[f_at[i]] += c
-            else:
-                y[f_at[i]] *= 1.0 + c
+            put_on(f_how[i], f_at[i], c, y)
 """
 
 _OWN_RATE = """if c > 100:

@@ -70,9 +70,7 @@ OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
-FORMULAS = (
-    0.5  # log error by which a curve may be worse than the best and a formula, or a jump, may still tell it better
-)
+FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
 SPLINES = 28  # of the best finalists where they still fail
 
 

@@ -20,17 +20,17 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, text_of
 from vaneloop.discrepancy.models.curve import runs
 from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.formula_fits import goes_on
+from vaneloop.discrepancy.models.formula_fits import effect_of, goes_on
 from vaneloop.discrepancy.models.held_out import with_held_out
 from vaneloop.discrepancy.models.learned import LearnedLaw
 from vaneloop.discrepancy.models.tried import Ground, Tried
-from vaneloop.discrepancy.stage import Array, Effect, Parameter
+from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learning import Learner
 
-__all__ = ["spoken"]
+__all__ = ["more_left", "spoken", "takes_mean_back"]
 
 LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
 
@@ -52,10 +52,12 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
             alone = next(t for g, t in fitted if g is f)
             if (one := _in_place(learner.ground, now, k, c, f, alone)) is not None:
                 options.append((f, *one))
-        left = {f.form: _left(learner, now, t, curves) for f, t, _ in options}
-        best = min([0.0, *(sum(v) for v in left.values())])
+        left = {f.form: more_left(learner, now, t, curves) for f, t, _ in options}
+        in_all = {form: held + (float(np.mean(tests)) if tests else 0.0) for form, (held, tests) in left.items()}
+        best = min([0.0, *in_all.values()])
         for f, t, said in options:
-            if max(left[f.form]) <= RIVAL and sum(left[f.form]) <= best + RIVAL and _harms_no(learner, now, t):
+            held, tests = left[f.form]
+            if max([held, *tests]) <= RIVAL and in_all[f.form] <= best + RIVAL:
                 formulas = [said if g is f else g for g in out[k].formulas]
                 form = next(g for g in FORMS if g.name == f.form)
                 reach = goes_on(learner.ground, c, form, np.array(list(said.numbers.values())))
@@ -66,19 +68,26 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
     return now, out
 
 
-def _left(learner: Learner, before: Tried, tried: Tried, curves: Sequence[Tried]) -> tuple[float, float]:
-    """Log of what a formula leaves over what stood there before it: held out where all curves know something, and of
-    the test logs.
+def more_left(learner: Learner, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
+    """Log of what a formula leaves over what stood there before it: held out where all of ``among`` know something,
+    whatever numbers it has; and of each test log, over all its samples.
     """
-    held = learner._score(tried, curves) - learner._score(before, curves)
+    held = learner._score(tried, among) - learner._score(before, among)
     held -= PER_PARAMETER * (len(tried.fit.free) - len(before.fit.free))
-    tests = [v for log, v in learner._change(before, tried).items() if log in learner.ground.tests]
-    return held, float(np.mean(tests)) if tests else 0.0
+    return held, [v for log, v in learner._change(before, tried).items() if log in learner.ground.tests]
 
 
-def _harms_no(learner: Learner, before: Tried, tried: Tried) -> bool:
-    """Whether no test log is worse for a formula."""
-    return all(v <= RIVAL for log, v in learner._change(before, tried).items() if log in learner.ground.tests)
+def takes_mean_back(level: float, numbers: Array, own: Array, place: int) -> bool:
+    """Put what a formula was given as its ``level`` back: the parameter at ``place`` of the model's ``own`` had its
+    mean m, p (1 + f - m) = p (1 - m) (1 + f / (1 - m)). Whether enough of the parameter is left then.
+    """
+    kept = 1.0 + level
+    if level and kept < LEAST:
+        return False
+    if level:
+        numbers[0] /= kept
+        own[place] *= kept
+    return True
 
 
 def _in_place(
@@ -92,15 +101,9 @@ def _in_place(
     form = next(f for f in FORMS if f.name == formula.form)
     numbers = np.array(list(formula.numbers.values()))
     own = alone.fit.theta[: len(alone.judge.stage.parameters)].copy()
-    if formula.level:  # the parameter had its mean: p (1 + f - m) = p (1 - m) (1 + f / (1 - m))
-        kept = 1.0 + formula.level
-        if kept < LEAST:
-            return None
-        numbers[0] /= kept
-        own[c.place] *= kept
-    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
-    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(form.numbers, size, strict=True))
-    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
+    if not takes_mean_back(formula.level, numbers, own, c.place):
+        return None
+    effect = effect_of(c.name, form.numbers, numbers)
     reach = goes_on(ground, c, form, numbers)
     table, jump = runs(form, *reach, ground.points)
     curves = list(now.curves)

@@ -16,15 +16,26 @@ import numpy as np
 from vaneloop.base.curve import FINE_SIDE as FINE
 from vaneloop.base.curve import POINTS
 from vaneloop.base.forms import FORMS, Form, product
-from vaneloop.discrepancy.error_share import FORM, PER_PARAMETER, RIVAL, score
+from vaneloop.discrepancy.error_share import FORM, RIVAL, score
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of
-from vaneloop.discrepancy.models.formula_fits import CLOSE, DEGREES, NEAR, PER_NUMBER, POOR, SHAPED, goes_on
+from vaneloop.discrepancy.models.formula_fits import (
+    CLOSE,
+    DEGREES,
+    MEANT,
+    NEAR,
+    PER_NUMBER,
+    POOR,
+    SHAPED,
+    effect_of,
+    goes_on,
+)  # fmt: skip
 from vaneloop.discrepancy.models.held_out import with_held_out
 from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.models.spoken import more_left, takes_mean_back
 from vaneloop.discrepancy.models.surfaces import SurfaceCandidate
 from vaneloop.discrepancy.models.tried import Ground, Tried
-from vaneloop.discrepancy.stage import Array, Effect, Parameter
+from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
 
 if TYPE_CHECKING:
@@ -34,8 +45,6 @@ __all__ = ["Product", "as_the_law", "fitted_products", "likely_products"]
 
 TURNS = 60  # by which f and g are found
 EACH, REFITTED = 4, 8  # formulas of each quantity, and pairs of them that are fitted in the simulation
-MEANT = 2_000  # samples that count
-LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
 Begun = tuple[Form, Array]  # a formula, and numbers to begin with
 Ends = tuple[tuple[float, float], tuple[float, float]]  # ranges of both quantities
 
@@ -180,9 +189,7 @@ def _fitted(
     names = (*one.numbers, *(f"second_{n}" for n in other.numbers[1:]))
     k, count = len(one.numbers), len(names)
     numbers = theta[-count:]
-    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
-    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(names, size, strict=True))
-    effect = Effect(c.name, ps, (tuple(float(v) for v in numbers),))
+    effect = effect_of(c.name, names, numbers)
     x, z = _samples(c)
 
     def mean(n: Array) -> float:
@@ -238,19 +245,14 @@ def as_the_law(learner: Learner, tried: Tried, formulas: Sequence[Formula]) -> t
             continue
         theta, at = alone.fit.theta.copy(), len(alone.judge.stage.parameters)
         theta[at:] = list(f.numbers.values())
-        if f.level:  # the parameter had its mean: p (1 + f - m) = p (1 - m) (1 + f / (1 - m))
-            if 1.0 + f.level < LEAST:
-                continue
-            theta[at] /= 1.0 + f.level
-            theta[c.place] *= 1.0 + f.level
+        if not takes_mean_back(f.level, theta[at:], theta[:at], c.place):
+            continue
         got = _fitted(ground, tried, *f.forms, theta, reach_of(ground, tried, f), False)
         if got is None:
             continue
         said, now = got
-        left = learner._score(now, [now, tried]) - learner._score(tried, [now, tried])
-        left -= PER_PARAMETER * (len(now.fit.free) - len(tried.fit.free))
-        tests = [v for log, v in learner._change(tried, now).items() if log in ground.tests]
-        if max([left, *tests]) <= RIVAL and isinstance(said, Product):
+        held, tests = more_left(learner, tried, now, [now, tried])
+        if max([held, *tests]) <= RIVAL and isinstance(said, Product):
             return now, said
     return None
 
