@@ -695,5 +695,7 @@ def test_what_is_searched_at_once_comes_first_and_then_the_longest() -> None:
 
     sizes = {"long": (16, 3), "short": (1, 1), "middle": (19, 1), "quick": (4, 1), "tenth": (5, 1)}
     stages = [type("S", (), {"effects": [0] * n, "outputs": [0] * m}) for n, m in sizes.values()]
-    names = [list(sizes)[i] for i in _order(stages)]  # type: ignore[arg-type]
+    names = [list(sizes)[i] for i in _order(stages, False)]  # type: ignore[arg-type]
     assert names == ["short", "quick", "long", "middle", "tenth"]
+    names = [list(sizes)[i] for i in _order(stages, True)]  # type: ignore[arg-type]
+    assert names == ["long", "short", "quick", "middle", "tenth"]

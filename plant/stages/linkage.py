@@ -14,6 +14,7 @@ from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
 from plant.places import (
+    LINKAGE_FRICTION,
     LVDT_BIAS,
     LVDT_GAIN,
     LVDT_LAG_ERROR,
@@ -21,6 +22,7 @@ from plant.places import (
     LVDT_THERMAL_DRIFT,
     POT,
     POT_LAG_ERROR,
+    RING_ECCENTRICITY,
     X,
 )
 from plant.stages.blocks import NOTHING, elsewhere, in_blocks, on_all_cores, parts_of
@@ -28,8 +30,8 @@ from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = ["linkage_run"]
 
-WIDE = 32  # lanes in a block: its short loops over fewer would be unrolled instead of vectorised
-SOME = 5  # so few lanes or fewer are quicker one by one
+WIDE = 16  # lanes in a block: more are no quicker each, and fewer sets than a block's lanes fill it badly
+SOME = 1  # so few lanes or fewer are quicker one by one
 # effects that the blocks call
 CALLED = (
     "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction",
@@ -67,7 +69,11 @@ def linkage_run(
     )
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
     alone = elsewhere(p, ("linkage", "pot"), CALLED) | (p[CURVES] != 0.0)
-    order = np.argsort(alone, kind="stable")
+    # what one lane of a block needs is computed for all of them: those that need the same are put side by side
+    stages = range(out.shape[1])
+    rubbed = (p[[LINKAGE_FRICTION + k for k in stages]] != 0.0).any(axis=0)
+    eccentric = (p[[RING_ECCENTRICITY + k for k in stages]] != 0.0).any(axis=0)
+    order = np.lexsort((eccentric, rubbed, (p[LVDT_NONLINEARITY : LVDT_NONLINEARITY + 2] != 0.0).any(axis=0), alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     to = out.transpose(2, 1, 0)
     to = to if to.flags.c_contiguous else np.empty(to.shape)

@@ -11,6 +11,7 @@ first order otherwise).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -19,6 +20,7 @@ import numpy as np
 
 from vaneloop.discrepancy.latest import Latest
 from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.whiten import whiten
 
 __all__ = ["Fit", "Judge", "Task", "bounded_step", "finished", "recalibrate"]
 
@@ -105,12 +107,7 @@ class Judge:
         self._moves = [(names.index(p.output) if p.output in names else None, p.log) for p in stage.all_parameters()]
         self._bounds = self._limits()
         self._turning = [c for c, p in enumerate(stage.all_parameters()) if p.period > 0.0]
-        self._counts: Array | None = None
-        if self.window_start is not None:
-            self._counts = np.maximum(np.add.reduceat(self.valid, self.window_start, axis=1), 1)
-            self._lengths = np.diff(np.append(self.window_start, len(t)))
-        self._counted = self.valid.astype(float)  # numpy multiplies by it at twice the speed of booleans
-        self._per_floor = self._counted / self.floor[:, None]
+        self._counted = self.valid.astype(float)
 
     def _scales(self) -> Array:
         """Size of a usual change of each parameter, for difference steps and damping."""
@@ -152,20 +149,10 @@ class Judge:
         return np.asarray(np.maximum(np.add.reduceat(lost, self.block_start) / np.maximum(self.samples, 1), 0.1))
 
     def _whiten(self, model: Array, out: Array | None = None) -> Array:
-        """Whitened errors of the outputs ``model``, [sets, outputs, samples], one set after the other, to stay in the
-        cache.
-        """
+        """Whitened errors of the outputs ``model``, [sets, outputs, samples]."""
         out = np.empty(np.shape(model)) if out is None else out
-        for e, m in zip(out, model, strict=True):
-            np.subtract(self.measured, m, out=e)
-            with np.errstate(invalid="ignore", over="ignore"):
-                finite = np.isfinite(e.sum())  # tells it in one quick pass
-            if not finite:
-                e[~np.isfinite(e)] = 0.0
-            if self.window_start is not None and self._counts is not None:
-                e *= self._counted
-                e -= np.repeat(np.add.reduceat(e, self.window_start, axis=1) / self._counts, self._lengths, axis=1)
-            e *= self._per_floor
+        starts = self.window_start if self.window_start is not None else np.empty(0, dtype=np.int64)
+        whiten(np.ascontiguousarray(model, float), self.measured, self._counted, self.floor, starts, out)
         return out
 
     def block_costs(self, e: Array) -> Array:
@@ -340,13 +327,16 @@ class Judge:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives
         (`linearise`).
         """
-        rows = np.concatenate([e[None], jac])
-        ends = np.append(self.block_start[1:], e.shape[1])
-        grams = np.zeros((self.n_blocks, len(rows), len(rows)))
-        for gram, i, j in zip(grams, self.block_start, ends, strict=True):
+        k = len(jac)
+        costs, gradients = np.zeros(self.n_blocks), np.zeros((self.n_blocks, k))
+        normals = np.zeros((self.n_blocks, k, k))
+        for b, (i, j) in enumerate(itertools.pairwise([*self.block_start, e.shape[1]])):
             for o in range(len(e)):
-                gram += rows[:, o, i:j] @ rows[:, o, i:j].T
-        return grams[:, 0, 0], grams[:, 1:, 0], grams[:, 1:, 1:]
+                error, slopes = e[o, i:j], jac[:, o, i:j]
+                costs[b] += error @ error
+                gradients[b] += slopes @ error
+                normals[b] += slopes @ slopes.T
+        return costs, gradients, normals
 
     def linearise(self, theta: Array, free: Array) -> tuple[Array, Array]:
         """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs,

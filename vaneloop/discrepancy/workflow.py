@@ -136,7 +136,8 @@ def diagnose(
     started = time.perf_counter()
     _WORK[:], _JUDGED[:] = list(stages), [judged]
     _FITS[:] = [multiprocessing.RawValue("l", 0) for _ in _WORK]
-    order = _order(_WORK)
+    side_by_side = workers > 1 and len(_WORK) > 1 and hasattr(os, "fork")
+    order = _order(_WORK, side_by_side)
     done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
 
     def tell(found: StageDiagnosis | None = None) -> None:
@@ -146,7 +147,7 @@ def diagnose(
         if news:
             news(told)
 
-    if workers > 1 and len(_WORK) > 1 and hasattr(os, "fork"):
+    if side_by_side:
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
             open_jobs = {pool.submit(_one, i): i for i in order}
             while open_jobs:
@@ -175,14 +176,15 @@ def verdict_of(results: Sequence[StageDiagnosis]) -> str:
     return "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
 
 
-def _order(stages: Sequence[Stage]) -> list[int]:
-    """Stages in the order in which they are searched: the longest first, but before them those that take next to
-    nothing, so that something is found at once.
+def _order(stages: Sequence[Stage], side_by_side: bool) -> list[int]:
+    """Stages in the order in which they are searched: those that take next to nothing, so that something is found at
+    once, then the longest. Side by side with others the longest of all begins: the end waits for it.
     """
     size = [len(s.effects) * len(s.outputs) for s in stages]
     by_size = sorted(range(len(stages)), key=lambda i: size[i])
     short = [i for i in by_size if SHORT * size[i] < size[by_size[-1]]]
-    return [*short, *(i for i in reversed(by_size) if i not in short)]
+    out = [*short, *(i for i in reversed(by_size) if i not in short)]
+    return sorted(out, key=lambda i: i != by_size[-1]) if side_by_side else out
 
 
 def _how_far(done: set[int]) -> tuple[float, str]:
