@@ -144,6 +144,7 @@ def place(b: Any, j: int, p: np.ndarray, s: np.ndarray, stages: int) -> None:
 @inlined
 def feed(b: Any, n: int, drive_way: int) -> None:
     """What the supply and the load give the drive of ``n`` lanes, while ``b.p_s``, ``b.t_oil`` and ``b.heard`` stay."""
+    lanes.wide_vectors()
     for j in range(n):
         b.root[j] = speed_factor(b.p_s[j], 0.0, b.p_ref[j])
         b.extending[j] = b.retracting[j] = b.flow[j]
@@ -158,6 +159,7 @@ def feed(b: Any, n: int, drive_way: int) -> None:
 @inlined
 def sample_lvdt(b: Any, n: int, drive_way: int, noise: float) -> None:
     """Put the LVDTs' samples (m) into ``b.in_x_lvdt``, with ``noise`` (standard normal) times ``b.sigma_lvdt``."""
+    lanes.wide_vectors()
     if drive_way == 0:
         for j in range(n):
             b.in_x_lvdt[j] = quantise(b.x_lvdt[j] + b.sigma_lvdt[j] * noise, b.lvdt_step[j])
@@ -172,6 +174,7 @@ def sample_lvdt(b: Any, n: int, drive_way: int, noise: float) -> None:
 @inlined
 def move(b: Any, n: int, stages: int, drive_way: int, vane_effects: bool, t: float) -> None:
     """Move ``n`` lanes on by one tick, to ``t`` (s), under the currents ``b.z_i_cmd`` (A)."""
+    lanes.wide_vectors()
     for j in range(n):
         b.n_r[j] = engine_step(b.n_r[j], b.n_dem[j], b.lag[j], b.acceleration[j], b.deceleration[j], chain.TICK)
     if drive_way == 0:

@@ -16,7 +16,7 @@ from controller.records import DUAL, INPUT_FIELDS, RUN, SCALAR_FIELDS, STATE_FIE
 from controller.schedule import schedule_step
 from hil.loop.tick import Loop
 from plant.chain_lanes import W
-from plant.lanes import filler, on_stack
+from plant.lanes import filler, on_stack, wide_vectors
 from vaneloop.base.compiled import inlined
 
 __all__ = ["between_frames", "fields", "on_frame", "place", "runs_in_lanes"]
@@ -70,6 +70,7 @@ def _no_frame(b: Any, j: int, inputs: Record) -> None:
 @inlined
 def on_frame(b: Any, n: int, tables: np.ndarray) -> None:
     """The firmware's tick of ``n`` lanes, every 10 ms, with the inputs in the block; tables[lane]: of its strokes."""
+    wide_vectors()
     inputs, z, k = on_stack(_Inputs), on_stack(_State), on_stack(_Scalars)
     z1, k1 = on_stack(_State), on_stack(_Scalars)
     z2, k2 = on_stack(_State), on_stack(_Scalars)
@@ -98,6 +99,7 @@ def between_frames(b: Any, n: int, phase: int) -> None:
 
     Where every lane runs and has no fault, the compiler is told so: what only other modes and faults need is left out.
     """
+    wide_vectors()
     inputs, z, k = on_stack(_Inputs), on_stack(_State), on_stack(_Scalars)
     inputs1, z1, k1 = on_stack(_Inputs), on_stack(_State), on_stack(_Scalars)
     other = 0

@@ -39,6 +39,7 @@ from hil.loop.lockstep import (
 from hil.loop.tick import FRAME, Loop, new_loop
 from plant import Plant, chain, chain_lanes
 from plant.chain_lanes import W
+from plant.lanes import wide_vectors
 from plant.stages.blocks import on_all_cores
 from vaneloop.base.compiled import compiled, in_place_free
 from vaneloop.base.vanes import VANES
@@ -81,6 +82,7 @@ def _advance(
     sigma_pots      float64[lane, stages] rad
     out             float64[rows or 0, columns, lane] in SI, a row every ``every`` ticks (`columns_of`)
     """
+    wide_vectors()
     b = block[0]
     noisy = noise.shape[0] > 1
     last_frame = stimuli.shape[1] - 1

@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
-import threading
 from collections.abc import Callable
+from concurrent.futures import CancelledError
+from contextlib import suppress
 from typing import Any
 
 from vaneloop.base.errors import InputError, meant
@@ -48,7 +49,7 @@ def rent(
     """
     needs("distributed")
     import dask
-    from dask.distributed import Client
+    from dask.distributed import Client, wait
 
     # the run's own leases see to lost work: a worker that dies is no reason to give its task up
     dask.config.set({"distributed.scheduler.allowed-failures": 1_000_000, "distributed.worker.daemon": False})
@@ -65,10 +66,11 @@ def rent(
             client.submit(_work, run, starter.name, every, key=f"fleet-{starter.name}-{i}", pure=False)
             for i in range(workers)
         ]
-        all_chunks, pause = len(folder.chunks()), threading.Event()
+        all_chunks = len(folder.chunks())
         while not all(t.done() for t in tasks):
             told(len(folder.finished()), all_chunks)
-            pause.wait(1.0)
+            with suppress(TimeoutError, CancelledError):
+                wait(tasks, timeout=1.0)
         counts: dict[str, int] = {}
         for task in tasks:
             for status, n in _result(task).items():
@@ -83,8 +85,6 @@ def rent(
 
 def _result(task: Any) -> dict[str, int]:
     """What a task gave back. An InputError of the worker passes; another error is ours to mend."""
-    from concurrent.futures import CancelledError
-
     try:
         return dict(task.result())
     except CancelledError:
