@@ -79,6 +79,7 @@ class Judge:
         self.stage, self.floor, self._latest = stage, np.asarray(floor, dtype=float), Latest()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
+        self.sparing = False  # one ends when a step takes off less than `STILL` of what it leaves beyond noise
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
             self.valid &= keep
@@ -316,7 +317,7 @@ class Judge:
             if not costs[k] < here:
                 break
             damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
-            if here - costs[k] < little:
+            if here - costs[k] < (max(little, STILL * (here - self.n)) if self.sparing else little):
                 break
         if linear is None:
             thetas, derivative = self._differences(theta, free, scale, high, known)

@@ -163,6 +163,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
 
     curves = (*tried.curves[:-1], (placed(c.basis.low, c.basis.high), effect))
     judge = Judge(ground.stage((), curves), ground.floor)
+    judge.sparing = True
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None

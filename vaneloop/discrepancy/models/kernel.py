@@ -52,6 +52,7 @@ def build_kernels(
     source = source.replace("{curved}", _CURVED_FUNCTIONS if curved else "")
     source = source.replace("{more}", f", {_CURVED}" if curved else "").replace("{rooms}", _ROOMS if curved else "")
     source = source.replace("shown(x, u, p, y)", f"shown(x, u, p, k, {_CURVED}, ub, pb, add, y)" if curved else _PLAIN)
+    source = source.replace("{as it is}", _AS_IT_IS if surfaces else "")
     source = source.replace("{bend more}", _BEND_MORE if surfaces else "")
     source = source.replace("{show more}", _SHOW_MORE if surfaces else "")
     source = source.replace(_CURVED, f"{_CURVED}, {_SURFACES}") if surfaces else source
@@ -145,8 +146,9 @@ if len(code) > 0:
 _PLAIN = "outputs(x, u, p, y)"
 _CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, c_jump, columns"
 _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
-_BENT = "for w in range(m):\n    dx[w] -= add[w] / mass[w]\n"
-_ROOMS = "ub, pb, add, bent = np.zeros(len(u)), np.zeros(len(p)), np.zeros(m), np.zeros(len(out))"
+_BENT = "for w in range(m):\n    if add[w] != 0.0:\n        dx[w] -= add[w] / mass[w]\n"
+# what no curve moves stays as it is for a whole simulation: only what drives the model is new at each step
+_ROOMS = "ub, pb, add, bent = np.zeros(len(u)), p.copy(), np.zeros(m), np.zeros(len(out))"
 _CURVED_FUNCTIONS = f"""
 @inline
 def quantity(of, x, u, y, columns, k):
@@ -165,6 +167,14 @@ def on_curve(q, low, high, table, jump):
     if jump[0] != 0.0:
         c += jump[0] * min(max((q - jump[1]) / jump[2], -1.0), 1.0)
     return c
+
+
+@inline
+def as_it_is(how, at, p, pb, add):
+    if how == 1:
+        pb[at] = p[at]
+    elif how == 4:
+        add[at] = 0.0
 
 
 @inline
@@ -191,10 +201,9 @@ def put_on(how, at, c, y):
 def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for j in range(len(u)):
         ub[j] = u[j]
-    for j in range(len(p)):
-        pb[j] = p[j]
-    for j in range(len(x)):
-        add[j] = 0.0
+    for i in range(len(c_how)):
+        as_it_is(c_how[i], c_at[i], p, pb, add)
+{{as it is}}
     for i in range(len(c_how)):
         if c_how[i] > 4:
             continue
@@ -216,6 +225,10 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
 
 """
 _SURFACES = "f_how, f_at, f_of, f_low, f_high, f_table, f_columns"
+_AS_IT_IS = """
+    for i in range(len(f_how)):
+        as_it_is(f_how[i], f_at[i], p, pb, add)
+"""
 _BEND_MORE = """
     for i in range(len(f_how)):
         if f_how[i] > 4:

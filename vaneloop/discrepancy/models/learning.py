@@ -416,8 +416,24 @@ class Learner:
 
     def _finished(self, current: Tried, quick: Tried) -> Tried:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
-        options = [self._fitted(current, quick.candidate, w, quick.fit.theta, 12) for w in WIGGLES]
-        return self._with_its_lag(current, min(options, key=self._score), TIMES[:1])
+        begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
+        return self._with_its_lag(current, self._smoothed(current, quick.candidate, begin, WIGGLES), TIMES[:1])
+
+    def _smoothed(
+        self, current: Tried, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
+        first: float = SCREENED,
+    ) -> Tried:  # fmt: skip
+        """A candidate fitted to the end, as smooth as suits it best: from the ``first`` smoother, else less so, while
+        that helps, each from where the last one ended.
+        """
+        best, at = self._fitted(current, candidate, first, begin, 12), wiggles.index(first)
+        for others in (wiggles[:at][::-1], wiggles[at + 1 :]):
+            for wiggle in others if best.wiggle == first else ():
+                more = self._fitted(current, candidate, wiggle, best.fit, 12)
+                if self._score(more) >= self._score(best):
+                    break
+                best = more
+        return best
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
@@ -441,12 +457,17 @@ class Learner:
         return self._finished(current, replace(smooth, candidate=c, fit=begun))
 
     def _fitted(
-        self, current: Tried, candidate: Candidate, wiggle: float, theta: Array, iterations: int, quick: bool = False
-    ) -> Tried:
+        self, current: Tried, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
+        quick: bool = False,
+    ) -> Tried:  # fmt: skip
+        """A candidate fitted beside the model and its curves; ``begin``: parameters, or its fit as smooth as another
+        ``wiggle`` makes it, on the same samples.
+        """
         curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
         judge = self._judge((), curves, quick)
+        judge.sparing = True
         names = tuple(e.name for _, e in curves)
-        fit = with_held_out(judge, judge.fit(names, theta, iterations))
+        fit = with_held_out(judge, judge.fit(names, begin, iterations))
         return Tried(candidate, wiggle, judge, fit, curves)
 
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,10 @@ from vaneloop.discrepancy.stage import Array, StageError
 
 __all__ = ["STARTS_LOADED", "Placed", "Runner"]
 
-SHORT = 10_000  # steps of a simulation below which a thread of its own costs more than it gains
+SHORT = 10_000  # steps of simulations below which a thread of its own costs more than it gains
 SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
 FEW = 4  # samples that a cubic spline needs
+_building = Lock()  # of kernels, by one thread
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
@@ -188,12 +190,20 @@ class Runner:
                 y[bad] = self.far
             np.clip(y[:, ::every], -self.far, self.far, out=out[i])
 
-        if s.kind in ("simulate", "closed_loop") and len(thetas) > 1 and n * self.steps > SHORT and threads() > 1:
-            with ThreadPoolExecutor(2) as pool:  # compiled code runs side by side
-                list(pool.map(one, range(len(thetas))))
-        else:
-            for i in range(len(thetas)):
+        def work() -> None:
+            for i in todo:
                 one(i)
+
+        todo = iter(range(len(thetas)))  # which threads share
+        moves = s.kind in ("simulate", "closed_loop")
+        if moves and threads() > 1 and (len(thetas) - 1) * n * self.steps > SHORT:
+            one(next(todo))  # what must be compiled is compiled here
+            with ThreadPoolExecutor(1) as pool:  # compiled code runs side by side
+                other = pool.submit(work)
+                work()
+                other.result()
+        else:
+            work()
         return out
 
     def _read_back(self, x0: Array, log: int, active: list[tuple[Placed, Array]]) -> None:
@@ -292,10 +302,11 @@ class Runner:
 
     def _kernels_for_curves(self, surfaces: bool) -> tuple[Kernel, Kernel]:
         """The kernel that takes curves, and surfaces, as `_tried` has it, and not compiled."""
-        if surfaces not in self.curved:
-            fast, slow = build_kernels(self.code, self.dispatch, curved=True, surfaces=surfaces)
-            self.curved[surfaces] = slow if self.kernel is self.slow else fast, slow
-        return self.curved[surfaces]
+        with _building:
+            if surfaces not in self.curved:
+                fast, slow = build_kernels(self.code, self.dispatch, curved=True, surfaces=surfaces)
+                self.curved[surfaces] = slow if self.kernel is self.slow else fast, slow
+            return self.curved[surfaces]
 
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None

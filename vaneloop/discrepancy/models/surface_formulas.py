@@ -203,6 +203,7 @@ def _fitted(
 
     curves = (*tried.curves[:-1], (placed(ends), effect))
     judge = Judge(ground.stage((), curves), ground.floor)
+    judge.sparing = True
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
     effects = tuple(e.name for e in judge.stage.effects)

@@ -29,6 +29,7 @@ TRIED, QUICK, FINISHED = 48, 10, 4  # surfaces that are fitted for one step, for
 FINE = SPLINES + 1  # splines each way where the best still fails
 WIGGLES = (0.03, 0.1, 0.3, 1.0, 5.0)  # as of curves, in smaller steps
 SCREENED = 1.0
+NEAR = 0.25  # log error within which another surface may still do as well with more splines
 
 
 def put_surface(learner: Learner, out: Outcome) -> None:
@@ -91,15 +92,12 @@ def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
     """The surfaces that promise most, fitted to the end in place of all curves; best first."""
     begun = [learner._fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True) for c in _candidates(learner)]
     begun.sort(key=lambda t: float(t.fit.cost.sum()))
-    quick = [learner._fitted(nothing, t.candidate, SCREENED, t.fit.theta, 5, True) for t in begun[:QUICK]]
+    quick = [learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True) for t in begun[:QUICK]]
     quick.sort(key=lambda t: score(t.judge, t.fit))
-    done = []
-    for t in quick[:FINISHED]:
-        options = [learner._fitted(nothing, t.candidate, w, t.fit.theta, 12) for w in WIGGLES]
-        done.append(min(options, key=learner._score))
-    done = learner._ordered(done)
+    done = learner._ordered([learner._smoothed(nothing, t.candidate, t.fit, WIGGLES) for t in quick[:FINISHED]])
     if done and learner.form.fails(done[0].fit):
-        done = learner._ordered([*done, *(f for t in done if (f := _finer(learner, nothing, t)) is not None)])
+        close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
+        done = learner._ordered([*done, *(f for t in close if (f := _finer(learner, nothing, t)) is not None)])
     first_of = {t.candidate.name: t for t in reversed(done)}
     return [t for t in done if first_of[t.candidate.name] is t]
 
@@ -137,7 +135,7 @@ def _finer(learner: Learner, nothing: Tried, coarse: Tried) -> Tried | None:
     (one, other), n = fine.grids, len(coarse.fit.theta) - len(amplitudes)
     design = np.kron(fine.basis.design(one), fine.across.design(other)) @ fine.turn
     theta = np.concatenate([coarse.fit.theta[:n], np.linalg.lstsq(design, table(amplitudes).ravel(), rcond=None)[0]])
-    return min((learner._fitted(nothing, fine, w, theta, 12) for w in WIGGLES), key=learner._score)
+    return learner._smoothed(nothing, fine, theta, WIGGLES, coarse.wiggle)
 
 
 def _sum(learner: Learner, nothing: Tried, whole: Tried) -> Tried:
