@@ -56,6 +56,10 @@ def build_kernels(
     source = source.replace("{bend more}", _BEND_MORE if surfaces else "")
     source = source.replace("{show more}", _SHOW_MORE if surfaces else "")
     source = source.replace(_CURVED, f"{_CURVED}, {_SURFACES}") if surfaces else source
+    driving = len(s.commands) if s.kind == "closed_loop" else len(code.in_names)
+    numbers = {"x0": len(s.states), "inputs": len(code.in_names), "u": max(driving, 1), "out": len(s.outputs)}
+    for name, number in numbers.items():  # loops over so many are written out by the compiler
+        source = source.replace(f"len({name})", str(number))
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
     def build(jit: Compile, inline: Compile, inline_own: Compile) -> Kernel:
