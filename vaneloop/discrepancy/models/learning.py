@@ -35,6 +35,7 @@ from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_b
 from vaneloop.discrepancy.models.memory import dissipates
 from vaneloop.discrepancy.models.periods import Lines
 from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
 from vaneloop.discrepancy.models.steps import best_step, starts_of
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
@@ -58,8 +59,7 @@ from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 __all__ = ["Learner"]
 
 MOST_CURVES = 2
-WIGGLES = (0.1, 1.0, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
-SCREENED = 1.0  # of them, where candidates are screened
+WIGGLES = (0.1, SCREENED, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
 SURE = 3  # of the latter that are chosen by data left out
 SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
@@ -417,23 +417,7 @@ class Learner:
     def _finished(self, current: Tried, quick: Tried) -> Tried:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
-        return self._with_its_lag(current, self._smoothed(current, quick.candidate, begin, WIGGLES), TIMES[:1])
-
-    def _smoothed(
-        self, current: Tried, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
-        first: float = SCREENED,
-    ) -> Tried:  # fmt: skip
-        """A candidate fitted to the end, as smooth as suits it best: from the ``first`` smoother, else less so, while
-        that helps, each from where the last one ended.
-        """
-        best, at = self._fitted(current, candidate, first, begin, 12), wiggles.index(first)
-        for others in (wiggles[:at][::-1], wiggles[at + 1 :]):
-            for wiggle in others if best.wiggle == first else ():
-                more = self._fitted(current, candidate, wiggle, best.fit, 12)
-                if self._score(more) >= self._score(best):
-                    break
-                best = more
-        return best
+        return self._with_its_lag(current, smoothed(self, current, quick.candidate, begin, WIGGLES), TIMES[:1])
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""

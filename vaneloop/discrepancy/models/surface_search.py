@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.discrepancy.error_share import RIVAL, UNKNOWN, score
+from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
 from vaneloop.discrepancy.models.surface_formulas import fitted_products
 from vaneloop.discrepancy.models.surfaces import SPLINES, SurfaceCandidate, may_be_of, surface_of
 from vaneloop.discrepancy.models.tried import Outcome, Tried, plain, strange
@@ -27,8 +28,7 @@ __all__ = ["put_surface"]
 QUANTITIES = 5  # of which pairs are made
 TRIED, QUICK, FINISHED = 48, 10, 4  # surfaces that are fitted for one step, for a few, to the end
 FINE = SPLINES + 1  # splines each way where the best still fails
-WIGGLES = (0.03, 0.1, 0.3, 1.0, 5.0)  # as of curves, in smaller steps
-SCREENED = 1.0
+WIGGLES = (0.03, 0.1, 0.3, SCREENED, 5.0)  # as of curves, in smaller steps
 NEAR = 0.25  # log error within which another surface may still do as well with more splines
 
 
@@ -94,7 +94,7 @@ def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
     begun.sort(key=lambda t: float(t.fit.cost.sum()))
     quick = [learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True) for t in begun[:QUICK]]
     quick.sort(key=lambda t: score(t.judge, t.fit))
-    done = learner._ordered([learner._smoothed(nothing, t.candidate, t.fit, WIGGLES) for t in quick[:FINISHED]])
+    done = learner._ordered([smoothed(learner, nothing, t.candidate, t.fit, WIGGLES) for t in quick[:FINISHED]])
     if done and learner.form.fails(done[0].fit):
         close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
         done = learner._ordered([*done, *(f for t in close if (f := _finer(learner, nothing, t)) is not None)])
@@ -135,7 +135,7 @@ def _finer(learner: Learner, nothing: Tried, coarse: Tried) -> Tried | None:
     (one, other), n = fine.grids, len(coarse.fit.theta) - len(amplitudes)
     design = np.kron(fine.basis.design(one), fine.across.design(other)) @ fine.turn
     theta = np.concatenate([coarse.fit.theta[:n], np.linalg.lstsq(design, table(amplitudes).ravel(), rcond=None)[0]])
-    return learner._smoothed(nothing, fine, theta, WIGGLES, coarse.wiggle)
+    return smoothed(learner, nothing, fine, theta, WIGGLES, coarse.wiggle)
 
 
 def _sum(learner: Learner, nothing: Tried, whole: Tried) -> Tried:
