@@ -53,6 +53,30 @@ def test_declared_parameters_hang_together(family: str, law: Law) -> None:
         assert all(p.low <= v <= p.high for p, v in zip(parameters, s, strict=True)), (law.name, s)
 
 
+def test_a_state_that_runs_away_leaves_the_laws_numbers_finite() -> None:
+    """A model whose first fit ends in the void: 1e200 is no size of anything."""
+    from vaneloop import Record, System, unknown
+    from vaneloop.discrepancy.models.data import Data
+    from vaneloop.discrepancy.models.dispatch import Dispatch
+    from vaneloop.discrepancy.models.nominal import Course
+    from vaneloop.discrepancy.models.places import places
+
+    system = System(
+        name="s", kind="simulate", model=lambda x, u, p: (p.a * x.level + u.pump, x.level - x.other),
+        inputs={"pump": "V"}, states={"level": "cm", "other": "cm"}, outputs={"level": "cm"},
+        parameters=[unknown("a", 1.0, "1/s")],
+    )  # fmt: skip
+    t = np.arange(0.0, 5.0, 0.01)
+    record = Record("log", t, {"pump": np.ones_like(t), "level": np.cos(t)})
+    data = Data(system, [record])
+    course = Course([[np.exp(np.minimum(140.0 * t, 690.0))], [np.full_like(t, 1e300)]], [])
+    _, effects = places(data, course, Dispatch())
+    assert {e.name.split(".")[0] for e in effects} >= {"level", "other"}
+    for e in effects:
+        numbers = [v for p in e.parameters for v in (p.low, p.value, p.high)] + [v for s in e.starts for v in s]
+        assert np.isfinite(numbers).all(), e.name
+
+
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 @pytest.mark.parametrize(("family", "law"), ALL, ids=[f"{f}-{x.name}" for f, x in ALL])
 def test_bounds_follow_the_data_whatever_the_unit(family: str, law: Law, factor: float) -> None:

@@ -18,11 +18,15 @@ from vaneloop.discrepancy.stage import Array, Effect
 __all__ = ["places"]
 
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
+RUN_AWAY = 1e50  # beyond it a simulated value is no size of anything; the numbers of laws made from it stay finite
 
 
 def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed], list[Effect]]:
     """Every law at every place where it may act, in the same order: what runs, and what the search is told of it."""
     s = data.system
+    states, commands = (
+        [[np.clip(v, -RUN_AWAY, RUN_AWAY) for v in logs] for logs in of] for of in (course.states, course.commands)
+    )
     out: list[Placed] = []
     effects: list[Effect] = []
 
@@ -62,11 +66,11 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 continue
             if name in s.rates.values() and name not in s.rates:
                 continue  # a displacement is the integral of its velocity, whatever else is missing
-            values = course.states[i]
+            values = states[i]
             rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
             if name in s.rates:
                 j = list(s.states).index(s.rates[name])
-                z = course.states[j]
+                z = states[j]
                 m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 force_unit = s.force_unit if name in s.masses else f"({unit})/s"
                 size = _size(
@@ -85,11 +89,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
         if s.allows("input", name):
-            rows = (
-                course.commands[i]
-                if s.kind == "closed_loop"
-                else [u[i + (3 if s.kind == "force" else 0)] for u in data.u]
-            )
+            rows = commands[i] if s.kind == "closed_loop" else [u[i + (3 if s.kind == "force" else 0)] for u in data.u]
             first = 3 if s.kind == "force" else 0
             add(name, "input", name, i + first, "signal", _size(data.records, rows, unit))
     for i, name in enumerate(outputs):
