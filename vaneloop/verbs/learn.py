@@ -226,7 +226,8 @@ def learned(
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
         ground = VaneGround(stage, d.floor, test)
-        learner = Learner(ground, d, lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones)), shape)  # type: ignore[misc]
+        said_by = lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones))  # noqa: E731
+        learner = Learner(ground, d, said_by, shape, formulas)
         one = learner.learned()
         out = out or one
         said += [f"{d.stage}: {note}" for note in one.notes]
@@ -295,7 +296,7 @@ def _learned(
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
     ground = OwnGround(logs)
-    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress, shape)
+    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress, shape, formulas)
     outcome = learner.learned()
     if outcome.verdict != "learned":
         return Learned(diagnosed, outcome, [], log=diagnosed.log)
@@ -311,6 +312,7 @@ def _learned(
             laws = [law.spoken_by(formula, reach_of(ground, last, formula), rms_of(last.judge, last.fit))]
     elif formulas:
         last, laws = spoken(learner, outcome.tried, laws)
+        outcome.tried = outcome.tried[: len(laws)]
     names = tuple(e.name for _, e in last.curves)
     judge, stage = last.judge, last.judge.stage
     theta = stage.neutral()
@@ -337,12 +339,10 @@ def _beside_named(
     from vaneloop.discrepancy.error_share import HARM, LEAST_FALL, UNKNOWN
     from vaneloop.discrepancy.fit import Judge
     from vaneloop.discrepancy.models.by_log import ByLog, as_given, bind
-    from vaneloop.discrepancy.stage_answer import rms_of
 
     assert diagnosed.by_log is not None
     by, d = diagnosed.by_log, diagnosed.diagnosis.stages[0]
-    last = alone.outcome.tried[-1] if alone.laws else None
-    left = rms_of(last.judge, last.fit) if last else d.excess
+    left = alone.laws[-1].error_after if alone.laws else d.excess
     if not d.effects or min(d.excess, left) <= UNKNOWN:
         return None
     test = by.logs.test.data.records if by.logs.test is not None else ()
@@ -358,10 +358,9 @@ def _beside_named(
     said = _learned(again, by.model, progress, shape, formulas)
     if not said.laws or said.by_log is None:
         return None
-    now = said.outcome.tried[-1]
-    if max(rms_of(now.judge, now.fit) ** 2 - 1.0, 0.0) > (1.0 - LEAST_FALL) * (left**2 - 1.0):
+    if max(said.laws[-1].error_after ** 2 - 1.0, 0.0) > (1.0 - LEAST_FALL) * (left**2 - 1.0):
         return None
-    before = (alone.by_log if alone.by_log is not None and last else by).tested()
+    before = (alone.by_log if alone.by_log is not None and alone.laws else by).tested()
     if any(np.log(v / before[log]) > HARM for log, v in said.by_log.tested().items()):
         return None
     named = " + ".join(d.final.effects)

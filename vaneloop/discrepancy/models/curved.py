@@ -32,6 +32,7 @@ IN_TIME = 24  # splines of a curve over time: what swings with time does so ofte
 LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the shortest lag tried to the longest
 SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
 JUMP = -1  # of a curve's amplitudes, the one that is of no function of its basis
+FINER = 0.025  # of what unknown parameters may move by: their size as their slopes are taken with, beside a curve
 CROSSES = 0.05  # share of a quantity's values to each side of 0, where a curve of it may jump
 
 
@@ -432,7 +433,7 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     n_present = sum(e.name in bound.present for e in bound.effects)
     both = list(zip(bound.placed, bound.effects, strict=True))
     kept = both[:n_present] + [b for name in laws for b in both if b[1].name == name] + list(curves)
-    at = len(bound.stage.parameters) - sum(len(e.parameters) for _, e in both[:n_present])
+    at = first = len(bound.stage.parameters) - sum(len(e.parameters) for _, e in both[:n_present])
     placed = []
     for q, e in kept:
         placed.append(replace(q, columns=slice(at, at + len(e.parameters))))
@@ -441,8 +442,13 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     out.effects = [e for _, e in kept]
     effects = tuple(out.effects[n_present:])
     stride = max(1, len(bound.t) // MOST_SAMPLES)
-    out.stage = replace(bound.stage, effects=effects, run=runner.run, begins=None)
-    out.thinned = replace(bound.thinned, effects=effects, run=lambda thetas: runner.run(thetas, stride), begins=None)
+    # a gain and a curve nearly make up for each other: what tells them apart is small beside how the model bends over
+    # a step of a parameter that is far too large
+    own = tuple(replace(p, scale=(FINER if k < first else 1.0) * p.scale) for k, p in enumerate(bound.stage.parameters))
+    out.stage = replace(bound.stage, parameters=own, effects=effects, run=runner.run, begins=None)
+    out.thinned = replace(
+        bound.thinned, parameters=own, effects=effects, run=lambda thetas: runner.run(thetas, stride), begins=None
+    )
     out.stages = [out.thinned]
     return out
 

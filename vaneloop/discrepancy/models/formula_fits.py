@@ -103,7 +103,8 @@ def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> 
     visited = _visited(tried)
     for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):
         y = values_of(f, visited)
-        if all(np.std(y - values_of(g, visited)) > SAME * np.std(y) for g in out):
+        simpler = [values_of(g, visited) for g in out if g.complexity < f.complexity]
+        if all(np.std(y - other) > SAME * np.std(y) for other in simpler):
             out.append(f)
     return out
 
@@ -146,11 +147,25 @@ def effect_of(name: str, names: Sequence[str], numbers: Array) -> Effect:
 
 
 def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> tuple[Formula, Tried] | None:
-    """A formula in the curve's place, fitted with the model's own parameters."""
+    """A formula in the curve's place, fitted with the model's own parameters.
+
+    Its first number is fitted as the RMS of the whole formula where the logs have been: the height of a limit is known
+    well, and its slope and its corner make up for each other.
+    """
     c = tried.candidate
-    effect = effect_of(c.name, form.numbers, numbers)
     been = c.quantity.visited[np.isfinite(c.quantity.visited)]
     been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
+
+    def size(inner: Array) -> float:
+        y = form.value(been, np.concatenate([[1.0], inner]))
+        return max(float(np.sqrt(np.mean(y * y))), 1e-300)
+
+    def plain(n: Array) -> Array:
+        return np.concatenate([[n[0] / size(n[1:])], n[1:]])
+
+    reach = goes_on(ground, c, form, numbers)  # what a model says to a reading may lie beyond what the logs show of it
+    numbers = np.concatenate([[numbers[0] * size(numbers[1:])], numbers[1:]])
+    effect = effect_of(c.name, form.numbers, numbers)
 
     def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
         if c.quantity.stops:
@@ -159,9 +174,10 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
 
     def placed(low: float, high: float) -> Placed:
         table, jump = runs(form, low, high, ground.points)
-        return c.placed_as(lambda n: table(n) - mean(n), len(numbers), (low, high), jump)
+        jumps = None if jump is None else lambda n: jump(plain(n))
+        return c.placed_as(lambda n: table(plain(n)) - mean(plain(n)), len(numbers), (low, high), jumps)
 
-    curves = (*tried.curves[:-1], (placed(c.basis.low, c.basis.high), effect))
+    curves = (*tried.curves[:-1], (placed(*reach), effect))
     judge = Judge(ground.stage((), curves), ground.floor)
     judge.sparing = True
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
@@ -172,7 +188,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
     fit = with_held_out(judge, judge.fit(names, theta, 12))
     if not np.isfinite(score(judge, fit)):
         return None
-    values = form.plain(fit.theta[-len(numbers) :])
+    values = form.plain(plain(fit.theta[-len(numbers) :]))
     said = dict(zip(form.numbers, (float(v) for v in values), strict=True))
     formula = Formula(
         form.name,
@@ -184,7 +200,9 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         -mean(values),
     )
     further = (*tried.curves[:-1], (placed(*goes_on(ground, c, form, values)), effect))  # on test logs
-    as_it = replace(tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None)
+    as_it = replace(
+        tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None, loose=None
+    )
     return formula, as_it
 
 

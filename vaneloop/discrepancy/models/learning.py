@@ -29,6 +29,7 @@ from vaneloop.discrepancy.error_share import (
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
+from vaneloop.discrepancy.models.by_formula import better_than, earning_by_formula, harmless, in_its_place, leaves
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_by_others, with_held_out
@@ -81,13 +82,15 @@ class Learner:
     d         what `diagnose` says of it
     progress  called with the share that is done
     shape     what is known of every curve (`vaneloop.discrepancy.models.curved.SHAPES`)
+    speaks    whether a formula that does as well as its curve will be the law
     """
 
     def __init__(
         self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
-        shape: Sequence[str] = (),
+        shape: Sequence[str] = (), speaks: bool = True,
     ):  # fmt: skip
         self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
+        self.speaks = speaks
         self.ranked: list[list[Tried]] = []  # of each search for a curve, what was fitted, best first
         self.judge = self._judge((), ())
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
@@ -118,10 +121,14 @@ class Learner:
             finalists = self._finalists(current)
             out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
             good = [t for t in finalists if self._earns(current, t)]
+            poor = [t for t in finalists if t not in good]
+            only_said = earning_by_formula(self, current, poor, finalists) if self.speaks else []
+            good += only_said
             if not good:
                 break
             left = {t.candidate.name: self._left(current, t, good) for t in good}
             self._with_formulas(current, good, left)
+            good = harmless(self, current, good, left)
             self._tell_apart(good, left)
             near = self._near(current, good, left)
             best = next((t for t in near if self._confirmed(current, t)), None)
@@ -134,17 +141,22 @@ class Learner:
             limit = left[best.candidate.name] + RIVAL
             rivals = [t.candidate.name for t in good if t is not best and left[t.candidate.name] < limit]
             best = self._with_its_lag(current, best, TIMES[1:])
+            best = self._settled(current, best)
             why = self._harmful(current, best)
-            if why:
+            if why or self.form.fails(best.fit):
+                best.formulas = fitted_formulas(self.ground, best)
+            speaking = [f for _, f in best.formulas or () if not self._harmful(current, f)]
+            if why and not (
+                self.speaks and any(self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL for f in speaking)
+            ):
                 out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
                 break
-            best = self._settled(current, best)
             current, fit = replace(best, rivals=rivals), best.fit
             out.tried.append(current)
-            if self.form.fails(fit):  # what splines do not follow is no second law where a formula does
-                current.formulas = fitted_formulas(self.ground, current)
-                if any(not self.form.fails(f.fit) for _, f in current.formulas):
-                    break
+            # what splines do not follow is no second law where a formula does
+            done = any(not self.form.fails(f.fit) for _, f in current.formulas or ())
+            if done or best.candidate.name in [t.candidate.name for t in only_said]:
+                break
         if len(out.tried) > 1:
             self._spare_first(out)
         put_surface(self, out)
@@ -185,11 +197,11 @@ class Learner:
             )
             return out
         last = out.tried[-1]
-        left, was = rms_of(last.judge, last.fit), rms_of(self.judge, self.base)
+        left, was = leaves(last), rms_of(self.judge, self.base)
         share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
         if left > UNKNOWN and share > MOST_LEFT:
             out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
-        elif named and self.d.effects and not self._worth(Tried(last.candidate, 0.0, *named, ()), last):
+        elif named and self.d.effects and not better_than(self, Tried(last.candidate, 0.0, *named, ()), last):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
         else:
@@ -244,21 +256,21 @@ class Learner:
         return float(np.mean(tests)) if tests else 0.0
 
     def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
-        """Where the best curve still fails, what each may leave with a formula in its place, else those of a plainer
-        quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they go astray. Every
-        formula counts as many numbers as the sparest of these curves, however many its own has.
+        """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
+        those of a plainer quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they
+        go astray. Every formula counts as many numbers as the sparest of these curves, however many its own has.
         """
         best = min(good, key=lambda t: left[t.candidate.name])
         costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum())) for t in good}]
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
-        if not self.form.fails(best.fit):
+        if not (self.form.fails(best.fit) or self._harmful(before, best)):
             close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         if not close:
             return
         sparest = min(len(t.fit.free) for t in (*close, best))
         for t in close:
             name = t.candidate.name
-            for _, f in fitted_formulas(self.ground, t, loose=True):
+            for f in in_its_place(self.ground, t):
                 spared = PER_PARAMETER * (sparest - len(f.fit.free))
                 left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
 

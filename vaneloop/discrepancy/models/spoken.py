@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.base.forms import FORMS
-from vaneloop.discrepancy.error_share import PER_PARAMETER, RIVAL
+from vaneloop.discrepancy.error_share import HARM, PER_PARAMETER, RIVAL
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, text_of
 from vaneloop.discrepancy.models.curve import runs
@@ -39,7 +39,8 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
     """The model with a formula in place of each curve that one does as well as, fitted together; and the laws with
     these formulas.
 
-    curves  as they were learned, each beside those before it; ``laws``: what is said of them
+    curves  as they were learned, each beside those before it; ``laws``: what is said of them. The second one goes where
+            it makes a test log clearly worse beside the first one's formula
     """
     now, out = curves[-1], list(laws)
     for k, tried in enumerate(curves):
@@ -57,12 +58,21 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
         best = min([0.0, *in_all.values()])
         for f, t, said in options:
             held, tests = left[f.form]
-            if max([held, *tests]) <= RIVAL and in_all[f.form] <= best + RIVAL:
+            as_well = held <= RIVAL or in_all[f.form] <= -RIVAL  # more is won on test logs than lost
+            as_well = as_well and max(tests, default=0.0) <= RIVAL
+            if as_well and in_all[f.form] <= best + RIVAL:
                 formulas = [said if g is f else g for g in out[k].formulas]
                 form = next(g for g in FORMS if g.name == f.form)
                 reach = goes_on(learner.ground, c, form, np.array(list(said.numbers.values())))
                 out[k], now = replace(out[k], spoken=said, reach=reach, formulas=formulas), t
                 break
+    if len(out) > 1 and out[0].spoken:  # what patched the first curve may harm its formula
+        formula = next(f for f in laws[0].formulas if f.form == out[0].spoken.form)
+        alone = next(t for g, t in curves[0].formulas or [] if g is formula)
+        one = _in_place(learner.ground, curves[0], 0, curves[0].candidate, formula, alone)
+        if one is not None and max(more_left(learner, one[0], now, curves)[1], default=0.0) > HARM:
+            formulas = [one[1] if g.form == formula.form else g for g in out[0].formulas]
+            now, out = one[0], [replace(out[0], spoken=one[1], formulas=formulas)]
     if now is not curves[-1]:
         out[-1] = replace(out[-1], error_after=rms_of(now.judge, now.fit))
     return now, out
@@ -126,5 +136,7 @@ def _in_place(
         formula, text=text, numbers=dict(zip(form.numbers, (float(v) for v in values), strict=True)),
         error=rms_of(judge, fit), level=0.0,
     )  # fmt: skip
-    tried = replace(now, judge=judge, fit=fit, curves=tuple(curves), told=None, errors=None, rows=None, formulas=None)
+    tried = replace(
+        now, judge=judge, fit=fit, curves=tuple(curves), told=None, errors=None, rows=None, formulas=None, loose=None
+    )
     return tried, said

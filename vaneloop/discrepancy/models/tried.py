@@ -84,7 +84,8 @@ class Tried:
     errors  in noise floors, log by log, once they have been simulated
     rivals  names of candidates that do as well in the new one's place
     rows    whitened error of each sample and its derivatives, once they have been simulated
-    formulas those that were fitted in its place, once they have been
+    formulas those that were fitted in its place, once they have been; ``loose``: those whose mean and slope may be what
+             parameters of the model could have
     """
 
     candidate: Candidate
@@ -97,6 +98,7 @@ class Tried:
     rivals: Sequence[str] = ()
     rows: tuple[Array, Array] | None = None
     formulas: list[tuple[Formula, Tried]] | None = None
+    loose: list[Tried] | None = None
 
     def counted(self, known: Array) -> Blocks:
         """What its blocks hold at samples that count."""

@@ -1,0 +1,59 @@
+"""Where a formula speaks for a curve while curves are chosen: where splines go astray, and a formula does not.
+
+Splines follow no corner. They are nothing beyond the values that the logs have visited, and little where one block
+alone has been. A formula that does as well says more there, and it is what the user gets
+(`vaneloop.discrepancy.models.spoken`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas
+from vaneloop.discrepancy.models.tried import Ground, Tried
+from vaneloop.discrepancy.stage_answer import rms_of
+
+if TYPE_CHECKING:
+    from vaneloop.discrepancy.models.learning import Learner
+
+__all__ = ["better_than", "earning_by_formula", "harmless", "in_its_place", "leaves"]
+
+NEAR = 0.25  # log error within which a curve that does not earn its place may do so by a formula
+FAR = 0.5  # log error from which what harms no test log is not taken instead of what does
+
+
+def in_its_place(ground: Ground, tried: Tried) -> list[Tried]:
+    """The model with each formula in a curve's place; mean and slope may be what parameters of the model could have."""
+    if tried.loose is None:
+        tried.loose = [f for _, f in fitted_formulas(ground, tried, loose=True)]
+    return tried.loose
+
+
+def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]) -> list[Tried]:
+    """Of curves that do not earn their place, but are near the best of ``among``, those of which a formula does; none
+    of what remembers. A block that alone has been somewhere says nothing of splines there, and much of a formula.
+    """
+    reach = min((learner._score(t, among) for t in among), default=0.0) + NEAR
+    near = [t for t in poor if learner._score(t, among) < reach and not t.candidate.quantity.remembers]
+    return [t for t in near if any(learner._worth(before, f) for f in in_its_place(learner.ground, t))]
+
+
+def harmless(learner: Learner, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+    """Of curves those that harm no test log, or of which a formula does not, if one is near the best; else all.
+
+    left  what orders them, by name
+    """
+    fine = [t for t in good if any(not learner._harmful(before, f) for f in (t, *(t.loose or ())))]
+    reach = min(left[t.candidate.name] for t in good) + FAR
+    return fine if any(left[t.candidate.name] < reach for t in fine) else good
+
+
+def leaves(tried: Tried) -> float:
+    """Held-out error, in noise floors, of a curve or of the best formula in its place."""
+    return min(rms_of(t.judge, t.fit) for t in (tried, *(f for _, f in tried.formulas or ())))
+
+
+def better_than(learner: Learner, before: Tried, tried: Tried) -> bool:
+    """Whether a curve, or a formula in its place, earns its place before something else."""
+    return any(learner._worth(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))
