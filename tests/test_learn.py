@@ -35,7 +35,7 @@ from vaneloop.discrepancy.formulas import begin, text_of
 from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import OwnGround, candidates, on_logs, with_curves
-from vaneloop.discrepancy.models.formula_fits import goes_on
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas, goes_on
 from vaneloop.discrepancy.models.held_out import held_out, surely_more, told_by_others
 from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
 from vaneloop.discrepancy.models.quantities import column_of
@@ -794,3 +794,35 @@ def test_a_force_is_not_said_as_a_gain_of_a_parameter() -> None:
     assert [law.name for law in said.laws] == ["force.curve_of_position"] and said.laws[0].formulas
     slope = np.polyfit(said.laws[0].x, said.laws[0].y, 1)[0]
     assert slope == pytest.approx(14.0, rel=0.05) or 1 in said.laws[0].untold
+
+
+def test_a_formula_of_a_full_sensor_is_fitted_beyond_what_the_sensor_shows() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(1200.0)
+    u = np.sin(t / 9.0) * np.where((t > 500.0) & (t < 560.0), 6.0, 2.0)
+    y = np.minimum(2.0 * u, 5.0) + 0.01 * rng.standard_normal(len(t))
+
+    def gauge(u, p):
+        return p.gain * u.pressure
+
+    system = System(
+        "gauge", "static", gauge, inputs={"pressure": "bar"}, outputs={"reading": "V"},
+        parameters=[unknown("gain", 1.0, "V/bar", low=0.0)],
+    )  # fmt: skip
+    ground = OwnGround(bind(system, [Record("run", t, {"pressure": u, "reading": y})]))
+    judge = Judge(ground.stage((), ()), ground.floor)
+    base = judge.fit((), judge.stage.neutral(), 12)
+    c = next(c for c in ground.candidates(base.theta) if c.name == "reading.curve_of_reading")
+    curves = ((c.placed(), c.effect(1.0)),)
+    curved = Judge(ground.stage((), curves), ground.floor)
+    fit = curved.fit((c.name,), np.concatenate([base.theta, np.zeros(len(c.parts))]), 12)
+    best, _ = fitted_formulas(ground, Tried(c, 1.0, curved, fit, curves))[0]
+    assert best.form == "above"
+    assert best.numbers["a"] == pytest.approx(-1.0, abs=0.02)
+    assert best.numbers["b"] == pytest.approx(5.0, abs=0.02)
+
+
+def test_beside_a_curve_the_slopes_of_unknown_parameters_are_taken_over_small_steps(bound) -> None:
+    for before, now in zip(bound.stage.parameters, with_curves(bound, (), ()).stage.parameters, strict=True):
+        assert now.tolerance == before.tolerance  # as free as before
+        assert now.scale < before.scale / 10.0
