@@ -12,7 +12,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -32,6 +32,7 @@ from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import begin, text_of
+from vaneloop.discrepancy.models.by_formula import harmless
 from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.curved import OwnGround, candidates, on_logs, with_curves
@@ -826,3 +827,14 @@ def test_beside_a_curve_the_slopes_of_unknown_parameters_are_taken_over_small_st
     for before, now in zip(bound.stage.parameters, with_curves(bound, (), ()).stage.parameters, strict=True):
         assert now.tolerance == before.tolerance  # as free as before
         assert now.scale < before.scale / 10.0
+
+
+def test_what_harms_a_test_log_makes_way_for_what_does_not_and_is_near_it() -> None:
+    def named(name: str, *formulas: Any) -> Any:
+        return SimpleNamespace(candidate=SimpleNamespace(name=name), loose=list(formulas))
+
+    bad, fine, said = named("bad"), named("fine"), named("said", named("formula"))
+    learner: Any = SimpleNamespace(_harmful=lambda _, t: "" if t.candidate.name in ("fine", "formula") else "worse")
+    before: Any = None
+    assert harmless(learner, before, [bad, fine, said], {"bad": 0.0, "fine": 0.4, "said": 0.3}) == [fine, said]
+    assert harmless(learner, before, [bad, fine], {"bad": 0.0, "fine": 0.6}) == [bad, fine]
