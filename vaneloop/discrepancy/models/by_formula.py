@@ -10,24 +10,37 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from vaneloop.discrepancy.error_share import MOST_LEFT
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
-from vaneloop.discrepancy.models.tried import Ground, Tried
+from vaneloop.discrepancy.models.tried import Ground, Tried, strange
 from vaneloop.discrepancy.stage_answer import rms_of
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learning import Learner
 
-__all__ = ["better_than", "earning_by_formula", "harmless", "in_its_place", "leaves"]
+__all__ = ["at_its_place", "better_than", "earning_by_formula", "harmless", "in_its_place", "leaves", "without_memory"]
 
 NEAR = 0.25  # log error within which a curve that does not earn its place may do so by a formula
 FAR = 0.5  # log error from which what harms no test log is not taken instead of what does
 
 
 def in_its_place(ground: Ground, tried: Tried) -> list[Tried]:
-    """The model with each formula in a curve's place; mean and slope may be what parameters of the model could have."""
+    """The model with each formula in a curve's place; mean and slope may be what parameters of the model could have,
+    unless the curve is nothing else.
+    """
     if tried.loose is None:
-        tried.loose = [f for _, f in fitted_formulas(ground, tried, loose=True)]
+        said = fitted_formulas(ground, tried, loose=True) or fitted_formulas(ground, tried)
+        tried.loose = [f for _, f in said]
     return tried.loose
+
+
+def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
+    """Those of what is at their place itself that explain most of the error: where one is a corner, splines leave a
+    tenth of it, and what follows them elsewhere leaves less.
+    """
+    n = before.judge.n
+    most = MOST_LEFT * max(float(before.fit.cost.sum()) - n, 0.0) + n
+    return [t for t in good if strange(t.candidate) == 0 and float(t.fit.cost.sum()) <= most]
 
 
 def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]) -> list[Tried]:
@@ -47,6 +60,15 @@ def harmless(learner: Learner, before: Tried, good: list[Tried], left: Mapping[s
     fine = [t for t in good if any(not learner._harmful(before, f) for f in (t, *(t.loose or ())))]
     reach = min(left[t.candidate.name] for t in good) + FAR
     return fine if any(left[t.candidate.name] < reach for t in fine) else good
+
+
+def without_memory(learner: Learner, before: Tried, good: list[Tried]) -> list[Tried]:
+    """Without what remembers, where a memoryless curve leaves nothing but noise, and harms no test log: memory imitates
+    much.
+    """
+    plain = [t for t in good if not t.candidate.quantity.remembers]
+    enough = any(not learner.form.fails(t.fit) and not learner._harmful(before, t) for t in plain)
+    return plain if enough else good
 
 
 def leaves(tried: Tried) -> float:

@@ -29,7 +29,15 @@ from vaneloop.discrepancy.error_share import (
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.bound import rms_of_rows
-from vaneloop.discrepancy.models.by_formula import better_than, earning_by_formula, harmless, in_its_place, leaves
+from vaneloop.discrepancy.models.by_formula import (
+    at_its_place,
+    better_than,
+    earning_by_formula,
+    harmless,
+    in_its_place,
+    leaves,
+    without_memory,
+)
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_by_others, with_held_out
@@ -129,6 +137,7 @@ class Learner:
             left = {t.candidate.name: self._left(current, t, good) for t in good}
             self._with_formulas(current, good, left)
             good = harmless(self, current, good, left)
+            good = without_memory(self, current, good)
             self._tell_apart(good, left)
             near = self._near(current, good, left)
             best = next((t for t in near if self._confirmed(current, t)), None)
@@ -263,6 +272,7 @@ class Learner:
         best = min(good, key=lambda t: left[t.candidate.name])
         costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum())) for t in good}]
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
+        close += [t for t in at_its_place(before, good) if t not in close]
         if not (self.form.fails(best.fit) or self._harmful(before, best)):
             close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         if not close:
