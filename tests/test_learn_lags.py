@@ -147,10 +147,24 @@ def test_an_excerpt_knows_what_went_before_it() -> None:
     rows = np.arange(2000, 3500)
     part = stage.excerpt(rows)
     assert isinstance(stage.made, Made) and isinstance(part.made, Made)
-    for name in ("x_lvdt_lagged_by_5_s", "speed_of_x_lvdt_lagged_by_5_s", "speed_of_x_lvdt"):
+    for name in ("x_lvdt_lagged_by_5_s", "speed_of_x_lvdt_lagged_by_5_s", "speed_of_x_lvdt", "vgv1"):
         assert np.array_equal(part.made.driven.quantity(name), stage.made.driven.quantity(name)[rows])
     n_r = whole.columns["n_r"]
     assert np.array_equal(stage.made.driven.quantity("n_r_lagged_by_5_s"), lagged(whole.t, n_r, 5.0))
+
+
+def test_an_excerpt_of_the_linkage_says_what_the_whole_log_says_there() -> None:
+    """Also at the last row of a piece: the speed there is not that of a leap to the next one."""
+    stage = chain()[1].stage("linkage")
+    x = chain()[1].columns["x_lvdt"]
+    ends = [(last, far) for last in range(2000, 2900) for far in range(3000, 4500, 50)]
+    last, far = max(ends, key=lambda e: abs(x[e[1]] - x[e[0]]))
+    rows = np.r_[500 : last + 1, far : far + 1400]
+    part = stage.excerpt(rows)
+    off = part.run(part.neutral()[None])[0] - stage.run(stage.neutral()[None])[0][:, rows]
+    counts, cut = np.isfinite(part.measured), last - 499
+    assert abs(x[far] - x[last]) > 10.0 and counts[:, :cut].any()
+    assert np.abs(off)[counts].max() < 0.1 * float(np.min(stage.floor))
 
 
 def test_lags_are_of_what_drives_a_stage() -> None:

@@ -28,7 +28,7 @@ from plant.places import (
 from plant.stages.blocks import NOTHING, elsewhere, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
-__all__ = ["linkage_run"]
+__all__ = ["linkage_run", "speed_reach"]
 
 WIDE = 16  # lanes in a block: more are no quicker each, and fewer sets than a block's lanes fill it badly
 SOME = 1  # so few lanes or fewer are quicker one by one
@@ -60,9 +60,7 @@ def linkage_run(
     known    signals of curves (`plant.curve.take`)
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
-    reach = max(
-        1, round(1e-2 / dt)
-    )  # samples over which the speed is taken: shorter, and the noise of the LVDT would come through its lag
+    reach = speed_reach(dt)
     ahead, behind = (
         np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1),
         np.maximum(np.arange(len(x_lvdt)) - reach, 0),
@@ -89,6 +87,13 @@ def linkage_run(
     on_all_cores(run, parts_of(p.shape[1], wide, WIDE))
     if not np.may_share_memory(to, out):
         out[...] = to.transpose(2, 1, 0)
+
+
+def speed_reach(dt: float) -> int:
+    """Samples to each side over which the stroke's speed is taken: fewer, and the noise of the LVDT would come through
+    its lag.
+    """
+    return max(1, round(1e-2 / dt))
 
 
 @inlined

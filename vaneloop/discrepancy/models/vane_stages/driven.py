@@ -73,7 +73,7 @@ class Driven(NamedTuple):
         if name == "x_lvdt":  # with less noise, where it can be had
             return self.columns.get("stroke", self.columns.get(name))
         values = self.columns.get(name)
-        if values is None and self.part_of is not None:  # what follows from all that went before
+        if self.part_of is not None and (values is None or name in VANES):  # what follows from the rows around, too
             whole, rows = self.part_of
             values = whole.quantity(name)
             return values if values is None else values[rows]

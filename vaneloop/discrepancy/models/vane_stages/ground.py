@@ -42,7 +42,7 @@ __all__ = [
 
 WHOLE = 12_000  # samples; of a longer log an excerpt is learned on, and the rest tests it
 QUICK = 4_000  # samples of the excerpt that tells which candidates to fit
-PIECE = 1_000  # samples in a row
+PIECE, FREE_PIECE = 1_000, 2_000  # samples in a row; of a stage that runs freely, and must find its state again
 SCALE = "scale"  # of a law from a file
 LOG, REST, TEST = "log", "rest of the log", "test"
 # a quantity that is the place's own output, or nothing but the reading there: it multiplies by the same as it adds
@@ -160,8 +160,9 @@ class VaneGround:
         self.whole = stage
         judge = Judge(stage, stage.floor)
         fit = judge.fit((), stage.neutral(), 1)
+        piece = PIECE if stage.window else FREE_PIECE
         if stage.excerpt is not None and len(stage.t) > WHOLE:
-            at = excerpt_of(judge, fit, PIECE, WHOLE)
+            at = excerpt_of(judge, fit, piece, WHOLE)
             self.rest = np.ones(len(stage.t), dtype=bool)
             self.rest[at] = False
             self.whole, self.tests = stage.excerpt(at), frozenset((REST,))
@@ -169,7 +170,7 @@ class VaneGround:
             self.tests |= {TEST}
         self.small = self.whole
         if stage.excerpt is not None and len(stage.t) > QUICK:
-            self.small = stage.excerpt(excerpt_of(judge, fit, PIECE, QUICK))
+            self.small = stage.excerpt(excerpt_of(judge, fit, piece, QUICK))
 
     def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects."""

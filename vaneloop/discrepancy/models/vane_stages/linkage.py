@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from plant.parameters import derive
-from plant.stages import linkage_run
+from plant.stages import linkage_run, speed_reach
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since
@@ -60,9 +60,11 @@ def linkage_stage(driven: Driven) -> Stage:
     }
 
     def kept(at: Array) -> Array:
-        keep = run[at]
+        keep, last = run[at], speed_reach(dt)
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
             keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
+            if at[piece[-1]] < len(t) - 1:  # the stroke's speed there is that of a leap to the next piece
+                keep[piece[-last:]] = False
         return keep
 
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
