@@ -158,12 +158,12 @@ def test_an_excerpt_of_the_linkage_says_what_the_whole_log_says_there() -> None:
     stage = chain()[1].stage("linkage")
     x = chain()[1].columns["x_lvdt"]
     ends = [(last, far) for last in range(2000, 2900) for far in range(3000, 4500, 50)]
-    last, far = max(ends, key=lambda e: abs(x[e[1]] - x[e[0]]))
+    last, far = max(ends, key=lambda e: (x[e[1]] - x[e[0]]) * np.clip(x[e[0]] - x[e[0] - 30], -1.0, 1.0))  # its own way
     rows = np.r_[500 : last + 1, far : far + 1400]
     part = stage.excerpt(rows)
     off = part.run(part.neutral()[None])[0] - stage.run(stage.neutral()[None])[0][:, rows]
     counts, cut = np.isfinite(part.measured), last - 499
-    assert abs(x[far] - x[last]) > 10.0 and counts[:, :cut].any()
+    assert abs(x[far] - x[last]) > 5.0 and counts[:, :cut].any()
     assert np.abs(off)[counts].max() < 0.1 * float(np.min(stage.floor))
 
 

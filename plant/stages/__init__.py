@@ -13,6 +13,6 @@ from plant.stages.actuator import actuator_run
 from plant.stages.bends import run_bends
 from plant.stages.currents import step_currents
 from plant.stages.engine import engine_run
-from plant.stages.linkage import linkage_run, speed_reach
+from plant.stages.linkage import linkage_run
 
-__all__ = ["actuator_run", "engine_run", "linkage_run", "run_bends", "speed_reach", "step_currents"]
+__all__ = ["actuator_run", "engine_run", "linkage_run", "run_bends", "step_currents"]

@@ -108,8 +108,11 @@ def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
 
 def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
     """Log of the held-out error, half over all samples, half over the blocks; less is better. ``blocks``: a resampling
-    of them.
+    of them. Near a noise that is known: of the error itself, in its stage's ``grain``.
     """
+    if judge.stage.grain < 1.0:
+        log_error = 0.5 * float(np.log(fit.held_out.sum() / max(judge.n, 1)))
+        return log_error / judge.stage.grain + PER_PARAMETER * len(fit.free)
     s, m = _levels(judge, fit)
     if blocks is not None:
         s, m = s[blocks], m[blocks]

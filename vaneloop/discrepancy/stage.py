@@ -117,6 +117,7 @@ class Stage:
     quick     a run costs next to nothing: slopes are taken at every start
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
+    grain     log error that counts as much as 1 does far from the noise: less, where a known noise tells laws apart
     made      how and from what it was made, for who makes others like it
     """
 
@@ -145,6 +146,7 @@ class Stage:
     begins: Array | None = None
     quick: bool = False
     excerpt: Callable[[Array], Stage] | None = None
+    grain: float = 1.0
     made: object = None
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learned import LearnedLaw
     from vaneloop.discrepancy.models.tried import Outcome, Tried
     from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.discrepancy.stage_answer import StageDiagnosis
     from vaneloop.pages.page import Page
 
 __all__ = ["Learned", "learn"]
@@ -216,7 +217,7 @@ def learned(
     begun = 0.0 if found else 0.4
     found = found or of_chain(chain, log, workers, lambda f: tell(0.4 * f))
     stages = found.diagnosis.stages
-    open_ones = [s for s in stages if s.verdict == "unknown" and chain.stage(s.stage).made is not None]
+    open_ones = [s for s in stages if _open(chain, s)]
     laws: list[LearnedLaw] = []
     model, said, out = before, [], None
     for i, d in enumerate(open_ones):
@@ -229,9 +230,11 @@ def learned(
         said_by = lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones))  # noqa: E731
         learner = Learner(ground, d, said_by, shape, formulas)
         one = learner.learned()
-        out = out or one
+        out = out or (one if d.verdict == "unknown" else None)
         said += [f"{d.stage}: {note}" for note in one.notes]
-        if one.verdict != "learned":
+        if one.verdict != "learned" and d.verdict == "none":  # little is above the noise, and no law says it
+            continue
+        if out is not None and one.verdict != "learned":
             said.append(f"{d.stage}: {one.why}")
             out.nearest += [n for n in one.nearest if n not in out.nearest]
             continue
@@ -247,7 +250,8 @@ def learned(
         if new:
             kept = replace(one, tried=[one.tried[k] for k in new])
             model = _with_stage(_as_model(model, kept, [own[k] for k in new], last), last.judge, last.fit)
-    verdict = "learned" if laws else "unknown" if open_ones else "named" if found.effects else "none"
+    unknown = any(s.verdict == "unknown" for s in open_ones)
+    verdict = "learned" if laws else "unknown" if unknown else "named" if found.effects else "none"
     why = {
         "named": f"{', '.join(found.effects)} of the library",
         "none": "the model comes down to the noise of the log's sensors: nothing is missing",
@@ -257,6 +261,17 @@ def learned(
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
     return Learned(found, outcome, laws, None, model if laws else None, log)
+
+
+def _open(chain: Chain, d: StageDiagnosis) -> bool:
+    """Whether a stage may lack a law that nobody listed: its error is more than noise, and no law has a name for it."""
+    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.discrepancy.models.at_the_noise import above_the_noise
+
+    stage = chain.stage(d.stage)
+    if stage.made is None or d.verdict == "missing":
+        return False
+    return d.verdict == "unknown" or above_the_noise(Judge(stage, d.floor), d.base)
 
 
 def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:

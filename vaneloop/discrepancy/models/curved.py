@@ -463,12 +463,16 @@ class OwnGround:
     """A user's own model, held against logs (`vaneloop.discrepancy.models.learning.Ground`)."""
 
     points, jumps, surfaces = FINE, True, True
+    noise_known = False
 
     def __init__(self, logs: Logs):
         self.logs, self.floor = logs, logs.fitted.floor
         self.whole = logs.fitted.stage
         self.tests = frozenset(logs.test.logs if logs.test else ())
         self._in_tests: dict[str, Array] = {}  # values of quantities there, by name
+
+    def in_grains(self, of: float) -> None:
+        """Nothing: errors are compared with each other, not with noise."""
 
     def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
         """The same with only these laws of the library, and these curves, as effects."""

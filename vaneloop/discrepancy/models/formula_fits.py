@@ -85,7 +85,8 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
             shaped.append((np.log(max(got[1], doubt, CLOSE)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
-    return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
+    grain = tried.judge.stage.grain
+    return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
 
 
 def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> list[Formula]:
@@ -93,12 +94,12 @@ def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> 
 
     before  held-out error without the curve, in noise floors: no law's form is known better than `FORM` of it
     """
-    own = rms_of(tried.judge, tried.fit)
-    poor = float(np.hypot(POOR * max(own, 1.0), FORM * before))
+    own, grain = rms_of(tried.judge, tried.fit), tried.judge.stage.grain
+    poor = float(np.hypot(POOR**grain * max(own, 1.0), FORM * before if grain == 1.0 else 0.0))
     near = [f for f, _ in fitted if f.error <= poor]
     if not near:
         return []
-    limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + NEAR)
+    limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + NEAR * grain)
     out: list[Formula] = []
     visited = _visited(tried)
     for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):

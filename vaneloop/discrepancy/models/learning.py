@@ -28,6 +28,7 @@ from vaneloop.discrepancy.error_share import (
 )
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
+from vaneloop.discrepancy.models.at_the_noise import earns, grain_of, in_grains, promises, unconfirmed
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.by_formula import (
     at_its_place,
@@ -61,6 +62,7 @@ from vaneloop.discrepancy.models.tried import (
     step_without,
     strange,
 )
+from vaneloop.discrepancy.noise_floor import correlation_of
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
@@ -104,6 +106,10 @@ class Learner:
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
         self.form = ErrorShare(self.judge)
         self.form.begin(self.base)
+        self.bare = np.inf  # what a step of the model's own parameters leaves where candidates are ranked
+        self.faint = ground.noise_known and not self.form.fails(self.base)
+        if self.faint:
+            in_grains(ground, grain_of(self.judge, self.base), [self.judge])
         self.candidates = [s for c in ground.candidates(self.base.theta) if (s := c.shaped(shape)) is not None]
 
     def _judge(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Judge:
@@ -113,7 +119,7 @@ class Learner:
         """Curves one after the other, each earning its place; at most two."""
         out = Outcome("none")
         unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
-        if not (unknown or self.form.fails(self.base)):
+        if not (unknown or self.faint or self.form.fails(self.base)):
             out.why = "the model comes down to the noise of its samples: nothing is missing"
             return out
         named = self._named()
@@ -124,7 +130,7 @@ class Learner:
         current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
         fit = self.base
         while current is not None and len(out.tried) < MOST_CURVES:
-            if not self.form.fails(fit) and (out.tried or not unknown):
+            if not self.form.fails(fit) and (out.tried or not (unknown or self.faint)):
                 break
             finalists = self._finalists(current)
             out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
@@ -242,6 +248,8 @@ class Learner:
         """Whether a curve earns its place, where it knows something and what it is held against does."""
         among = [tried, before] if before.curves else [tried]
         (judge, was), (_, now) = (self._judged(t, among) for t in (before, tried))
+        if self.faint:
+            return earns(judge, was, now, correlation_of(tried.judge, tried.fit))
         return worth(judge, was, now, self.form.form).good
 
     def _earns(self, before: Tried, tried: Tried) -> bool:
@@ -394,6 +402,8 @@ class Learner:
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
         quick, screened = [], self._screened(current)
+        if self.faint and not (screened and promises(self.bare, screened[0][0])):
+            return []
         for k, (_, candidate, theta) in enumerate(screened):
             quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
@@ -412,6 +422,10 @@ class Learner:
         for k, t in enumerate(chosen):
             done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
+        if self.faint and done:
+            nearest = min(done, key=lambda t: float(t.fit.held_out.sum()))
+            grain = grain_of(nearest.judge, nearest.fit)
+            in_grains(self.ground, grain, [self.judge, *(t.judge for t in (*quick, *done))])
         done = self._ordered(done)
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}
@@ -479,6 +493,7 @@ class Learner:
     def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
         """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
         starts = starts_of(self._judge((), current.curves, True), current.fit)
+        self.bare = starts[0][1].left(starts[0][1].error)[0]
         every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
         out = sorted((self._promise(current, c, starts) for c in every), key=lambda o: o[0])
         best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
@@ -541,6 +556,8 @@ class Learner:
     def _harmful(self, before: Tried, tried: Tried) -> str:
         """Why the logs speak against a curve; "": they do not."""
         change = self._change(before, tried)
+        if self.faint and (why := unconfirmed(before.errors or {}, tried.errors or {}, self.ground.tests)):
+            return why
         worst = max((log for log in change if log in self.ground.tests), key=lambda log: change[log], default=None)
         if worst is not None and change[worst] > HARM:
             return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
@@ -558,7 +575,11 @@ class Learner:
             of.errors = self.ground.errors(of.curves, of.fit.theta)
         out = {}
         for log, e in of.errors.items():
-            rms = rms_of_rows(e[:, part[log]] if log in part else e)
+            some = e[:, part[log]] if log in part else e
+            if self.faint:
+                out[log] = 0.5 * float(np.log(np.nanmean(some**2))) / self.judge.stage.grain
+                continue
+            rms = rms_of_rows(some)
             if np.isfinite(rms).all():
                 out[log] = float(np.log(np.maximum(rms, 1.0)).mean())
         return out

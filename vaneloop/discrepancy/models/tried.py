@@ -17,6 +17,7 @@ from vaneloop.discrepancy.models.memory import named_lag
 from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
+from vaneloop.discrepancy.noise_floor import NATS
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
 __all__ = [
@@ -44,7 +45,7 @@ class Ground(Protocol):
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
     tests  names of the logs that nothing is fitted to
     points of the table of a formula; ``jumps``: whether curves may jump; ``surfaces``: whether functions of two
-           quantities can run
+           quantities can run; ``noise_known``: whether the model may come down to a noise that is known
     """
 
     whole: Stage
@@ -53,6 +54,10 @@ class Ground(Protocol):
     points: int
     jumps: bool
     surfaces: bool
+    noise_known: bool
+
+    def in_grains(self, of: float) -> None:
+        """Compare errors in so large steps from now on (`Stage.grain`)."""
 
     def stage(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects; ``quick``: on as many
@@ -181,7 +186,8 @@ def one_constant(tried: Sequence[Tried]) -> list[Tried]:
     out, have = [], set()
     for t in tried:
         place, left = (t.candidate.how, t.candidate.at), left_by_its_mean(t)
-        least = max(LEAST_FALL * (left - t.judge.n), LEAST_OF_NOISE * t.judge.n)
+        known = 2.0 * NATS if t.judge.stage.grain < 1.0 else LEAST_OF_NOISE * t.judge.n
+        least = max(LEAST_FALL * (left - t.judge.n), known)
         if left - float(t.fit.cost.sum()) < least:
             if place in have:
                 continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,6 +59,7 @@ LAGGED = {  # what drives a stage, and not what it gives: curves there may have 
     "demand": ("n_dem", "n_r"), "servo": ("x_dem", "x_lvdt"), "engine": ("n_dem",),
     "actuator": ("i_cmd", "n_r", "p_s", "t_oil"), "linkage": ("x_lvdt", "speed_of_x_lvdt", "n_r", "t_oil"),
 }  # fmt: skip
+PROBED = 0.01  # of a curve's usual size by which a place is moved to see what that does
 CHANGED = 0.01  # of a channel's spread that a lag must change
 SLIPS = {  # what moves a place that may have a hysteresis: a torque motor's iron, joints on the way to the vanes
     "valve.current": "i_cmd", "linkage.crank": "x_lvdt", "linkage.ring": "x_lvdt",
@@ -112,7 +114,7 @@ def remade(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, Eff
     assert isinstance(stage.made, Made)
     make, driven = stage.made
     out = make(driven._replace(laws=tuple(laws), curves=tuple(curves)))
-    for name in ("floor", "quiet", "noise", "raster_error", "memory", "regimes", "regime_units"):
+    for name in ("floor", "quiet", "noise", "raster_error", "memory", "regimes", "regime_units", "grain"):
         setattr(out, name, getattr(stage, name))
     return out
 
@@ -150,6 +152,7 @@ class VaneGround:
     """
 
     points, jumps = POINTS, False  # as the plant's rows have them
+    noise_known = True
     surfaces = False  # a curve is rows of the plant's parameters, of one signal
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
@@ -171,6 +174,10 @@ class VaneGround:
         self.small = self.whole
         if stage.excerpt is not None and len(stage.t) > QUICK:
             self.small = stage.excerpt(excerpt_of(judge, fit, piece, QUICK))
+
+    def in_grains(self, of: float) -> None:
+        """Compare errors in so large steps from now on (`Stage.grain`)."""
+        self.whole.grain = self.small.grain = of
 
     def stage(self, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]], quick: bool = False) -> Stage:
         """The same stage with only these laws of the library, and these curves, as effects."""
@@ -257,7 +264,23 @@ class VaneGround:
                 size = self._size(place, error)
                 near = q.name in NEAR.get(place.at, ())
                 out.append(Candidate(name, place.how, number, place.at, place.unit, size, not q.stops, q, basis, near))
-        return out
+        return out if stage.grain == 1.0 else self._as_the_noise(out, fit.theta)
+
+    def _as_the_noise(self, candidates: Sequence[Candidate], theta: Array) -> list[Candidate]:
+        """Candidates no larger in usual than what moves the outputs by their noise: where little is missing, a curve
+        that may be a hundred times as large goes astray wherever a block is left out.
+        """
+        usual: dict[int, float] = {}
+        for c in candidates:
+            if c.place in usual or c.quantity.stops:
+                continue
+            judge = Judge(self.stage((), ((c.placed(), c.effect(1.0)),)), self.floor)
+            moved = np.repeat(np.concatenate([theta, np.zeros(len(c.kept))])[None], 2, axis=0)
+            moved[1, len(theta)] = PROBED * c.size  # a constant at that place
+            still, by = judge.errors(moved)
+            rms = float(np.sqrt(np.sum((by - still) ** 2) / max(judge.n, 1)))
+            usual[c.place] = min(c.size, PROBED * c.size / max(rms, 1e-300))
+        return [replace(c, size=usual.get(c.place, c.size)) for c in candidates]
 
     def _stops(self, driven: Driven, channel: str, rows: Array) -> Quantity | None:
         """Stops that a channel moves; None: it does not move. ``rows``: those that have an output."""

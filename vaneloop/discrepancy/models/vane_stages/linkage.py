@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from plant.parameters import derive
-from plant.stages import linkage_run, speed_reach
+from plant.stages import linkage_run
+from plant.stages.linkage import speed_reach
 from vaneloop.discrepancy.models.vane_stages.declared import declared, lanes
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made, excerpts
 from vaneloop.discrepancy.models.vane_stages.raster import SETTLE, pieces_of, since

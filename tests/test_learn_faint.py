@@ -1,0 +1,74 @@
+"""Laws of the vane chain that move an output by a few per cent of its noise, and what noise alone may not look like."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_learn_vanes import chain
+from vaneloop.discrepancy.error_share import PER_PARAMETER, RIVAL, score
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.at_the_noise import above_the_noise, earns, grain_of, unconfirmed
+from vaneloop.discrepancy.models.vane_stages.ground import VaneGround, remade
+from vaneloop.discrepancy.noise_floor import NATS, RIVAL_NATS
+
+N = 30_000
+
+
+def nominal(name: str = "linkage"):
+    stage = remade(chain()[1].stage(name), (), ())
+    judge = Judge(stage, stage.floor)
+    return judge, judge.fit((), stage.neutral())
+
+
+def test_at_the_noise_rivals_are_as_many_nats_apart_as_laws_with_names() -> None:
+    judge, fit = nominal()
+    quiet = replace(fit, held_out=fit.held_out * judge.n / fit.held_out.sum())  # leaves nothing but noise
+    judge.stage.grain = grain = grain_of(judge, quiet)
+    worse = replace(quiet, held_out=quiet.held_out * (1.0 + 2.0 * RIVAL_NATS / judge.n))
+    assert 0.0 < grain < 0.05
+    assert score(judge, worse) - score(judge, quiet) == pytest.approx(RIVAL, rel=0.01)
+    assert score(judge, quiet) == pytest.approx(PER_PARAMETER * len(quiet.free), abs=1e-6)
+
+
+def test_two_per_cent_of_the_noise_earn_a_curve_its_place_and_chance_does_not() -> None:
+    judge, fit = nominal()
+    after = replace(fit, held_out=fit.held_out * judge.n / fit.held_out.sum())
+    before = replace(after, held_out=after.held_out * 1.02**2)
+    assert above_the_noise(judge, before) and not above_the_noise(judge, after)
+    assert earns(judge, before, after, 1.0)
+    assert not earns(judge, before, after, 1e3)  # errors that repeat themselves a thousand times say little
+    chance = replace(after, held_out=after.held_out * (1.0 + 2.0 * (NATS - 1.0) / judge.n))
+    assert not earns(judge, chance, after, 1.0)
+
+
+@pytest.mark.parametrize(("rest", "why"), [(0.98, ""), (1.0, "rest of the log says so by 0.0 nats only")])
+def test_samples_that_nothing_was_fitted_to_must_say_so_too(rest: float, why: str) -> None:
+    before = {"log": np.ones((1, N)), "rest of the log": np.ones((1, N))}
+    after = {"log": 0.97 * np.ones((1, N)), "rest of the log": rest * np.ones((1, N))}
+    assert unconfirmed(before, after, frozenset(("rest of the log",))) == why
+
+
+def test_what_is_sure_and_too_little_is_no_law() -> None:
+    """Errors of form have many nats on a long log."""
+    before, after = {"log": np.ones((1, N))}, {"log": 0.995 * np.ones((1, N))}
+    assert "spreads" in unconfirmed(before, after, frozenset())
+
+
+def test_near_the_noise_no_curve_is_larger_than_what_moves_the_outputs_by_it() -> None:
+    ground = VaneGround(chain()[1].stage("actuator"))
+    theta = ground.whole.neutral()[: len(ground.whole.parameters)]
+    usual = {c.name: c.size for c in ground.candidates(theta)}
+    ground.in_grains(0.05)
+    small = {c.name: c for c in ground.candidates(theta)}
+    assert usual.keys() == small.keys()
+    assert all(c.size <= usual[name] for name, c in small.items())
+    gain = small["actuator.flow_gain.gain_of_t_oil"]
+    assert gain.size < 0.1 * usual[gain.name]
+    judge = Judge(ground.stage((), ((gain.placed(), gain.effect(1.0)),)), ground.floor)
+    moved = np.repeat(judge.stage.neutral()[None], 2, axis=0)
+    moved[1, len(theta)] = gain.size
+    still, by = judge.errors(moved)
+    assert np.sqrt(np.sum((by - still) ** 2) / judge.n) == pytest.approx(1.0, rel=0.2)
