@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from vaneloop.base.forms import FORMS, Form
 from vaneloop.discrepancy.error_share import FORM, score
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
+from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.curve import runs
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import at_samples, with_held_out
@@ -58,6 +60,9 @@ def _variance(tried: Tried, visited: Array) -> Array:
 def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
     """The formulas that come nearest to a curve, each fitted in the simulation in its place; best first.
 
+    A curve is known where the log tells it. Splines that leave more than noise are off by their smoothness, too, most
+    where a law has its corner: there formulas count as well that come near it everywhere alike.
+
     loose  whether only the curve's bends choose them: its mean and slope may be what parameters of the model could have
     """
     c = tried.candidate
@@ -65,7 +70,24 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     at_visited = tried.at(visited, tried.table()[1])
     lent = c.lent | ({0, 1} if loose else set())
     variance, spread = _variance(tried, visited), max(float(np.var(at_visited)), 1e-300)
-    weight = 1.0 / np.sqrt(variance + CLOSE * spread)  # a curve is known where the log tells it
+    weights = [1.0 / np.sqrt(variance + CLOSE * spread)]
+    if not agrees(rms_of(tried.judge, tried.fit), 1.0):
+        weights.append(np.ones(len(visited)))
+    ranked = [_nearest(c, visited, at_visited, variance, lent, weight) for weight in weights]
+    taken = {form.name: (form, numbers) for turn in zip_longest(*ranked) for form, numbers in filter(None, turn)}
+    shaped = list(taken.values())[:REFITTED]
+    fitted = [f for form, numbers in shaped if (f := _in_simulation(ground, tried, form, numbers))]
+    grain = tried.judge.stage.grain
+    return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
+
+
+def _nearest(
+    c: Candidate, visited: Array, at_visited: Array, variance: Array, lent: set[int], weight: Array
+) -> list[tuple[Form, Array]]:
+    """Formulas that come near a curve, the nearest first, each with its numbers.
+
+    variance  of the curve at visited values; ``weight`` that each of them has; ``lent``: a mean, a slope it may have
+    """
     middle = np.average(at_visited, weights=weight**2)
     doubt = float(np.sum(weight**2 * variance) / max(np.sum((weight * (at_visited - middle)) ** 2), 1e-300))
     shaped = []
@@ -84,9 +106,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
         if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
             shaped.append((np.log(max(got[1], doubt, CLOSE)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
-    fitted = [f for _, form, numbers in shaped[:REFITTED] if (f := _in_simulation(ground, tried, form, numbers))]
-    grain = tried.judge.stage.grain
-    return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
+    return [(form, numbers) for _, form, numbers in shaped]
 
 
 def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> list[Formula]:

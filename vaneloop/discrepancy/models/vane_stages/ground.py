@@ -28,6 +28,7 @@ from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
 from vaneloop.discrepancy.models.vane_stages.driven import Driven, Made
 from vaneloop.discrepancy.scout import excerpt_of
 from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
+from vaneloop.discrepancy.stage_answer import rms_of
 
 __all__ = [
     "OF_STROKE",
@@ -264,11 +265,11 @@ class VaneGround:
                 size = self._size(place, error)
                 near = q.name in NEAR.get(place.at, ())
                 out.append(Candidate(name, place.how, number, place.at, place.unit, size, not q.stops, q, basis, near))
-        return out if stage.grain == 1.0 else self._as_the_noise(out, fit.theta)
+        return self._as_the_error(out, fit.theta, rms_of(judge, fit))
 
-    def _as_the_noise(self, candidates: Sequence[Candidate], theta: Array) -> list[Candidate]:
-        """Candidates no larger in usual than what moves the outputs by their noise: where little is missing, a curve
-        that may be a hundred times as large goes astray wherever a block is left out.
+    def _as_the_error(self, candidates: Sequence[Candidate], theta: Array, error: float) -> list[Candidate]:
+        """Candidates no larger in usual than what moves the outputs by the ``error`` that there is (noise floors):
+        where little is missing, a curve that may be a hundred times as large goes astray wherever a block is left out.
         """
         usual: dict[int, float] = {}
         for c in candidates:
@@ -279,7 +280,7 @@ class VaneGround:
             moved[1, len(theta)] = PROBED * c.size  # a constant at that place
             still, by = judge.errors(moved)
             rms = float(np.sqrt(np.sum((by - still) ** 2) / max(judge.n, 1)))
-            usual[c.place] = min(c.size, PROBED * c.size / max(rms, 1e-300))
+            usual[c.place] = min(c.size, PROBED * c.size * error / max(rms, 1e-300))
         return [replace(c, size=usual.get(c.place, c.size)) for c in candidates]
 
     def _stops(self, driven: Driven, channel: str, rows: Array) -> Quantity | None:
