@@ -174,7 +174,7 @@ class VaneGround:
             self.tests |= {TEST}
         self.small = self.whole
         if stage.excerpt is not None and len(stage.t) > QUICK:
-            self.small = stage.excerpt(excerpt_of(judge, fit, piece, QUICK))
+            self.small = stage.excerpt(excerpt_of(judge, fit, PIECE, QUICK))
 
     def in_grains(self, of: float) -> None:
         """Compare errors in so large steps from now on (`Stage.grain`)."""
@@ -270,6 +270,7 @@ class VaneGround:
     def _as_the_error(self, candidates: Sequence[Candidate], theta: Array, error: float) -> list[Candidate]:
         """Candidates no larger in usual than what moves the outputs by the ``error`` that there is (noise floors):
         where little is missing, a curve that may be a hundred times as large goes astray wherever a block is left out.
+        Not so a hysteresis: of that a constant says nothing.
         """
         usual: dict[int, float] = {}
         for c in candidates:
@@ -281,7 +282,7 @@ class VaneGround:
             still, by = judge.errors(moved)
             rms = float(np.sqrt(np.sum((by - still) ** 2) / max(judge.n, 1)))
             usual[c.place] = min(c.size, PROBED * c.size * error / max(rms, 1e-300))
-        return [replace(c, size=usual.get(c.place, c.size)) for c in candidates]
+        return [c if c.quantity.stops else replace(c, size=usual[c.place]) for c in candidates]
 
     def _stops(self, driven: Driven, channel: str, rows: Array) -> Quantity | None:
         """Stops that a channel moves; None: it does not move. ``rows``: those that have an output."""
