@@ -242,7 +242,7 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
         y = rows @ np.array([0.3, mean, slope]) + rng.standard_normal(n)
         theta = np.linalg.lstsq(rows, y, rcond=None)[0]
         e = y - rows @ theta
-        stage = SimpleNamespace(index=lambda: {"c": slice(1, 3)})
+        stage = SimpleNamespace(index=lambda: {"c": slice(1, 3)}, grain=1.0)
         judge = SimpleNamespace(stage=stage, scale=np.array([2.0, 1.0, 0.5]), n=n)
         j = rows * judge.scale
         fit = SimpleNamespace(
