@@ -43,10 +43,9 @@ from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_by_others, with_held_out
 from vaneloop.discrepancy.models.memory import dissipates
-from vaneloop.discrepancy.models.periods import Lines
 from vaneloop.discrepancy.models.quantities import TIME
+from vaneloop.discrepancy.models.screening import screened
 from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
-from vaneloop.discrepancy.models.steps import best_step, starts_of
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
     Ground,
@@ -63,7 +62,6 @@ from vaneloop.discrepancy.models.tried import (
     strange,
 )
 from vaneloop.discrepancy.noise_floor import correlation_of
-from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of
 
@@ -79,7 +77,6 @@ PLAINER = 2  # more that are fitted to the end, where they are plainer than the 
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
-PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
 FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
 SPLINES = 28  # of the best finalists where they still fail
@@ -106,7 +103,6 @@ class Learner:
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
         self.form = ErrorShare(self.judge)
         self.form.begin(self.base)
-        self.bare = np.inf  # what a step of the model's own parameters leaves where candidates are ranked
         self.faint = ground.noise_known and not self.form.fails(self.base)
         if self.faint:
             in_grains(ground, grain_of(self.judge, self.base), [self.judge])
@@ -401,10 +397,10 @@ class Learner:
 
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
-        quick, screened = [], self._screened(current)
-        if self.faint and not (screened and promises(self.bare, screened[0][0])):
+        quick, (bare, promising) = [], screened(self, current, QUICK, TIMES[0])
+        if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
-        for k, (_, candidate, theta) in enumerate(screened):
+        for k, (_, candidate, theta) in enumerate(promising):
             quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
@@ -417,7 +413,7 @@ class Learner:
         others.sort(key=lambda t: float(t.fit.cost.sum()))
         chosen = [*first, *others[: FINISHED - SURE]]
         # a short excerpt has too few turns for what slips: the hystereses that promised most go on, too
-        slipping = [c.name for _, c, _ in screened if c.quantity.stops][:SLIPPING]
+        slipping = [c.name for _, c, _ in promising if c.quantity.stops][:SLIPPING]
         chosen += [t for t in quick if t.candidate.name in slipping and t not in chosen]
         for k, t in enumerate(chosen):
             done.append(self._finished(current, t))
@@ -489,67 +485,6 @@ class Learner:
         names = tuple(e.name for _, e in curves)
         fit = with_held_out(judge, judge.fit(names, begin, iterations))
         return Tried(candidate, wiggle, judge, fit, curves)
-
-    def _screened(self, current: Tried) -> list[tuple[float, Candidate, Array]]:
-        """The `QUICK` best candidates, each with what it would leave and parameters to begin from; best first."""
-        starts = starts_of(self._judge((), current.curves, True), current.fit)
-        self.bare = starts[0][1].left(starts[0][1].error)[0]
-        every = [c for c in (*self.candidates, *self._periodic(current)) if not stands(current, c)]
-        out = sorted((self._promise(current, c, starts) for c in every), key=lambda o: o[0])
-        best: dict[tuple[str, str, str, bool], tuple[float, Candidate, Array]] = {}
-        for one in out:  # of several lags of a channel, one
-            c = one[1]
-            best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
-        first = [self._its_lag(current, one, starts) for one in list(best.values())[:QUICK]]
-        return sorted(first, key=lambda o: o[0])
-
-    def _its_lag(
-        self, current: Tried, one: tuple[float, Candidate, Array], starts: Sequence[tuple[Array, Slopes]]
-    ) -> tuple[float, Candidate, Array]:
-        """A candidate with the lag that promises most: those that were tried first are far apart."""
-        for factor in (TIMES[0], 1.0 / TIMES[0]) if one[1].quantity.remembers else ():
-            while (c := one[1].slower(factor)) is not None and not stands(current, c):
-                other = self._promise(current, c, starts)
-                if other[0] >= one[0]:
-                    break
-                one = other
-        return one
-
-    def _periodic(self, current: Tried) -> list[Candidate]:
-        """Every curve over time that may repeat itself, with the periods of the error; none where a shape is known."""
-        over_time = [c for c in self.candidates if c.quantity.name == TIME and not c.shape]
-        if not over_time:
-            return []
-        fit = current.fit
-        courses = self.ground.courses(current.curves, fit.theta)
-        lines = Lines(courses)
-        out, plain = [], lines.periods()
-        for c in over_time:
-            periods = plain
-            if c.how.endswith("times"):
-                whole = replace(c, name=PROBE, mean=True, untold=())
-                values = np.zeros(len(whole.kept))
-                values[0] = SMALL
-                curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
-                moved = self.ground.courses(curves, np.concatenate([fit.theta, values]))
-                periods = lines.periods([m.error - w.error for m, w in zip(moved, courses, strict=True)])
-            out += [c.every(p) for p in periods]
-        return out
-
-    def _promise(
-        self, current: Tried, candidate: Candidate, starts: Sequence[tuple[Array, Slopes]]
-    ) -> tuple[float, Candidate, Array]:
-        """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from
-        where that leaves least.
-
-        Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
-        """
-        effect = candidate.effect(SCREENED)
-        judge = self._judge((), (*current.curves, (candidate.placed(), effect)), True)
-        slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
-        steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
-        left, theta = min(steps, key=lambda s: s[0])
-        return left, candidate, theta
 
     # ---- other logs --------------------------------------------------------------------------------------------------
 
