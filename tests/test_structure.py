@@ -439,3 +439,23 @@ def test_prose_stands_in_lines_of_120_columns() -> None:
             if len(line) > 120 and not code and not re.match(r"\s*[|#`!]", line):
                 long.append(f"{file.relative_to(ROOT)}:{number}: {len(line)} columns")
     assert not long, "\n".join(long)
+
+
+def test_what_holds_arrays_is_compared_by_identity() -> None:
+    """``==`` of two such records, and ``in`` a list of them, would ask arrays whether they are true."""
+    fields: dict[str, list[str]] = {}
+    identity: dict[str, bool] = {}
+    for path in sorted((ROOT / "vaneloop" / "discrepancy").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            how = [ast.unparse(d) for d in getattr(node, "decorator_list", ()) if "dataclass" in ast.unparse(d)]
+            if isinstance(node, ast.ClassDef) and how:
+                held = [ast.unparse(a.annotation) for a in node.body if isinstance(a, ast.AnnAssign)]
+                name = node.name if node.name not in fields else f"{node.name} of {path.stem}"
+                fields[name] = [f for f in held if "Callable" not in f] + [ast.unparse(b) for b in node.bases]
+                identity[name] = "eq=False" in how[0]
+    arrays = {"Array", "ndarray", "NDArray"}
+    while more := {n for n, of in fields.items() if n not in arrays and arrays & set(re.findall(r"\w+", " ".join(of)))}:
+        arrays |= more
+    holders = arrays & identity.keys()
+    assert {"Fit", "Tried", "Stage"} <= holders
+    assert [n for n in sorted(holders) if not identity[n]] == []

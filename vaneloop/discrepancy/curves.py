@@ -29,7 +29,7 @@ EDGE = 0.001  # share of the visited values at each end that may lie apart from 
 STRAY = 0.25  # of the others' range: no further from them are the first and the last knot
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Basis:
     """Functions of one quantity.
 

@@ -42,7 +42,7 @@ MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
-@dataclass
+@dataclass(eq=False)
 class Fit:
     """Parameters fitted with some effects present.
 

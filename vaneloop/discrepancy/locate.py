@@ -63,7 +63,7 @@ class StageFigures:
         return {**asdict(self), "ratio": self.ratio, "agrees": self.agrees}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Regime:
     """Error of one output against one condition.
 
@@ -115,7 +115,7 @@ class Regime:
         }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Located:
     """What one stage says with nothing added: how large its error is, whether that is more than noise, under which
     conditions.
@@ -315,7 +315,7 @@ def step_in(level: Array) -> int:
     return int(k[np.argmax(explained)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape:
     """What is left, as a function of something physical."""
 

@@ -83,7 +83,7 @@ class Effect:
     holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
 
 
-@dataclass
+@dataclass(eq=False)
 class Stage:
     """One part of the machine on one log.
 

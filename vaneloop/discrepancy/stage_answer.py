@@ -34,7 +34,7 @@ class Candidate:
     left: float = float("nan")
 
 
-@dataclass
+@dataclass(eq=False)
 class Found:
     """An effect named as missing.
 
@@ -61,7 +61,7 @@ class Found:
     refused: str = ""
 
 
-@dataclass
+@dataclass(eq=False)
 class StageDiagnosis:
     """What one stage says."""
 

@@ -21,7 +21,7 @@ __all__ = ["BLOCKS", "Failing", "Sums", "failing", "joined", "of_whole", "sums_o
 BLOCKS = 6  # of a piece: a piece fails only if it does so without its worst blocks, too
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sums:
     """Squared errors of a stage, in squared noise floors, by block of the log's raster.
 

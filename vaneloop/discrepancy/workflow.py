@@ -25,7 +25,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-@dataclass
+@dataclass(eq=False)
 class Diagnosis:
     """What all stages say together."""
 
@@ -54,7 +54,7 @@ def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
     return [figures for located in locate_stages(stages) for figures in located.signals]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class News:
     """How far a search is.
 

@@ -73,7 +73,7 @@ def as_given(logs: Logs, fit: Fit) -> StageDiagnosis:
     return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
 
 
-@dataclass
+@dataclass(eq=False)
 class ByLog:
     """What an answer (``d``) means for each log.
 

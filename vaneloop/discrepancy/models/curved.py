@@ -44,7 +44,7 @@ SHAPES = {
 }  # what may be known of a curve
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Quantity:
     """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had; of stops,
     the radii.
@@ -76,7 +76,7 @@ class Quantity:
         return is_memory(self.name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A curve that may be missing.
 

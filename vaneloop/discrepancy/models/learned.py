@@ -30,7 +30,7 @@ BAND = 0.90
 BINS = 24
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LearnedLaw:
     """A law that was learned.
 

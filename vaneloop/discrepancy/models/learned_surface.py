@@ -23,7 +23,7 @@ SHOWN = 9  # places each way of its JSON, as many as of its curve
 SAMPLES = 1_000  # places where the logs have been that a page shows
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LearnedSurface(LearnedLaw):
     """A law of two quantities that was learned; its curve is that of the first where the second is in its middle.
 

@@ -13,7 +13,7 @@ from vaneloop.discrepancy.stage import Array
 __all__ = ["Course", "nominal_course"]
 
 
-@dataclass
+@dataclass(eq=False)
 class Course:
     """How the nominal model goes.
 

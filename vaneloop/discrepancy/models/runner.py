@@ -34,7 +34,7 @@ _building = Lock()  # of kernels, by one thread
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
-@dataclass
+@dataclass(eq=False)
 class Placed:
     """A law at a place: effect name, law, kind of place, index of the signal or state there, constant.
 

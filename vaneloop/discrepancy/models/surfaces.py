@@ -27,7 +27,7 @@ __all__ = ["SurfaceCandidate", "may_be_of", "surface_of"]
 SPLINES = 5  # of each quantity
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SurfaceCandidate(Candidate):
     """A surface that may be missing: a curve's candidate with another quantity.
 

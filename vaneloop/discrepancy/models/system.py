@@ -41,7 +41,7 @@ def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: floa
     return Parameter(name, value, unit, low, high, np.inf)
 
 
-@dataclass
+@dataclass(eq=False)
 class Record:
     """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured.
 

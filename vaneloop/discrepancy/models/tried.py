@@ -80,7 +80,7 @@ class Ground(Protocol):
         """The error of every sample of the logs that are fitted."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Tried:
     """A curve fitted beside the model, and curves before it.
 
@@ -126,7 +126,7 @@ class Tried:
         return curve.at(q, curve.row(amplitudes))
 
 
-@dataclass
+@dataclass(eq=False)
 class Outcome:
     """What learning says.
 

@@ -72,7 +72,7 @@ LEAST_FLOOR = {
 }  # border units: nobody measures finer
 
 
-@dataclass
+@dataclass(eq=False)
 class Chain:
     """The stages of one log.
 
