@@ -757,6 +757,27 @@ def test_a_formula_that_does_as_well_as_its_curve_is_the_law(tmp_path: Path) -> 
     assert law.reach[0] < -0.7 and law.reach[1] > 0.7  # where the test log has been
 
 
+def weighed(seed: int, size: float) -> Record:
+    """A slide that is moved, on which a constant force acts that nobody listed."""
+    run = hardening(seed, size)
+    way, force = run.columns["way"], run.columns["force"]
+    return Record(run.name, run.t, {"way": way, "force": force - 90.0 * way**3 + 1.3})
+
+
+def test_a_constant_is_said_as_one_and_holds_on_a_log_that_goes_further() -> None:
+    """A curve that is nearly one stays at its ends as chance has it: there it harms, and makes way."""
+    system = System(
+        "slide", "force", lambda u, p: p.mass * u.acceleration + p.viscous * u.velocity, position="way",
+        outputs={"force": "N"}, without=["force.force_offset"],
+        parameters=[unknown("mass", 1.0, "kg", low=0.0), unknown("viscous", 3.0, "N s/m", low=0.0)],
+    )  # fmt: skip
+    said = learn([weighed(1, 0.3), weighed(2, 0.25)], system, test=[weighed(3, 0.5)])
+    (law,) = said.laws
+    assert law.spoken.form == "constant" and law.spoken.numbers["a"] == pytest.approx(1.3, abs=0.01)
+    assert law.sentence() == f"a constant is added to the force, {law.spoken.text}"
+    assert max(said.by_log.tested().values()) < 1.2  # noise floors
+
+
 def test_a_force_of_position_or_speed_is_one_at_the_place_itself() -> None:
     t = np.arange(0.0, 20.0, 0.02)
     boom = System(

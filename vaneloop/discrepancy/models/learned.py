@@ -72,6 +72,11 @@ class LearnedLaw:
         return (self.how, self.at, mine) == (other.how, other.at, its)
 
     @property
+    def constant(self) -> bool:
+        """Whether it is the same whatever its quantity is."""
+        return self.spoken is not None and self.spoken.form == "constant"
+
+    @property
     def of_what(self) -> str:
         """Of which quantity it is a function."""
         return self.of
@@ -87,7 +92,7 @@ class LearnedLaw:
     def range_note(self) -> str:
         """Where its quantity has been, what it does beyond, and what the law file has of it, in words."""
         has = "the formula, which does as well as the curve" if self.spoken else "the curve"
-        if period_of(self.of):
+        if period_of(self.of) or self.constant:
             return f"{self.name}: the law file has {has}"
         been = f"{self.name}: {self.of} has been in {range_of(self.x, self.of_unit)}; the law file has {has}"
         if not self.spoken:
@@ -103,6 +108,8 @@ class LearnedLaw:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
         if period := period_of(self.of):
             what = f"a function of the time within each {period:.6g} s"
+        if self.constant:
+            what = "a constant"
         does = {
             "parameter times": f"{self.at} is multiplied by 1 + {what}",
             "input adds": f"{what} is added to {self.at}",

@@ -142,26 +142,22 @@ class Learner:
             good = without_memory(self, current, good)
             self._tell_apart(good, left)
             near = self._near(current, good, left)
-            best = next((t for t in near if self._confirmed(current, t)), None)
+            best, harms = None, []
+            for chosen in (t for t in near if self._confirmed(current, t)):  # what harms makes way for the next
+                last, why = self._as_learned(current, chosen)
+                if not why:
+                    best = last
+                    break
+                harms.append(f"{last.candidate.name} fits, but is not learned: {why}")
             if best is None:
-                out.notes.append(
+                forgets = (
                     f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
                     f"another amplitude confirms it"
                 )
+                out.notes += harms[:1] or [forgets]
                 break
-            limit = left[best.candidate.name] + RIVAL
-            rivals = [t.candidate.name for t in good if t is not best and left[t.candidate.name] < limit]
-            best = self._with_its_lag(current, best, TIMES[1:])
-            best = self._settled(current, best)
-            why = self._harmful(current, best)
-            if why or self.form.fails(best.fit):
-                best.formulas = fitted_formulas(self.ground, best)
-            speaking = [f for _, f in best.formulas or () if not self._harmful(current, f)]
-            if why and not (
-                self.speaks and any(self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL for f in speaking)
-            ):
-                out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
-                break
+            limit = left[chosen.candidate.name] + RIVAL
+            rivals = [t.candidate.name for t in good if t is not chosen and left[t.candidate.name] < limit]
             current, fit = replace(best, rivals=rivals), best.fit
             out.tried.append(current)
             # what splines do not follow is no second law where a formula does
@@ -172,6 +168,19 @@ class Learner:
             self._spare_first(out)
         put_surface(self, out)
         return self._concluded(out, named)
+
+    def _as_learned(self, current: Tried, tried: Tried) -> tuple[Tried, str]:
+        """A curve with the lag that suits it best, and without what parameters of the model can have; and why it is not
+        learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
+        """
+        best = self._settled(current, self._with_its_lag(current, tried, TIMES[1:]))
+        why = self._harmful(current, best)
+        if why or self.form.fails(best.fit):
+            best.formulas = fitted_formulas(self.ground, best)
+        for _, f in best.formulas or () if why and self.speaks else ():
+            if not self._harmful(current, f) and self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL:
+                why = ""
+        return best, why
 
     def _spare_first(self, out: Outcome) -> None:
         """Take out a first curve that only stood for what the second one is."""
