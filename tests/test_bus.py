@@ -264,7 +264,11 @@ class TestLocal(BusTests):
             for k in range(50):
                 a.send(data_frame(0x0A0, bytes([k] * 8)))
             heard = [logger.stdout.readline().decode() for _ in range(50)]
-            logger.send_signal(signal.SIGINT)
+            until = time.monotonic() + PATIENCE
+            while logger.poll() is None and time.monotonic() < until:  # an interrupt can be lost in a destructor
+                logger.send_signal(signal.SIGINT)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    logger.wait(5.0)
             assert b" ID: " not in logger.communicate(timeout=PATIENCE)[0]  # no frame came twice
         finally:
             logger.kill()
