@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import zip_longest
 
 import numpy as np
@@ -221,10 +220,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         -mean(values),
     )
     further = (*tried.curves[:-1], (placed(*goes_on(ground, c, form, values)), effect))  # on test logs
-    as_it = replace(
-        tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None, loose=None
-    )
-    return formula, as_it
+    return formula, tried.refitted(judge, fit, further)
 
 
 # forms that are laws of the library, where the curve is of what is at its own place

@@ -136,7 +136,4 @@ def _in_place(
         formula, text=text, numbers=dict(zip(form.numbers, (float(v) for v in values), strict=True)),
         error=rms_of(judge, fit), level=0.0,
     )  # fmt: skip
-    tried = replace(
-        now, judge=judge, fit=fit, curves=tuple(curves), told=None, errors=None, rows=None, formulas=None, loose=None
-    )
-    return tried, said
+    return now.refitted(judge, fit, tuple(curves)), said

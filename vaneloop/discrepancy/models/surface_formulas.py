@@ -220,10 +220,7 @@ def _fitted(
         one.complexity + other.complexity, "", -mean(values), other.name,
     )  # fmt: skip
     further = (*tried.curves[:-1], (placed(reach_of(ground, tried, formula)), effect))
-    now = replace(
-        tried, judge=judge, fit=fit, curves=further, told=None, errors=None, rows=None, formulas=None, loose=None
-    )
-    return formula, now
+    return formula, tried.refitted(judge, fit, further)
 
 
 def reach_of(ground: Ground, tried: Tried, formula: Product) -> Ends:

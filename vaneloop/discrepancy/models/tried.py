@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -104,6 +104,12 @@ class Tried:
     rows: tuple[Array, Array] | None = None
     formulas: list[tuple[Formula, Tried]] | None = None
     loose: list[Tried] | None = None
+
+    def refitted(self, judge: Judge, fit: Fit, curves: Placings) -> Tried:
+        """The same candidate as another fit has it: nothing that was worked out of this one holds of that."""
+        return replace(
+            self, judge=judge, fit=fit, curves=curves, told=None, errors=None, rows=None, formulas=None, loose=None
+        )
 
     def counted(self, known: Array) -> Blocks:
         """What its blocks hold at samples that count."""
