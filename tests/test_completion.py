@@ -64,7 +64,7 @@ def asked(shell: str, text: str, folder: Path) -> str:
     flags = ["-f"] if shell == "zsh" else ["--no-config"] if shell == "fish" else ["--norc"]
     home = dict(os.environ, HOME=str(folder))
     done = subprocess.run(
-        [shell, *flags], input=text, text=True, capture_output=True, check=True, cwd=folder, env=home, timeout=60
+        [shell, *flags], input=text, text=True, capture_output=True, check=True, cwd=folder, env=home, timeout=600
     )
     assert not done.stderr
     return done.stdout

@@ -207,7 +207,7 @@ def test_a_frame_passes_between_python_can_and_can_utils_both_ways() -> None:
             seen, _ = foreign.communicate(timeout=PATIENCE)
         assert re.fullmatch(rf"\(\d+\.\d{{6}}\) {INTERFACE} 123#0001020304050607\n", seen)
         subprocess.run(["cansend", INTERFACE, "0A0#DEADBEEF"], check=True, timeout=PATIENCE)
-        received = bus.recv(timeout=5.0)
+        received = bus.recv(timeout=PATIENCE)
     assert received is not None
     assert (received.arbitration_id, bytes(received.data)) == (0x0A0, bytes.fromhex("DEADBEEF"))
 

@@ -92,7 +92,7 @@ class Server:
 
     def stop(self) -> None:
         self.process.send_signal(signal.SIGINT)
-        self.process.wait(60)
+        self.process.wait(600)
 
 
 def renamed(path: Path) -> None:
@@ -255,7 +255,7 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     page.keyboard.press("Enter")
     page.get_by_text("stopped").wait_for()
     holds_focus(page, ".find-missing")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600
     while during & set(server.workers()) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not during & set(server.workers())  # workers and the spare process that had nothing to do stay
@@ -994,7 +994,7 @@ def answer_of(
     """One request with headers of our own; status, headers by small names and content of the answer."""
     from http.client import HTTPConnection
 
-    connection = HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = HTTPConnection("127.0.0.1", server.port, timeout=600)
     connection.request(method, path, body=body, headers={k.replace("_", "-"): v for k, v in headers.items()})
     answer = connection.getresponse()
     return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read().decode("utf-8", "replace")
@@ -1282,7 +1282,7 @@ def raw_status(server: Server, request: bytes) -> int:
     """Status of the answer to these bytes; 0 where the connection is only closed."""
     import socket
 
-    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as s:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=600) as s:
         with contextlib.suppress(OSError):  # closed before it has read all of it
             s.sendall(request)
             s.shutdown(socket.SHUT_WR)
