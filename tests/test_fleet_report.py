@@ -131,6 +131,21 @@ def test_onsets_and_growth_are_found_and_their_intervals_hold() -> None:
     assert 0.82 <= np.mean([f.onset_low <= x[3] <= f.onset_high for f, x in named]) <= 0.97
 
 
+@pytest.mark.parametrize(("common", "least", "most"), [(0.0, 0.85, 0.95), (1.0, 0.85, 0.95), (3.0, 0.85, 0.99)])
+def test_growth_is_as_uncertain_as_its_logs_scatter_whatever_they_have_wrong_alike(
+    common: float, least: float, most: float
+) -> None:
+    """Each log claims the scatter and what all of them have wrong alike, in scatters; the latter moves the level."""
+    rng, inside = np.random.default_rng(round(common)), []
+    for _ in range(400):
+        t, y, _, onset, rate = series(rng, 24, 9.0, "growth")
+        f = trend(t, y + rng.normal(0.0, common), np.full(24, np.hypot(1.06, common)))
+        if f.kind == "growth":
+            inside.append(f.rate_low <= rate <= f.rate_high)
+            assert f.now_high - f.now_low > 2.0 * common or common == 0.0
+    assert len(inside) > 350 and least <= np.mean(inside) <= most
+
+
 def test_the_time_to_a_limit_is_within_its_interval() -> None:
     inside = []
     for f, (t, _, _, onset, rate) in shares("growth", 50, 8.0, 150, 5):

@@ -8,10 +8,9 @@ standard deviation s that each log gives.
     growth   y = a + g max(t - T, 0)            wear sets in at T (T may be the beginning)
 
 The logs of an engine may differ by more than s: then the scatter b beyond it is estimated with the curve. They may
-differ by less: what a log claims beyond the scatter is wrong in all logs of the engine alike. It shifts the level. How
-far it changes as the quantity grows cannot be seen; but from log to log it changes for a like reason, that another
-motion is shown. So it is taken to change by the scatter of a single log, and by no less than claims come to that are
-averaged over the logs.
+differ by less: what a log claims beyond the scatter is wrong in all logs of the engine alike. It shifts the level, and
+the level's interval has it in full. The growth is as uncertain as the scatter makes it, and no surer than such claims
+are when they are averaged over the logs: logs without any scatter do not make it exact.
 """
 
 from __future__ import annotations
@@ -59,8 +58,8 @@ class Trend:
     p                 probability of so good a fit without any change
     scatter           from log to log, beyond what the logs say of themselves
     lines             curves that fit about as well, a row each: T, a, g, variance of a, covariance, variance of g, how
-                      many of their deviations still fit, and by how much all logs alike may have a and g wrong; the
-                      intervals are what all of them allow together
+                      many of their deviations still fit, by how much all logs alike may have a wrong, and how far g is in
+                      doubt at least; the intervals are what all of them allow together
     """
 
     kind: Kind
@@ -128,12 +127,11 @@ def _changed(
     room = float(stats.f.ppf(LEVEL, 1, freedom)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
     kept, q = fits[room >= 0.0], np.sqrt(room[room >= 0.0])
     most = squares / float(stats.chi2.ppf(1.0 - LEVEL, freedom))  # scatter that chance allows
-    alike, one = np.sqrt(np.maximum([1.0 - most, sigma2], 0.0)) * np.sqrt(told.sum() / w[told].sum())
+    alike = np.sqrt(max(1.0 - most, 0.0) * told.sum() / w[told].sum())
     full = np.maximum(t[-1] - kept[:, 0], 1e-9) if kind == "growth" else np.ones(len(kept))
-    moves = np.clip(one, alike / np.sqrt(told.sum()), alike)
-    wrong = np.column_stack([np.full(len(kept), alike), moves / full]) * HALF
+    wrong = np.column_stack([np.full(len(kept), alike), alike / np.sqrt(told.sum()) / full]) * HALF
     lines = np.column_stack([kept[:, :3], kept[:, 4:] * sigma2, q, wrong])
-    rate, half = lines[:, 2], np.hypot(q * np.sqrt(lines[:, 5]), lines[:, 8])
+    rate, half = lines[:, 2], np.maximum(q * np.sqrt(lines[:, 5]), lines[:, 8])
     now, now_half = _along(lines, t[-1] - lines[:, 0] if kind == "growth" else np.ones(len(lines)))
     end = float(a + g * (t[-1] - T if kind == "growth" else 1.0))
     return Trend(
@@ -146,8 +144,8 @@ def _changed(
 def _along(lines: Array, late: Array) -> tuple[Array, Array]:
     """Level of each line at ``late`` years after its beginning, and half its interval."""
     _, a, g, vaa, vag, vgg, q, level, growth = lines.T
-    own = q**2 * np.maximum(vaa + 2.0 * late * vag + late**2 * vgg, 0.0)
-    return a + g * late, np.sqrt(own + level**2 + (late * growth) ** 2)
+    own = q * np.sqrt(np.maximum(vaa + 2.0 * late * vag + late**2 * vgg, 0.0))
+    return a + g * late, np.hypot(np.maximum(own, late * growth), level)
 
 
 def limit_of(found: Trend, t_last: float, limit: float) -> Limit:
