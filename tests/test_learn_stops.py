@@ -26,6 +26,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
 from vaneloop.discrepancy.models.learning import Learner
+from vaneloop.discrepancy.models.memory import BEFORE, forgotten, of_stops
 from vaneloop.discrepancy.models.tried import Tried
 from vaneloop.discrepancy.models.vane_stages.driven import Made
 from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, SLIPS, VaneGround, with_laws
@@ -84,6 +85,26 @@ def test_a_way_round_costs_energy_and_its_loop_closes(seed: int) -> None:
     first, second = gives[400:801], gives[800:]  # whole ways round, with the step that closes them
     assert second[1:-1] == pytest.approx(first[1:-1], abs=1e-9)
     assert np.sum(0.5 * (second[1:] + second[:-1]) * np.diff(course[800:])) >= -1e-9
+
+
+@given(st.integers(0, 2**31))
+def test_where_a_hysteresis_has_forgotten_what_was_before_the_log_it_is_what_it_is_from_rest(seed: int) -> None:
+    """Whatever its channel did before. It is never sure of the last part of its height that wide stops give."""
+    rng = np.random.default_rng(seed)
+    before, log = (rng.uniform(-6.0, 6.0) + np.cumsum(0.3 * rng.standard_normal(400)) for _ in range(2))
+    table = -np.tanh(np.linspace(0.0, 8.0, POINTS) * rng.uniform(0.3, 2.0))
+    whole = np.concatenate([before, np.linspace(before[-1], log[0], 50), log])
+    known, rest = forgotten(log, 8.0, table), of_stops(log, 0.0, 8.0, table)
+    after = of_stops(whole, 0.0, 8.0, table)[-len(log) :]
+    assert known.any() or np.ptp(log) < 16.0
+    assert np.all(np.abs(after - rest)[known] < 2.0 * BEFORE * np.max(np.abs(table)) + 0.01)
+
+
+def test_a_channel_that_has_hardly_moved_is_sure_of_nothing_and_one_that_went_everywhere_of_all_after_it() -> None:
+    table = np.linspace(0.0, 1.0, POINTS)  # slips at 5 only
+    assert not forgotten(np.sin(np.linspace(0.0, 20.0, 200)), 5.0, table).any()
+    there = np.concatenate([np.linspace(0.0, 10.0, 101), np.zeros(50)])
+    assert np.flatnonzero(forgotten(there, 5.0, table))[0] in (95, 96) and forgotten(there, 5.0, table)[100:].all()
 
 
 def test_stops_of_nothing_change_no_bit() -> None:

@@ -76,7 +76,7 @@ class Judge:
         """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured
         ones).
         """
-        self.stage, self.floor, self._latest = stage, np.asarray(floor, dtype=float), Latest()
+        self.stage, self.floor, self._latest, self.keep = stage, np.asarray(floor, dtype=float), Latest(), keep
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
         self.sparing = False  # one ends when a step takes off less than `STILL` of what it leaves beyond noise

@@ -57,7 +57,7 @@ def visited_figure(law: LearnedLaw) -> Figure:
 
 COLUMNS = ["formula", "held-out error, noise floors", "law of the library"]
 HOW = "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first."
-BAND = "The band holds the curve in 90 % of draws of the log's blocks."
+BAND = "The band holds the curve, as a whole, in 90 % of draws of the log's blocks."
 ABOUT = (
     f"{BAND} Dashed: no log has been there, and the curve stays as at its end. A formula that is the law goes on; the "
     f"notes say how far."

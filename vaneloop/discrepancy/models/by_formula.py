@@ -38,9 +38,8 @@ def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
     """Those of what is at their place itself that explain most of the error: where one is a corner, splines leave a
     tenth of it, and what follows them elsewhere leaves less.
     """
-    n = before.judge.n
-    most = MOST_LEFT * max(float(before.fit.cost.sum()) - n, 0.0) + n
-    return [t for t in good if strange(t.candidate) == 0 and float(t.fit.cost.sum()) <= most]
+    most = MOST_LEFT * max(float(before.fit.cost.sum()) / before.judge.n - 1.0, 0.0) + 1.0
+    return [t for t in good if strange(t.candidate) == 0 and float(t.fit.cost.sum()) / max(t.judge.n, 1) <= most]
 
 
 def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]) -> list[Tried]:
@@ -67,7 +66,7 @@ def without_memory(learner: Learner, before: Tried, good: list[Tried]) -> list[T
     much.
     """
     plain = [t for t in good if not t.candidate.quantity.remembers]
-    enough = any(not learner.form.fails(t.fit) and not learner._harmful(before, t) for t in plain)
+    enough = any(not learner.fails(t) and not learner._harmful(before, t) for t in plain)
     return plain if enough else good
 
 

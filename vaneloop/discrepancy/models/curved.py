@@ -88,6 +88,7 @@ class Candidate:
     untold of its mean (0) and slope (1): what it has not, as the logs do not tell it from fitted parameters
     shape  what is known of it beforehand (`SHAPES`)
     jump   whether it has a jump, too, where its quantity is 0
+    settled  samples at which it does not remember what was before the log; None: all
     """
 
     name: str
@@ -103,6 +104,7 @@ class Candidate:
     untold: tuple[int, ...] = ()
     shape: tuple[str, ...] = ()
     jump: bool = False
+    settled: Array | None = None
 
     @property
     def lent(self) -> set[int]:

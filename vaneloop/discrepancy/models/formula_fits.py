@@ -198,7 +198,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         return c.placed_as(lambda n: table(plain(n)) - mean(plain(n)), len(numbers), (low, high), jumps)
 
     curves = (*tried.curves[:-1], (placed(*reach), effect))
-    judge = Judge(ground.stage((), curves), ground.floor)
+    judge = Judge(ground.stage((), curves), ground.floor, tried.settled)
     judge.sparing = True
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):

@@ -105,7 +105,8 @@ def surface_law_of(before: tuple[Judge, Fit], tried: Tried) -> LearnedSurface:
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     assert isinstance(c, SurfaceCandidate)
     table, amplitudes = tried.table()
-    values, (low, high), (x, across) = table(amplitudes), band_of(tried), c.grids
+    within = (c.nearest == np.arange(SIDE * SIDE)).reshape(SIDE, SIDE)
+    values, (low, high), (x, across) = table(amplitudes), band_of(tried, within), c.grids
     good = np.isfinite(c.quantity.visited) & np.isfinite(c.other.visited)
     both = np.stack([c.quantity.visited[good], c.other.visited[good]])
     some = both[:, np.linspace(0, both.shape[1] - 1, min(both.shape[1], SAMPLES)).astype(int)]
@@ -117,6 +118,6 @@ def surface_law_of(before: tuple[Judge, Fit], tried: Tried) -> LearnedSurface:
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
         likely_products(tried, rms_of(*before)), rivals=list(tried.rivals),
         second=c.other.name, second_unit=c.other.unit, middle=float(across[k]), across=across, values=values,
-        lowest=low, highest=high, within=(c.nearest == np.arange(SIDE * SIDE)).reshape(SIDE, SIDE), samples=some,
+        lowest=low, highest=high, within=within, samples=some,
         been=c.been, knots_across=c.across.knots,
     )  # fmt: skip

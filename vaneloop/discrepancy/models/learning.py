@@ -73,7 +73,7 @@ QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of th
 SURE = 3  # of the latter that are chosen by data left out
 SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
-PLAINER = 2  # more that are fitted to the end, where they are plainer than the best
+PLAINER = 2  # more that are fitted to the end, where they are plainer than the best; and as many at their place itself
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
@@ -108,8 +108,14 @@ class Learner:
             in_grains(ground, grain_of(self.judge, self.base), [self.judge])
         self.candidates = [s for c in ground.candidates(self.base.theta) if (s := c.shaped(shape)) is not None]
 
-    def _judge(self, laws: Sequence[str], curves: Placings, quick: bool = False) -> Judge:
-        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor)
+    def _judge(
+        self, laws: Sequence[str], curves: Placings, quick: bool = False, keep: Array | None = None
+    ) -> Judge:  # fmt: skip
+        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor, keep)
+
+    def fails(self, tried: Tried) -> bool:
+        """Whether there is any error beyond noise where it is judged."""
+        return not agrees(rms_of(tried.judge, tried.fit), 1.0)
 
     def learned(self) -> Outcome:
         """Curves one after the other, each earning its place; at most two."""
@@ -124,9 +130,8 @@ class Learner:
             out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
             return out
         current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
-        fit = self.base
         while current is not None and len(out.tried) < MOST_CURVES:
-            if not self.form.fails(fit) and (out.tried or not (unknown or self.faint)):
+            if not self.fails(current) and (out.tried or not (unknown or self.faint)):
                 break
             finalists = self._finalists(current)
             out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
@@ -158,10 +163,10 @@ class Learner:
                 break
             limit = left[chosen.candidate.name] + RIVAL
             rivals = [t.candidate.name for t in good if t is not chosen and left[t.candidate.name] < limit]
-            current, fit = replace(best, rivals=rivals), best.fit
+            current = replace(best, rivals=rivals)
             out.tried.append(current)
             # what splines do not follow is no second law where a formula does
-            done = any(not self.form.fails(f.fit) for _, f in current.formulas or ())
+            done = any(not self.fails(f) for _, f in current.formulas or ())
             if done or best.candidate.name in [t.candidate.name for t in only_said]:
                 break
         if len(out.tried) > 1:
@@ -175,7 +180,7 @@ class Learner:
         """
         best = self._settled(current, self._with_its_lag(current, tried, TIMES[1:]))
         why = self._harmful(current, best)
-        if why or self.form.fails(best.fit):
+        if why or self.fails(best):
             best.formulas = fitted_formulas(self.ground, best)
         for _, f in best.formulas or () if why and self.speaks else ():
             if not self._harmful(current, f) and self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL:
@@ -235,6 +240,8 @@ class Learner:
         for q in {q.name: q for t in among for q, _ in t.candidate.axes}.values():
             if (values := at_samples(q.visited, n)) is not None:
                 known &= told_by_others(values, start)
+        for settled in (t.settled for t in among):
+            known &= True if settled is None else settled
         return known if known.any() else ~known
 
     def _judged(self, tried: Tried, among: Sequence[Tried]) -> tuple[Judge, Fit]:
@@ -283,10 +290,10 @@ class Learner:
         go astray. Every formula counts as many numbers as the sparest of these curves, however many its own has.
         """
         best = min(good, key=lambda t: left[t.candidate.name])
-        costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum())) for t in good}]
+        costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum() / t.judge.n)) for t in good}]
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
         close += [t for t in at_its_place(before, good) if t not in close]
-        if not (self.form.fails(best.fit) or self._harmful(before, best)):
+        if not (self.fails(best) or self._harmful(before, best)):
             close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         if not close:
             return
@@ -304,7 +311,7 @@ class Learner:
         """
         plain_ones = [t for t in good if strange(t.candidate) <= 1]
         best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
-        if best is None or self.form.fails(best.fit):
+        if best is None or self.fails(best):
             return
         for t in plain_ones:
             (_, worse), (_, fit) = (self._judged(one, [t, best]) for one in (t, best))
@@ -354,7 +361,7 @@ class Learner:
         parts = [log == k for k in range(log.max() + 1)] if log.any() else [large, ~large]
         if not large.any() or not log.any() and not np.median(far[large]) > OTHER * np.median(far[~large]) > 0.0:
             return False
-        fit, now = tried.fit, before.fit.cost
+        fit, now = tried.fit, before.fit.cost if tried.settled is None else before.counted(tried.settled)[0]
         for held in parts:
             step = step_without(tried, held)
             left = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
@@ -428,7 +435,7 @@ class Learner:
             done.append(self._finished(current, t))
             self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
         if self.faint and done:
-            nearest = min(done, key=lambda t: float(t.fit.held_out.sum()))
+            nearest = min(done, key=lambda t: rms_of(t.judge, t.fit))
             grain = grain_of(nearest.judge, nearest.fit)
             in_grains(self.ground, grain, [self.judge, *(t.judge for t in (*quick, *done))])
         done = self._ordered(done)
@@ -437,16 +444,19 @@ class Learner:
             reach = min(score(t.judge, t.fit) for t in quick) + NEAR
             plainer = [t for t in quick if t.candidate.name not in have and plain(t.candidate) < plain(leader)]
             alike = {t.candidate.name for t in plainer if channel_of(t.candidate) == channel_of(leader)}
+            home = sorted(at_its_place(current, plainer), key=lambda t: float(t.fit.cost.sum()))[:PLAINER]
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
-            done = self._ordered([*done, *(self._finished(current, t) for t in plainer[:PLAINER])])
-        if done and self.form.fails(done[0].fit):  # a curve may turn more often than its splines
+            more = dict.fromkeys([*plainer[:PLAINER], *home])
+            done = self._ordered([*done, *(self._finished(current, t) for t in more)])
+        if done and self.fails(done[0]):  # a curve may turn more often than its splines
             best = self._score(done[0], done)
             close = [t for t in done if self._score(t, done) < best + NEAR]
-            finer = [f for t in close if (f := self._finer(current, t)) is not None]
+            finer = {t: f for t in close if (f := self._finer(current, t)) is not None}
             close = [t for t in done if self._score(t, done) < best + FORMULAS]
             jumping = [j for t in close if (j := self._jumping(current, t)) is not None]
-            done = self._ordered([*done, *finer, *jumping])
+            coarse = [t for t in done if t in finer and self._worth(t, finer[t])]  # a second law would patch them
+            done = self._ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
             first_of = {t.candidate.name: t for t in reversed(done)}
             done = [t for t in done if first_of[t.candidate.name] is t]
         return done
@@ -458,7 +468,10 @@ class Learner:
     def _finished(self, current: Tried, quick: Tried) -> Tried:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
-        return self._with_its_lag(current, smoothed(self, current, quick.candidate, begin, WIGGLES), TIMES[:1])
+        done = smoothed(self, current, quick.candidate, begin, WIGGLES)
+        if (settled := done.forgotten()) is not None:  # what was before the log is no matter of the curve
+            done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, WIGGLES, done.wiggle)
+        return self._with_its_lag(current, done, TIMES[:1])
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
@@ -489,7 +502,8 @@ class Learner:
         ``wiggle`` makes it, on the same samples.
         """
         curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
-        judge = self._judge((), curves, quick)
+        settled = [s for s in (current.settled, candidate.settled) if s is not None and not quick]
+        judge = self._judge((), curves, quick, np.logical_and.reduce(settled) if settled else None)
         judge.sparing = True
         names = tuple(e.name for _, e in curves)
         fit = with_held_out(judge, judge.fit(names, begin, iterations))

@@ -14,9 +14,10 @@ from vaneloop.base.durations import in_name, named_lag
 from vaneloop.base.hysteresis import STOPS, slipped, weights_of
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["STOPS", "dissipates", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
+__all__ = ["STOPS", "dissipates", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
 
 COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
+BEFORE = 0.05  # share of a hysteresis's height that may be of what was before the log
 NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
 
 
@@ -53,3 +54,16 @@ def dissipates(low: float, high: float, table: Array) -> bool:
     weights = weights_of(low, high, table, COARSE)[:-1]  # the last one stands for all that is wider
     size = float(np.abs(weights).sum())
     return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE * size
+
+
+def forgotten(q: Array, high: float, table: Array) -> Array:
+    """Where a hysteresis with this virgin curve, from 0 to ``high``, has forgotten what its channel ``q`` did before;
+    bool[samples].
+
+    A channel that has gone a way R from one end to the other has moved stops of radius R / 2 to where they stand after
+    any start. What wider ones give is the rest of the virgin curve: how far it goes on from its height at R / 2.
+    """
+    way = np.maximum.accumulate(q) - np.minimum.accumulate(q)
+    highest, lowest = (f.accumulate(table[::-1])[::-1] for f in (np.maximum, np.minimum))
+    rest = np.interp(0.5 * way, np.linspace(0.0, high, len(table)), np.maximum(highest - table, table - lowest))
+    return np.asarray(np.maximum.accumulate(rest <= BEFORE * np.max(np.abs(table))))

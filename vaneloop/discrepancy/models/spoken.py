@@ -118,7 +118,7 @@ def _in_place(
     table, jump = runs(form, *reach, ground.points)
     curves = list(now.curves)
     curves[k] = (c.placed_as(table, len(numbers), reach, jump), effect)
-    judge = Judge(ground.stage((), tuple(curves)), ground.floor)
+    judge = Judge(ground.stage((), tuple(curves)), ground.floor, now.settled)
     theta, index = judge.stage.neutral(), judge.stage.index()
     theta[: len(own)] = own
     for name, at in now.judge.stage.index().items():

@@ -40,7 +40,7 @@ def put_surface(learner: Learner, out: Outcome) -> None:
     before = (last.judge, last.fit) if last else (learner.judge, learner.base)
     if not learner.ground.surfaces or learner.shape or not learner.ranked or rms_of(*before) <= UNKNOWN:
         return
-    if last and any(not learner.form.fails(f.fit) for _, f in last.formulas or ()):
+    if last and any(not learner.fails(f) for _, f in last.formulas or ()):
         return
     nothing = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     done = _finished(learner, nothing)
@@ -95,7 +95,7 @@ def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
     quick = [learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True) for t in begun[:QUICK]]
     quick.sort(key=lambda t: score(t.judge, t.fit))
     done = learner._ordered([smoothed(learner, nothing, t.candidate, t.fit, WIGGLES) for t in quick[:FINISHED]])
-    if done and learner.form.fails(done[0].fit):
+    if done and learner.fails(done[0]):
         close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
         done = learner._ordered([*done, *(f for t in close if (f := _finer(learner, nothing, t)) is not None)])
     first_of = {t.candidate.name: t for t in reversed(done)}

@@ -13,7 +13,7 @@ from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import Blocks
-from vaneloop.discrepancy.models.memory import named_lag
+from vaneloop.discrepancy.models.memory import forgotten, named_lag
 from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 Placings = tuple[tuple[Placed, Effect], ...]
+LEAST_SETTLED = 0.5  # share of the samples that must be left where those that remember what was before are not counted
 
 
 class Ground(Protocol):
@@ -104,6 +105,21 @@ class Tried:
     rows: tuple[Array, Array] | None = None
     formulas: list[tuple[Formula, Tried]] | None = None
     loose: list[Tried] | None = None
+
+    @property
+    def settled(self) -> Array | None:
+        """Samples at which none of its curves remembers what was before the log; None: all."""
+        return self.judge.keep
+
+    def forgotten(self) -> Array | None:
+        """Of a hysteresis, the samples at which it has forgotten what was before the log; None: all, or hardly any."""
+        c, n = self.candidate, len(self.judge.stage.t)
+        if not c.quantity.stops:
+            return None
+        table, amplitudes = self.table()
+        known = np.concatenate([forgotten(q, c.basis.high, table(amplitudes)) for q in c.quantity.course])
+        known = known[:: max(1, round(len(known) / n))][:n]
+        return None if known.all() or known.mean() < LEAST_SETTLED else known
 
     def refitted(self, judge: Judge, fit: Fit, curves: Placings) -> Tried:
         """The same candidate as another fit has it: nothing that was worked out of this one holds of that."""
