@@ -238,7 +238,7 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
     n, x = 600, np.linspace(-1.0, 1.0, 600)
     rows = np.stack([np.sin(9.0 * x), np.ones(n), x], axis=1)
 
-    def tried(at: str, mean: float, slope: float) -> Tried:
+    def tried(at: str, mean: float, slope: float, of: str = "q") -> Tried:
         y = rows @ np.array([0.3, mean, slope]) + rng.standard_normal(n)
         theta = np.linalg.lstsq(rows, y, rcond=None)[0]
         e = y - rows @ theta
@@ -249,8 +249,9 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
             free=np.arange(3), theta=theta, prior=np.zeros(3), cost=np.array([e @ e]), gradients=(j.T @ e)[None],
             normals=(j.T @ j)[None],
         )  # fmt: skip
-        one = cast(Tried, SimpleNamespace(candidate=SimpleNamespace(how="adds", at=at, name="c", kept=[0, 1]),
-                                          fit=fit, judge=judge))  # fmt: skip
+        quantity = SimpleNamespace(name=of, period=0.0, remembers="lagged" in of)
+        c = SimpleNamespace(how="adds", at=at, name="c", kept=[0, 1], quantity=quantity, near=False)
+        one = cast(Tried, SimpleNamespace(candidate=c, fit=fit, judge=judge))
         only = np.linalg.lstsq(rows[:, :2], y, rcond=None)[0]
         assert left_by_its_mean(one) == pytest.approx(np.sum((y - rows[:, :2] @ only) ** 2))
         return one
@@ -263,6 +264,8 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
     )
     assert one_constant([bent, flat, again, elsewhere]) == [bent, flat, elsewhere]
     assert one_constant([again, flat, bent]) == [again, bent]
+    late = tried("a", 9.0, 0.0, "q_lagged_by_3_s")
+    assert one_constant([late, bent, flat, again]) == [flat, bent]  # the plainest: all of a log may tell more
 
 
 @given(st.floats(0.2, 30.0), st.sampled_from([-1.0, 1.0]))

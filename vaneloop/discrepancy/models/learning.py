@@ -60,6 +60,7 @@ from vaneloop.discrepancy.models.tried import (
     stands,
     step_without,
     strange,
+    without_its_lag,
 )
 from vaneloop.discrepancy.noise_floor import correlation_of
 from vaneloop.discrepancy.stage import Array
@@ -451,7 +452,7 @@ class Learner:
             done = self._ordered([*done, *(self._finished(current, t) for t in more)])
         if done and self.fails(done[0]):  # a curve may turn more often than its splines
             best = self._score(done[0], done)
-            close = [t for t in done if self._score(t, done) < best + NEAR]
+            close = [t for t in done if self._score(t, done) < best + NEAR or without_its_lag(t, done[0])]
             finer = {t: f for t in close if (f := self._finer(current, t)) is not None}
             close = [t for t in done if self._score(t, done) < best + FORMULAS]
             jumping = [j for t in close if (j := self._jumping(current, t)) is not None]

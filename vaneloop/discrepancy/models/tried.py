@@ -34,6 +34,7 @@ __all__ = [
     "stands",
     "step_without",
     "strange",
+    "without_its_lag",
 ]
 
 Placings = tuple[tuple[Placed, Effect], ...]
@@ -199,23 +200,30 @@ def channel_of(candidate: Candidate) -> str:
     return lag[0] if lag else candidate.quantity.name
 
 
+def without_its_lag(tried: Tried, late: Tried) -> bool:
+    """Whether a curve is at the same place as one that remembers, of the channel behind it: it may say the same."""
+    c, other = tried.candidate, late.candidate
+    same = (c.how, c.at, c.quantity.name) == (other.how, other.at, channel_of(other))
+    return other.quantity.remembers and same
+
+
 def one_constant(tried: Sequence[Tried]) -> list[Tried]:
-    """Of those that are ``tried``, in their order, the first at each place that is no more than a constant there, and
-    all others: a constant is the same law, whatever it is called a function of.
+    """Those that are ``tried``, in their order, but of those that are no more than a constant at one place only the
+    plainest, in the place of the first: a constant is the same law, whatever it is called a function of. The rest of
+    the log may tell more.
 
     More than a constant is what explains as much of what that leaves as a second law has to.
     """
-    out, have = [], set()
+    flat: dict[tuple[str, str], list[Tried]] = {}
     for t in tried:
-        place, left = (t.candidate.how, t.candidate.at), left_by_its_mean(t)
+        left = left_by_its_mean(t)
         known = 2.0 * NATS if t.judge.stage.grain < 1.0 else LEAST_OF_NOISE * t.judge.n
         least = max(LEAST_FALL * (left - t.judge.n), known)
         if left - float(t.fit.cost.sum()) < least:
-            if place in have:
-                continue
-            have.add(place)
-        out.append(t)
-    return out
+            flat.setdefault((t.candidate.how, t.candidate.at), []).append(t)
+    plainest = {id(alike[0]): min(alike, key=lambda t: strange(t.candidate)) for alike in flat.values()}
+    gone = {id(t) for alike in flat.values() for t in alike[1:]}
+    return [plainest.get(id(t), t) for t in tried if id(t) not in gone]
 
 
 def left_by_its_mean(tried: Tried) -> float:
