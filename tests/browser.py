@@ -20,6 +20,10 @@ COLOURS = AXE.replace("]}", "], runOnly: {type: 'rule', values: ['color-contrast
 # A curve is a path for each of its strokes, 13,000 of the 19,000 elements of a replay's page. A path has no words, name
 # or role that a rule could ask for, and axe takes three times as long with them.
 NO_STROKES = "for (const e of document.querySelectorAll('.main-svg path')) e.remove()"
+# A page draws its curves anew some time after the scheme has changed: before that, their colours are the other's, and
+# after it the strokes are back.
+REDRAWN = """(scheme) => [...document.querySelectorAll('.js-plotly-plot')].every((p) => p._fullLayout.font.color ===
+    JSON.parse(document.getElementById('themes').textContent)[scheme].text)"""
 # ms; a slow machine with other work compiles the simulator first
 LONG = 1000.0 * float(os.environ.get("VANELOOP_PATIENCE", "240"))
 WHY_NOT = "no Chromium: apt-get install chromium (make test does, where it may)"
@@ -60,6 +64,7 @@ def look_at(browser: Any, file: Path, name: str, *, every: bool = False) -> None
         assert wide <= width, f"{name}: {wide} px of {width}"
         for scheme in schemes if every else schemes[:1]:
             page.emulate_media(color_scheme=scheme)
+            page.wait_for_function(REDRAWN, arg=scheme, timeout=LONG)
             shot(page, f"report_{name}_{width}_{scheme}")
             page.evaluate(f"() => {{ {NO_STROKES} }}")
             assert not violations(page, AXE if scheme == schemes[0] else COLOURS), f"{name} at {width}, {scheme}"
