@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from vaneloop.base import side_by_side as sharing
+from vaneloop.base.side_by_side import shared_out, side_by_side
 from vaneloop.discrepancy import Record, System, unknown
-from vaneloop.discrepancy.models import runner
+from vaneloop.discrepancy.models import nominal, runner
 from vaneloop.discrepancy.models.smoothness import smoothed
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -69,3 +72,47 @@ def test_smoothness_goes_the_way_that_helps_from_fit_to_fit(
     assert tried[0.1] == 1.0
     assert tried.get(5.0, 1.0) == 1.0
     assert tried.get(0.03, 0.1) == 0.1
+
+
+def test_work_that_is_shared_out_comes_back_in_order_and_is_not_shared_out_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two threads at one time: each item waits for another one's thread."""
+    monkeypatch.setattr(sharing, "threads", lambda: 2)
+    both = threading.Barrier(2, timeout=30.0)
+
+    def work(item: int) -> tuple[int, bool, list[bool], int]:
+        both.wait()
+        return item, shared_out(), list(side_by_side(lambda _: shared_out(), range(3))), threading.get_ident()
+
+    out = list(side_by_side(work, range(6)))
+    assert [item for item, *_ in out] == list(range(6))
+    assert all(mine and all(inner) for _, mine, inner, _ in out)
+    assert len({thread for *_, thread in out}) == 2
+    assert not shared_out()
+    with pytest.raises(ZeroDivisionError):
+        list(side_by_side(lambda k: 1 // k, [1, 0, 1]))
+
+
+def test_states_that_nobody_measures_are_walked_through_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two lags in a row, at rest, under a step: 1 - exp(-t) and 1 - (1 + t) exp(-t)."""
+    walked = []
+    walk = nominal._hidden
+    monkeypatch.setattr(nominal, "_hidden", lambda *of: walked.append(of) or walk(*of))
+
+    def lags(x: Any, u: Any, p: Any) -> Any:
+        return u.v - x.first, x.first - x.second
+
+    t = 0.01 * np.arange(1000)
+    system = System(
+        name="lags", kind="simulate", model=lags, inputs={"v": "V"}, states={"first": "V", "second": "V"},
+        outputs={"sum": "V"}, output=lambda x, u, p: x.first + x.second, start={"first": 0.0, "second": 0.0},
+        parameters=[unknown("unused", 1.0, "-")],
+    )  # fmt: skip
+    record = Record("log", t, {"v": np.ones(1000), "sum": 2.0 - (2.0 + t) * np.exp(-t)})
+    bound = system.bind([record])
+    walked.clear()
+    states = nominal.nominal_course(bound.runner, np.array([1.0])).states
+    np.testing.assert_allclose(states[0][0], 1.0 - np.exp(-t), atol=1e-5)
+    np.testing.assert_allclose(states[1][0], 1.0 - (1.0 + t) * np.exp(-t), atol=1e-5)
+    assert len(walked) == 1

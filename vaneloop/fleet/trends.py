@@ -58,8 +58,8 @@ class Trend:
     p                 probability of so good a fit without any change
     scatter           from log to log, beyond what the logs say of themselves
     lines             curves that fit about as well, a row each: T, a, g, variance of a, covariance, variance of g, how
-                      many of their deviations still fit, by how much all logs alike may have a wrong, and how far g is in
-                      doubt at least; the intervals are what all of them allow together
+                      many of their deviations still fit, by how much all logs alike may have a wrong, and how far g is
+                      in doubt at least; the intervals are what all of them allow together
     """
 
     kind: Kind

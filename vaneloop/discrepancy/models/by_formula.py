@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from vaneloop.base.side_by_side import side_by_side
 from vaneloop.discrepancy.error_share import MOST_LEFT
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.tried import Ground, Tried, strange
@@ -18,7 +19,15 @@ from vaneloop.discrepancy.stage_answer import rms_of
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learning import Learner
 
-__all__ = ["at_its_place", "better_than", "earning_by_formula", "harmless", "in_its_place", "leaves", "without_memory"]
+__all__ = [
+    "all_in_their_place",
+    "at_its_place",
+    "better_than",
+    "earning_by_formula",
+    "harmless",
+    "leaves",
+    "without_memory",
+]
 
 NEAR = 0.25  # log error within which a curve that does not earn its place may do so by a formula
 FAR = 0.5  # log error from which what harms no test log is not taken instead of what does
@@ -32,6 +41,11 @@ def in_its_place(ground: Ground, tried: Tried) -> list[Tried]:
         said = fitted_formulas(ground, tried, loose=True) or fitted_formulas(ground, tried)
         tried.loose = [f for _, f in said]
     return tried.loose
+
+
+def all_in_their_place(ground: Ground, tried: Sequence[Tried]) -> list[list[Tried]]:
+    """`in_its_place` of several curves, side by side."""
+    return list(side_by_side(lambda t: in_its_place(ground, t), tried, ground.shares))
 
 
 def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
@@ -48,7 +62,8 @@ def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], a
     """
     reach = min((learner._score(t, among) for t in among), default=0.0) + NEAR
     near = [t for t in poor if learner._score(t, among) < reach and not t.candidate.quantity.remembers]
-    return [t for t in near if any(learner._worth(before, f) for f in in_its_place(learner.ground, t))]
+    said = all_in_their_place(learner.ground, near)
+    return [t for t, formulas in zip(near, said, strict=True) if any(learner._worth(before, f) for f in formulas)]
 
 
 def harmless(learner: Learner, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:

@@ -229,15 +229,15 @@ class Candidate:
         return self.basis.effect(self.name, self.unit, self.size, wiggle, self.kept, self.jump)
 
 
-def quantities(bound: Bound, values: Array) -> list[Quantity]:
+def quantities(bound: Bound, values: Array, states: Sequence[Sequence[Array]] | None = None) -> list[Quantity]:
     """Every quantity that is known, with the values that it has in the fitted logs; ``values``: the model's own
-    parameters, and starts.
+    parameters, and starts; ``states``: their courses as `nominal_course` has them, where they are known.
     """
     s, data = bound.system, bound.data
     out: list[Quantity] = []
     moves = s.kind in ("simulate", "closed_loop")
     if moves:
-        states = nominal_course(bound.runner, values).states
+        states = states or nominal_course(bound.runner, values).states
         out += [Quantity(n, u, i, np.concatenate(states[i])) for i, (n, u) in enumerate(s.states.items())]
     if s.kind == "closed_loop":
         for i, (name, unit) in enumerate(s.commands.items()):
@@ -340,7 +340,8 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
     """Every curve that may be missing: each place with each quantity."""
     s = bound.system
     moves = s.kind in ("simulate", "closed_loop")
-    known = [(q, b) for q in quantities(bound, values) if (b := basis_for(q)) is not None]
+    states = nominal_course(bound.runner, values).states if moves else []
+    known = [(q, b) for q in quantities(bound, values, states) if (b := basis_for(q)) is not None]
     out: list[Candidate] = []
 
     def put(
@@ -371,7 +372,6 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
         if s.allows("parameter", p.name):
             put("parameter times", i, p.name, "-", 0.5, mean=p.tolerance == 0.0)
     if moves:
-        states = nominal_course(bound.runner, values).states
         for i, (name, unit) in enumerate(s.states.items()):
             if name in s.rates.values() and name not in s.rates:
                 continue
@@ -468,6 +468,7 @@ class OwnGround:
     noise_known = False
 
     def __init__(self, logs: Logs):
+        self.shares = logs.fitted.system.kind in ("simulate", "closed_loop")
         self.logs, self.floor = logs, logs.fitted.floor
         self.whole = logs.fitted.stage
         self.tests = frozenset(logs.test.logs if logs.test else ())

@@ -9,6 +9,7 @@ import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import FORMS, Form
+from vaneloop.base.side_by_side import side_by_side
 from vaneloop.discrepancy.error_share import FORM, score
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
@@ -75,7 +76,7 @@ def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[t
     ranked = [_nearest(c, visited, at_visited, variance, lent, weight) for weight in weights]
     taken = {form.name: (form, numbers) for turn in zip_longest(*ranked) for form, numbers in filter(None, turn)}
     shaped = list(taken.values())[:REFITTED]
-    fitted = [f for form, numbers in shaped if (f := _in_simulation(ground, tried, form, numbers))]
+    fitted = [f for f in side_by_side(lambda s: _in_simulation(ground, tried, *s), shaped, ground.shares) if f]
     grain = tried.judge.stage.grain
     return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
 

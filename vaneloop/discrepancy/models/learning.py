@@ -9,11 +9,12 @@ laws with names it must do clearly better than the best of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from vaneloop.base.side_by_side import Answer, Item, side_by_side
 from vaneloop.discrepancy.error_share import (
     BETTER,
     HARM,
@@ -31,11 +32,11 @@ from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.at_the_noise import earns, grain_of, in_grains, promises, unconfirmed
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.by_formula import (
+    all_in_their_place,
     at_its_place,
     better_than,
     earning_by_formula,
     harmless,
-    in_its_place,
     leaves,
     without_memory,
 )
@@ -117,6 +118,10 @@ class Learner:
     def fails(self, tried: Tried) -> bool:
         """Whether there is any error beyond noise where it is judged."""
         return not agrees(rms_of(tried.judge, tried.fit), 1.0)
+
+    def each(self, f: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+        """`side_by_side` where the ground's models allow it."""
+        return side_by_side(f, items, self.ground.shares)
 
     def learned(self) -> Outcome:
         """Curves one after the other, each earning its place; at most two."""
@@ -298,10 +303,11 @@ class Learner:
             close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         if not close:
             return
+        all_in_their_place(self.ground, close)
         sparest = min(len(t.fit.free) for t in (*close, best))
         for t in close:
             name = t.candidate.name
-            for f in in_its_place(self.ground, t):
+            for f in t.loose or ():
                 spared = PER_PARAMETER * (sparest - len(f.fit.free))
                 left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
 
@@ -417,8 +423,9 @@ class Learner:
         quick, (bare, promising) = [], screened(self, current, QUICK, TIMES[0])
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
-        for k, (_, candidate, theta) in enumerate(promising):
-            quick.append(self._fitted(current, candidate, SCREENED, theta, 3, True))
+        few = lambda p: self._fitted(current, p[1], SCREENED, p[2], 3, True)  # noqa: E731
+        for k, t in enumerate(self.each(few, promising)):
+            quick.append(t)
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
@@ -432,8 +439,8 @@ class Learner:
         # a short excerpt has too few turns for what slips: the hystereses that promised most go on, too
         slipping = [c.name for _, c, _ in promising if c.quantity.stops][:SLIPPING]
         chosen += [t for t in quick if t.candidate.name in slipping and t not in chosen]
-        for k, t in enumerate(chosen):
-            done.append(self._finished(current, t))
+        for k, t in enumerate(self.each(lambda t: self._finished(current, t), chosen)):
+            done.append(t)
             self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
         if self.faint and done:
             nearest = min(done, key=lambda t: rms_of(t.judge, t.fit))
@@ -449,13 +456,14 @@ class Learner:
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
             more = dict.fromkeys([*plainer[:PLAINER], *home])
-            done = self._ordered([*done, *(self._finished(current, t) for t in more)])
+            done = self._ordered([*done, *self.each(lambda t: self._finished(current, t), more)])
         if done and self.fails(done[0]):  # a curve may turn more often than its splines
             best = self._score(done[0], done)
             close = [t for t in done if self._score(t, done) < best + NEAR or without_its_lag(t, done[0])]
-            finer = {t: f for t in close if (f := self._finer(current, t)) is not None}
+            more_splines = zip(close, self.each(lambda t: self._finer(current, t), close), strict=True)
+            finer = {t: f for t, f in more_splines if f is not None}
             close = [t for t in done if self._score(t, done) < best + FORMULAS]
-            jumping = [j for t in close if (j := self._jumping(current, t)) is not None]
+            jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
             coarse = [t for t in done if t in finer and self._worth(t, finer[t])]  # a second law would patch them
             done = self._ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
             first_of = {t.candidate.name: t for t in reversed(done)}

@@ -33,6 +33,7 @@ def nominal_course(runner: Runner, values: Array) -> Course:
     course = Course([[] for _ in names], [[] for _ in s.commands], np.zeros(len(names)))
     y = runner.run(values[None])[0]
     for log, (r, at) in enumerate(zip(data.records, data.logs.values(), strict=True)):
+        hidden = None
         for i, name in enumerate(names):
             if name in r.columns:
                 v = np.where(
@@ -43,7 +44,8 @@ def nominal_course(runner: Runner, values: Array) -> Course:
             elif name in s.rates and s.rates[name] in r.columns:
                 v = np.gradient(smoothed(r.t, r.columns[s.rates[name]]), r.t)
             else:
-                v = _hidden(runner, values, log, i)
+                hidden = _hidden(runner, values, log) if hidden is None else hidden
+                v = hidden[i]
             course.states[i].append(v)
         for i, name in enumerate(s.commands):
             if name in r.columns:
@@ -58,18 +60,20 @@ def nominal_course(runner: Runner, values: Array) -> Course:
     return course
 
 
-def _hidden(runner: Runner, values: Array, log: int, state: int) -> Array:
-    """Course of a state that is not measured, from the nominal model in open loop with measured inputs."""
+def _hidden(runner: Runner, values: Array, log: int) -> Array:
+    """Courses of all states as if none were measured, float64[states, samples], from the nominal model in open loop
+    with measured inputs.
+    """
     s, data, code = runner.system, runner.data, runner.code
     if s.kind == "closed_loop":
-        return np.linspace(-1.0, 1.0, len(data.records[log].t))
+        return np.tile(np.linspace(-1.0, 1.0, len(data.records[log].t)), (len(s.states), 1))
     p = code.P(*values[: len(s.parameters)]) if s.parameters else code.P(0.0)
     t, u = data.records[log].t, data.u[log]
     x = np.array([data.first_state(log, m, 0.0) for m in s.states])
     for k, (which, m) in enumerate(runner.free_starts):
         if which == log:
             x[m] = values[len(s.parameters) + k]
-    out = np.empty(len(t))
+    out = np.empty((len(s.states), len(t)))
     restart, at_restart = data.restarts(log, len(t))
     stride = max(1, len(t) // 4000)
     last = 0
@@ -83,7 +87,7 @@ def _hidden(runner: Runner, values: Array, log: int, state: int) -> Array:
             a = np.atleast_1d(np.asarray(f(code.X(*x), ui, p), dtype=float))
             b = np.atleast_1d(np.asarray(f(code.X(*(x + 0.5 * dt * a)), ui, p), dtype=float))
             x = x + dt * b
-        out[k : k + stride] = x[state]
+        out[:, k : k + stride] = x[:, None]
         last = k
     bad = ~np.isfinite(out)
     out[bad] = 0.0

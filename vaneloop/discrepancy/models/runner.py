@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base.compiled import compiled_free, threads
+from vaneloop.base.side_by_side import shared_out
 from vaneloop.base.spline_rates import SplineRates
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.library import Law
@@ -196,8 +197,7 @@ class Runner:
 
         todo = iter(range(len(thetas)))  # which threads share
         moves = s.kind in ("simulate", "closed_loop")
-        if moves and threads() > 1 and (len(thetas) - 1) * n * self.steps > SHORT:
-            one(next(todo))  # what must be compiled is compiled here
+        if moves and threads() > 1 and not shared_out() and (len(thetas) - 1) * n * self.steps > SHORT:
             with ThreadPoolExecutor(1) as pool:  # compiled code runs side by side
                 other = pool.submit(work)
                 work()

@@ -35,12 +35,12 @@ def screened(learner: Learner, current: Tried, many: int, apart: float) -> tuple
     starts = starts_of(learner._judge((), current.curves, True), current.fit)
     bare = starts[0][1].left(starts[0][1].error)[0]
     every = [c for c in (*learner.candidates, *_periodic(learner, current)) if not stands(current, c)]
-    out = sorted((_promise(learner, current, c, starts) for c in every), key=lambda o: o[0])
+    out = sorted(learner.each(lambda c: _promise(learner, current, c, starts), every), key=lambda o: o[0])
     best: dict[tuple[str, str, str, bool], Promise] = {}
     for one in out:  # of several lags of a channel, one
         c = one[1]
         best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
-    first = [_its_lag(learner, current, one, starts, apart) for one in list(best.values())[:many]]
+    first = learner.each(lambda one: _its_lag(learner, current, one, starts, apart), list(best.values())[:many])
     return bare, sorted(first, key=lambda o: o[0])
 
 

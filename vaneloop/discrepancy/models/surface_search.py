@@ -44,7 +44,7 @@ def put_surface(learner: Learner, out: Outcome) -> None:
         return
     nothing = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     done = _finished(learner, nothing)
-    sums = [_sum(learner, nothing, t) for t in done]
+    sums = list(learner.each(lambda t: _sum(learner, nothing, t), done))
     others = [nothing, *([last] if last else []), *sums]
     good = [t for t in done if all(learner._worth(other, t) for other in others)]
     if not good:
@@ -90,14 +90,19 @@ def _candidates(learner: Learner) -> list[SurfaceCandidate]:
 
 def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
     """The surfaces that promise most, fitted to the end in place of all curves; best first."""
-    begun = [learner._fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True) for c in _candidates(learner)]
+    one_step = lambda c: learner._fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
+    begun = list(learner.each(one_step, _candidates(learner)))
     begun.sort(key=lambda t: float(t.fit.cost.sum()))
-    quick = [learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True) for t in begun[:QUICK]]
+    few = lambda t: learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True)  # noqa: E731
+    quick = list(learner.each(few, begun[:QUICK]))
     quick.sort(key=lambda t: score(t.judge, t.fit))
-    done = learner._ordered([smoothed(learner, nothing, t.candidate, t.fit, WIGGLES) for t in quick[:FINISHED]])
+    to_the_end = lambda t: smoothed(learner, nothing, t.candidate, t.fit, WIGGLES)  # noqa: E731
+    done = learner._ordered(list(learner.each(to_the_end, quick[:FINISHED])))
     if done and learner.fails(done[0]):
         close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
-        done = learner._ordered([*done, *(f for t in close if (f := _finer(learner, nothing, t)) is not None)])
+        done = learner._ordered(
+            [*done, *(f for f in learner.each(lambda t: _finer(learner, nothing, t), close) if f is not None)]
+        )
     first_of = {t.candidate.name: t for t in reversed(done)}
     return [t for t in done if first_of[t.candidate.name] is t]
 

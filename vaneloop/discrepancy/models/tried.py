@@ -47,7 +47,8 @@ class Ground(Protocol):
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
     tests  names of the logs that nothing is fitted to
     points of the table of a formula; ``jumps``: whether curves may jump; ``surfaces``: whether functions of two
-           quantities can run; ``noise_known``: whether the model may come down to a noise that is known
+           quantities can run; ``noise_known``: whether the model may come down to a noise that is known;
+           ``shares``: whether it runs in compiled loops, which threads can share out among candidates
     """
 
     whole: Stage
@@ -57,6 +58,7 @@ class Ground(Protocol):
     jumps: bool
     surfaces: bool
     noise_known: bool
+    shares: bool
 
     def in_grains(self, of: float) -> None:
         """Compare errors in so large steps from now on (`Stage.grain`)."""

@@ -154,6 +154,7 @@ class VaneGround:
 
     points, jumps = POINTS, False  # as the plant's rows have them
     noise_known = True
+    shares = False  # its stages run many lanes at one time themselves
     surfaces = False  # a curve is rows of the plant's parameters, of one signal
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
