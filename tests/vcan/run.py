@@ -435,6 +435,7 @@ def in_guest(kernel: Kernel, arguments: list[str], job: Path) -> Outcome:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
     settings = {k: os.environ[k] for k in HANDED_ON if k in os.environ} | {"PATH": path, **kernel.settings}
     settings |= {"VANELOOP_NEED_VCAN": "1", "VANELOOP_NOT_TESTED": f"{job}/not_tested"}
+    settings |= {"PYTHONDONTWRITEBYTECODE": "1"}  # of a module that is just written into the share half may be read
     exports = "".join(f"export {k}={shlex.quote(v)}\n" for k, v in settings.items())
     for file, inside in (("check", [sys.executable, "-c", CHECK]), ("command", command(arguments, short=kernel.short))):
         (job / file).write_text(
