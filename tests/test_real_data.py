@@ -18,7 +18,6 @@ import vaneloop
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import System, unknown
 from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.models.curved import on_logs
 from vaneloop.verbs.search import Diagnosed, read_record
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -205,9 +204,9 @@ def worse_elsewhere(system: System, fit: str, others: list[str]) -> list[str]:
     answer = vaneloop.learn(records[:1], system)
     if not answer.laws:
         return []
-    logs, last = bind(system, records[:1], records[1:]), answer.outcome.tried[-1]
-    named = logs.figures(answer.diagnosed.diagnosis.stages[0].final.theta)
-    learned = on_logs(logs, last.curves).figures(last.fit.theta)
+    named = bind(system, records[:1], records[1:]).figures(answer.diagnosed.diagnosis.stages[0].final.theta)
+    logs = bind(system, records[:1], records[1:], answer.model)  # with the laws beside which it was learned
+    learned = logs.figures(logs.fitted.stage.neutral())
     return [log for log in named if (learned[log] > 1.001 * named[log]).any()]
 
 
