@@ -478,7 +478,8 @@ class Learner:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
         done = smoothed(self, current, quick.candidate, begin, WIGGLES)
-        if (settled := done.forgotten()) is not None:  # what was before the log is no matter of the curve
+        # what was before the log is no matter of the curve; of own models laws with names remember it as well
+        if self.ground.noise_known and (settled := done.forgotten()) is not None:
             done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, WIGGLES, done.wiggle)
         return self._with_its_lag(current, done, TIMES[:1])
 
