@@ -79,7 +79,7 @@ def test_work_that_is_shared_out_comes_back_in_order_and_is_not_shared_out_again
 ) -> None:
     """Two threads at one time: each item waits for another one's thread."""
     monkeypatch.setattr(sharing, "threads", lambda: 2)
-    both = threading.Barrier(2, timeout=30.0)
+    both = threading.Barrier(2, timeout=600.0)
 
     def work(item: int) -> tuple[int, bool, list[bool], int]:
         both.wait()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from plant.effects import EFFECTS, NEUTRAL, ROW
 from plant.layout import N_NOMINAL
 from vaneloop.base.compiled import inlined, threads
+from vaneloop.base.side_by_side import side_by_side
 
 __all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
 
@@ -38,13 +38,8 @@ def parts_of(lanes: int, wide: int, width: int) -> list[range]:
 
 def on_all_cores(run: Callable[[range], None], work: list[range]) -> None:
     """``run`` all parts: compiled code needs no interpreter. The costly ones, which come last, begin first."""
-    many = min(len(work), threads())
-    if many > 1:
-        with ThreadPoolExecutor(many) as pool:
-            list(pool.map(run, work[::-1]))
-    else:
-        for part in work:
-            run(part)
+    for _ in side_by_side(run, work[::-1]):
+        pass
 
 
 def elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:

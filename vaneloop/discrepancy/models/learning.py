@@ -117,7 +117,7 @@ class Learner:
 
     def fails(self, tried: Tried) -> bool:
         """Whether there is any error beyond noise where it is judged."""
-        return not agrees(rms_of(tried.judge, tried.fit), 1.0)
+        return ErrorShare(tried.judge).fails(tried.fit)
 
     def each(self, f: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
         """`side_by_side` where the ground's models allow it."""
