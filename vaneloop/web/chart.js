@@ -160,9 +160,10 @@ export default {
       const own = this.live && new Set(first).size > 1; // panels of other lines: each tells its own, above them
       this.own = own;
       const shown = this.head.panels.map((p, i) => i).filter((i) => this.wanted(this.head.panels[i]));
+      const several = !own && this.head.panels.some((p) => p.lines.length > 1); // where each has one, its title names it
       this.plots = shown.map((i) => {
         const panel = this.head.panels[i];
-        if (!own) panel.lines.forEach((l) => legend.set(l.name, l));
+        if (several) panel.lines.forEach((l) => legend.set(l.name, l));
         const last = i === shown[shown.length - 1];
         const axis = { stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, font: "12px system-ui, sans-serif" };
         const plot = new uPlot({
