@@ -99,12 +99,12 @@ def hundred_thousand() -> Iterator[Row]:
 
 
 def workers() -> Iterator[Row]:
-    """120 logs by one worker and by two; both cores must be free. What starts the workers takes some seconds: of few
+    """360 logs by one worker and by two; both cores must be free. What starts the workers takes some seconds: of few
     logs it would be a large share.
     """
     with tempfile.TemporaryDirectory() as place:
         logs = f"{place}/logs"
-        _measured("fleet", "demo", "--engines", "4", "--logs", "120", "--out", logs)
+        _measured("fleet", "demo", "--engines", "12", "--logs", "360", "--out", logs)
         seconds = []
         for n in (1, 1, 2):  # the first run compiles
             few = logs if seconds else f"{logs}/engine_000"
@@ -113,7 +113,7 @@ def workers() -> Iterator[Row]:
             )
         share = seconds[1] / (2.0 * seconds[2])
         yield Row(
-            "a fleet of 120 logs, one worker and two", f"{seconds[2]:.0f} s", f"{seconds[1]:.0f} s", share,
+            "a fleet of 360 logs, one worker and two", f"{seconds[2]:.0f} s", f"{seconds[1]:.0f} s", share,
             "efficiency at least 0.9", share >= 0.9, f"load {os.getloadavg()[0]:.1f}",
         )  # fmt: skip
 
