@@ -170,6 +170,8 @@ def test_a_seed_draws_the_same_case_and_kinds_come_in_their_shares() -> None:
     kinds = [draw_case(4, i, ("valve_bench",), samples=60).kind for i in range(200)]
     for kind, share in zip(("clean", "outside", "pair", "single"), (0.25, 0.25, 0.2, 0.3), strict=True):
         assert abs(kinds.count(kind) / 200 - share) < 0.1
+    some = ("clean", "outside")
+    assert {draw_case(4, i, ("valve_bench",), samples=60, kinds=some).kind for i in range(40)} == {*some}
 
 
 def test_a_lag_is_the_exponential_and_a_dead_time_is_late() -> None:
@@ -420,6 +422,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Captu
         (["--workers", "65"], "--workers (=65) must be in [1, 64]"),
         (["--family", "tank"], "--family 'tank': not a family; allowed: tanks, flow_loop"),
         (["--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
+        (["--kinds", "clean", "--leave-out"], "--kinds clean: not with --leave-out or --surface"),
     ],
 )
 def test_bad_options_are_told_in_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

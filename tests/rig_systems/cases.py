@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -188,15 +188,17 @@ def _names(f: Family, kind: str, rng: np.random.Generator) -> list[str]:
 
 def draw_case(
     seed: int, index: int, families: tuple[str, ...] = (), names: list[str] | None = None, samples: int | None = None,
-    extra: Mapping[str, Outside] | None = None,
+    extra: Mapping[str, Outside] | None = None, kinds: Collection[str] = KINDS,
 ) -> Case:  # fmt: skip
     """System ``index`` of the series ``seed``, simulated.
 
+    kinds     of `KINDS`, that are drawn
     families  to draw from (default: all); ``names``: what to hide instead of drawing it; ``samples``: a log's length
     extra     laws that the library does not have, beside the family's
     """
     rng = np.random.default_rng([seed, index])
-    kind = str(rng.choice(KINDS, p=SHARES))
+    shares = np.where(np.isin(KINDS, list(kinds)), SHARES, 0.0)
+    kind = str(rng.choice(KINDS, p=shares / shares.sum()))
     f = FAMILIES[str(rng.choice(families or list(FAMILIES)))]
     f = replace(f, outside={**f.outside, **extra}) if extra else f
     p = f.draw(rng)

@@ -14,10 +14,22 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 
-__all__ = ["INSIDE", "as_curve", "from_checkout", "print_shares", "read_rows", "run", "share", "write_rows"]
+__all__ = [
+    "INSIDE", "KINDS", "add_kinds", "as_curve", "from_checkout", "print_shares", "read_rows", "run", "share",
+    "write_rows",
+]  # fmt: skip
 
 Row = dict[str, Any]
+KINDS = ("clean", "outside", "pair", "single")  # of what is hidden; outside: what the library does not have
 INSIDE = 0.90  # of the visited values: there the truth must be in the band of a curve that is the law
+
+
+def add_kinds(parser: argparse.ArgumentParser, what: str) -> None:
+    """Declare ``--kinds`` of ``what``."""
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
+        help=f"draw only {what} of these kinds: {', '.join(KINDS)} (default: all)",
+    )  # fmt: skip
 
 
 def from_checkout(names: Iterable[str], needed: str) -> tuple[Any, ...]:

@@ -21,7 +21,7 @@ from vaneloop.base import terminal
 from vaneloop.base.durations import named_lag, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
+from vaneloop.cli.blind import INSIDE, KINDS, add_kinds, as_curve, from_checkout, print_shares, read_rows, run, share
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -39,7 +39,6 @@ examples:
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
 
-KINDS = ("clean", "outside", "pair", "single")
 SHARES = (0.25, 0.25, 0.20, 0.30)
 GAPS = 0.2  # of the logs lack rows
 MODES = 0.2  # of the logs have seconds in another mode
@@ -75,10 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="hide only effects of the library that are functions of one quantity, each taken out of the library: does "
         "vaneloop learn find it?",
     )
-    parser.add_argument(
-        "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
-        help=f"draw only logs of these kinds: {', '.join(KINDS)} (default: all)",
-    )  # fmt: skip
+    add_kinds(parser, "logs")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
     parser.add_argument(
         "--out",

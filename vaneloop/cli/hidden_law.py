@@ -10,13 +10,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.durations import within_no_period
-from vaneloop.cli.blind import INSIDE, as_curve, from_checkout, print_shares, read_rows, run, share
+from vaneloop.cli.blind import INSIDE, KINDS, add_kinds, as_curve, from_checkout, print_shares, read_rows, run, share
 from vaneloop.cli.same_law import same_by_equations
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
@@ -30,7 +31,7 @@ answers are judged.
 examples:
   vaneloop hidden-law --systems 32 --seed 1 --out out/hidden_law.parquet
   vaneloop hidden-law --systems 200 --seed 1 --out out/hidden_law.parquet      (continues where it was stopped)
-  vaneloop hidden-law --systems 32 --seed 1 --learn --out out/learned.parquet
+  vaneloop hidden-law --systems 32 --seed 1 --kinds outside clean --learn --out out/learned.parquet
   vaneloop hidden-law --systems 32 --seed 1 --leave-out --out out/left_out.parquet
   vaneloop hidden-law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/variants.parquet
 
@@ -69,6 +70,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="hide a law of two quantities in every other system, and in the others nothing, or a law of one: does "
         "vaneloop learn find both quantities, and no surface where there is none?",
     )
+    add_kinds(parser, "systems")
     parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
     )
@@ -137,10 +139,11 @@ def _as_learned(asked: Any, test: str, floors: Any, truth: Any, true: Any) -> di
 
 def judge_case(
     seed: int, index: int, families: tuple[str, ...] = (), variants: bool = False, learn: bool = False,
-    leave_out: bool = False, surface: bool = False,
+    leave_out: bool = False, surface: bool = False, kinds: Sequence[str] = KINDS,
 ) -> Row:  # fmt: skip
     """Draw, simulate and diagnose one system; a flat record.
 
+    kinds      of `KINDS`, that are drawn
     leave_out  hide a law of the library that is a function of one quantity, and take it out of the library
     surface    hide a law of two quantities in systems of even number, in the others nothing, or a law of one
     """
@@ -150,7 +153,7 @@ def judge_case(
 
     logging.getLogger("numba").setLevel(logging.ERROR)
     rig, nominal, changes, left_out, surfaces = _systems()
-    case = _left_out_case(seed, index, families) if leave_out else rig.draw_case(seed, index, families)
+    case = _left_out_case(seed, index, families) if leave_out else rig.draw_case(seed, index, families, kinds=kinds)
     both: tuple[str, ...] = ()
     if surface and index % 2 == 0:
         case, both = surfaces.draw_surface(seed, index, families)
@@ -459,6 +462,10 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(
             f"{path}: has rows {'without' if args.leave_out else 'of'} --leave-out; allowed: another --out"
         )
+    if set(args.kinds) != set(KINDS) and (args.leave_out or args.surface):
+        raise InputError(f"--kinds {' '.join(args.kinds)}: not with --leave-out or --surface, which draw their own")
+    if other := {r["kind"] for r in rows} - {*args.kinds, "left out", "surface"}:
+        raise InputError(f"{path}: has rows of kind {min(other)}; allowed: --kinds with it, or another --out")
     terminal.say(args, f"seed {seed}; {len(rows)} systems done before")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -477,6 +484,7 @@ def command(args: argparse.Namespace) -> int:
         args.learn,
         args.leave_out,
         args.surface,
+        tuple(k for k in KINDS if k in args.kinds),
     )
     _print(args, rows)
     tables = {"by_size": by_size(rows), "by_family": by_family(rows), "misses": misses(rows)}
