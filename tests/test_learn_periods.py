@@ -15,6 +15,7 @@ from hil.logs import Channel, Log
 from plant import Model, build_plant, load_model
 from plant.curve import LVDT_ADDS, S_TIME, bend, quantity_of
 from plant.effects import N_STATE
+from plant.model import Learned
 from tests import rig
 from tests.firmware_on_rig import firmware
 from tests.test_learn import TANK
@@ -66,6 +67,17 @@ def test_a_curve_that_repeats_itself_is_waves_without_a_seam(period: float, seed
     assert ours == pytest.approx(a @ np.array(wave), abs=0.01 * np.abs(a).sum())
     ends = basis.design(np.array([0.0, period])) @ basis.turn @ a
     assert ends[0] == pytest.approx(ends[1], abs=0.01 * np.abs(a).sum())
+
+
+def test_a_law_file_holds_the_finest_waves() -> None:
+    basis = waves_of(20.0, FINE_HARMONICS)
+    values = basis.turn @ np.random.default_rng(1).standard_normal(basis.turn.shape[1])
+    law = Learned(
+        how="times", at="actuator.flow_gain", of="time_every_20_s", low=0.0, high=20.0, values=list(values),
+        knots=list(basis.knots),
+    )  # fmt: skip
+    x = np.linspace(0.0, 20.0, 257)
+    assert law.table()(np.array(law.values)) == pytest.approx(basis.design(x) @ values)
 
 
 # ---- periods
