@@ -243,7 +243,8 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
         theta = np.linalg.lstsq(rows, y, rcond=None)[0]
         e = y - rows @ theta
         stage = SimpleNamespace(index=lambda: {"c": slice(1, 3)}, grain=1.0)
-        judge = SimpleNamespace(stage=stage, scale=np.array([2.0, 1.0, 0.5]), n=n)
+        wide = np.full(3, np.inf)
+        judge = SimpleNamespace(stage=stage, scale=np.array([2.0, 1.0, 0.5]), n=n, bounds=lambda: (-wide, wide))
         j = rows * judge.scale
         fit = SimpleNamespace(
             free=np.arange(3), theta=theta, prior=np.zeros(3), cost=np.array([e @ e]), gradients=(j.T @ e)[None],
@@ -254,6 +255,10 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
         one = cast(Tried, SimpleNamespace(candidate=c, fit=fit, judge=judge))
         only = np.linalg.lstsq(rows[:, :2], y, rcond=None)[0]
         assert left_by_its_mean(one) == pytest.approx(np.sum((y - rows[:, :2] @ only) ** 2))
+        held = np.array([theta[0], np.inf, np.inf])  # at its bound, the model's own parameter takes over nothing
+        judge.bounds = lambda: (held * [1.0, -1.0, -1.0], held)
+        alone = y - rows[:, 0] * theta[0]
+        assert left_by_its_mean(one) == pytest.approx(np.sum((alone - alone.mean()) ** 2))
         return one
 
     flat, again, elsewhere, bent = (

@@ -15,6 +15,7 @@ from hil.logs import Channel, Log
 from plant import Model, build_plant, load_model
 from plant.curve import LVDT_ADDS, S_TIME, bend, quantity_of
 from plant.effects import N_STATE
+from plant.model import Learned
 from tests import rig
 from tests.firmware_on_rig import firmware
 from tests.test_learn import TANK
@@ -24,7 +25,7 @@ from vaneloop.base.durations import in_name, of_name, period_of, within_no_perio
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.curves import waves_of
+from vaneloop.discrepancy.curves import FINE_HARMONICS, waves_of
 from vaneloop.discrepancy.models.curve_file import from_file
 from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.periods import Course, Lines
@@ -68,6 +69,17 @@ def test_a_curve_that_repeats_itself_is_waves_without_a_seam(period: float, seed
     assert ends[0] == pytest.approx(ends[1], abs=0.01 * np.abs(a).sum())
 
 
+def test_a_law_file_holds_the_finest_waves() -> None:
+    basis = waves_of(20.0, FINE_HARMONICS)
+    values = basis.turn @ np.random.default_rng(1).standard_normal(basis.turn.shape[1])
+    law = Learned(
+        how="times", at="actuator.flow_gain", of="time_every_20_s", low=0.0, high=20.0, values=list(values),
+        knots=list(basis.knots),
+    )  # fmt: skip
+    x = np.linspace(0.0, 20.0, 257)
+    assert law.table()(np.array(law.values)) == pytest.approx(basis.design(x) @ values)
+
+
 # ---- periods
 
 
@@ -105,6 +117,31 @@ def test_what_drives_the_model_has_no_period_of_time(seed: int, f: float, order:
     assert Lines([course(seed, 3.0, order * f, driver=np.sin(2.0 * np.pi * f * t))]).periods() == []
     again = np.tile(np.repeat(np.random.default_rng(seed).standard_normal(100), 10), 4)  # the same four times
     assert Lines([course(seed, 3.0, order / 10.0 + 1.0, driver=again)]).periods() == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dips_of_a_gain_are_found_at_their_own_period_and_not_at_a_part_of_it(seed: int) -> None:
+    """A second consumer draws for a seventh of each 20 s, while motion comes and goes: no line stands out."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(30_000) * 0.01
+    phase = (t / 20.0) % 1.0
+    dips = np.where(phase < 0.15, np.sin(np.pi * phase / 0.15), 0.0)
+    motion = np.repeat(rng.standard_normal(60) * (rng.random(60) < 0.5), 500)
+    wander = np.cumsum(rng.standard_normal(len(t))) * 0.01  # it has much of what is slow, and no line
+    c = Course(t, (0.3 * rng.standard_normal(len(t)) - 2.0 * dips * motion)[None], wander[None])
+    period, harmonics = Lines([c]).found([motion[None]])[0]
+    assert period == pytest.approx(20.0, rel=0.005)
+    assert harmonics == FINE_HARMONICS
+
+
+def test_a_drive_that_swings_for_a_while_and_later_in_another_phase_has_no_line() -> None:
+    t = np.arange(30_000) * 0.01
+    swing, turned = (np.sin(2.0 * np.pi * 0.5 * t + phase) for phase in (0.0, 1.6))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        drive = 0.1 * rng.standard_normal(len(t)) + swing * (abs(t - 92.0) < 9.0) + turned * (abs(t - 212.0) < 9.0)
+        error = swing + 0.5 * rng.standard_normal(len(t))
+        assert Lines([Course(t, error[None], drive[None])]).periods()[0] == pytest.approx(2.0, rel=0.001)
 
 
 def test_of_two_logs_a_driven_line_counts_where_its_phase_is_the_same() -> None:

@@ -18,13 +18,14 @@ import numpy as np
 from vaneloop.base.curve import DEGREE, splines
 from vaneloop.discrepancy.stage import Array, Effect, Parameter
 
-__all__ = ["COUNT", "LEVEL", "Basis", "basis_of", "waves_of"]
+__all__ = ["COUNT", "FINE_HARMONICS", "HARMONICS", "LEVEL", "Basis", "basis_of", "waves_of"]
 
 COUNT = 10  # splines of a curve
 LEAST = 5  # with fewer it could hardly bend
 RESOLVED = 1e-3  # of the range: knots do not stand closer
 LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
-HARMONICS, AROUND = 3, 27  # waves of a curve that repeats itself, and splines that they are made of
+HARMONICS, FINE_HARMONICS = 3, 10  # waves of a curve that repeats itself; of one that must be finer
+AROUND = 9  # splines that each of its waves is made of
 EDGE = 0.001  # share of the visited values at each end that may lie apart from the others
 STRAY = 0.25  # of the others' range: no further from them are the first and the last knot
 
@@ -152,13 +153,14 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     return Basis(low + (high - low) * knots, turn, np.concatenate([[0.0, 0.0], bends[2:] / bends[2]]))
 
 
-def waves_of(period: float) -> Basis:
-    """The basis for a quantity that repeats itself: a constant, a sine and a cosine of its ``period``, and `HARMONICS`
-    times as fast ones.
+def waves_of(period: float, harmonics: int = HARMONICS) -> Basis:
+    """The basis for a quantity that repeats itself: a constant, a sine and a cosine of its ``period``, and up to
+    ``harmonics`` times as fast ones.
     """
-    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0.0, 1.0, AROUND - DEGREE + 1), np.ones(DEGREE)])
-    z = np.linspace(0.0, 1.0, 8 * AROUND)
-    order = np.arange(1, HARMONICS + 1)
+    around = AROUND * harmonics
+    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0.0, 1.0, around - DEGREE + 1), np.ones(DEGREE)])
+    z = np.linspace(0.0, 1.0, 8 * around)
+    order = np.arange(1, harmonics + 1)
     turns = 2.0 * np.pi * z[:, None] * order
     waves = np.sqrt(2.0) * np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(len(z), -1)
     turn = np.linalg.lstsq(splines(knots, z), np.column_stack([np.ones(len(z)), waves]), rcond=None)[0]

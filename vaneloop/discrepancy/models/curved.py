@@ -12,7 +12,7 @@ import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.durations import period_of
-from vaneloop.discrepancy.curves import COUNT, Basis, basis_of, waves_of
+from vaneloop.discrepancy.curves import COUNT, FINE_HARMONICS, HARMONICS, Basis, basis_of, waves_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve, Jump, Table
@@ -168,8 +168,8 @@ class Candidate:
             basis = basis.rising(rises)
         return basis.zeroed() if basis is not None and "zero" in shape else basis
 
-    def every(self, period: float) -> Candidate:
-        """The same of the time within each ``period`` (s), of a candidate of time."""
+    def every(self, period: float, harmonics: int = HARMONICS) -> Candidate:
+        """The same of the time within each ``period`` (s), of a candidate of time, with so many harmonics."""
         time = self.quantity
         span = float(np.ptp(time.visited))
 
@@ -180,12 +180,13 @@ class Candidate:
 
         q = within(period)
         name = self.name.removesuffix(time.name) + q.name
-        return replace(self, name=name, quantity=q, basis=waves_of(q.period))
+        return replace(self, name=name, quantity=q, basis=waves_of(q.period, harmonics))
 
     def slower(self, times: float) -> Candidate | None:
         """The same with a lag, or a period, so many times as long; None: it has none, or it would not be one."""
         q = self.quantity.slower(times) if self.quantity.slower is not None else None
-        basis = replace(self, quantity=q).basis_of() if q is not None else None
+        many = len(self.basis.bend) if self.quantity.period else 0
+        basis = replace(self, quantity=q).basis_of(many) if q is not None else None
         if q is None or basis is None or basis.turn.shape != self.basis.turn.shape:
             return None
         return replace(self, name=self.name.replace(self.quantity.name, q.name), quantity=q, basis=basis)
@@ -314,7 +315,7 @@ def basis_for(q: Quantity, count: int = 0) -> Basis | None:
     values.
     """
     if q.period:
-        return waves_of(q.period)
+        return waves_of(q.period, FINE_HARMONICS if count > COUNT else HARMONICS)
     count = count or usual(q)
     if q.stops:  # from a radius of 0 to where every way there and back is within it
         return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)

@@ -1,9 +1,9 @@
 """Periods in time with which a model's error repeats itself, and what drives the model does not.
 
 A ripple, a hum or a shaken base is a curve of the time within its period. Its period is where the error's spectrum has
-a line. Where it multiplies, the line is in the error times what a constant would do there: a gain that swings at 50 Hz
-shows at 50 Hz beside the motion that it acts on. Lines of what drives the model, and multiples of them, are the model's
-own: they say nothing of time.
+a line. Where it multiplies, a gain that swings at 50 Hz shows at 50 Hz beside the motion that it acts on. There a wave
+is fitted as that gain, alone and with its multiples: a gain that dips for a moment has many, and none stands out. Lines
+of what drives the model, and multiples of them, are the model's own: they say nothing of time.
 """
 
 from __future__ import annotations
@@ -13,18 +13,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vaneloop.discrepancy.curves import FINE_HARMONICS, HARMONICS
 from vaneloop.discrepancy.stage import Array
 
 __all__ = ["Course", "Lines"]
 
 MOST = 2  # periods of one place that are tried
 CLEAR = 40.0  # times the median power about it: a line; the highest of 100,000 of white noise is 17 times it
+CLEAR_COMB = 15.0  # the same of three harmonics, of which noise has 6.5 times the median
 ABOUT = 50  # lines each way that "about" means
 CYCLES, SAMPLES = 6.0, 2.5  # least of the first in a log, of the second in a period
 ORDERS = 6  # multiples of a driven line that are the model's own
 SHARE, MAIN = 0.01, 0.2  # of the variance of what drives the model in a line of it; in one that is most of it
 AGAIN = 0.9  # correlation of what drives the model with itself a while later that means it is repeated
 ALIKE = 0.9  # of the power that logs have in a line: what they have together, where it is the same in each
+PIECES, STEADY = 5, 0.7  # of a log; of a line's power in them: what they have together, 1 of a sine, 0.2 of noise
+MOSTLY = 0.5  # of the sum of squares: what takes off more may be all that is missing, whatever is about it
+TOLD = 0.5  # lines: nearer two frequencies are not told apart
 FINE = 4  # lines of a spectrum for each that its length resolves
 
 
@@ -47,15 +52,61 @@ class _Even(NamedTuple):
     rows: Array
 
 
-def _even(t: Array, rows: Array) -> _Even:
-    """Signals at even steps, without their straight line."""
-    from scipy.signal import detrend
-
+def _even(t: Array, rows: Array, straight: bool = True) -> _Even:
+    """Signals at even steps; ``straight``: without their straight line."""
     n = len(t)
     even = np.linspace(t[0], t[-1], n)
     if np.max(np.abs(even - t)) > 0.1 * (t[-1] - t[0]) / n:
         rows = np.array([np.interp(even, t, row) for row in rows]).reshape(len(rows), n)
-    return _Even(even, detrend(rows) if len(rows) else rows)
+    return _Even(even, detrended(rows) if straight and len(rows) else rows)
+
+
+def detrended(rows: Array) -> Array:
+    """Signals without their straight line."""
+    from scipy.signal import detrend
+
+    return np.asarray(detrend(rows))
+
+
+def _taken(part: _Even) -> Array:
+    """Of errors, and behind them what a constant would do to each, their products."""
+    n = len(part.rows) // 2
+    return part.rows[:n] * part.rows[n:]
+
+
+def _fitted(parts: Sequence[_Even], harmonics: int, numbers: Array, apart: float) -> Array:
+    """By how much the sum of squares of errors falls with a constant and so many harmonics of each frequency, beside a
+    constant alone, where what they multiply is known; the same in all logs.
+
+    parts    of each log errors, and behind them what a constant would do to each
+    numbers  of the frequencies, in ``apart`` (Hz)
+    """
+    from scipy.signal import czt
+
+    falls, weights = np.zeros((2, 2 * harmonics * int(numbers[-1]) + 1), dtype=complex)
+    for part in parts:
+        step = float(part.t[1] - part.t[0])
+        window = np.hanning(len(part.t))
+        f = apart * np.arange(len(weights))
+        begun = np.exp(-2j * np.pi * f * part.t[0])
+        turn = np.exp(-2j * np.pi * apart * step)
+        squares = np.sum(part.rows[len(part.rows) // 2 :] ** 2, axis=0)
+        weights += begun * czt(window * squares, len(f), turn)
+        falls += begun * czt(window * np.sum(_taken(part), axis=0), len(f), turn)
+    order = np.arange(-harmonics, harmonics + 1)
+    at = numbers[:, None] * order
+
+    def of(spectrum: Array, at: Array) -> Array:
+        return np.where(at < 0, np.conj(spectrum[np.abs(at)]), spectrum[np.abs(at)])
+
+    g = of(falls, at)
+    normal = of(weights, numbers[:, None, None] * (order[:, None] - order[None, :]))
+    mean = float(weights[0].real)
+    if not mean > 0.0:
+        return np.zeros(len(numbers))
+    normal = normal + 1e-6 * mean * np.eye(len(order))
+    solved = np.linalg.solve(normal, g[..., None])[..., 0]
+    return np.maximum(np.sum((np.conj(g) * solved).real, axis=1) - float(falls[0].real) ** 2 / mean, 0.0)
 
 
 def _spectrum(part: _Even, f: Array) -> Array:
@@ -89,34 +140,65 @@ class Lines:
         self.shortest, self.longest = min(spans), max(spans)
         step = max(span / (len(c.t) - 1) for span, c in zip(spans, courses, strict=True))
         low, high = CYCLES / self.shortest, 1.0 / (SAMPLES * step)
-        self.f = np.arange(low, high, 1.0 / (FINE * self.longest)) if 2.0 * low < high else np.zeros(0)
-        self.driven = np.array([_driven(c, self.f) for c in courses if len(self.f)])
+        apart = 1.0 / (FINE * self.longest)
+        numbers = np.arange(int(np.ceil(low / apart)), int(high / apart)) if 2.0 * low < high else np.zeros(0, int)
+        self.apart, self.numbers, self.f = apart, numbers, apart * numbers
+        self.driven = [_driven(c, float(self.f[-1])) for c in courses if len(numbers)]
 
     def periods(self, times: Sequence[Array] = ()) -> list[float]:
-        """Periods (s) in which the error repeats itself.
+        """Periods (s) in which the error repeats itself; arguments as of `found`."""
+        return [period for period, _ in self.found(times)]
+
+    def found(self, times: Sequence[Array] = ()) -> list[tuple[float, int]]:
+        """Periods (s) in which the error repeats itself, and the harmonics that a curve needs for it.
 
         times  what a constant would do to the error at the place that is asked for, log by log; none: the error itself
         """
-        from scipy.signal import find_peaks
-
         if not len(self.f):
             return []
-        weighed = [c.error if not len(times) else c.error * times[k] for k, c in enumerate(self.courses)]
-        parts = [_even(c.t, w) for c, w in zip(self.courses, weighed, strict=True)]
+        if len(times):
+            found = self._swings(times)
+        else:
+            parts = [_even(c.t, c.error) for c in self.courses]
+            found = [(_highest(parts, f, self.longest), parts, 1) for f in self._lines(parts)]
+        out: list[tuple[float, int]] = []
+        for g, parts, harmonics in found:
+            # a line that is driven, too, may be one of time where it has the same phase in every log
+            driven = any(d.has(g, harmonics == 1) for d in self.driven)
+            own = not driven or (len(parts) > 1 and _coherence(parts, g) > ALIKE)
+            if own and all(abs(g - 1.0 / h) > 2.0 / self.shortest for h, _ in out):
+                out.append((1.0 / g, max(harmonics, HARMONICS)))
+        return out[:MOST]
+
+    def _peaks(self, power: Array, least: Array) -> list[float]:
+        """Frequencies (Hz) of its lines that are above the ``least``, the highest first."""
+        from scipy.signal import find_peaks
+
+        at = find_peaks(power, least, distance=2 * FINE)[0]
+        return [float(self.f[k]) for k in sorted(at, key=lambda k: -power[k])]
+
+    def _lines(self, parts: Sequence[_Even]) -> list[float]:
+        """Of the error itself."""
         own = np.array([_spectrum(part, self.f) for part in parts])
-        usual = np.array([_about(o) for o in own])
+        return self._peaks(own.sum(axis=0), CLEAR * np.array([_about(o) for o in own]).sum(axis=0))
 
-        def lines(power: Array) -> list[float]:  # the highest first, as far as the length of the logs tells them
-            at = find_peaks(power, CLEAR * usual.sum(axis=0), distance=2 * FINE)[0]
-            return [_highest(parts, self.f[k], self.longest) for k in sorted(at, key=lambda k: -power[k])[: 2 * MOST]]
-
-        # a line that is driven, too, may be one of time where it has the same phase in every log
-        alike = [g for g in lines(own.sum(axis=0)) if _coherence(parts, g) > ALIKE] if len(parts) > 1 else []
-        out: list[float] = []
-        for g in (*alike, *lines(np.where(self.driven, usual, own).sum(axis=0))):
-            if all(abs(g - h) > 2.0 / self.shortest for h in out):
-                out.append(g)
-        return [1.0 / g for g in out[:MOST]]
+    def _swings(self, times: Sequence[Array]) -> list[tuple[float, list[_Even], int]]:
+        """Of what swings where a constant would do ``times`` to the error: a wave of each frequency, and one with all
+        `HARMONICS`, fitted. Beside a product's line, what a swing does elsewhere would stand as noise.
+        """
+        logs = list(zip(self.courses, times, strict=True))
+        both = [_even(c.t, np.concatenate([c.error, w]), straight=False) for c, w in logs]
+        products = [part._replace(rows=detrended(np.array([np.sum(_taken(part), axis=0)]))) for part in both]
+        whole = sum(float(np.sum(part.rows[: len(part.rows) // 2] ** 2 * np.hanning(len(part.t)))) for part in both)
+        out: list[tuple[float, list[_Even], int]] = []
+        for harmonics, clear in ((FINE_HARMONICS, np.inf), (HARMONICS, CLEAR_COMB), (1, CLEAR)):
+            below = self.numbers[harmonics * self.numbers <= self.numbers[-1]]
+            if len(below) > 2 * ABOUT:
+                falls = _fitted(both, harmonics, below, self.apart)
+                least = np.minimum(clear * _about(falls), MOSTLY * whole)
+                many = None if harmonics == 1 else 1  # the next ones are multiples, and parts, of the first
+                out += [(f, products, harmonics) for f in self._peaks(falls, least)[:many]]
+        return out
 
 
 def _highest(parts: Sequence[_Even], f: float, span: float) -> float:
@@ -136,26 +218,51 @@ def _coherence(parts: Sequence[_Even], f: float) -> float:
     return _coherent(parts, f) / max(alone, 1e-300)
 
 
-def _driven(c: Course, f: Array) -> Array:
-    """Which of the frequencies ``f`` (Hz) are of what drives the model: its lines, multiples of a line that is most of
-    it, and multiples of how often it is repeated; bool[frequencies].
+class _Driven(NamedTuple):
+    """What drives a model repeats itself: at frequencies ``most`` (Hz), which are most of it, and their multiples; at
+    ``some`` others, each known to ``apart``; and after the times ``again`` (s), each known so that no multiple of
+    1 / ``again`` is off by more than ``width`` (Hz).
     """
+
+    most: list[float]
+    some: list[float]
+    apart: float
+    again: list[float]
+    width: float
+
+    def has(self, f: float, alone: bool) -> bool:
+        """Whether a frequency is one of them; ``alone``: of a wave that has no multiples: those that are not most of
+        what drives a model make no others.
+        """
+        lines = [*self.most, *(self.some if alone else ())]
+        repeats = any(abs(f * a - round(f * a)) < self.width * a for a in self.again)
+        return repeats or any(abs(f - g) < self.apart for g in lines)
+
+
+def _driven(c: Course, highest: float) -> _Driven:
+    """Frequencies (Hz) up to the ``highest`` of what drives the model: its lines, multiples of a line that is most of
+    it, and multiples of how often it is repeated.
+
+    A line has one phase all along the log. A drive that has more of what is slow, or swings for a while, has none.
+    """
+    from scipy.signal import find_peaks
+
     span = float(c.t[-1] - c.t[0])
-    fine = np.arange(1.0 / span, f[-1], 1.0 / (FINE * span))
-    width = 2.0 / span
-    out = np.zeros(len(f), dtype=bool)
+    fine = np.arange(1.0 / span, highest, 1.0 / (FINE * span))
+    out = _Driven([], [], TOLD / span, [], 2.0 / span)
     for row in c.drivers:
         if not np.ptp(row) > 0.0:
             continue
         part = _even(c.t, row[None])
         power = _spectrum(part, fine)
         share = np.convolve(power, np.ones(2 * FINE + 1), mode="same") / power.sum()
-        lines = (power > CLEAR * _about(power)) & (share > SHARE)
-        for order in range(1, ORDERS + 1):
-            at = order * fine[lines & (share > (MAIN if order > 1 else SHARE))]
-            out |= np.searchsorted(at, f - width, "right") < np.searchsorted(at, f + width)
-        for again in _repeats(part.rows[0], span / (len(c.t) - 1)):
-            out |= np.abs(f * again - np.round(f * again)) < width * again
+        pieces = [_Even(part.t[k], part.rows[:, k]) for k in np.array_split(np.arange(len(part.t)), PIECES)]
+        for k in find_peaks(power * (share > SHARE), CLEAR * _about(power))[0]:
+            f = _highest([part], fine[k], span)
+            if _coherence(pieces, f) > STEADY:
+                most = share[k] > MAIN
+                (out.most if most else out.some).extend(order * f for order in range(1, ORDERS + 1 if most else 2))
+        out.again.extend(_repeats(part.rows[0], span / (len(c.t) - 1)))
     return out
 
 

@@ -63,7 +63,7 @@ def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
     fit, ground = current.fit, learner.ground
     courses = ground.courses(current.curves, fit.theta)
     lines = Lines(courses)
-    out, plain = [], lines.periods()
+    out, plain = [], lines.found()
     for c in over_time:
         periods = plain
         if c.how.endswith("times"):
@@ -72,8 +72,8 @@ def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
             values[0] = SMALL
             curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
             moved = ground.courses(curves, np.concatenate([fit.theta, values]))
-            periods = lines.periods([m.error - w.error for m, w in zip(moved, courses, strict=True)])
-        out += [c.every(p) for p in periods]
+            periods = lines.found([m.error - w.error for m, w in zip(moved, courses, strict=True)])
+        out += [c.every(*p) for p in periods]
     return out
 
 

@@ -229,7 +229,9 @@ def one_constant(tried: Sequence[Tried]) -> list[Tried]:
 
 
 def left_by_its_mean(tried: Tried) -> float:
-    """Sum of squares with only the mean of the last curve, by the slopes of its fit; infinite where it has no mean."""
+    """Sum of squares with only the mean of the last curve, by the slopes of its fit, the model's own parameters within
+    their bounds; infinite where it has no mean.
+    """
     c, fit, judge = tried.candidate, tried.fit, tried.judge
     if 0 not in c.kept:
         return np.inf
@@ -238,7 +240,8 @@ def left_by_its_mean(tried: Tried) -> float:
     step = -fit.theta[fit.free] / judge.scale[fit.free] * gone
     a = fit.normals.sum(axis=0) + np.diag(fit.prior * judge.scale[fit.free] ** 2 + 1e-9)
     g = fit.gradients.sum(axis=0)
-    step[~gone] = np.linalg.solve(a[np.ix_(~gone, ~gone)], (g - a @ step)[~gone])
+    low, high = ((b - fit.theta)[fit.free][~gone] / judge.scale[fit.free][~gone] for b in judge.bounds())
+    step[~gone] = bounded_step(a[np.ix_(~gone, ~gone)], (g - a @ step)[~gone], low, high)
     n = fit.normals.sum(axis=0)
     return float(fit.cost.sum() - 2.0 * g @ step + step @ n @ step)
 

@@ -45,6 +45,7 @@ __all__ = [
 WHOLE = 12_000  # samples; of a longer log an excerpt is learned on, and the rest tests it
 QUICK = 4_000  # samples of the excerpt that tells which candidates to fit
 PIECE, FREE_PIECE = 1_000, 2_000  # samples in a row; of a stage that runs freely, and must find its state again
+SHORT_PIECE = 500  # of the smaller excerpt, of a stage in windows: of few long pieces all may hold the same
 SCALE = "scale"  # of a law from a file
 LOG, REST, TEST = "log", "rest of the log", "test"
 # a quantity that is the place's own output, or nothing but the reading there: it multiplies by the same as it adds
@@ -175,7 +176,7 @@ class VaneGround:
             self.tests |= {TEST}
         self.small = self.whole
         if stage.excerpt is not None and len(stage.t) > QUICK:
-            self.small = stage.excerpt(excerpt_of(judge, fit, PIECE, QUICK))
+            self.small = stage.excerpt(excerpt_of(judge, fit, SHORT_PIECE if stage.window else PIECE, QUICK))
 
     def in_grains(self, of: float) -> None:
         """Compare errors in so large steps from now on (`Stage.grain`)."""
