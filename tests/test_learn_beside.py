@@ -50,6 +50,8 @@ def test_a_curve_is_learned_behind_a_dead_time(tmp_path: Path) -> None:
     middle = np.abs(law.x) < 2.5
     assert (law.y + line(law.x))[middle] == pytest.approx(notches(law.x)[middle], abs=0.08)
     assert said.by_log is not None and max(said.by_log.tested().values()) < 1.5
+    for log, v in said.by_log.tested(0.1 * said.by_log.logs.fitted.floor).items():  # in another noise
+        assert max(0.1 * v, 1.0) == pytest.approx(said.by_log.tested()[log])
     said.write(tmp_path / "law.toml")
     model = read(tmp_path / "law.toml", Model)
     assert model.effects["lever.dead_time"]["delay"] == pytest.approx(LATE, abs=0.02)

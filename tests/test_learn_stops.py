@@ -25,6 +25,7 @@ from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
+from vaneloop.discrepancy.models.confirmed import another_confirms
 from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.memory import BEFORE, forgotten, of_stops
 from vaneloop.discrepancy.models.tried import Tried
@@ -200,7 +201,7 @@ def test_of_what_a_bushing_may_be_the_hysteresis_at_the_crank_is_best(monkeypatc
     before = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     best = learner._finalists(before)[0]
     assert best.candidate.at == "linkage.crank"
-    assert learner._earns(before, best) and learner._confirmed(before, best)
+    assert learner._earns(before, best) and another_confirms(learner, before, best)
     # its first spline is wider than the bushing's first play
     assert rms_of(best.judge, best.fit) < 0.2 * rms_of(learner.judge, learner.base)
     table, amplitudes = best.table()

@@ -373,10 +373,14 @@ def _beside_named(
     said = _learned(again, by.model, progress, shape, formulas)
     if not said.laws or said.by_log is None:
         return None
-    if max(said.laws[-1].error_after ** 2 - 1.0, 0.0) > (1.0 - LEAST_FALL) * (left**2 - 1.0):
+    # with other laws the noise of what drives a model comes to another error: all is held against that of the first
+    floor, error = by.logs.fitted.floor, said.by_log.d.error_after
+    ratio = float(np.linalg.norm(error / floor) / np.linalg.norm(error / logs.fitted.floor))
+    held = ratio * said.laws[-1].error_after
+    if max(held**2 - 1.0, 0.0) > (1.0 - LEAST_FALL) * (left**2 - 1.0):
         return None
     before = (alone.by_log if alone.by_log is not None and alone.laws else by).tested()
-    if any(np.log(v / before[log]) > HARM for log, v in said.by_log.tested().items()):
+    if any(np.log(v / before[log]) > HARM for log, v in said.by_log.tested(floor).items()):
         return None
     named = " + ".join(d.final.effects)
     steps = list(said.by_log.steps.items())[1:]

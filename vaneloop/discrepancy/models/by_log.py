@@ -181,9 +181,9 @@ class ByLog:
                 out.append((f"all {len(bound.logs)} together", what, k, errors, _size(bound.measured[k])))
         return out
 
-    def tested(self) -> dict[str, float]:
-        """What the last step leaves of each test log, in noise floors, not below one."""
-        last, floor = list(self.steps.values())[-1], self.logs.fitted.floor
+    def tested(self, floor: Array | None = None) -> dict[str, float]:
+        """What the last step leaves of each test log, in noise floors (default: its own), not below one."""
+        last, floor = list(self.steps.values())[-1], self.logs.fitted.floor if floor is None else floor
         levels = {log: np.maximum(v / floor, 1.0) for log, v in last.items() if log not in self.logs.fitted.logs}
         return {log: float(np.exp(np.nanmean(np.log(v)))) for log, v in levels.items() if np.isfinite(v).any()}
 

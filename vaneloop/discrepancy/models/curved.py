@@ -456,10 +456,10 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     return out
 
 
-def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]]) -> Logs:
-    """The model with these curves on all its logs."""
-    test = with_curves(logs.test, (), curves) if logs.test is not None else None
-    return Logs(with_curves(logs.fitted, (), curves), test)
+def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]], laws: Sequence[str] = ()) -> Logs:
+    """The model with these curves, and these laws of the library, on all its logs."""
+    test = with_curves(logs.test, laws, curves) if logs.test is not None else None
+    return Logs(with_curves(logs.fitted, laws, curves), test)
 
 
 class OwnGround:
@@ -487,9 +487,11 @@ class OwnGround:
         starts = len(self.logs.fitted.system.parameters) + len(self.logs.fitted.runner.free_starts)
         return candidates(with_curves(self.logs.fitted, (), ()), theta[:starts])
 
-    def errors(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+    def errors(
+        self, curves: Sequence[tuple[Placed, Effect]], theta: Array, laws: Sequence[str] = ()
+    ) -> dict[str, Array]:  # fmt: skip
         """Error of every sample of each output in noise floors, log by log, test logs too."""
-        return {log: e / self.floor[:, None] for log, e in on_logs(self.logs, curves).errors(theta).items()}
+        return {log: e / self.floor[:, None] for log, e in on_logs(self.logs, curves, laws).errors(theta).items()}
 
     def within(self, candidate: Candidate) -> dict[str, Array]:
         """Of test logs, the samples where a candidate's quantity is where its curve was learned."""

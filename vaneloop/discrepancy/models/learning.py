@@ -34,12 +34,12 @@ from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.by_formula import (
     all_in_their_place,
     at_its_place,
-    better_than,
     earning_by_formula,
     harmless,
     leaves,
     without_memory,
 )
+from vaneloop.discrepancy.models.confirmed import another_confirms, instead_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.held_out import at_samples, surely_more, told_by_others, with_held_out
@@ -55,11 +55,9 @@ from vaneloop.discrepancy.models.tried import (
     Tried,
     adds_what,
     channel_of,
-    moves,
     one_constant,
     plain,
     stands,
-    step_without,
     strange,
     without_its_lag,
 )
@@ -77,7 +75,6 @@ SLIPPING = 2  # hystereses that are, whatever data left out say: what promises m
 OVER_TIME = 2  # of these of time: with its many splines it imitates much
 PLAINER = 2  # more that are fitted to the end, where they are plainer than the best; and as many at their place itself
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
-OTHER = 1.5  # times as large: another amplitude
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
 TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
 FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
@@ -154,7 +151,7 @@ class Learner:
             self._tell_apart(good, left)
             near = self._near(current, good, left)
             best, harms = None, []
-            for chosen in (t for t in near if self._confirmed(current, t)):  # what harms makes way for the next
+            for chosen in (t for t in near if another_confirms(self, current, t)):  # what harms makes way for the next
                 last, why = self._as_learned(current, chosen)
                 if not why:
                     best = last
@@ -232,12 +229,16 @@ class Learner:
         share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
         if left > UNKNOWN and share > MOST_LEFT:
             out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
-        elif named and self.d.effects and not better_than(self, Tried(last.candidate, 0.0, *named, ()), last):
+        elif named and self.d.effects and not instead_of(self, self._as_tried(last.candidate, *named), last):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
         else:
             out.verdict = "learned"
         return out
+
+    def _as_tried(self, candidate: Candidate, judge: Judge, fit: Fit) -> Tried:
+        """The laws of the library, to hold a candidate against them."""
+        return Tried(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
 
     def _known(self, among: Sequence[Tried]) -> Array:
         """Samples where all these curves are told by more than one block."""
@@ -351,30 +352,6 @@ class Learner:
             return False
         mine, its = (self._tested(before, t, [tried, best]) for t in (tried, best))
         return mine < its + HARM
-
-    def _confirmed(self, before: Tried, tried: Tried) -> bool:
-        """Whether another log, or another amplitude, says the same of a curve that remembers.
-
-        Manoeuvres of one size do not hold out a hysteresis: what imitates one of them imitates all. So each log is left
-        out in turn; of one log, the half of its blocks in which the channel moves most, then the other half.
-        """
-        if not tried.candidate.quantity.remembers:
-            return True
-        change = self._change(before, tried)
-        if change and self.ground.tests & set(change):
-            return min(change[log] for log in self.ground.tests & set(change)) < -LEAST_USE
-        far, log = moves(tried)
-        large = far > np.median(far)
-        parts = [log == k for k in range(log.max() + 1)] if log.any() else [large, ~large]
-        if not large.any() or not log.any() and not np.median(far[large]) > OTHER * np.median(far[~large]) > 0.0:
-            return False
-        fit, now = tried.fit, before.fit.cost if tried.settled is None else before.counted(tried.settled)[0]
-        for held in parts:
-            step = step_without(tried, held)
-            left = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
-            if not (fit.cost[held] + left).sum() < (1.0 - LEAST_USE) ** 2 * now[held].sum():
-                return False
-        return True
 
     def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
         """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""

@@ -14,10 +14,11 @@ from vaneloop.base.durations import in_name, named_lag
 from vaneloop.base.hysteresis import STOPS, slipped, weights_of
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["STOPS", "dissipates", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops"]
+__all__ = ["STOPS", "dissipates", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops", "swings"]
 
 COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
 BEFORE = 0.05  # share of a hysteresis's height that may be of what was before the log
+NO_TURN = 0.02  # share of its whole way by which a channel may go back without having turned
 NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
 
 
@@ -67,3 +68,28 @@ def forgotten(q: Array, high: float, table: Array) -> Array:
     highest, lowest = (f.accumulate(table[::-1])[::-1] for f in (np.maximum, np.minimum))
     rest = np.interp(0.5 * way, np.linspace(0.0, high, len(table)), np.maximum(highest - table, table - lowest))
     return np.asarray(np.maximum.accumulate(rest <= BEFORE * np.max(np.abs(table))))
+
+
+def swings(q: Array) -> Array:
+    """Of each sample of a channel, how far it goes from the turn before to the turn after; float64[samples].
+
+    It has turned where it goes back by more than `NO_TURN` of its whole way. What the log cuts off, before the first
+    turn and after the last, is as wide as the next swing at least.
+    """
+    least = NO_TURN * float(np.ptp(q))
+    high = low = heads = 0
+    turns: list[int] = []
+    for k, v in enumerate(q.tolist()):
+        high, low = (k if v > q[high] else high), (k if v < q[low] else low)
+        if heads >= 0 and q[high] - v > least:
+            turns.append(high)
+            heads, low = -1, k
+        elif heads <= 0 and v - q[low] > least:
+            turns.append(low)
+            heads, high = 1, k
+    if not turns:
+        return np.zeros(len(q))
+    turns.append(len(q) - 1)
+    wide = np.abs(np.diff(q[turns]))
+    wide[[0, -1]] = wide[:2].max(), wide[-2:].max()
+    return np.repeat(wide, np.diff([0, *turns[1:-1], len(q)]))

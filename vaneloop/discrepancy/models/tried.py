@@ -28,7 +28,6 @@ __all__ = [
     "adds_what",
     "channel_of",
     "left_by_its_mean",
-    "moves",
     "one_constant",
     "plain",
     "stands",
@@ -71,7 +70,7 @@ class Ground(Protocol):
     def candidates(self, theta: Array) -> list[Candidate]:
         """Every curve that may be missing, at parameters ``theta`` of a stage without any."""
 
-    def errors(self, curves: Placings, theta: Array) -> dict[str, Array]:
+    def errors(self, curves: Placings, theta: Array, laws: Sequence[str] = ()) -> dict[str, Array]:
         """Error of every sample of each output in noise floors, log by log, test logs too; NaN where none is known."""
 
     def within(self, candidate: Candidate) -> dict[str, Array]:
@@ -249,17 +248,6 @@ def left_by_its_mean(tried: Tried) -> float:
 def stands(current: Tried, candidate: Candidate) -> bool:
     """Whether a candidate, with just this lag or period, is one of the curves that were learned already."""
     return any(q.effect == candidate.name for q, _ in current.curves)
-
-
-def moves(tried: Tried) -> tuple[Array, Array]:
-    """How far the channel that a curve remembers goes in each block, and the number of the log that the block is of."""
-    courses, judge = tried.candidate.quantity.course, tried.judge
-    log = np.repeat(np.arange(len(courses)), [len(c) for c in courses])
-    course = np.concatenate(courses)
-    n, start = judge.measured.shape[1], judge.block_start
-    some = slice(None, None, max(1, round(len(course) / n)))
-    course, log = course[some][:n], log[some][:n]
-    return np.maximum.reduceat(course, start) - np.minimum.reduceat(course, start), log[start]
 
 
 def step_without(tried: Tried, held: Array) -> Array:

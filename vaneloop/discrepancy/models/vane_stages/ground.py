@@ -186,7 +186,9 @@ class VaneGround:
         """The same stage with only these laws of the library, and these curves, as effects."""
         return remade(self.small if quick else self.whole, laws, curves)
 
-    def errors(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, Array]:
+    def errors(
+        self, curves: Sequence[tuple[Placed, Effect]], theta: Array, laws: Sequence[str] = ()
+    ) -> dict[str, Array]:  # fmt: skip
         """Error of every sample of each output in noise floors: of what was fitted, of the rest of the log where there
         is one, and of the test log.
         """
@@ -196,7 +198,7 @@ class VaneGround:
         for name, stage, part in asked:
             if stage is None or (name == REST and REST not in self.tests):
                 continue
-            judge = Judge(remade(stage, (), curves), self.floor, part)
+            judge = Judge(remade(stage, laws, curves), self.floor, part)
             out[name] = np.where(judge.valid, judge.errors(theta[None])[0], np.nan)
         return out
 
