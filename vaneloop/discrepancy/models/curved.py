@@ -89,6 +89,7 @@ class Candidate:
     shape  what is known of it beforehand (`SHAPES`)
     jump   whether it has a jump, too, where its quantity is 0
     settled  samples at which it does not remember what was before the log; None: all
+    splines  how many it was to have (0: as many as usual)
     """
 
     name: str
@@ -105,6 +106,7 @@ class Candidate:
     shape: tuple[str, ...] = ()
     jump: bool = False
     settled: Array | None = None
+    splines: int = 0
 
     @property
     def lent(self) -> set[int]:
@@ -183,13 +185,29 @@ class Candidate:
         return replace(self, name=name, quantity=q, basis=waves_of(q.period, harmonics))
 
     def slower(self, times: float) -> Candidate | None:
-        """The same with a lag, or a period, so many times as long; None: it has none, or it would not be one."""
+        """The same, as fine, with a lag, or a period, so many times as long; None: it has none, or it would not be
+        one.
+        """
         q = self.quantity.slower(times) if self.quantity.slower is not None else None
-        many = len(self.basis.bend) if self.quantity.period else 0
+        many = len(self.basis.bend) if self.quantity.period else self.splines
         basis = replace(self, quantity=q).basis_of(many) if q is not None else None
-        if q is None or basis is None or basis.turn.shape != self.basis.turn.shape:
+        if q is None or basis is None:
             return None
         return replace(self, name=self.name.replace(self.quantity.name, q.name), quantity=q, basis=basis)
+
+    def finer(self, splines: int) -> Candidate | None:
+        """The same with so many splines; None where it has as many, or where its quantity has too few values."""
+        basis = self.basis_of(splines)
+        if basis is None or len(basis.bend) <= len(self.basis.bend):
+            return None
+        return replace(self, basis=basis, splines=splines)
+
+    def as_of(self, other: Candidate, amplitudes: Array) -> Array:
+        """Its amplitudes where it is nearest to another's curve, from end to end of both."""
+        n = len(other.kept)
+        curve = other.basis.design(other.grid) @ (other.turn @ amplitudes[:n])
+        own = np.linalg.lstsq(self.basis.design(self.grid) @ self.turn, curve, rcond=None)[0]
+        return np.maximum(np.append(own, amplitudes[n:]), [p.low for p in self.effect(1.0).parameters])
 
     @property
     def turn(self) -> Array:

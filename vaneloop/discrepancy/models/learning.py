@@ -370,8 +370,20 @@ class Learner:
         slower = best.candidate.slower(times)
         if slower is None or stands(current, slower):
             return None
-        more = self._fitted(current, slower, best.wiggle, best.fit.theta, 12)
-        return more if self._score(more, [more, best]) < self._score(best, [more, best]) - STEP else None
+        more = self._fitted(current, slower, best.wiggle, self._begun(best, slower), 12)
+        (judge, now), (_, was) = (self._judged(t, [more, best]) for t in (more, best))
+        worse = score(judge, now) - score(judge, was)
+        # within the noise the score does not tell: what is left there still does
+        falls = 0.5 * float(np.log(was.held_out.sum() / now.held_out.sum()))
+        return more if worse < -STEP or (worse < STEP and falls > STEP) else None
+
+    def _begun(self, tried: Tried, candidate: Candidate) -> Array:
+        """Parameters from which a candidate begins that is nearly what has been fitted."""
+        c, theta = tried.candidate, tried.fit.theta
+        if candidate.splines == c.splines and candidate.parts == c.parts:
+            return theta
+        own = tried.judge.stage.index()[c.name]
+        return np.concatenate([theta[: own.start], candidate.as_of(c, theta[own])])
 
     def _settled(self, current: Tried, best: Tried) -> Tried:
         """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
@@ -462,16 +474,10 @@ class Learner:
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
-        c = coarse.candidate
-        basis = c.basis_of(SPLINES)
-        if basis is None or len(basis.bend) <= len(c.basis.bend):
+        fine = coarse.candidate.finer(SPLINES)
+        if fine is None:
             return None
-        fine = replace(c, basis=basis)
-        curve = c.basis.design(fine.grid) @ (c.turn @ coarse.fit.theta[coarse.judge.stage.index()[c.name]])
-        amplitudes = np.linalg.lstsq(basis.design(fine.grid) @ fine.turn, curve, rcond=None)[0]
-        amplitudes = np.maximum(amplitudes, [p.low for p in fine.effect(1.0).parameters])
-        theta = np.concatenate([coarse.fit.theta[: coarse.judge.stage.index()[c.name].start], amplitudes])
-        return self._fitted(current, fine, WIGGLES[-1], theta, 12)
+        return self._fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12)
 
     def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
         """The same curve with a jump where its quantity is 0."""
