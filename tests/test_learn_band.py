@@ -66,3 +66,23 @@ def test_where_no_log_has_been_a_draw_may_leave_the_band() -> None:
     (low, high), (lowest, highest) = band_of(tried, some), band_of(tried, np.ones(POINTS, dtype=bool))
     assert np.all(high - low <= highest - lowest)
     assert np.median((high - low) / (highest - lowest)) < 0.95
+
+
+def test_each_draw_counts_to_both_sides() -> None:
+    """A block that alone tells an end pulls all draws without it one way; the fit may be off to the other."""
+    tried, _, design = a_fit(2)
+    y = design @ tried.fit.theta
+    tried.fit.gradients[0] += 3.0 * tried.fit.normals.sum(axis=0)[0]
+    low, high = band_of(tried, np.ones(POINTS, dtype=bool))
+    assert np.allclose(high - y, y - low, rtol=1e-9)
+
+
+def test_a_band_ends_where_amplitudes_do() -> None:
+    """An amplitude that cannot be less than it is leaves nothing below."""
+    tried, _, design = a_fit(3)
+    theta, n = tried.fit.theta, len(tried.fit.theta)
+    tried.judge.bounds = lambda: (theta, np.full(n, np.inf))
+    tried.table = lambda: (np.abs(design).__matmul__, theta)
+    low, high = band_of(tried, np.ones(POINTS, dtype=bool))
+    y = np.abs(design) @ theta
+    assert np.max(y - low) < 1e-6 * np.median(high - y)

@@ -156,6 +156,9 @@ def band_of(tried: Tried, been: Array) -> tuple[Array, Array]:
     """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
     the fit. What the log cannot tell apart is as wide as it was known before.
 
+    Each draw counts to both sides: it tells how far the fit may be off. To which side is its own, as a block that alone
+    tells an end pulls its own way (Hall 1988).
+
     It holds nine draws in ten as a whole, at all points of the table where logs have ``been`` (Ruppert, Wand and
     Carroll 2003, 6.5): one that holds nine in ten point by point leaves most of them somewhere.
     """
@@ -174,7 +177,8 @@ def band_of(tried: Tried, been: Array) -> tuple[Array, Array]:
     for w, drawn in zip(weights, known, strict=True):
         a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
         step = np.linalg.solve(a, (w - 1.0) @ fit.gradients + drawn)
-        curves.append(table(np.clip(fit.theta[fit.free] + step * scale, *bounds)[mine]))
+        for off in (step, -step):
+            curves.append(table(np.clip(fit.theta[fit.free] + off * scale, *bounds)[mine]))
     edge = 50.0 * (1.0 - BAND)
     low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
     y = table(amplitudes)
