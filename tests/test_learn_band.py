@@ -34,7 +34,7 @@ def a_fit(seed: int) -> tuple[Any, np.ndarray, np.ndarray]:
     )  # fmt: skip
     judge = SimpleNamespace(
         scale=np.ones(len(theta)), n_blocks=BLOCKS, bounds=lambda: (np.full(len(theta), -np.inf), np.inf * theta**2),
-        stage=SimpleNamespace(index=lambda: {"curve": slice(0, len(theta))}),
+        stage=SimpleNamespace(index=lambda: {"curve": slice(0, len(theta))}, neutral=lambda: np.zeros(len(theta))),
     )  # fmt: skip
     design = basis.design(np.linspace(basis.low, basis.high, POINTS)) @ basis.turn
     tried = SimpleNamespace(
@@ -72,7 +72,6 @@ def test_each_draw_counts_to_both_sides() -> None:
     """A block that alone tells an end pulls all draws without it one way; the fit may be off to the other."""
     tried, _, design = a_fit(2)
     y = design @ tried.fit.theta
-    tried.fit.gradients[0] += 3.0 * tried.fit.normals.sum(axis=0)[0]
     low, high = band_of(tried, np.ones(POINTS, dtype=bool))
     assert np.allclose(high - y, y - low, rtol=1e-9)
 
@@ -86,3 +85,15 @@ def test_a_band_ends_where_amplitudes_do() -> None:
     low, high = band_of(tried, np.ones(POINTS, dtype=bool))
     y = np.abs(design) @ theta
     assert np.max(y - low) < 1e-6 * np.median(high - y)
+
+
+def test_a_fit_that_ends_before_its_solution_has_the_same_band() -> None:
+    """What it is still pulled by is no block's: of an end that one block tells it would make any width."""
+    done, _, design = a_fit(4)
+    low, high = band_of(done, np.ones(POINTS, dtype=bool))
+    short = 0.05 * np.sqrt(1.0 / (done.fit.normals.sum(axis=0).diagonal() + done.fit.prior))
+    done.fit.theta = theta = done.fit.theta - short
+    done.fit.gradients = done.fit.gradients + done.fit.normals @ short
+    done.table = lambda: (design.__matmul__, theta)
+    lower, higher = band_of(done, np.ones(POINTS, dtype=bool))
+    assert np.allclose(higher - lower, high - low, rtol=1e-6)
