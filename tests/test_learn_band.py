@@ -34,7 +34,7 @@ def a_fit(seed: int) -> tuple[Any, np.ndarray, np.ndarray]:
     )  # fmt: skip
     judge = SimpleNamespace(
         scale=np.ones(len(theta)), n_blocks=BLOCKS, bounds=lambda: (np.full(len(theta), -np.inf), np.inf * theta**2),
-        stage=SimpleNamespace(index=lambda: {"curve": slice(0, len(theta))}),
+        stage=SimpleNamespace(index=lambda: {"curve": slice(0, len(theta))}, neutral=lambda: np.zeros(len(theta))),
     )  # fmt: skip
     design = basis.design(np.linspace(basis.low, basis.high, POINTS)) @ basis.turn
     tried = SimpleNamespace(
@@ -66,3 +66,34 @@ def test_where_no_log_has_been_a_draw_may_leave_the_band() -> None:
     (low, high), (lowest, highest) = band_of(tried, some), band_of(tried, np.ones(POINTS, dtype=bool))
     assert np.all(high - low <= highest - lowest)
     assert np.median((high - low) / (highest - lowest)) < 0.95
+
+
+def test_each_draw_counts_to_both_sides() -> None:
+    """A block that alone tells an end pulls all draws without it one way; the fit may be off to the other."""
+    tried, _, design = a_fit(2)
+    y = design @ tried.fit.theta
+    low, high = band_of(tried, np.ones(POINTS, dtype=bool))
+    assert np.allclose(high - y, y - low, rtol=1e-9)
+
+
+def test_a_band_ends_where_amplitudes_do() -> None:
+    """An amplitude that cannot be less than it is leaves nothing below."""
+    tried, _, design = a_fit(3)
+    theta, n = tried.fit.theta, len(tried.fit.theta)
+    tried.judge.bounds = lambda: (theta, np.full(n, np.inf))
+    tried.table = lambda: (np.abs(design).__matmul__, theta)
+    low, high = band_of(tried, np.ones(POINTS, dtype=bool))
+    y = np.abs(design) @ theta
+    assert np.max(y - low) < 1e-6 * np.median(high - y)
+
+
+def test_a_fit_that_ends_before_its_solution_has_the_same_band() -> None:
+    """What it is still pulled by is no block's: of an end that one block tells it would make any width."""
+    done, _, design = a_fit(4)
+    low, high = band_of(done, np.ones(POINTS, dtype=bool))
+    short = 0.05 * np.sqrt(1.0 / (done.fit.normals.sum(axis=0).diagonal() + done.fit.prior))
+    done.fit.theta = theta = done.fit.theta - short
+    done.fit.gradients = done.fit.gradients + done.fit.normals @ short
+    done.table = lambda: (design.__matmul__, theta)
+    lower, higher = band_of(done, np.ones(POINTS, dtype=bool))
+    assert np.allclose(higher - lower, high - low, rtol=1e-6)

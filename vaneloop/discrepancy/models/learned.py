@@ -11,7 +11,7 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.base.durations import period_of, within_no_period
-from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas, likely
@@ -156,6 +156,10 @@ def band_of(tried: Tried, been: Array) -> tuple[Array, Array]:
     """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
     the fit. What the log cannot tell apart is as wide as it was known before.
 
+    Each draw counts to both sides: it tells how far the fit may be off. To which side is its own, as a block that alone
+    tells an end pulls its own way (Hall 1988). A fit ends a little before its solution. What it is still pulled by is
+    no block's, so the pulls are those at the solution.
+
     It holds nine draws in ten as a whole, at all points of the table where logs have ``been`` (Ruppert, Wand and
     Carroll 2003, 6.5): one that holds nine in ten point by point leaves most of them somewhere.
     """
@@ -170,11 +174,19 @@ def band_of(tried: Tried, been: Array) -> tuple[Array, Array]:
     at = judge.stage.index()[c.name]
     bounds = tuple(b[fit.free] for b in judge.bounds())
     mine = np.flatnonzero((fit.free >= at.start) & (fit.free < at.stop))
+    deviation = (fit.theta - judge.stage.neutral())[fit.free] / scale
+    rest = bounded_step(
+        fit.normals.sum(axis=0) + np.diag(prior + 1e-9),
+        fit.gradients.sum(axis=0) - prior * deviation,
+        *((b - fit.theta[fit.free]) / scale for b in bounds),
+    )
+    pulls = fit.gradients - fit.normals @ rest
     curves = []
     for w, drawn in zip(weights, known, strict=True):
         a = np.tensordot(w, fit.normals, 1) + np.diag(prior + 1e-9)
-        step = np.linalg.solve(a, (w - 1.0) @ fit.gradients + drawn)
-        curves.append(table(np.clip(fit.theta[fit.free] + step * scale, *bounds)[mine]))
+        step = np.linalg.solve(a, (w - 1.0) @ pulls + drawn)
+        for off in (step, -step):
+            curves.append(table(np.clip(fit.theta[fit.free] + off * scale, *bounds)[mine]))
     edge = 50.0 * (1.0 - BAND)
     low, high = np.percentile(curves, [edge, 100.0 - edge], axis=0)
     y = table(amplitudes)
