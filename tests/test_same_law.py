@@ -67,3 +67,23 @@ def test_a_drag_is_a_gain_of_the_damping_and_no_gain_of_the_mass(how: str, at: s
         law(how, at, of, x, y, 0.01), bound, CART, "speed", "speed", lambda v: 0.7 / 4.0 * v * np.abs(v)
     )
     assert (said["inside"] > 0.95) == same
+
+
+@pytest.mark.parametrize("untold", [(), (0,), (1,), (0, 1)])
+@pytest.mark.parametrize(("flow", "same"), [(0.3, True), (0.4, False)])
+def test_a_bias_of_the_pump_is_a_constant_flow_into_its_tank_whatever_cannot_be_told(
+    untold: tuple[int, ...], flow: float, same: bool
+) -> None:
+    tanks = System(
+        "tanks", "simulate",
+        lambda x, u, p: [p.inflow * u.pump - p.outflow * x.upper, p.outflow * x.upper - 0.2 * x.lower],
+        inputs={"pump": "V"}, states={"upper": "cm", "lower": "cm"}, outputs={"lower": "cm"},
+        parameters=[unknown("inflow", 0.15, "cm/(V s)"), unknown("outflow", 0.35, "1/s")],
+    )  # fmt: skip
+    pump = 3.0 + 2.0 * np.sin(T)
+    bound = tanks.bind([Record("run", T, {"pump": pump, "lower": 2.0 * pump})])
+    x = np.linspace(1.0, 5.0, 257)
+    # what adds to a state is taken off it; no parameter makes a constant flow
+    learned = law("state adds", "upper", "pump", x, np.full(257, -flow), 1e-3, untold=untold)
+    judged = same_by_equations(learned, bound, tanks, "pump", "", lambda q: np.full(len(q), 2.0))
+    assert (judged["inside"] > 0.9) is same

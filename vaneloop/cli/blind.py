@@ -106,8 +106,9 @@ def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row
     visited = weight > 0.0
     x, w = law.x[visited], weight[visited]
     off = law.y[visited] - value(x)
-    if law.untold:  # a slope that a gain takes makes the rest larger by as much
-        lines = np.stack([(np.ones(len(x)), x, value(x))[k] for k in (*law.untold, *([2] if 1 in law.untold else []))])
+    if law.untold:  # a slope that a gain takes makes the rest larger by as much, but no constant
+        larger = [2] if 1 in law.untold and np.ptp(value(x)) > 0.0 else []
+        lines = np.stack([(np.ones(len(x)), x, value(x))[k] for k in (*law.untold, *larger)])
         off = off - np.linalg.lstsq((lines * np.sqrt(w)).T, off * np.sqrt(w), rcond=1e-9)[0] @ lines
     low, high = (law.low - law.y)[visited], (law.high - law.y)[visited]
     within = (low <= -off) & (-off <= high)
