@@ -113,8 +113,12 @@ class Heard:
         return bool(self.signal("VGV_SERVO", "fault_paused").any())
 
     def degraded(self) -> bool:
-        """The controller was in DEGRADED; not judged where it stood still."""
-        return self.stood_still() or bool((self.signal("VGV_STATUS", "state") == DEGRADED).any())
+        """The controller said that it refused a burst of frames, and was in DEGRADED, or in FAIL_SAFE, where the ECU's
+        own frames were too late as well; not judged where it stood still.
+        """
+        refused = bool(self.signal("VGV_SERVO", "fault_demand_rejected").any())
+        state = self.signal("VGV_STATUS", "state")
+        return self.stood_still() or (refused and bool(np.isin(state, (DEGRADED, MODES.index("FAIL_SAFE"))).any()))
 
 
 def listeners() -> int:
