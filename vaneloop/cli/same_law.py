@@ -52,9 +52,7 @@ def same_by_equations(law: Any, bound: Any, model: Any, at: str, of: str, value:
     taken = list(range(len(model.parameters))) if law.untold else []
     if law.how == "parameter times":
         taken.append([p.name for p in model.parameters].index(law.at))
-    # where a law changes nothing, what parameters take off leaves rounding of what the model says there
     little = 1e-6 * np.max(np.abs(truth), axis=1, keepdims=True)
-    little = little + 1e-9 * np.max(np.abs(world.plain), axis=1, keepdims=True)
     bends = 1 in law.untold and np.ptp(value(world.known(of))) > 0.0  # a gain makes what bends larger, no constant
     # parameters may take what cannot be told, or nothing: least squares moves them a little for any difference at all
     offs = [truth - middle, world.less(truth - middle, taken, [truth] if bends else [])]
