@@ -6,6 +6,7 @@ Pictures are kept in the folder VANELOOP_SHOTS, where it is set.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -16,6 +17,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +91,16 @@ class Server:
                 own = [c for task in Path(f"/proc/{pid}/task").glob("*/children") for c in task.read_text().split()]
                 below[pid] = {int(c) for c in own}
         return {p for pid, own in below.items() if own for p in (pid, *own)}
+
+    def hold_search(self) -> set[int]:
+        """Stop the processes of the search that was just asked for where they are, as soon as there are any."""
+        deadline = time.monotonic() + LONG / 1000.0
+        while len(found := self.searching()) < 2:  # a search has a worker and its own processes
+            assert time.monotonic() < deadline, "no search has begun"
+            time.sleep(0.01)
+        for pid in found:
+            os.kill(pid, signal.SIGSTOP)
+        return found
 
     def stop(self) -> None:
         self.process.send_signal(signal.SIGINT)
@@ -248,9 +260,7 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     # a cancelled search leaves nothing behind
     tab_to(page, ".find-missing")
     page.keyboard.press("Enter")
-    page.get_by_text("stages searched").wait_for()
-    during = server.searching()
-    assert len(during) >= 2, "a search has a worker and its own processes"
+    during = server.hold_search()
     holds_focus(page, ".cancel")  # the button that began it is gone
     page.keyboard.press("Enter")
     page.get_by_text("stopped").wait_for()
@@ -262,9 +272,11 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
 
     # a reload in the middle of a search keeps it
     page.keyboard.press("Enter")
-    page.get_by_text("stages searched").wait_for()
+    during = server.hold_search()
     page.reload()
-    page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
+    page.get_by_role("button", name="Cancel").wait_for()
+    for pid in during:
+        os.kill(pid, signal.SIGCONT)
     page.get_by_text("The actuator stage lacks valve_dead_band and aero_load").wait_for()
     wait_ratio(page, "< 1.1")
     found = page.locator('[data-effect="valve_dead_band"] .about').inner_text()
@@ -373,11 +385,20 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
 
 @needs_browser
 def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path: Path) -> None:
-    """In the browser what to do next, in the terminal the line of the defect; no traceback anywhere."""
+    """In the browser what to do next, in the terminal the line of the defect; no traceback anywhere. The other parts
+    go on: a search whose answer is late shows what its stages said meanwhile.
+    """
     (tmp_path / "broken_pages.py").write_text(
         "import sys\nfrom vaneloop.cli.main import main\nimport vaneloop.web.schedule as s\n"
         "import vaneloop.web.chosen_log as c\n"
         "s.build = lambda *_: 1 / 0\nc.ChosenLog._channels = lambda self: self.s.choice.file and {}['gone']\n"
+        "import asyncio, pathlib\nfrom vaneloop.web.jobs import Worker\ncall = Worker.call\n"
+        "async def late(self, name, text, **given):\n"
+        "    answer = await call(self, name, text, **given)\n"
+        "    while name == 'diagnose' and not pathlib.Path('answered').exists():\n"
+        "        await asyncio.sleep(0.05)\n"
+        "    return answer\n"
+        "Worker.call = late\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     server = Server(tmp_path, module="broken_pages", PYTHONPATH=str(tmp_path))
@@ -390,6 +411,12 @@ def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path
         choose(page, "hidden_effect.parquet")
         page.get_by_role("alert").filter(has_text="a part of this page failed").wait_for()
         page.get_by_text("fails most in the actuator stage").wait_for()  # the other parts go on
+        page.get_by_role("button", name="Find the missing physics").click()
+        page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
+        page.get_by_text("stages searched").wait_for()
+        (tmp_path / "answered").touch()
+        page.get_by_text("The actuator stage lacks valve_dead_band and aero_load").wait_for()
+        page.get_by_text("so far:").first.wait_for(state="detached")  # the answer says it
         page.context.close()
     finally:
         server.stop()
@@ -966,9 +993,17 @@ def test_the_commands_of_a_run_name_the_bus_that_it_is_on(tmp_path: Path) -> Non
                 else:
                     assert args.profile == loop.profile
     loop.bus = "local"
-    loop._worker = lambda name: type("W", (), {"call": lambda self, task, _, **given: asked.append((task, given))})()  # type: ignore
-    with pytest.raises(TypeError):  # these answers cannot be waited for
-        loop._in_real_time().send(None)
+
+    class Asked:
+        """Answers at once."""
+
+        async def call(self, task: str, _: str, **given: Any) -> dict[str, Any]:
+            asked.append((task, given))
+            return {}
+
+    loop._worker = lambda name: Asked()  # type: ignore
+    with ThreadPoolExecutor(1) as pool:  # this thread may be Playwright's
+        pool.submit(asyncio.run, loop._in_real_time()).result()
     assert [given["bus"] for _, given in asked] == [loop.bus_name] * 3
 
 
