@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -67,6 +67,22 @@ class Fit:
     low: Array
     high: Array
     stalled: bool = False
+
+
+class _End(NamedTuple):
+    """Where a descent has come to.
+
+    total   what it minimises there
+    errors  whitened errors there; ``linear``: costs, gradients and normals of the blocks; None: they are not known
+    """
+
+    theta: Array
+    total: float
+    free: Array
+    prior: Array
+    errors: Array | None
+    linear: tuple[Array, Array, Array] | None
+    stalled: bool
 
 
 class Judge:
@@ -251,6 +267,27 @@ class Judge:
         self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None
     ) -> Task[Fit]:
         """`fit` as a task for `together`."""
+        end = yield from self._descent(effects, start, iterations, weights)
+        s, free, scale, linear = self.stage, end.free, self.scale[end.free], end.linear
+        low, high = self.bounds()
+        if linear is None:
+            thetas, derivative = self._differences(end.theta, free, scale, high, end.errors)
+            linear = self._blocks(*derivative((yield thetas)))
+        fit = self._finish(effects, end.theta, free, end.prior, scale, s.neutral(), low, high, *linear)
+        return replace(fit, stalled=end.stalled)
+
+    def leading(self, effects: tuple[str, ...], start: Array, iterations: int) -> Task[tuple[float, Array]]:
+        """Where the first steps of a `fitting` lead: what it has minimised there, and the parameters.
+
+        What a fit is judged by, its derivatives at its end, costs as much as a step. Here it is left out.
+        """
+        end = yield from self._descent(effects, start, iterations)
+        return end.total, end.theta
+
+    def _descent(
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int, weights: Array | None = None
+    ) -> Task[_End]:
+        """The steps of a `fitting`."""
         s = self.stage
         free = self.columns(effects)
         low, high = self.bounds()
@@ -274,12 +311,13 @@ class Judge:
         stalled = False
         best: float | None = None
         known: Array | None = None  # errors at theta
+        reached = np.inf
         for _ in range(iterations):
             if linear is None:
                 thetas, derivative = self._differences(theta, free, scale, high, known)
                 linear = self._blocks(*derivative((yield thetas)))
             cost, gradients, normals = linear
-            here = float(total(cost[None], theta[None])[0])
+            here = reached = float(total(cost[None], theta[None])[0])
             little = 0.2 * len(free)
             if self.roughly:
                 little *= 1.0 + max(here - self.n, 0.0) / EVIDENCE
@@ -317,12 +355,10 @@ class Judge:
             if not costs[k] < here:
                 break
             damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
+            reached = float(costs[k])
             if here - costs[k] < (max(little, STILL * (here - self.n)) if self.sparing else little):
                 break
-        if linear is None:
-            thetas, derivative = self._differences(theta, free, scale, high, known)
-            linear = self._blocks(*derivative((yield thetas)))
-        return replace(self._finish(effects, theta, free, prior, scale, nominal, low, high, *linear), stalled=stalled)
+        return _End(theta, reached, free, prior, known, linear, stalled)
 
     def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives

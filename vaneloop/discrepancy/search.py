@@ -250,20 +250,26 @@ class Search:
         """What a quick fit of an effect leaves, from the start that is best once the model's own parameters have
         followed it; that fit and the starts then are where a fit begins.
         """
-        fits = []
+        led = []
         for start in self.starts[name]:
-            fits.append((yield from self.judge.fitting((), start, 2)))
-        fits.sort(key=self.judge.total_of)
-        quick = yield from self.judge.fitting((name,), fits[0].theta, 2)
-        self.starts[name] = [quick.theta, *(f.theta for f in fits[1:])]
-        return self.judge.total_of(quick)
+            led.append((yield from self.judge.leading((), start, 2)))
+        led.sort(key=lambda of: of[0])
+        left, theta = yield from self.judge.leading((name,), led[0][1], 2)
+        self.starts[name] = [theta, *(theta for _, theta in led[1:])]
+        return left
 
     def _begun(self, name: str) -> Task[Fit]:
         """The best of quick fits of an effect, one from each start."""
-        fits = []
-        for start in self.starts[name]:
-            fits.append((yield from self.judge.fitting((name,), start, 3)))
-        return min(fits, key=self.judge.total_of)
+        return (yield from self._best((name,), self.starts[name]))
+
+    def _best(self, effects: tuple[str, ...], starts: Sequence[Array]) -> Task[Fit]:
+        """The best of quick fits from these starts."""
+        if len(starts) == 1:
+            return (yield from self.judge.fitting(effects, starts[0], 3))
+        led = []
+        for start in starts:
+            led.append((yield from self.judge.leading(effects, start, 3)))
+        return (yield from self.judge.fitting(effects, min(led, key=lambda of: of[0])[1], 0))
 
     def _steps(self, effects: Sequence[str]) -> int:
         """How many steps finish a fit; more of one effect with a direction: a curve leads from one to the next."""
@@ -393,9 +399,8 @@ class Search:
         out = []
         for k in np.argsort(left, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
             rest, theta = begins[k]
-            fit = yield from judge.fitting(rest, theta, 2)
-            fit = yield from judge.fitting(effects, fit.theta, 2)
-            out.append((judge.total_of(fit), fit.theta))
+            _, theta = yield from judge.leading(rest, theta, 2)
+            out.append((yield from judge.leading(effects, theta, 2)))
         return sorted(out, key=lambda c: c[0])
 
     def _left(self, rest: frozenset[str], errors: Array) -> float:
@@ -422,10 +427,7 @@ class Search:
         key = frozenset(effects)
         if key not in self.fits:
             begins = self.begun.get(key) or (yield from self._begins(effects))
-            fits = []
-            for _, theta in begins:
-                fits.append((yield from self.judge.fitting(tuple(effects), theta, 3)))
-            self.fits[key] = min(fits, key=self.judge.total_of)
+            self.fits[key] = yield from self._best(tuple(effects), [theta for _, theta in begins])
             self.tick()
         if finished and key not in self.finished:
             task = self.judge.fitting(tuple(effects), self.fits[key], 8)
@@ -450,7 +452,7 @@ class Search:
         for share in (0.25, 0.5, 0.75, 1.0):  # by and by, so that the others can follow
             theta = theta.copy()
             theta[at] = first + share * (neutral - first)
-            theta = self.judge.fit(rest, theta, 5).theta
+            _, theta = self.judge.together([self.judge.leading(rest, theta, 5)])[0]
         other = self.judge.together([self._finished(self.judge.fitting(rest, theta, 8))])[0]
         if self.judge.total_of(other) < 0.99 * self.judge.total_of(known):
             self.fits[frozenset(rest)] = known = other
