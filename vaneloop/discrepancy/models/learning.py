@@ -49,6 +49,7 @@ from vaneloop.discrepancy.models.screening import screened
 from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
+    MEASURED,
     Ground,
     Outcome,
     Placings,
@@ -317,7 +318,7 @@ class Learner:
         where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
         little more.
         """
-        plain_ones = [t for t in good if strange(t.candidate) <= 1]
+        plain_ones = [t for t in good if strange(t.candidate) <= MEASURED]
         best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
         if best is None or self.fails(best):
             return
