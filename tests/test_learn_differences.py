@@ -136,6 +136,14 @@ def test_a_difference_is_less_plain_than_its_channels_and_plainer_than_what_drif
     assert max(at["motor"], at["drum"]) < at[D] < min(at["time"], at["direction_of_motor"], at[lag])
 
 
+def test_a_curve_of_a_difference_has_the_shape_that_is_known(bound) -> None:
+    c = next(c for c in candidates(bound, np.array([2.0, 0.8])) if c.name == f"drum.curve_of_{D}")
+    odd = c.shaped(["odd"])
+    assert odd is not None
+    y = odd.basis.design(odd.grid) @ odd.turn
+    assert np.allclose(y, -y[::-1], atol=1e-9 * np.abs(y).max())
+
+
 @given(st.lists(st.sampled_from(["a", "b", "minus", "a_minus_b"]), min_size=2, max_size=2, unique=True))
 def test_a_name_is_taken_apart_where_both_sides_are_known(names: list[str]) -> None:
     one, other = names
