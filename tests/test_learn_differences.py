@@ -8,6 +8,7 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace as Values
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,10 +22,12 @@ from vaneloop.base.tables import read
 from vaneloop.cli.same_law import same_by_equations
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.formulas import Formula
+from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import candidates, with_curves
+from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
 from vaneloop.discrepancy.models.known import quantities
 from vaneloop.discrepancy.models.learned import LearnedLaw
+from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.python_law import python_law
 from vaneloop.discrepancy.models.quantities import sides_of
 from vaneloop.discrepancy.models.tried import plain
@@ -288,6 +291,21 @@ def test_the_judge_knows_a_difference_by_its_two_sides(bound, at: str, of: str, 
     assert (said["inside"] > 0.9) is same and said["formula"] is same
 
 
+def test_a_test_log_speaks_of_a_difference_that_would_be_none_by_itself() -> None:
+    """In the test log the belt stands, so that less it a speed is the same quantity there."""
+    further = run_of_a_drive(2, size=12.0)
+    further = Record("further", further.t, {**further.columns, "belt": np.full(len(further.t), 1.0)})
+    ground = OwnGround(bind(DRIVE, [run_of_a_drive(1)], [further]))
+    assert ground.logs.test is not None and list(differences(ground.logs.test)) == [D]
+    every = ground.candidates(ground.logs.fitted.stage.neutral()[:2])
+    for of in (D, "motor_minus_belt"):
+        c = next(c for c in every if c.name == f"clutch.gain_of_{of}")
+        one, other = (further.columns[n] for n in of.split("_minus_"))
+        inside = (one - other >= c.basis.low) & (one - other <= c.basis.high)
+        assert 0.4 < inside.mean() < 0.95
+        assert np.mean(ground.within(c)["further"] == inside) > 0.98
+
+
 # ---- learning --------------------------------------------------------------------------------------------------------
 
 
@@ -317,6 +335,26 @@ def test_what_is_of_one_of_the_two_alone_is_learned_as_that() -> None:
     answer = learn([run_of_a_drive(1, windage)], DRIVE, test=[run_of_a_drive(2, windage)])
     assert answer.verdict in ("learned", "named")
     assert all(law.of == "drum" for law in answer.laws)
+
+
+def test_where_a_formula_of_a_plainer_curve_goes_before_the_best_curve_all_have_theirs() -> None:
+    """A log that goes further asks for formulas: a curve of one side must not win by its formula over the difference's
+    curve without one.
+    """
+
+    def fitted(of: str, formula: float) -> Any:
+        quantity = Values(name=of, less=(1, "b") if "minus" in of else None, remembers=False, period=0.0)
+        candidate = Values(name=of, at="place", near=False, how="state adds", quantity=quantity)
+        said = Values(fit=Values(free=[0]), left=formula)
+        return Values(candidate=candidate, fit=Values(cost=np.ones(1), free=[0]), judge=Values(n=1), loose=[said])
+
+    learner: Any = Values(
+        fails=lambda _: False, _harmful=lambda *_: "", ground=Values(shares=False), _left=lambda _, f, __: f.left
+    )
+    for plainer, expected in ((-0.5, {"a": -0.5, "a_minus_b": -2.0}), (0.2, {"a": 0.2, "a_minus_b": 0.0})):
+        left = {"a": 0.3, "a_minus_b": 0.0}
+        Learner._with_formulas(learner, fitted("b", 9.0), [fitted("a", plainer), fitted("a_minus_b", -2.0)], left)
+        assert left == expected
 
 
 def test_where_nothing_is_missing_no_difference_is_learned() -> None:
