@@ -14,7 +14,7 @@ from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
 from vaneloop.discrepancy.models.data import noise_of_channel
 from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
-from vaneloop.discrepancy.models.motion import highest_frequency, low_pass
+from vaneloop.discrepancy.models.motion import MOTION, highest_frequency, low_pass
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.quantities import DISTANCE, MINUS, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.system import Record
@@ -114,16 +114,20 @@ def _differences(bound: Bound, values: Array, have: Sequence[Quantity]) -> list[
     """Differences of states and of what drives the model, of one unit: what flows, slips and bends between two. None of
     one that is a multiple of a quantity that is there by then, as far as any law tells.
     """
-    channels = [q for q in have if q.of < OUTPUT or q.name in bound.system.inputs]
+    s = bound.system
+    declared = [*s.states, *s.commands, *MOTION, *s.inputs]
+    channels = [q for q in have if q.of < OUTPUT or q.name in s.inputs]
+    channels.sort(key=lambda q: declared.index(q.name))
     pairs = [(a, b) for a, b in combinations(channels, 2) if a.unit == b.unit and a.unit not in NO_KIND]
     if len(pairs) > (most := EACH * len(channels)):
         together = _acting(bound, values, {q.name: q.visited for q in channels})
         pairs = sorted(pairs, key=lambda p: (p[0].name, p[1].name) not in together)[:most]
     out: list[Quantity] = []
     for a, b in pairs:
-        name, d = f"{a.name}{MINUS}{b.name}", difference(bound, a.visited, b.visited)
-        if all(q.name != name for q in have) and not any(_alike(d, q.visited) for q in (*have, *out)):
-            out.append(Quantity(name, a.unit, a.of, d, less=(b.of, b.name)))
+        with np.errstate(all="ignore"):  # a state may have run away
+            name, d = f"{a.name}{MINUS}{b.name}", difference(bound, a.visited, b.visited)
+            if all(q.name != name for q in have) and not any(_alike(d, q.visited) for q in (*have, *out)):
+                out.append(Quantity(name, a.unit, a.of, d, less=(b.of, b.name)))
     return out
 
 
@@ -169,7 +173,7 @@ def _acting(bound: Bound, values: Array, visited: Mapping[str, Array]) -> set[tu
             try:
                 with np.errstate(all="ignore"):
                     signs[k, j] = np.sign(rates({**point, name: point[name] + by}) - rates(point))
-            except Exception:  # noqa: S112  # the user's model may be nothing there
+            except Exception:  # the user's model may be nothing there
                 continue
     opposed = ((signs[:, :, None] * signs[:, None]) < 0.0).any(axis=3).mean(axis=0) > 0.5
     return {(a, b) for i, a in enumerate(visited) for j, b in enumerate(visited) if opposed[i, j]}
