@@ -250,7 +250,7 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
             free=np.arange(3), theta=theta, prior=np.zeros(3), cost=np.array([e @ e]), gradients=(j.T @ e)[None],
             normals=(j.T @ j)[None],
         )  # fmt: skip
-        quantity = SimpleNamespace(name=of, period=0.0, remembers="lagged" in of)
+        quantity = SimpleNamespace(name=of, period=0.0, remembers="lagged" in of, less=None)
         c = SimpleNamespace(how="adds", at=at, name="c", kept=[0, 1], quantity=quantity, near=False)
         one = cast(Tried, SimpleNamespace(candidate=c, fit=fit, judge=judge))
         only = np.linalg.lstsq(rows[:, :2], y, rcond=None)[0]

@@ -26,7 +26,8 @@ LEARNED: dict[tuple[str, str], frozenset[str]] = {
         ("heat_exchanger", "fouling", "conductance.gain_of_time"),
         ("dc_motor", "cogging", "speed.curve_of_angle"),
         ("dc_motor", "weakening", "inertia.gain_of_time"),  # the current's sensor does not see it
-        ("rectified_drive", "slip", ""),  # of the difference of two speeds
+        # the belt's torque; its parameter is in the damping, too, so that no gain of it is the same
+        ("rectified_drive", "slip", "change.curve_of_motor_minus_speed"),
         ("rectified_drive", "ripple", "motor.curve_of_time drive.curve_of_time"),
         ("battery", "empties", "r0.gain_of_charge fall.gain_of_current"),  # proportional to charge times current
         ("battery", "cold", "r0.gain_of_time"),

@@ -21,7 +21,8 @@ from vaneloop.base.curve import splines
 from vaneloop.discrepancy.curves import basis_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.curve import COLUMN
-from vaneloop.discrepancy.models.curved import Candidate, Quantity
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.known import Quantity
 from vaneloop.discrepancy.models.memory import is_memory
 from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
 from vaneloop.discrepancy.models.vane_stages.driven import Made

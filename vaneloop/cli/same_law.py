@@ -71,7 +71,7 @@ class _World:
 
     def __init__(self, bound: Any, model: Any):
         from vaneloop.discrepancy.models.curve import INPUT, OUTPUT
-        from vaneloop.discrepancy.models.curved import quantities
+        from vaneloop.discrepancy.models.known import quantities
         from vaneloop.discrepancy.models.user_code import UserCode
 
         rng = np.random.default_rng(0)
@@ -81,7 +81,10 @@ class _World:
         own = np.array([p.value for p in bound.stage.parameters[:starts]])
         self.values: dict[str, Array] = {}
         for q in quantities(bound, own):
-            if not OUTPUT <= q.of < OUTPUT + INPUT and (good := q.visited[np.isfinite(q.visited)]).size:
+            if q.less is not None:  # it follows from both, which come first
+                one, other = q.sides
+                self.values[q.name] = self.values[one] - self.values[other]
+            elif not OUTPUT <= q.of < OUTPUT + INPUT and (good := q.visited[np.isfinite(q.visited)]).size:
                 self.values[q.name] = rng.choice(good, DRAWN)
         self.p = np.array([p.value for p in model.parameters])
         self.plain = self._says(self.p)

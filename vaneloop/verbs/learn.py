@@ -106,8 +106,8 @@ class Learned(Answer):
     def write_python(self, path: str | Path, system: System | None = None) -> Path:
         """Write the first law as a Python file; return its path.
 
-        system  the user's own model, to whose ``laws`` it can be added; None: of the vane chain, the function alone,
-                as always where it is one of two quantities
+        system  the user's own model, to whose ``laws`` it can be added, or which calls it, of a difference; None: of
+                the vane chain, the function alone, as always where it is one of two quantities
         """
         from vaneloop.discrepancy.models.learned_surface import LearnedSurface
         from vaneloop.discrepancy.models.python_law import python_law

@@ -9,9 +9,9 @@
 | output adds, output times  | an output     | y + c(q), y (1 + c(q))                                                |
 
 The quantity q is a simulated state or output, what drives the model, or a column that is known beforehand
-(`vaneloop.discrepancy.models.quantities`). Beyond the values that q has had a curve stays as at its end. A curve may
-jump: then its table is what is left beside the jump, which runs as friction of the library does: within a small range
-of q it is a straight line.
+(`vaneloop.discrepancy.models.quantities`), or the difference of two of these. Beyond the values that q has had a curve
+stays as at its end. A curve may jump: then its table is what is left beside the jump, which runs as friction of the
+library does: within a small range of q it is a straight line.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import Form
 from vaneloop.discrepancy.models.memory import STOPS, of_stops
+from vaneloop.discrepancy.models.quantities import MINUS
 from vaneloop.discrepancy.stage import Array
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["COLUMN", "HOW", "INPUT", "OUTPUT", "SENSED", "Curve", "Jump", "Table", "bent", "curves_for_kernel", "runs"]
 
 INPUT, OUTPUT, COLUMN = 100, 200, 300  # numbers of quantities: states are below
+NOTHING = -1  # in the place of one that would be taken off
 Table = Callable[[Array], Array]
 Jump = Callable[[Array], tuple[float, float]]
 HOW = {
@@ -40,7 +42,7 @@ HOW = {
     "force adds": 5,
 }  # fmt: skip
 SENSED = ("output adds", "output times")
-AT_ONCE = 1e-3  # of the range of a simulated state that is no speed, within which a jump is a straight line
+AT_ONCE = 1e-3  # of the range of what is simulated and is no state's speed, within which a jump is a straight line
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class Curve:
 
     how       see above; ``place``: index of the parameter, input, state or output
     of        number of the quantity (state, INPUT + k, OUTPUT + k, COLUMN: known beforehand); ``quantity``: its name
+    less      of a difference, number and name of what is taken off; ``of`` is then of what it is taken off from
     low, high the range in which it bends
     table     from its parameters to the curve, less its jump, at points evenly from low to high
     jump      from its parameters to half the height of its jump, and where that is; None: it has none
@@ -62,6 +65,7 @@ class Curve:
     high: float
     table: Table
     jump: Jump | None = None
+    less: tuple[int, str] | None = None
 
     def row(self, values: Array) -> Array:
         """What runs with these parameters: its table, behind it the jump that it may have."""
@@ -86,11 +90,23 @@ class Curve:
 
     @property
     def quantities(self) -> tuple[tuple[int, str], ...]:
-        """Number and name of what it is a function of."""
-        return ((self.of, self.quantity),)
+        """Number and name of what it is a function of; of a difference, those of both."""
+        if self.less is None:
+            return ((self.of, self.quantity),)
+        return (self.of, self.quantity.removesuffix(f"{MINUS}{self.less[1]}")), self.less
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its quantity is a state, or the difference to one."""
+        return any(of < INPUT for of, _ in self.quantities)
+
+    def value(self, one: Callable[[int, str], Array]) -> Array:
+        """Its quantity, where ``one`` says what each number and name stands for."""
+        first, *other = (one(*of) for of in self.quantities)
+        return np.asarray(first - other[0] if other else first)
 
     def values(self, data: Data, log: int, u: Array, y: Array | None = None) -> Array:
-        """Its quantity on a log, of a model that is not simulated; of two, float64[2, samples]."""
+        """Its quantity on a log, of a model that is not simulated; of a surface, float64[2, samples]."""
 
         def one(of: int, name: str) -> Array:
             if of >= COLUMN:
@@ -99,8 +115,7 @@ class Curve:
                 return np.asarray(data.y[log][of - OUTPUT] if y is None else y[of - OUTPUT])
             return np.asarray(u[of - INPUT])
 
-        rows = [one(of, name) for of, name in self.quantities]
-        return rows[0] if len(rows) == 1 else np.array(rows)
+        return self.value(one)
 
 
 def runs(form: Form, low: float, high: float, points: int = FINE) -> tuple[Table, Jump | None]:
@@ -135,20 +150,25 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
     """The last arguments of a compiled simulation with curves; ``smalls``: state by state, range within which a jump is
     a straight line.
     """
-    of, low, high, tables, columns, jumps = [], [], [], [], [], []
+    of, low, high, tables, jumps = [], [], [], [], []
+    columns: list[Array] = []
     for c, row in curves:
         a, b = c.low, c.high
         table, half, place = c.parts(row)
-        small = (float(smalls[c.of]) or AT_ONCE * (b - a)) if c.of < INPUT else 0.0
+        speed = float(smalls[c.of]) if c.of < INPUT and c.less is None else 0.0
+        small = (speed or AT_ONCE * (b - a)) if c.simulated else 0.0
         jumps.append((half, place, max(small, 1e-300)))
-        if c.of >= COLUMN:
-            column = data.column(log, c.quantity)[:n]
-            if c.quantity.startswith(STOPS):  # what they make of it, as it is
-                column = c.at(column, row)
-                b = max(float(np.abs(column).max()), 1e-300)
-                a, table = -b, np.linspace(-b, b, POINTS)
-            columns.append(column)
-        of.append(COLUMN + len(columns) - 1 if c.of >= COLUMN else c.of)
+        numbers = [NOTHING, NOTHING]
+        for k, (number, name) in enumerate(c.quantities):
+            numbers[k] = number
+            if number >= COLUMN:
+                numbers[k] = COLUMN + len(columns)
+                columns.append(data.column(log, name)[:n])
+        if c.quantity.startswith(STOPS) and c.of >= COLUMN:  # what they make of it, as it is
+            columns[-1] = c.at(columns[-1], row)
+            b = max(float(np.abs(columns[-1]).max()), 1e-300)
+            a, table = -b, np.linspace(-b, b, POINTS)
+        of.append(numbers)
         low.append(a)
         high.append(b)
         tables.append(table)
@@ -156,7 +176,7 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
     tables = [t if len(t) == most else np.interp(np.linspace(0, 1, most), np.linspace(0, 1, len(t)), t) for t in tables]
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
-        np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64),
+        np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64).reshape(-1, 2),
         np.array(low), np.array(high), np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 3),
         np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from vaneloop.discrepancy.library import Law
 from vaneloop.discrepancy.models.curve import COLUMN, HOW, INPUT, OUTPUT, Curve, runs
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
+from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, sides_of
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.surface import Surface
 from vaneloop.discrepancy.stage import Effect, Parameter, StageError
@@ -59,7 +59,8 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
             raise wrong("of", of, ", ".join([*known, TIME, *sorted(columns - set(known))]), where)
         return found
 
-    of = number(law.of)
+    sides = None if law.second else sides_of(law.of, {*known, *columns})  # a surface is of no difference
+    of, less = number(sides[0] if sides else law.of), (number(sides[1]), sides[1]) if sides else None
     try:
         law.check(f"curves.{name}")
     except InputError as e:
@@ -69,7 +70,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     if law.jump and not form:
         smooth = law.model_copy(update={"jump": False}).table()
         table, jump = (lambda v: smooth(v[:-1])), (lambda v: (float(v[-1]), 0.0))
-    curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump)
+    curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump, less)
     if (two := law.second) is not None:
         curve = Surface(
             curve.how, curve.place, of, law.of, law.low, law.high, table, of_second=number(two.of, ".second"),

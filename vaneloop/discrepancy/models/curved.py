@@ -5,7 +5,7 @@ model with some of them as effects.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,20 +17,19 @@ from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT, Curve, Jump, Table
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
-from vaneloop.discrepancy.models.memory import STOPS, is_memory, lagged_name
+from vaneloop.discrepancy.models.known import Quantity, difference, quantities
+from vaneloop.discrepancy.models.memory import STOPS
 from vaneloop.discrepancy.models.nominal import nominal_course
 from vaneloop.discrepancy.models.periods import Course
-from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY, every
+from vaneloop.discrepancy.models.quantities import TIME, every
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import System
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["Candidate", "OwnGround", "Quantity", "candidates", "on_logs", "quantities", "with_curves"]
+__all__ = ["Candidate", "OwnGround", "candidates", "on_logs", "with_curves"]
 
 
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
-LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the shortest lag tried to the longest
-SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
 JUMP = -1  # of a curve's amplitudes, the one that is of no function of its basis
 FINER = 0.025  # of what unknown parameters may move by: their size as their slopes are taken with, beside a curve
 CROSSES = 0.05  # share of a quantity's values to each side of 0, where a curve of it may jump
@@ -42,38 +41,6 @@ SHAPES = {
     "rising": "never falls",
     "falling": "never rises",
 }  # what may be known of a curve
-
-
-@dataclass(frozen=True, eq=False)
-class Quantity:
-    """What a curve may be a function of: its name, unit, number (`Curve.of`) and the values that it has had; of stops,
-    the radii.
-
-    course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag, or a period, so
-            many times as long
-    """
-
-    name: str
-    unit: str
-    of: int
-    visited: Array
-    course: tuple[Array, ...] = ()
-    slower: Callable[[float], Quantity | None] | None = None
-
-    @property
-    def stops(self) -> bool:
-        """Whether a curve of it is a hysteresis (`vaneloop.discrepancy.models.memory`)."""
-        return self.name.startswith(STOPS)
-
-    @property
-    def period(self) -> float:
-        """Of the time within each period (s): this period; 0: it is another quantity."""
-        return period_of(self.name)
-
-    @property
-    def remembers(self) -> bool:
-        """Whether it is a lag or stops."""
-        return is_memory(self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,87 +207,12 @@ class Candidate:
                 return y - y[0]
 
         low, high = reach or (self.basis.low, self.basis.high)
-        curve = Curve(self.how, self.place, q.of, q.name, low, high, table, jump)
+        curve = Curve(self.how, self.place, q.of, q.name, low, high, table, jump, q.less)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
     def effect(self, wiggle: float) -> Effect:
         """What the search is told."""
         return self.basis.effect(self.name, self.unit, self.size, wiggle, self.kept, self.jump)
-
-
-def quantities(bound: Bound, values: Array, states: Sequence[Sequence[Array]] | None = None) -> list[Quantity]:
-    """Every quantity that is known, with the values that it has in the fitted logs; ``values``: the model's own
-    parameters, and starts; ``states``: their courses as `nominal_course` has them, where they are known.
-    """
-    s, data = bound.system, bound.data
-    out: list[Quantity] = []
-    moves = s.kind in ("simulate", "closed_loop")
-    if moves:
-        states = states or nominal_course(bound.runner, values).states
-        out += [Quantity(n, u, i, np.concatenate(states[i])) for i, (n, u) in enumerate(s.states.items())]
-    if s.kind == "closed_loop":
-        for i, (name, unit) in enumerate(s.commands.items()):
-            if all(name in r.columns for r in data.records):
-                out.append(Quantity(name, unit, INPUT + i, np.concatenate([r.columns[name] for r in data.records])))
-    else:
-        unit = s.units.get("position", "m")
-        units = {"position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2", **s.inputs}
-        for i, name in enumerate(data.in_names):
-            out.append(Quantity(name, units[name], INPUT + i, np.concatenate([u[i] for u in data.u])))
-    for i, (name, unit) in enumerate(s.outputs.items()):
-        if name not in s.states and name not in s.inputs and name not in s.commands:
-            out.append(Quantity(name, unit, OUTPUT + i, bound.measured[i]))
-
-    def column(name: str, unit: str) -> None:
-        rows = [data.column(k, name) for k in range(len(data.records))]
-        out.append(Quantity(name, unit, COLUMN, np.concatenate(rows)))
-
-    column(TIME, "s")
-    known = {q.name for q in out} | {s.position, s.velocity}
-    shared = set.intersection(*(set(r.columns) for r in data.records))
-    for name in sorted(shared - known):
-        column(name, s.inputs.get(name, ""))
-    all_units = {**s.inputs, **s.outputs, **({s.position: s.units.get("position", "m")} if s.position else {})}
-    for name, unit in all_units.items():
-        if name in shared:
-            column(WAY + name, "-")
-            column(DISTANCE + name, unit)
-            column(SINCE + name, "s")
-    return [*out, *_remembering(bound, shared)]
-
-
-def _remembering(bound: Bound, shared: set[str]) -> list[Quantity]:
-    """Lags of what drives the model, and stops that it moves. What the model gives is none of them: its measured course
-    would tell the model what it has to say.
-    """
-    s, data = bound.system, bound.data
-    unit = s.units.get("position", "m")
-    motion = ((s.position, unit), (s.velocity, f"{unit}/s")) if s.kind == "force" else ()
-    driving = [(n, u) for n, u in (*motion, *s.inputs.items()) if n in shared]
-
-    def course(name: str) -> tuple[Array, ...]:
-        return tuple(data.column(k, name) for k in range(len(data.records)))
-
-    step = max(float(np.median(np.diff(r.t))) for r in data.records)
-    shortest, longest = SHORTEST * step, LONGEST * min(float(r.t[-1] - r.t[0]) for r in data.records)
-
-    def slow(name: str, unit: str, tau: float) -> Quantity | None:
-        if not 0.5 * shortest < tau < 2.0 * longest:
-            return None
-        lag = lagged_name(name, tau)
-        again = lambda times: slow(name, unit, tau * times)  # noqa: E731
-        return Quantity(lag, unit, COLUMN, np.concatenate(course(lag)), course(name), again)
-
-    out = []
-    for name, unit in driving:
-        if not any(np.ptp(c) > 0.0 for c in course(name)):
-            continue
-        if longest > 4.0 * shortest:
-            out += [q for z in LAGS if (q := slow(name, unit, shortest * (longest / shortest) ** z)) is not None]
-        if name != s.velocity:
-            radii = 0.5 * np.concatenate(course(DISTANCE + name))
-            out.append(Quantity(STOPS + name, unit, COLUMN, radii, course(name)))
-    return out
 
 
 def usual(q: Quantity) -> int:
@@ -410,7 +302,7 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
     for i, (name, unit) in enumerate(signals.items()):
         if s.allows("input", name):
             k = i + (3 if s.kind == "force" else 0)
-            rows = next((q.visited for q, _ in known if q.of == INPUT + k), np.array([-1.0, 1.0]))
+            rows = next((q.visited for q, _ in known if q.of == INPUT + k and q.less is None), np.array([-1.0, 1.0]))
             put("input adds", k, name, unit, 0.3 * half(rows))
             put("input times", k, name, "-", 0.3, but=name)
     said = _said(bound, values)
@@ -530,15 +422,20 @@ class OwnGround:
         """Values of a quantity in the test logs."""
         test = self.logs.test
         assert test is not None
-        if q.name not in self._in_tests:
-            if q.of == COLUMN:
-                values = np.concatenate([test.data.column(k, q.name) for k in range(len(test.data.records))])
-                self._in_tests[q.name] = values
-            else:
-                starts = len(test.system.parameters) + len(test.runner.free_starts)
-                plain = with_curves(test, (), ())
-                own = [p.value for p in plain.stage.parameters[:starts]]
-                self._in_tests |= {o.name: o.visited for o in quantities(plain, np.array(own)) if o.of != COLUMN}
+        if q.name in self._in_tests:
+            return self._in_tests[q.name]
+        if q.less is not None:
+            one, other = q.sides
+            sides = replace(q, name=one, less=None), replace(q, name=other, of=q.less[0], less=None)
+            self._in_tests[q.name] = difference(test, *(self._tested(side) for side in sides))
+        elif q.of == COLUMN:
+            values = np.concatenate([test.data.column(k, q.name) for k in range(len(test.data.records))])
+            self._in_tests[q.name] = values
+        else:
+            starts = len(test.system.parameters) + len(test.runner.free_starts)
+            plain = with_curves(test, (), ())
+            own = [p.value for p in plain.stage.parameters[:starts]]
+            self._in_tests |= {o.name: o.visited for o in quantities(plain, np.array(own)) if o.of != COLUMN}
         return self._in_tests[q.name]
 
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:

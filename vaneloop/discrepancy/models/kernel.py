@@ -144,9 +144,9 @@ if len(code) > 0:
             dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
 {bent}"""
 
-# curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of), from
-# low to high, the jump of each (half its height, where, within how much of the quantity), and the other columns that
-# they may be of
+# curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of; beside it
+# what is taken off that, below 0: nothing), from low to high, the jump of each (half its height, where, within how much
+# of the quantity), and the other columns that they may be of
 _PLAIN = "outputs(x, u, p, y)"
 _CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, c_jump, columns"
 _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
@@ -163,6 +163,14 @@ def quantity(of, x, u, y, columns, k):
     if of < COLUMN:
         return y[of - OUTPUT]
     return columns[of - COLUMN, k]
+
+
+@inline
+def of_both(of, x, u, y, columns, k):
+    q = quantity(of[0], x, u, y, columns, k)
+    if of[1] >= 0:
+        q -= quantity(of[1], x, u, y, columns, k)
+    return q
 
 
 @inline
@@ -211,9 +219,9 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
     for i in range(len(c_how)):
         if c_how[i] > 4:
             continue
-        if OUTPUT <= c_of[i] < COLUMN:
+        if OUTPUT <= c_of[i, 0] < COLUMN:
             outputs(x, u, p, y)
-        c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
+        c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
         put_in(c_how[i], c_at[i], c, ub, pb, add)
 {{bend more}}
 
@@ -223,7 +231,7 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     outputs(x, ub, pb, y)
     for i in range(len(c_how)):
         if c_how[i] > 4:
-            c = on_curve(quantity(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
+            c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
             put_on(c_how[i], c_at[i], c, y)
 {{show more}}
 

@@ -49,6 +49,7 @@ from vaneloop.discrepancy.models.screening import screened
 from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
+    MEASURED,
     Ground,
     Outcome,
     Placings,
@@ -294,30 +295,33 @@ class Learner:
     def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
         """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
         those of a plainer quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they
-        go astray. Every formula counts as many numbers as the sparest of these curves, however many its own has.
+        go astray. Where one of those is then before the best, all have theirs. Every formula counts as many numbers as
+        the sparest of these curves, however many its own has.
         """
         best = min(good, key=lambda t: left[t.candidate.name])
         costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum() / t.judge.n)) for t in good}]
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
         close += [t for t in at_its_place(before, good) if t not in close]
+        first = close
         if not (self.fails(best) or self._harmful(before, best)):
-            close = [t for t in close if strange(t.candidate) < strange(best.candidate)]
-        if not close:
-            return
-        all_in_their_place(self.ground, close)
-        sparest = min(len(t.fit.free) for t in (*close, best))
-        for t in close:
-            name = t.candidate.name
-            for f in t.loose or ():
-                spared = PER_PARAMETER * (sparest - len(f.fit.free))
-                left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
+            first = [t for t in close if strange(t.candidate) < strange(best.candidate)]
+        sparest, least = min(len(t.fit.free) for t in (*close, best)), left[best.candidate.name]
+        for some in (first, [t for t in close if t not in first]):
+            all_in_their_place(self.ground, some)
+            for t in some:
+                name = t.candidate.name
+                for f in t.loose or ():
+                    spared = PER_PARAMETER * (sparest - len(f.fit.free))
+                    left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
+            if min((left[t.candidate.name] for t in first), default=least) >= least:
+                break
 
     def _tell_apart(self, good: Sequence[Tried], left: dict[str, float]) -> None:
         """Put those behind that are surely worse, block by block, than the best of what neither remembers nor drifts,
         where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
         little more.
         """
-        plain_ones = [t for t in good if strange(t.candidate) <= 1]
+        plain_ones = [t for t in good if strange(t.candidate) <= MEASURED]
         best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
         if best is None or self.fails(best):
             return

@@ -1,7 +1,8 @@
 """A learned law as a Python file: its formula, or its curve as a table, with units, range, and a test of its own.
 
 On a user's own model it is a `vaneloop.Law`, for the ``laws`` of the `System`; there a law may be a function of the
-signal or state that it acts on, of a displacement, or of time. Of the vane chain it is the function alone.
+signal or state that it acts on, of a displacement, or of time. Of a difference of two, which no such law is given, it
+is functions for the model itself. Of the vane chain it is the function alone.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
+from vaneloop.discrepancy.models.quantities import sides_of
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learned import LearnedLaw
@@ -67,6 +69,24 @@ LAW = Law(
 
 '''
 
+OF_DIFFERENCE = '''
+def quantity(x, u):
+    """What it is a function of: a difference that no law of its own is given, so that the model calls both functions.
+
+    With c = curve(quantity(x, u)), {use}.
+    """
+    return {one} - {other}
+
+'''
+USES = {
+    "parameter times": "p.{at} * (1.0 + c) stands in the place of p.{at}",
+    "input adds": "u.{at} + c stands in the place of u.{at}",
+    "input times": "u.{at} * (1.0 + c) stands in the place of u.{at}",
+    "state adds": "{c} is taken off the derivative of {at}",
+    "output adds": "c is added to what the output {at} gives",
+    "output times": "the output {at} gives 1.0 + c times as much",
+}
+
 OWN_TEST = '''
 
 def test_law():
@@ -119,7 +139,12 @@ def _code(law: LearnedLaw) -> tuple[str, str, str]:
 
 
 def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
-    """The parts of the file that make it a `Law`."""
+    """The parts of the file that make it a `Law`, or functions for the model."""
+    if (sides := _sides(law, system)) is not None:
+        c = f"c / p.{system.masses[law.at]}" if law.at in system.masses else "c"
+        one, other = sides
+        use = USES[law.how].format(at=law.at, c=c)
+        return {"imports": "", "law": OF_DIFFERENCE.format(use=use, one=one, other=other), "test": ""}
     own = law.at.removesuffix("_sensor")
     name = law.name.rpartition(".")[2]
     on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
@@ -146,3 +171,11 @@ def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
         "imports": "\nfrom vaneloop import Law, Parameter\n", "law": OWN_LAW.format(**parts),
         "test": OWN_TEST.format(**parts),
     }  # fmt: skip
+
+
+def _sides(law: LearnedLaw, system: System) -> tuple[str, str] | None:
+    """Of a law of a difference of what the model is called with, both as the model has them; None: it is another."""
+    drives = system.commands if system.kind == "closed_loop" else system.inputs
+    known = {**{n: f"u.{n}" for n in drives}, **{n: f"x.{n}" for n in system.states}}
+    sides = sides_of(law.of, known) if system.states and law.how in USES else None
+    return None if sides is None else (known[sides[0]], known[sides[1]])

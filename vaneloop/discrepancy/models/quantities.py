@@ -4,6 +4,8 @@ what follows from how a channel turns, and what it was before (`vaneloop.discrep
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from plant.curve import TURN, turns
@@ -13,15 +15,27 @@ from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.system import Record
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["DISTANCE", "SINCE", "TIME", "WAY", "column_of", "every"]
+__all__ = ["DISTANCE", "MINUS", "SINCE", "TIME", "WAY", "column_of", "every", "sides_of"]
 
 TIME = "time"
+MINUS = "_minus_"
 WAY, DISTANCE, SINCE = "direction_of_", "distance_since_reversal_of_", "time_since_reversal_of_"
 
 
 def every(period: float, cycles: float) -> str:
     """Name of the time within each ``period`` (s), to as many digits as so many ``cycles`` tell."""
     return f"{TIME}_every_{in_name(period, max(int(np.ceil(np.log10(200.0 * cycles))), 4))}"
+
+
+def sides_of(name: str, known: Collection[str]) -> tuple[str, str] | None:
+    """Of a difference ``ONE_minus_OTHER`` of quantities that are ``known``, both names; None: it is none, or the name
+    of a quantity itself.
+    """
+    if name in known:
+        return None
+    words = name.split(MINUS)
+    pairs = ((MINUS.join(words[:k]), MINUS.join(words[k:])) for k in range(1, len(words)))
+    return next((pair for pair in pairs if pair[0] in known and pair[1] in known), None)
 
 
 def column_of(record: Record, t: Array, name: str) -> Array:

@@ -227,16 +227,15 @@ class Runner:
             return
         reading, u = x0[m], self.data.u[log][:, :1]
 
-        def first(of: int, quantity: str) -> float:
+        def first(of: int, quantity: str) -> Array:
             if of < INPUT:
-                return float(x0[of])
+                return x0[of : of + 1]
             if of < OUTPUT:
-                return float(u[of - INPUT, 0])
-            return float(reading if of < COLUMN else self.data.column(log, quantity)[0])
+                return np.asarray(u[of - INPUT])
+            return np.array([reading]) if of < COLUMN else self.data.column(log, quantity)[:1]
 
         for _ in range(8):
-            q = np.array([[first(*of)] for of in curve.quantities])
-            c = float(curve.at(q if len(q) > 1 else q[0], row)[0])
+            c = float(curve.at(curve.value(first), row)[0])
             x0[m] = reading - c if curve.how == "output adds" else reading / max(1.0 + c, 0.1)
 
     def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
@@ -347,7 +346,7 @@ class Runner:
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
         plain, surfaces = apart(curves)
-        if any(c.of < INPUT and c.parts(row)[1] for c, row in plain):
+        if any(c.simulated and c.parts(row)[1] for c, row in plain):
             steps = max(steps, SWITCHED)
         kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves(bool(surfaces))
         out = np.full((len(s.outputs), len(t)), np.nan)

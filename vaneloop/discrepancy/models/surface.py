@@ -6,7 +6,7 @@ Beyond where the log has been of both at once, a surface stays as at the nearest
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,10 @@ class Surface(Curve):
     def quantities(self) -> tuple[tuple[int, str], ...]:
         """Number and name of what it is a function of."""
         return ((self.of, self.quantity), (self.of_second, self.second))
+
+    def value(self, one: Callable[[int, str], Array]) -> Array:
+        """Both quantities, a row each."""
+        return np.array([one(*of) for of in self.quantities])
 
     def at(self, q: Array, table: Array) -> Array:
         """The surface at values of its quantities, float64[2, n]."""

@@ -16,7 +16,8 @@ from vaneloop.base.hull import hull_of, nearest_within, within
 from vaneloop.discrepancy.curves import LEVEL, Basis, basis_of
 from vaneloop.discrepancy.models.curve import Jump, Table
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
-from vaneloop.discrepancy.models.curved import Candidate, Quantity
+from vaneloop.discrepancy.models.curved import Candidate
+from vaneloop.discrepancy.models.known import Quantity
 from vaneloop.discrepancy.models.quantities import DISTANCE, SINCE, TIME, WAY
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.surface import Surface
@@ -107,9 +108,10 @@ class SurfaceCandidate(Candidate):
 
 def may_be_of(q: Quantity) -> bool:
     """Whether a surface may be of a quantity: of what is measured or simulated. What follows from time or from turning
-    points imitates much by itself.
+    points imitates much by itself; a difference is a function of two by itself.
     """
-    return not (q.remembers or q.period or q.name == TIME or q.name.startswith((WAY, DISTANCE, SINCE)))
+    follows = q.remembers or q.period or q.name == TIME or q.name.startswith((WAY, DISTANCE, SINCE))
+    return q.less is None and not follows
 
 
 def surface_of(one: Candidate, two: Candidate, splines: int = SPLINES) -> SurfaceCandidate | None:

@@ -21,6 +21,7 @@ from vaneloop.discrepancy.noise_floor import NATS
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
 __all__ = [
+    "MEASURED",
     "Ground",
     "Outcome",
     "Placings",
@@ -37,6 +38,7 @@ __all__ = [
 ]
 
 Placings = tuple[tuple[Placed, Effect], ...]
+MEASURED = 2  # up to here what is `strange` is of measured or simulated channels alone, as they are
 LEAST_SETTLED = 0.5  # share of the samples that must be left where those that remember what was before are not counted
 
 
@@ -170,17 +172,20 @@ class Outcome:
 def strange(candidate: Candidate) -> int:
     """Which of several candidates that do as well is meant: the lower, the plainer.
 
-    What is at a place itself is plainer than what another signal says of it. Reversals follow from every quantity that
-    turns, and time from every one that drifts. What remembers imitates most.
+    What is at a place itself is plainer than what another signal says of it, and a signal is plainer than its
+    difference to another. Reversals follow from every quantity that turns, and time from every one that drifts. What
+    remembers imitates most.
     """
     name = candidate.quantity.name
     if name == candidate.at.removesuffix("_sensor").rpartition(".")[2] or candidate.near:
         return 0
     if candidate.quantity.remembers:
-        return 4
+        return 5
     if name.startswith((WAY, DISTANCE, SINCE)) or candidate.quantity.period:
+        return 4
+    if name == TIME:
         return 3
-    return 2 if name == TIME else 1
+    return 1 if candidate.quantity.less is None else MEASURED
 
 
 def plain(candidate: Candidate) -> tuple[int, bool]:

@@ -19,7 +19,8 @@ from vaneloop.discrepancy.curves import COUNT, basis_of
 from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.models.curve import COLUMN, Curve
 from vaneloop.discrepancy.models.curve_file import CURVE_LAW
-from vaneloop.discrepancy.models.curved import IN_TIME, LAGS, LONGEST, SHORTEST, Candidate, Quantity, basis_for
+from vaneloop.discrepancy.models.curved import IN_TIME, Candidate, basis_for
+from vaneloop.discrepancy.models.known import LAGS, LONGEST, SHORTEST, Quantity
 from vaneloop.discrepancy.models.memory import lagged_name
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.periods import Course
