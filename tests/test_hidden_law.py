@@ -304,6 +304,26 @@ def test_what_is_learned_is_counted_where_it_was_asked() -> None:
     assert not any(k.startswith("learned") for k in hidden_law.summary([row("clean", [], [], {})]))
 
 
+@pytest.mark.parametrize(
+    ("named", "verdict", "curve", "right"),
+    [
+        (["a", "b"], "named", "", True),
+        (["a", "b"], "unknown", "", True),  # of curves; what is named is what is hidden
+        (["a", "b"], "learned", "c.curve_of_u", False),  # a wrong curve instead of the right names
+        (["a"], "unknown", "", False),
+        (["a"], "named", "", False),
+    ],
+)
+def test_nothing_is_left_to_learn_where_the_laws_that_amount_to_it_are_named(
+    named: list[str], verdict: str, curve: str, right: bool
+) -> None:
+    laws = [{"names": [curve], "formulas": []}] if curve else []
+    said = {"verdict": verdict, "laws": laws, "error": None, "nearest": []}
+    of = row("outside", ["edge"], [5.0], {n: [] for n in named}, amounts=[["a", "b"]])
+    s = hidden_law.summary([{**of, "learned": json.dumps(said), "curves": "[]"}])
+    assert s["learned: outside the library, right place and quantity"]["hits"] == right
+
+
 def test_what_is_left_out_is_counted_beside_what_other_laws_say() -> None:
     def asked(laws: list[dict[str, Any]], *also: str) -> Any:
         said = {"verdict": "learned", "laws": laws, "error": None, "nearest": [], "also": also}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -243,6 +245,40 @@ def test_a_valve_that_sticks_breaks_away_after_its_width_and_jumps(jump: float) 
     assert back[first] - back[first + 1] == pytest.approx(jump * width, abs=0.021)  # and jumps
     slides = np.diff(back[first + 1 :])
     np.testing.assert_allclose(slides, np.diff(u[500 + first + 1 :]), atol=1e-9)  # and then slides with its command
+
+
+@pytest.mark.parametrize("times", [2, 6, 25])
+def test_a_command_that_a_log_repeats_has_not_stopped(times: int) -> None:
+    rng = np.random.default_rng(1)
+    u = np.cumsum(rng.standard_normal(400))
+    u[100:110] = u[100]  # here it stops, whatever the log's raster
+    u[110:130] = u[100] + 0.1 * np.arange(1, 21)  # and creeps on
+    often = np.repeat(u, times)
+
+    def moved(values: np.ndarray, step: float, held: float) -> np.ndarray:
+        law = SIGNAL_LAWS["stiction"]
+        assert law.constant is not None
+        p = np.array([1.5, 0.5, 0.2, law.constant(replace(SIZE, step=step, held=held))])
+        return np.asarray(laws.apply(law.code, step * np.arange(len(values)), values, p))
+
+    once = moved(u, 1.0, 1.0)
+    np.testing.assert_array_equal(moved(often, 1.0 / times, 1.0)[times - 1 :: times], once)
+    assert np.ptp(once[100:117]) == 0.0 and once[129] > once[100]  # stopped, it moves again beyond the jump only
+
+
+@pytest.mark.parametrize("start", [(0.8, 0.0), (0.8, 0.7), (3.0, -0.4)])
+def test_where_stiction_begins_from_play_it_slides_as_far_behind_and_stands_at_the_same_place(
+    start: tuple[float, float],
+) -> None:
+    stiction = SIGNAL_LAWS["stiction"]
+    assert stiction.onward is not None and stiction.holds is not None and stiction.holds[0] == "play"
+    ways = stiction.onward(start)
+    u = np.linspace(0.0, 50.0, 5001)
+    play = laws.apply(laws.PLAY, np.arange(len(u)) * 0.01, u, np.array([*start, 0.0, 0.0]))
+    for values in ways[::2]:
+        y = laws.apply(laws.STICTION, np.arange(len(u)) * 0.01, u, np.array([*values, 0.0]))
+        assert y[0] == pytest.approx(play[0]) and y[-1] == pytest.approx(play[-1])
+    assert {values[1] for values in ways} == {0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8}
 
 
 def test_a_stem_that_sticks_again_at_once_moves_in_stairs() -> None:

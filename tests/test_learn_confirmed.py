@@ -10,9 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import vaneloop
+from vaneloop import Record, System, unknown
 from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.formulas import begin
+from vaneloop.discrepancy.library import FORCE_LAWS
+from vaneloop.discrepancy.models.by_formula import earning_by_formula
 from vaneloop.discrepancy.models.confirmed import OTHER, moves, stands_before
+from vaneloop.discrepancy.models.learning import Learner
 from vaneloop.discrepancy.models.memory import NO_TURN, swings
 
 T = np.linspace(0.0, 28.0, 5601)  # s
@@ -93,3 +98,58 @@ def test_a_formula_comes_as_near_as_from_each_of_its_begins_alone(name: str) -> 
         assert np.sum((form.value(q, got[0]) - y) ** 2) == pytest.approx(got[1] * np.sum(y * y), rel=1e-9)
         again = least_squares(lambda n, y=y: form.value(q, n) - y, got[0], x_scale=np.maximum(np.abs(got[0]), 1e-3))
         assert 2.0 * again.cost > 0.999 * got[1] * np.sum(y * y)
+
+
+def test_a_curve_at_its_place_is_asked_by_its_formula_however_far_its_splines_go_astray() -> None:
+    """A block alone has been as fast: left out, splines of the speed say anything there."""
+
+    def tried(near: bool, score: float, left: float, good: bool, remembers: bool = False) -> Any:
+        return SimpleNamespace(
+            candidate=SimpleNamespace(
+                near=near, at="force.force", quantity=SimpleNamespace(name="q", remembers=remembers, period=0.0)
+            ),
+            score=score, fit=SimpleNamespace(cost=np.array([left**2 * 100.0])), judge=SimpleNamespace(n=100),
+            loose=[SimpleNamespace(good=good)],
+        )  # fmt: skip
+
+    learner: Any = SimpleNamespace(
+        _score=lambda t, among: t.score, _worth=lambda _, f: f.good, ground=SimpleNamespace(shares=False)
+    )
+    before = tried(False, 0.0, 4.0, False)
+    best, elsewhere = tried(False, 0.4, 1.0, False), tried(False, 2.0, 0.9, True)
+    home, corner = tried(True, 2.0, 0.9, True), tried(True, 2.0, 0.9, False)
+    poor, stops = tried(True, 2.0, 3.5, True), tried(True, 2.0, 0.9, True, remembers=True)
+    every = [best, elsewhere, home, corner, poor, stops]
+    assert earning_by_formula(learner, before, every, every) == [home]
+
+
+def test_a_friction_is_tried_with_its_jump_though_its_splines_leave_more_than_another_curve(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Enough(Exception):
+        pass
+
+    finalists: list[Any] = []
+    found = Learner._finalists
+
+    def first(self: Learner, current: Any) -> Any:
+        finalists.extend(found(self, current))
+        raise Enough
+
+    monkeypatch.setattr(Learner, "_finalists", first)
+    t, rng = np.arange(0.0, 16.0, 0.01), np.random.default_rng(3)
+    phases = zip((0.3, 0.7, 1.1, 1.7), rng.uniform(0.0, 6.0, 4), strict=True)
+    x = np.sum([np.sin(2.0 * np.pi * f * t + phase) / f for f, phase in phases], axis=0)
+    v = np.gradient(x, t, edge_order=2)
+    force = 40.0 * x + 0.4 * v + 1.5 * np.sign(v) + 0.02 * rng.standard_normal(len(t))
+    system = System(
+        "slide", "force", lambda u, p: p.stiffness * u.position + p.damping * u.velocity, position="way",
+        outputs={"force": "N"}, parameters=[unknown("stiffness", 40.0, "N/m"), unknown("damping", 1.0, "N s/m")],
+        without=[f"force.{law}" for law in FORCE_LAWS if law != "force_offset"],
+    )  # fmt: skip
+    with pytest.raises(Enough):
+        vaneloop.learn([Record("log", t, {"way": x, "force": force})], system)
+    assert finalists[0].candidate.name != "force.curve_of_velocity"
+    (friction,) = [f for f in finalists if f.candidate.name == "force.curve_of_velocity"]
+    assert friction.candidate.jump
+    assert np.sqrt(friction.fit.cost.sum() / friction.judge.n) < 5.0  # 39 without

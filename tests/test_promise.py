@@ -8,6 +8,7 @@ import pytest
 from vaneloop import Record, System, unknown
 from vaneloop.discrepancy.error_share import ErrorShare
 from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.laws import STICTION, apply
 from vaneloop.discrepancy.models.motion import low_pass
 from vaneloop.discrepancy.models.stairs import steps_seen
 from vaneloop.discrepancy.promise import Slopes, _solved, along, followed, out_of, within
@@ -152,6 +153,29 @@ def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first
     play, stiction = search.single("command.play"), search.single("command.stiction")
     assert judge.total_of(play) < 1.2 * N
     assert judge.total_of(stiction) <= judge.total_of(play) * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(("width", "jump", "noise"), [(11.0, 0.5, 0.5), (11.0, 0.5, 1.0), (3.0, 0.6, 0.3)])
+def test_stiction_is_found_on_from_the_play_that_stands_in_for_it(width: float, jump: float, noise: float):
+    n, every = 1500, 4  # the controller is four times slower than the log
+    t, k = 0.1 * np.arange(n), np.arange(n)
+    command = np.repeat((40.0 * np.sin(0.01 * k) + 10.0 * np.sin(0.055 * k))[::every], every)
+    stem = apply(STICTION, t, command, np.array([width, jump, 0.0, 0.5]))
+    flow, kept = stem.copy(), np.exp(-0.13)
+    for i in range(1, n):
+        flow[i] = kept * flow[i - 1] + (1.0 - kept) * stem[i - 1]
+    flow += noise * np.random.default_rng(1).standard_normal(n)
+    system = System(
+        "valve", "simulate", lambda x, u, p: p.rate * (u.command - x.flow), inputs={"command": "%"},
+        states={"flow": "%"}, outputs={"flow": "%"}, parameters=[unknown("rate", 1.0, "1/s")], places=["command"],
+    )  # fmt: skip
+    bound = system.bind([Record("valve", t, {"command": command, "flow": flow})])
+    judge = Judge(bound.thinned, bound.floor)
+    search = Search(ErrorShare(judge))
+    play, stiction = search.single("command.play"), search.single("command.stiction")
+    found = stiction.theta[judge.stage.index()["command.stiction"]]
+    assert judge.total_of(stiction) < 1.1 * judge.n < judge.total_of(play) / 1.2
+    assert found[0] == pytest.approx(width, rel=0.05) and found[1] == pytest.approx(jump, abs=0.1)
 
 
 def test_what_cannot_be_told_apart_is_followed_by_the_least_step():

@@ -265,11 +265,16 @@ def _right(row: Row) -> bool:
     if row["kind"] == "surface":
         return _both(row) or not _seen(row)
     if row["kind"] == "outside":
-        if sorted(row["named"]) in json.loads(row["amounts"]):
+        if _amounts(row):
             return True
         return not row["named"] and (row["verdict"] == "unknown" or not _seen(row))
     wrong = [n for n in row["named"] if not any(_hit_by(n, law, row) for law in row["truth"])]
     return not wrong and all(_hit(law, row) for law, v in zip(row["truth"], row["left"], strict=True) if v > DETECTABLE)
+
+
+def _amounts(row: Row) -> bool:
+    """Whether laws of the library are named that together are what is hidden."""
+    return sorted(row["named"]) in json.loads(row["amounts"])
 
 
 def _hit_by(name: str, law: str, row: Row) -> bool:
@@ -374,9 +379,9 @@ def learned_summary(rows: list[Row]) -> dict[str, Any]:
 
 def _learned_right(row: Row, said: dict[str, Any]) -> bool:
     """Whether a curve that was learned, or a rival of it, is what is hidden; or laws of the library that amount to it
-    are named.
+    are named, and no curve instead of them: nothing was left to learn.
     """
-    if said["verdict"] == "named":
+    if said["verdict"] == "named" or (_amounts(row) and not said["laws"]):
         return _right(row)
     curves = set(json.loads(row["curves"]))
     return bool(said["laws"]) and any(curves & {within_no_period(n) for n in law["names"]} for law in said["laws"])

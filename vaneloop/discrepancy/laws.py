@@ -80,7 +80,7 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
         s[0] = x + p[1] * h if k == 0 else min(max(s[0], x - h), x + h)
         return s[0]
     if code == STICTION or code == STICK_SLIP:  # p[0]: width, p[1]: jump as a share of it
-        return _stuck(code, x, x - u[k - 1] if k > 0 else 0.0, k == 0, p, s)
+        return _stuck(code, t[k], x, x - u[k - 1] if k > 0 else 0.0, k == 0, p, s)
     if code == RATE_LIMIT:
         s[0] = x if k == 0 else s[0] + min(max(x - s[0], -p[0] * dt), p[0] * dt)
         return s[0]
@@ -133,19 +133,22 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
 
 
 @inlined
-def _stuck(code: int, x: float, dx: float, first: bool, p: Array, s: Array) -> float:
-    """Position of a valve's stem that sticks, for its command ``x`` that has just changed by ``dx``.
+def _stuck(code: int, t: float, x: float, dx: float, first: bool, p: Array, s: Array) -> float:
+    """Position of a valve's stem that sticks, for its command ``x`` that has just, at ``t``, changed by ``dx``.
 
     It rests until the command is farther from it than static friction holds, (1 + j) S/2 with width S and jump j; then
     it jumps, and slides (1 - j) S/2 behind. STICTION slides on until the command stops or turns (Choudhury, Thornhill
     and Shah 2005, S and J = j S); STICK_SLIP sticks again at once (He, Wang, Pottmann and Qin 2007). Without a jump
-    both are play of the width S. ``p``: S, j, where in its band it begins (-1 to 1); ``s``: position, direction of
-    sliding or 0.
+    both are play of the width S. A log may repeat each value until the controller's next: a command has stopped that
+    has not changed for longer than p[3]. ``p``: S, j, where in its band it begins (-1 to 1), s; ``s``: position,
+    direction of sliding or 0, time of the last change.
     """
     holds, behind = 0.5 * p[0] * (1.0 + p[1]), 0.5 * p[0] * (1.0 - p[1])
     if first:
-        s[0], s[1] = x + p[2] * holds, 0.0
-    if s[1] * dx <= 0.0 or code == STICK_SLIP:
+        s[0], s[1], s[2] = x + p[2] * holds, 0.0, t
+    if dx != 0.0:
+        s[2] = t
+    if s[1] * dx < 0.0 or t - s[2] > p[3] or code == STICK_SLIP:
         s[1] = 0.0
     e = x - s[0]
     if s[1] == 0.0 and abs(e) > holds:

@@ -7,7 +7,7 @@ place, never from constants of one machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ class Size:
     rate        RMS of the derivative, per s
     fastest     99.9 % quantile of the derivative's magnitude
     step, span  s: median time between samples, length of the longest log
+    held        s: median time from one change of the value to the next; 0: not known
     noise       RMS of the noise in the values
     unit        of the values
     force       RMS of the force (or derivative) that the law adds to
@@ -47,6 +48,7 @@ class Size:
     speed_unit: str = "-"
     travel: float = 1.0
     travel_unit: str = "-"
+    held: float = 0.0
 
     @property
     def half(self) -> float:
@@ -67,6 +69,7 @@ class Law:
     looks  how it shows in a log
     memory True where the answer depends on what was before
     holds   a law of the same place that this one is at some values of its parameters, and where, as `Effect.holds`
+    onward  from values of the law that it holds to starts of this one, as `Effect.onward`
     constant  a number of the law that is not free, from the size of the data; it follows the parameters
     """
 
@@ -78,6 +81,7 @@ class Law:
     memory: bool = False
     constant: Callable[[Size], float] | None = None
     holds: tuple[str, tuple[float | None, ...]] | None = None
+    onward: Callable[[Sequence[float]], list[tuple[float, ...]]] | None = None
 
 
 # ---- parameters from the size of the data ----------------------------------------------------------------------------
@@ -167,6 +171,20 @@ def _stiction(z: Size) -> _Made:
     jump = Parameter("jump", 0.5, "-", 0.0, 1.0, shape=True)
     ps = (Parameter("width", 0.0, z.unit, 0.0, 4.0 * z.half), jump, _BEGIN)
     return ps, tuple((width, j, begin) for width in widths for j in (0.3, 1.0) for begin in (0.6, -0.6))
+
+
+def _from_play(values: Sequence[float]) -> list[tuple[float, ...]]:
+    """What sticks and slides as far behind as something with play, and stands at first where that does; and what slides
+    less far behind: play without the jumps is wider.
+    """
+    width, begin = values
+    jumps = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+    return [(part * width / (1.0 - j), j, begin * (1.0 - j) / (1.0 + j)) for j in jumps for part in (1.0, 0.9)]
+
+
+def _stopped(z: Size) -> float:
+    """Time without a change from which a command has stopped: where it changes with every sample, the next one."""
+    return max(1.5 * z.held - z.step, 0.5 * z.step)
 
 
 def _overflow(z: Size) -> _Made:
@@ -369,7 +387,9 @@ LAWS: dict[str, dict[str, Law]] = {
                 _stiction,
                 "flat after each reversal or stop, a jump, then parallel",
                 True,
+                constant=_stopped,
                 holds=("play", (None, 0.0, None)),
+                onward=_from_play,
             ),
             Law(
                 "stick_slip",
@@ -379,6 +399,7 @@ LAWS: dict[str, dict[str, Law]] = {
                 "stairs while the command moves",
                 True,
                 holds=("play", (None, 0.0, None)),
+                onward=_from_play,
             ),
             Law(
                 "rate_limit",

@@ -167,6 +167,17 @@ def within(stage: Stage, theta: Array, name: str, held: str) -> Array:
     return out
 
 
+def onward(stage: Stage, theta: Array, name: str, held: str) -> list[Array]:
+    """Where the effect ``name`` may begin that holds ``held`` within it, by the parameters of a model with that."""
+    effect, index = stage.effect(name), stage.index()
+    low, high = ([getattr(p, end) for p in effect.parameters] for end in ("low", "high"))
+    out = []
+    for values in effect.onward(theta[index[held]].tolist()) if effect.onward is not None else []:
+        out.append(within(stage, theta, name, held))
+        out[-1][index[name]] = np.clip(values, low, high)
+    return out
+
+
 def out_of(stage: Stage, theta: Array, name: str, held: str) -> Array:
     """The parameters of a model with the effect ``name`` as those of one with ``held``, which it holds within it."""
     index, out = stage.index(), theta.copy()

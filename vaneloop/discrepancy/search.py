@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step, finished, recalibrate
-from vaneloop.discrepancy.promise import Slopes, along, followed, out_of, within
+from vaneloop.discrepancy.promise import Slopes, along, followed, onward, out_of, within
 from vaneloop.discrepancy.stage import Array, Effect
 
 if TYPE_CHECKING:
@@ -96,6 +96,7 @@ class Search:
         # of fits: effect that could be added -> what the best of its starts would leave, and that start
         self.promises: dict[frozenset[str], dict[str, tuple[float, Array]]] = {}
         self.sloped: dict[frozenset[str], tuple[Fit, Slopes]] = {}
+        self.led: dict[tuple[frozenset[str], str], Fit] = {}  # sets, and an effect held there: the fit gone on from
         begins = [self.stage.neutral()]
         if self.stage.begins is not None:
             begins += list(self.stage.begins)
@@ -295,7 +296,7 @@ class Search:
         A part's parameters are parameters of the whole, with the other effects at neutral, and a fit never ends higher
         than it starts.
         """
-        mine = frozenset(fit.effects)
+        fit, mine = (yield from self._led_on(fit)), frozenset(fit.effects)
         parts = [(f, f.theta) for key, f in self.fits.items() if key < mine]
         parts += [(f, within(self.stage, f.theta, name, held)) for name, held, f in self._held(fit.effects)]
         part, theta = min(parts, key=lambda p: self.judge.total_of(p[0]), default=(None, fit.theta))
@@ -303,6 +304,21 @@ class Search:
             return fit
         again = yield from self.judge.fitting(fit.effects, theta, 8)
         return min(again, fit, key=self.judge.total_of)
+
+    def _led_on(self, fit: Fit) -> Task[Fit]:
+        """The fit, or a better one from where an effect leads that one of these holds within it: what does nearly the
+        same lies along a valley that no start of its own need be in.
+        """
+        mine = frozenset(fit.effects)
+        for name, held, f in self._held(fit.effects):
+            if self.led.get((mine, held)) is f or not (thetas := onward(self.stage, f.theta, name, held)):
+                continue
+            self.led[mine, held] = f
+            costs = self.judge.totals((yield np.array(thetas)), np.array(thetas))
+            if costs.min() < self.judge.total_of(f):
+                again = yield from self.judge.fitting(fit.effects, thetas[int(np.argmin(costs))], 8)
+                fit = min(again, fit, key=self.judge.total_of)
+        return fit
 
     def _held(self, effects: Sequence[str]) -> list[tuple[str, str, Fit]]:
         """Fits made with an effect that one of these holds within it in its place: that one, the other, the fit."""

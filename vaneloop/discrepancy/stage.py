@@ -8,7 +8,7 @@ rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -74,6 +74,8 @@ class Effect:
     excites     what a log needs to show it, in words
     holds       effects that it is at some values of its parameters: (name, a number for each parameter that is fixed,
                 NaN where any will do, None for each that is the other's, in order)
+    onward      function from the parameters of the one that it holds to starts that do nearly the same, farther and
+                farther from it; None: its own starts will do
     """
 
     name: str
@@ -81,6 +83,7 @@ class Effect:
     starts: tuple[tuple[float, ...], ...]
     excites: str = ""
     holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
+    onward: Callable[[Sequence[float]], list[tuple[float, ...]]] | None = None
 
 
 @dataclass(eq=False)

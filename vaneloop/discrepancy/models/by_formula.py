@@ -57,11 +57,13 @@ def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
 
 
 def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]) -> list[Tried]:
-    """Of curves that do not earn their place, but are near the best of ``among``, those of which a formula does; none
-    of what remembers. A block that alone has been somewhere says nothing of splines there, and much of a formula.
+    """Of curves that do not earn their place, but are near the best of ``among`` or explain most of the error at their
+    place itself, those of which a formula does; none of what remembers. A block that alone has been somewhere says
+    nothing of splines there, and much of a formula.
     """
-    reach = min((learner._score(t, among) for t in among), default=0.0) + NEAR
-    near = [t for t in poor if learner._score(t, among) < reach and not t.candidate.quantity.remembers]
+    reach, home = min((learner._score(t, among) for t in among), default=0.0) + NEAR, at_its_place(before, poor)
+    near = [t for t in poor if t in home or learner._score(t, among) < reach]
+    near = [t for t in near if not t.candidate.quantity.remembers]
     said = all_in_their_place(learner.ground, near)
     return [t for t, formulas in zip(near, said, strict=True) if any(learner._worth(before, f) for f in formulas)]
 

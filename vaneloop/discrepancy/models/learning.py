@@ -455,7 +455,8 @@ class Learner:
             close = [t for t in done if self._score(t, done) < best + NEAR or without_its_lag(t, done[0])]
             more_splines = zip(close, self.each(lambda t: self._finer(current, t), close), strict=True)
             finer = {t: f for t, f in more_splines if f is not None}
-            close = [t for t in done if self._score(t, done) < best + FORMULAS]
+            home = at_its_place(current, done)
+            close = [t for t in done if t in home or self._score(t, done) < best + FORMULAS]
             jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
             coarse = [t for t in done if t in finer and self._worth(t, finer[t])]  # a second law would patch them
             done = self._ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])

@@ -36,7 +36,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         if law.holds is not None:
             other, pattern = law.holds
             holds = ((f"{name.rpartition('.')[0]}.{other}", pattern),)
-        effects.append(Effect(name, tuple(ps), starts, law.looks, holds))
+        effects.append(Effect(name, tuple(ps), starts, law.looks, holds, law.onward))
         out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
 
     def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:
@@ -123,4 +123,7 @@ def _size(records: Sequence[Record], rows: list[Array], unit: str, **more: Any) 
     fastest = float(np.quantile(np.abs(rates), 0.999)) if len(rates) else 0.0
     least = (high - low) / span
     step = float(np.median(np.diff(records[0].t)))
-    return Size(float(low), float(high), max(rms, least), max(fastest, least), step, span, unit=unit, **more)
+    changes = [np.diff(r.t[1:][np.diff(v) != 0.0]) for v, r in zip(rows, records, strict=True)]
+    held = float(np.median(np.concatenate(changes))) if any(map(len, changes)) else 0.0
+    rate, top = max(rms, least), max(fastest, least)
+    return Size(float(low), float(high), rate, top, step, span, unit=unit, held=held, **more)
