@@ -104,10 +104,9 @@ def test_a_curve_at_its_place_is_asked_by_its_formula_however_far_its_splines_go
     """A block alone has been as fast: left out, splines of the speed say anything there."""
 
     def tried(near: bool, score: float, left: float, good: bool, remembers: bool = False) -> Any:
+        quantity = SimpleNamespace(name="q", remembers=remembers, period=0.0, less=None)
         return SimpleNamespace(
-            candidate=SimpleNamespace(
-                near=near, at="force.force", quantity=SimpleNamespace(name="q", remembers=remembers, period=0.0)
-            ),
+            candidate=SimpleNamespace(near=near, at="force.force", quantity=quantity),
             score=score, fit=SimpleNamespace(cost=np.array([left**2 * 100.0])), judge=SimpleNamespace(n=100),
             loose=[SimpleNamespace(good=good)],
         )  # fmt: skip
