@@ -178,6 +178,38 @@ def test_stiction_is_found_on_from_the_play_that_stands_in_for_it(width: float, 
     assert found[0] == pytest.approx(width, rel=0.05) and found[1] == pytest.approx(jump, abs=0.1)
 
 
+@pytest.mark.parametrize("iterations", [1, 3, 12])
+def test_quick_steps_lead_where_the_fit_goes_with_fewer_simulations(iterations: int):
+    rng = np.random.default_rng(6)
+    u = 3.0 * np.sin(0.03 * np.arange(N))
+    system = System(
+        "bent", "static", lambda u, p: p.gain * u.u + p.bend * u.u**3 / (1.0 + p.bend * u.u**2), inputs={"u": "V"},
+        outputs={"y": "V"}, parameters=[unknown("gain", 1.0, "-"), unknown("bend", 0.1, "-", low=0.0)], places=["u"],
+    )  # fmt: skip
+    y = 2.0 * u + 0.7 * u**3 / (1.0 + 0.7 * u**2) + 0.5 + 0.05 * rng.standard_normal(N)
+    bound = system.bind([Record("bent", T, {"u": u, "y": y})])
+    asked: list[int] = []
+
+    class Counting(Judge):
+        def _simulated(self, thetas):
+            asked.append(len(thetas))
+            return super()._simulated(thetas)
+
+    for effects in ((), ("u.bias",)):
+        sims = []
+        for quick in (False, True):
+            judge = Counting(bound.thinned, bound.floor)
+            asked.clear()
+            task = judge.leading if quick else judge.fitting
+            start = judge.stage.neutral()
+            start[:2] *= 0.6
+            sims.append((judge.together([task(effects, start, iterations)])[0], sum(asked)))
+        (fit, whole), ((total, theta), fewer) = sims
+        np.testing.assert_array_equal(theta, fit.theta)
+        assert total == pytest.approx(judge.total_of(fit), rel=1e-9)
+        assert fewer <= whole and (iterations > 1 or fewer == whole - len(fit.free))
+
+
 def test_what_cannot_be_told_apart_is_followed_by_the_least_step():
     # an offset and a gain of a signal that stands still at 2
     offset_and_gain = np.outer([1.0, 2.0], [1.0, 2.0])
