@@ -13,6 +13,7 @@ from vaneloop.base import side_by_side as sharing
 from vaneloop.base.side_by_side import shared_out, side_by_side
 from vaneloop.discrepancy import Record, System, unknown
 from vaneloop.discrepancy.models import nominal, runner
+from vaneloop.discrepancy.models.dispatch import compiled_code
 from vaneloop.discrepancy.models.smoothness import smoothed
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -43,6 +44,91 @@ def test_sets_in_two_threads_are_those_run_one_by_one(monkeypatch: pytest.Monkey
     monkeypatch.setattr(runner, "SHORT", 0)
     assert np.array_equal(stage.run(sets), alone)
     assert not np.array_equal(alone[0], alone[1])
+
+
+def as_list(x: float, y: float) -> Any:
+    d = [x - y, 2.0]
+    return d
+
+
+def as_list_or_tuple(x: float, y: float) -> Any:
+    if x > 0.0:
+        return [0, y]
+    return x, y
+
+
+def as_array(x: float, y: float) -> Any:
+    return np.array([x, x * y, 3])
+
+
+def counted_before(x: float, y: float) -> Any:
+    d = [x, y]
+    d.append(float(len(d)))
+    return d
+
+
+def of_two_lengths(x: float, y: float) -> Any:
+    return [x, y] if x > 0.0 else [x]
+
+
+def as_its_array(x: float, y: float) -> Any:
+    return np.array([x, y]) * 2.0
+
+
+@pytest.mark.parametrize(
+    ("f", "kind"),
+    [
+        (as_list, tuple), (as_list_or_tuple, tuple), (as_array, tuple),
+        (counted_before, list), (of_two_lengths, list), (as_its_array, np.ndarray),
+    ],
+)  # fmt: skip
+def test_what_only_leaves_a_function_leaves_it_in_a_tuple(f: Any, kind: type) -> None:
+    """A list that numba makes in memory at each call takes longer than most models; its numbers are the same."""
+    for x, y in ((1.0, 2.0), (-1.5, 0.25)):
+        got = compiled_code(f, in_a_tuple=True)(x, y)
+        assert isinstance(got, kind)
+        assert list(got) == list(f(x, y))
+        if f is not as_list_or_tuple:  # which numba cannot compile as it is
+            assert not isinstance(compiled_code(f)(x, y), tuple)
+
+
+def rates(x: Any, u: Any, p: Any) -> Any:
+    return [p.rate * (u.v - x.first), x.first - x.second]
+
+
+def seen(x: Any, u: Any, p: Any) -> Any:
+    return [x.second, rates(x, u, p)[1]]
+
+
+def rates_in_a_tuple(x: Any, u: Any, p: Any) -> Any:
+    return p.rate * (u.v - x.first), x.first - x.second
+
+
+def seen_in_a_tuple(x: Any, u: Any, p: Any) -> Any:
+    return x.second, x.first - x.second
+
+
+def test_models_that_return_a_list_run_as_those_that_return_a_tuple() -> None:
+    """Bit for bit, also where the output asks the model, which then gives it a list."""
+
+    rng = np.random.default_rng(5)
+    t = 0.02 * np.arange(500)
+    columns = {"v": np.repeat(rng.uniform(-1.0, 1.0, 50), 10), "level": rng.standard_normal(500)}
+    record = Record("log", t, {**columns, "rate": rng.standard_normal(500)})
+    made = []
+    for model, output in ((rates, seen), (rates_in_a_tuple, seen_in_a_tuple)):
+        system = System(
+            name="lags", kind="simulate", model=model, inputs={"v": "V"}, states={"first": "V", "second": "V"},
+            outputs={"level": "V", "rate": "V/s"}, output=output, parameters=[unknown("rate", 2.0, "1/s")],
+        )  # fmt: skip
+        bound = system.bind([record])
+        assert not any("plain Python" in note for note in bound.data.notes)
+        stage = bound.stage
+        sets = np.repeat(stage.neutral()[None], 4, axis=0)
+        sets[:, 0] *= np.linspace(0.5, 1.5, 4)
+        made.append(stage.run(sets))
+    assert np.array_equal(made[0], made[1])
+    assert made[0].std() > 0.0
 
 
 @pytest.mark.parametrize(

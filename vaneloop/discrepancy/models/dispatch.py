@@ -17,6 +17,7 @@ from numba import njit
 
 from vaneloop.base.kept import kept_njit
 from vaneloop.discrepancy import laws, library
+from vaneloop.discrepancy.models.in_a_tuple import InATuple
 from vaneloop.discrepancy.models.own_laws import FIRST_CODE, Law
 from vaneloop.discrepancy.models.user_code import cannot, place_of
 from vaneloop.discrepancy.stage import Array, StageError
@@ -49,8 +50,11 @@ class Dispatch:
     python: str = ""
 
 
-def compiled_code(f: Any, done: dict[int, Any] | None = None) -> Any:
-    """A user's function compiled, with the functions of the same file that it calls."""
+def compiled_code(f: Any, done: dict[int, Any] | None = None, in_a_tuple: bool = False) -> Any:
+    """A user's function compiled, with the functions of the same file that it calls.
+
+    in_a_tuple  what it returns in a list or an array comes in a tuple, where that is all the same to it
+    """
     if hasattr(f, "py_func") or not isinstance(f, types.FunctionType):
         return f if hasattr(f, "py_func") else njit(error_model="numpy", nogil=True)(f)
     done = {} if done is None else done
@@ -67,6 +71,10 @@ def compiled_code(f: Any, done: dict[int, Any] | None = None) -> Any:
         g.__module__ = f.__module__
     else:
         g = f
+    if in_a_tuple:  # under another name: another function may call it, which then gets its list
+        named = types.FunctionType(g.__code__, g.__globals__, f"{f.__name__}_in_a_tuple", g.__defaults__, g.__closure__)
+        named.__module__ = g.__module__
+        return kept_njit(named, error_model="numpy", nogil=True, pipeline_class=InATuple)
     done[id(f)] = kept_njit(g, error_model="numpy", nogil=True)
     return done[id(f)]
 

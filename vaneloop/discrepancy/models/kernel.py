@@ -62,12 +62,13 @@ def build_kernels(
         source = source.replace(f"len({name})", str(number))
     source = source.replace("{outs}", _output_source(code)).replace("{control}", _control_source(code))
 
-    def build(jit: Compile, inline: Compile, inline_own: Compile) -> Kernel:
+    def build(jit: Compile, returned: Compile, inline: Compile, inline_own: Compile) -> Kernel:
         space: dict[str, Any] = {
             "np": np, "jit": jit, "inline": inline, "inline_own": inline_own,
             "X": code.X, "U": code.U, "P": code.P, "Y": code.Y, "R": code.R,
-            "model": jit(s.model),
-            "output": jit(s.output) if s.output else None, "control": jit(s.control) if s.control else None,
+            "model": returned(s.model),
+            "output": returned(s.output) if s.output else None,
+            "control": returned(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
             "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table, "on_grid": on_grid,
             "LOOP": s.kind == "closed_loop", "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
@@ -83,7 +84,8 @@ def build_kernels(
     # Parts of the kernel are compiled into what calls them: a call that hands over a dozen arrays and counts who refers
     # to them takes 0.3 us. What calls the user's functions counts: they may return arrays.
     own = partial(kept_njit, error_model="numpy", nogil=True, forceinline=True)
-    return build(compiled_code, partial(own, _nrt=False), own), build(uncompiled, uncompiled, uncompiled)
+    returned = partial(compiled_code, in_a_tuple=True)
+    return build(compiled_code, returned, partial(own, _nrt=False), own), build(*[uncompiled] * 4)
 
 
 def _output_source(code: UserCode) -> str:
