@@ -29,6 +29,8 @@ Task = Generator[
     Array, Array, Answer
 ]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
 
+Moves = tuple[int | None, int | None]  # the only output and the only log that a parameter moves; None: all
+
 MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
 BLOCKS, MOST_BLOCKS = 24, 60  # blocks of a stage of unknown memory; at most
 MAX_SETS = 64  # parameter sets in one call of run
@@ -122,6 +124,10 @@ class Judge:
         self.scale = self._scales()
         names = stage.outputs  # what each parameter moves: the only output, the only log
         self._moves = [(names.index(p.output) if p.output in names else None, p.log) for p in stage.all_parameters()]
+        self._shared: dict[bytes, tuple[Array, int]] = {}  # of columns: see `_sharing`
+        width = np.array([p.tolerance for p in stage.all_parameters()])
+        # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
+        self._prior = np.where(width > 0.0, 3.0 / np.where(width > 0.0, width, 1.0) ** 2, 0.0)
         self._bounds = self._limits()
         self._turning = [c for c, p in enumerate(stage.all_parameters()) if p.period > 0.0]
         self._counted = self.valid.astype(float)
@@ -213,10 +219,7 @@ class Judge:
         """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior,
         float64[sets].
         """
-        tolerance = np.array([p.tolerance for p in self.stage.all_parameters()])
-        prior = np.where(tolerance > 0.0, 3.0 / np.where(tolerance > 0.0, tolerance, 1.0) ** 2, 0.0)
-        prior = np.where(np.isfinite(prior), prior, 0.0)
-        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.neutral()) ** 2 @ prior)
+        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.neutral()) ** 2 @ self._prior)
 
     def total_of(self, fit: Fit) -> float:
         """What the fit has minimised."""
@@ -298,9 +301,7 @@ class Judge:
             start = start.theta
         theta = self.wrapped(np.clip(np.array(start, dtype=float), low, high))
         nominal = s.neutral()
-        tolerance = np.array([p.tolerance for p in s.all_parameters()])
-        # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
-        prior = np.array([3.0 / tolerance[c] ** 2 if tolerance[c] > 0.0 else 0.0 for c in free])
+        prior = self._prior[free]
         scale = self.scale[free]
         block_weights = np.ones(self.n_blocks) if weights is None else weights
 
@@ -389,18 +390,8 @@ class Judge:
         if they are.
         """
         moves = [self._moves[c] for c in free]
-        row = np.zeros(len(free), dtype=int)
-        groups: list[list[tuple[int | None, int | None]]] = []
-        for i, mine in enumerate(moves):  # parameters that move different outputs or logs share a simulation
-            for g, taken in enumerate(groups):
-                if all(any(None not in (a, b) and a != b for a, b in zip(mine, other, strict=True)) for other in taken):
-                    taken.append(mine)
-                    row[i] = g
-                    break
-            else:
-                groups.append([mine])
-                row[i] = len(groups) - 1
-        thetas = np.repeat(theta[None], len(groups) + 1, axis=0)
+        row, groups = self._sharing(free)
+        thetas = np.repeat(theta[None], groups + 1, axis=0)
         steps = np.empty(len(free))
         for i, c in enumerate(free):
             d = DIFFERENCE * scale[i]
@@ -421,6 +412,18 @@ class Judge:
             return here, jac
 
         return thetas if known is None else thetas[1:], derivative
+
+    def _sharing(self, free: Array) -> tuple[Array, int]:
+        """The simulation of each of these, which it shares with what moves other outputs or logs; and how many."""
+        key = free.tobytes()
+        if key not in self._shared:
+            moves, row, many = [self._moves[c] for c in free], np.zeros(len(free), dtype=int), 0
+            for i, mine in enumerate(moves):
+                alike = {int(row[j]) for j in range(i) if not _apart(mine, moves[j])}
+                row[i] = next(g for g in range(many + 1) if g not in alike)
+                many = max(many, int(row[i]) + 1)
+            self._shared[key] = row, many
+        return self._shared[key]
 
     def _finish(
         self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array,
@@ -495,6 +498,11 @@ class Judge:
         step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
         step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
         return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))
+
+
+def _apart(one: Moves, other: Moves) -> bool:
+    """Whether what two parameters move is not the same output, or not the same log."""
+    return any(None not in (a, b) and a != b for a, b in zip(one, other, strict=True))
 
 
 def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:

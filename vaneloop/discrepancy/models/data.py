@@ -193,9 +193,10 @@ class Data:
     def restarts(self, log: int, n: int) -> tuple[Array, Array]:
         """At which of a log's first ``n`` samples a window starts anew, bool[n]; states there, float64[states, n]."""
         s = self.system
-        restart = np.zeros(n, dtype=np.bool_)
         if not self.window:
-            return restart, np.zeros((len(s.states), 1))
+            if (n, 0.0) not in self._restart_cache:
+                self._restart_cache[n, 0.0] = np.zeros(n, dtype=np.bool_), np.zeros((len(s.states), 1))
+            return self._restart_cache[n, 0.0]
         if (log, self.window) not in self._restart_cache:
             r = self.records[log]
             w = (r.t / self.window + 1e-9).astype(int)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -32,6 +33,7 @@ SHORT = 10_000  # steps of simulations below which a thread of its own costs mor
 SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
 FEW = 4  # samples that a cubic spline needs
 _building = Lock()  # of kernels, by one thread
+_SWITCHING = frozenset(laws.SWITCHING.tolist())
 STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
@@ -50,11 +52,6 @@ class Placed:
     columns: slice = field(default_factory=lambda: slice(0, 0))
     neutral: Array = field(default_factory=lambda: np.zeros(0))
     curve: Curve | None = None
-
-    @cached_property
-    def idle(self) -> list[float]:
-        """Its neutral values: arrays of two take ten times as long to compare."""
-        return list(self.neutral.tolist())
 
 
 class Runner:
@@ -78,12 +75,13 @@ class Runner:
         self.code = UserCode(s, data.in_names)
         self.dispatch: Dispatch = like.dispatch if like else dispatch_of(s.laws)
         self.trying = False  # whether numba can compile the model
+        self._first: dict[int, Array] = {}  # states at the start of each log, as it or the user tells them
         self.kernel: Kernel
         self.slow: Kernel  # the same, not compiled
         # both with curves (and surfaces: True), made when they are first needed; every runner of these logs shares them
         self.curved: dict[bool, tuple[Kernel, Kernel]] = like.curved if like else {}
         self.ready = like is not None  # the model ran with the user's own values
-        self.placed: list[Placed] = []
+        self.placed = []
         self.free_starts: list[tuple[int, int]] = []
         self.splines: dict[int, tuple[SplineRates, Array]] = {}  # and the rates of the inputs as logged, see `_rates`
         self.steps: int = like.steps if like else 1
@@ -142,18 +140,33 @@ class Runner:
             theta, np.array([self.data.first_state(0, m, 0.0) for m in self.system.states]), 0, [], 1, upto=n
         )
 
-    def _active(self, theta: Array) -> list[tuple[Placed, Array]]:
+    @property
+    def placed(self) -> list[Placed]:
+        """Laws and their columns in a set of parameters."""
+        return self._placed
+
+    @placed.setter
+    def placed(self, placed: list[Placed]) -> None:
+        self._placed = placed
+        many = [q.columns.stop - q.columns.start for q in placed]
+        self._owners = np.repeat(np.arange(len(placed)), many)
+        self._columns = np.array([c for q in placed for c in range(q.columns.start, q.columns.stop)], dtype=int)
+        idle = [np.zeros(n) if q.curve is not None else q.neutral for q, n in zip(placed, many, strict=True)]
+        self._idle = np.concatenate([np.zeros(0), *idle])
+
+    def _active(self, theta: Array, moved: Array) -> list[tuple[Placed, Array]]:
+        """The laws that do anything, and their rows; ``moved``: of all their columns, those that do."""
         out = []
-        numbers = theta.tolist()
-        for q in self.placed:
-            values = numbers[q.columns]
-            if q.curve is not None and any(values):
-                out.append((q, q.curve.row(theta[q.columns])))
-            elif q.curve is None and values != q.idle:
-                row = np.zeros(self.dispatch.parameters + 1)
-                row[: len(values)] = values
-                row[len(values)] = q.constant
-                out.append((q, row))
+        for k in dict.fromkeys(self._owners[moved].tolist()):
+            q = self._placed[k]
+            values = theta[q.columns]
+            if q.curve is not None:
+                out.append((q, q.curve.row(values)))
+                continue
+            row = np.zeros(self.dispatch.parameters + 1)
+            row[: len(values)] = values
+            row[len(values)] = q.constant
+            out.append((q, row))
         return out
 
     def run(self, thetas: Array, every: int = 1) -> Array:
@@ -164,39 +177,21 @@ class Runner:
         s = self.system
         n = len(self.data.t)
         out = np.empty((len(thetas), len(s.outputs), len(range(0, n, every))))
-        n_p = len(s.parameters)
+        moves = s.kind in ("simulate", "closed_loop")
+        given = self._columns < thetas.shape[1]  # sets of the model's own parameters alone have no law
+        moved = np.zeros((len(thetas), len(given)), dtype=bool)
+        moved[:, given] = thetas[:, self._columns[given]] != self._idle[given]
 
         def one(i: int) -> None:
-            theta = thetas[i]
-            active = self._active(theta)
-            y = np.empty((len(s.outputs), n))
-            for log, at in enumerate(self.data.logs.values()):
-                if s.kind in ("static", "force"):
-                    try:
-                        starts = [theta[n_p + k] for k, (which, _) in enumerate(self.free_starts) if which == log]
-                        y[:, at] = self._algebraic(theta[:n_p], log, active, sum(starts))
-                    except StageError:
-                        if not self.ready:
-                            raise
-                        y[:, at] = np.nan
-                else:
-                    x0 = np.array([self.data.first_state(log, m, 0.0) for m in s.states])
-                    for k, (which, m) in enumerate(self.free_starts):
-                        if which == log:
-                            x0[m] = theta[n_p + k]
-                    self._read_back(x0, log, active)
-                    y[:, at] = self._simulate(theta[:n_p], x0, log, active, self.steps)
-            bad = ~np.isfinite(y)
-            if bad.any():
-                y[bad] = self.far
-            np.clip(y[:, ::every], -self.far, self.far, out=out[i])
+            active = self._active(thetas[i], moved[i])
+            parts = [self._on_log(thetas[i], log, active) for log in range(len(self.data.logs))]
+            _bounded(np.concatenate(parts, axis=1) if len(parts) > 1 else parts[0], self.far, every, out[i])
 
         def work() -> None:
             for i in todo:
                 one(i)
 
         todo = iter(range(len(thetas)))  # which threads share
-        moves = s.kind in ("simulate", "closed_loop")
         if moves and threads() > 1 and not shared_out() and (len(thetas) - 1) * n * self.steps > SHORT:
             with ThreadPoolExecutor(1) as pool:  # compiled code runs side by side
                 other = pool.submit(work)
@@ -206,10 +201,37 @@ class Runner:
             work()
         return out
 
+    def _on_log(self, theta: Array, log: int, active: list[tuple[Placed, Array]]) -> Array:
+        """Outputs of a parameter set on one log; NaN where they are not known."""
+        s, n_p = self.system, len(self.system.parameters)
+        if s.kind in ("static", "force"):
+            starts = [theta[n_p + k] for k, (which, _) in enumerate(self.free_starts) if which == log]
+            try:
+                return np.ascontiguousarray(self._algebraic(theta[:n_p], log, active, sum(starts)), dtype=float)
+            except StageError:
+                if not self.ready:
+                    raise
+                return np.full((len(s.outputs), len(self.data.times[log])), np.nan)
+        x0 = self._states(log).copy()
+        for k, (which, m) in enumerate(self.free_starts):
+            if which == log:
+                x0[m] = theta[n_p + k]
+        self._read_back(x0, log, active)
+        return self._simulate(theta[:n_p], x0, log, active, self.steps)
+
+    def _states(self, log: int) -> Array:
+        """States at the start of a log, as it or the user tells them; else 0."""
+        if log not in self._first:
+            self._first[log] = np.array([self.data.first_state(log, m, 0.0) for m in self.system.states])
+        return self._first[log]
+
     def _read_back(self, x0: Array, log: int, active: list[tuple[Placed, Array]]) -> None:
         """Put a state that starts at its sensor's reading to where the sensor, with its law, reads that."""
-        names, s = list(self.system.states), self.system
+        s = self.system
         for q, row in active:
+            if q.curve is None and q.place != "output":
+                continue
+            names = list(s.states)
             if q.curve is not None and q.curve.how in SENSED and (name := list(s.outputs)[q.curve.place]) in names:
                 self._read_back_curve(x0, log, names.index(name), q.curve, row)
                 continue
@@ -307,28 +329,56 @@ class Runner:
                 self.curved[surfaces] = slow if self.kernel is self.slow else fast, slow
             return self.curved[surfaces]
 
+    @cached_property
+    def _no_states(self) -> Array:
+        return np.zeros(len(self.system.states))
+
+    @cached_property
+    def _position(self) -> Array:
+        """Of each state that is a rate, the state that it is the rate of; else -1."""
+        rates, names = self.system.rates, list(self.system.states)
+        return np.array([names.index(rates[n]) if n in rates else -1 for n in names], dtype=np.int64)
+
+    @cached_property
+    def _masses(self) -> list[tuple[int, int]]:
+        """States with a mass, and the parameter that it is."""
+        masses, known = self.system.masses, [q.name for q in self.system.parameters]
+        return [(m, known.index(masses[n])) for m, n in enumerate(self.system.states) if n in masses]
+
+    @cached_property
+    def _nothing(self) -> tuple[Array, Array, Array, Array]:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, np.zeros((0, self.dispatch.parameters + 1)), np.zeros(0, dtype=np.bool_)
+
+    def _in_the_loop(self, active: list[tuple[Placed, Array]]) -> tuple[Array, Array, Array, Array]:
+        """Of laws that act within a simulation: codes, places, parameters, and whether they remember."""
+        if not active:
+            return self._nothing
+        code = np.array([q.law.code for q, _ in active], dtype=np.int64)
+        where = np.array([q.at for q, _ in active], dtype=np.int64)
+        memory = np.array([q.law.memory for q, _ in active], dtype=np.bool_)
+        return code, where, np.array([row for _, row in active]), memory
+
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
     ) -> Array:
         s = self.system
         t, u = self.data.times[log][:upto], self.data.u[log][:, :upto]
         loop = s.kind == "closed_loop"
-        n_states = len(s.states)
-        names = list(s.states)
         inside = [(q, row) for q, row in active if q.place in ("force", "state") and q.law.code not in laws.MODIFIERS]
-        gap, asymmetry = np.zeros(n_states), np.zeros(n_states)
+        gap = asymmetry = self._no_states
         for q, row in active:
-            if q.law.code == laws.BACKLASH_GAP:
-                gap[q.at] += row[0]
-            elif q.law.code == laws.FRICTION_ASYMMETRY:
-                asymmetry[q.at] += row[0]
-        code = np.array([q.law.code for q, _ in inside], dtype=np.int64)
-        where = np.array([q.at for q, _ in inside], dtype=np.int64)
-        memory = np.array([q.law.memory for q, _ in inside], dtype=np.bool_)
-        rows = np.array([row for _, row in inside]).reshape(len(inside), self.dispatch.parameters + 1)
-        position = np.array([names.index(s.rates[n]) if n in s.rates else -1 for n in names], dtype=np.int64)
-        known = [q.name for q in s.parameters]
-        mass = np.array([p[known.index(s.masses[n])] if n in s.masses else 1.0 for n in names])
+            if q.law.code in laws.MODIFIERS:
+                of = np.zeros(len(s.states))
+                of[q.at] = row[0]
+                if q.law.code == laws.BACKLASH_GAP:
+                    gap = gap + of
+                else:
+                    asymmetry = asymmetry + of
+        code, where, rows, memory = self._in_the_loop(inside)
+        mass = self._no_states + 1.0
+        for m, k in self._masses:
+            mass[m] = p[k]
         changed = sorted({q.at for q, _ in active if q.place == "input"}) if not loop else []
         if changed:
             u = u.copy()
@@ -336,12 +386,10 @@ class Runner:
                 if q.place == "input":
                     u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
         ends = [(q, row) for q, row in active if q.place in ("input", "output")] if loop else []
-        e_code = np.array([q.law.code for q, _ in ends], dtype=np.int64)
-        e_at = np.array([q.at for q, _ in ends], dtype=np.int64)
+        e_code, e_at, e_rows, _ = self._in_the_loop(ends)
         e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
-        e_rows = np.array([row for _, row in ends]).reshape(len(ends), self.dispatch.parameters + 1)
         own_forces = range(FIRST_CODE["force"], FIRST_CODE["state"])
-        if any(q.law.code in laws.SWITCHING or q.law.code in own_forces for q, _ in inside):
+        if any(q.law.code in _SWITCHING or q.law.code in own_forces for q, _ in inside):
             steps = max(steps, SWITCHED)
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
@@ -352,7 +400,7 @@ class Runner:
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments: tuple[Any, ...] = (
             t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
-            rows, position, gap,
+            rows, self._position, gap,
             asymmetry, self.smalls, mass, steps, s.between != "hold", self._rates(log, t, u, changed), len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
@@ -392,3 +440,12 @@ def _forces(
         if k == 0 and held != 0.0:
             out[k] = laws.load(code, x[0], row, gap, asymmetry, held, s)
     return out
+
+
+@compiled_free
+def _bounded(y: Array, far: float, every: int, out: Array) -> None:
+    """Each so many-th sample within ``far`` on either side; what is not finite is that far off."""
+    for o in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            v = y[o, k * every]
+            out[o, k] = min(max(v, -far), far) if math.isfinite(v) else far
