@@ -180,6 +180,24 @@ def test_work_that_is_shared_out_comes_back_in_order_and_is_not_shared_out_again
         list(side_by_side(lambda k: 1 // k, [1, 0, 1]))
 
 
+def test_a_set_of_the_model_s_own_parameters_has_no_law() -> None:
+    """Learning walks through the model as it is, beside laws that a model file names: none of them at zero size, where
+    a gain lets nothing through.
+    """
+    rng = np.random.default_rng(2)
+    t = np.arange(600.0)
+    pump = np.repeat(rng.uniform(0.0, 8.0, 12), 50)
+    record = Record("log", t, {"pump": pump, "level": 20.0 + 0.5 * rng.standard_normal(600)})
+    system = System(
+        name="tank", kind="simulate", model=tank, inputs={"pump": "V"}, states={"level": "cm"},
+        outputs={"level": "cm"}, parameters=[unknown("inflow", 0.1, "cm/(V s)"), unknown("outflow", 0.05, "1/s")],
+    )  # fmt: skip
+    bound = system.bind([record])
+    whole, own = bound.stage.neutral(), len(bound.stage.parameters)
+    assert {"pump.gain", "level_sensor.gain"} <= {q.effect for q in bound.placed}
+    assert np.array_equal(bound.run(whole[None, :own]), bound.run(whole[None]))
+
+
 def test_states_that_nobody_measures_are_walked_through_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two lags in a row, at rest, under a step: 1 - exp(-t) and 1 - (1 + t) exp(-t)."""
     walked = []

@@ -138,12 +138,14 @@ if len(code) > 0:
                 dx[w] -= state_rate(c, AT[w], rows[i])
         elif not memory[i]:
             dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
-    for w in range(m):
-        dx[w] -= held[w]
-    for i in range(len(code)):
-        if code[i] == STATE_RATE_LIMIT:
-            w = where[i]
-            dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
+    if holds:
+        for w in range(m):
+            dx[w] -= held[w]
+    if brakes:
+        for i in range(len(code)):
+            if code[i] == STATE_RATE_LIMIT:
+                w = where[i]
+                dx[w] = min(max(dx[w], -rows[i, 0]), rows[i, 0])
 {bent}"""
 
 # curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of; beside it
@@ -304,6 +306,11 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
     held = np.zeros(m)
     dx, total, z = np.zeros(m), np.zeros(m), np.zeros(m)
     {rooms}
+    holds = brakes = limits = False
+    for i in range(len(code)):
+        holds |= memory[i]
+        brakes |= code[i] == STATE_RATE_LIMIT
+        limits |= code[i] == STATE_LIMIT or code[i] == STATE_OVERFLOW
     first = True
     for k in range(n):
         if restart[k]:
@@ -340,10 +347,11 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
             break
         h = (t[k + 1] - t[k]) / steps
         for q in range(steps):
-            for w in range(m):
-                held[w] = 0.0
             now = t[k] + q * h
-            for i in range(len(code)):
+            if holds:
+                for w in range(m):
+                    held[w] = 0.0
+            for i in range(len(code) if holds else 0):
                 {own}if memory[i] and code[i] <= 40:
                     w = where[i]
                     f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
@@ -369,7 +377,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                         total[w] += 2.0 * dx[w]
                     else:
                         x[w] += h / 6.0 * (total[w] + dx[w])
-            for i in range(len(code)):
+            for i in range(len(code) if limits else 0):
                 if code[i] == STATE_LIMIT:
                     w = where[i]
                     x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
