@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.discrepancy.error_share import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, UNKNOWN
-from vaneloop.discrepancy.models.by_formula import better_than, leaves
+from vaneloop.discrepancy.models.by_formula import better_than
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.memory import swings
 from vaneloop.discrepancy.models.tried import Tried, step_without
 from vaneloop.discrepancy.stage import Array
@@ -71,14 +72,27 @@ def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
 
 def instead_of(learner: Learner, named: Tried, tried: Tried) -> bool:
     """Whether a curve stands instead of the laws with names: it must earn that as a second law must before the first,
-    and be the law, or be confirmed (`stands_before`).
+    and be the law, or be confirmed (`stands_before`). So may a formula in its place: a test log that goes further tells
+    what splines say at their ends, and the user gets the formula.
     """
+    if _stands(learner, named, tried):
+        return True
+    one = len(tried.candidate.axes) == 1 and not tried.candidate.quantity.stops
+    if not (learner.speaks and one and tried.formulas is None):
+        return False
+    tried.formulas = fitted_formulas(learner.ground, tried)
+    return _stands(learner, named, tried)
+
+
+def _stands(learner: Learner, named: Tried, tried: Tried) -> bool:
     if not better_than(learner, named, tried):
         return False
-    said = [learner._change(named, t) for t in (tried, *(f for _, f in tried.formulas or ()))]
-    on_tests = [{log: c for log, c in change.items() if log in learner.ground.tests} for change in said]
     was = rms_of(named.judge, named.fit)
-    return any(stands_before(was, leaves(tried), change) for change in on_tests)
+    for t in (tried, *(f for _, f in tried.formulas or ())):
+        tests = {log: c for log, c in learner._change(named, t).items() if log in learner.ground.tests}
+        if stands_before(was, rms_of(t.judge, t.fit), tests):
+            return True
+    return False
 
 
 def stands_before(named: float, learned: float, tests: Mapping[str, float]) -> bool:
