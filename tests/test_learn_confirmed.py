@@ -104,10 +104,10 @@ def test_before_a_name_stands_the_formula_is_asked(
     learner: Any = SimpleNamespace(
         speaks=True, ground=SimpleNamespace(tests={"test"}), _change=lambda _, t: {"test": t.change, "fitted": 0.0}
     )
-    assert confirmed.instead_of(learner, named, curve) is stands
+    assert confirmed.instead_of(learner, named, [curve]) is stands
     assert asked == [curve]
     learner.speaks = False
-    assert not confirmed.instead_of(learner, named, tried(1.06, 0.2))
+    assert not confirmed.instead_of(learner, named, [tried(1.06, 0.2)])
 
 
 @pytest.mark.parametrize("name", [f.name for f in FORMS if f.inner and f.name not in ("step", "Arrhenius", "quotient")])

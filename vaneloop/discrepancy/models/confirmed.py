@@ -7,7 +7,7 @@ already, another law that is not the truth either does not stand before them for
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,18 +70,22 @@ def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
     return True
 
 
-def instead_of(learner: Learner, named: Tried, tried: Tried) -> bool:
-    """Whether a curve stands instead of the laws with names: it must earn that as a second law must before the first,
-    and be the law, or be confirmed (`stands_before`). So may a formula in its place: a test log that goes further tells
-    what splines say at their ends, and the user gets the formula.
+def instead_of(learner: Learner, named: Tried, curves: Sequence[Tried]) -> bool:
+    """Whether curves, of which the last stands beside the others, are taken instead of the laws with names: they must
+    earn that as a second law must before the first, and be the law, or be confirmed (`stands_before`). So may a formula
+    in place of either: a test log that goes further tells what splines say at their ends, and what they do not follow
+    of a first law is not the second's to follow. The user gets the formula.
     """
+    tried = curves[-1]
     if _stands(learner, named, tried):
         return True
-    one = len(tried.candidate.axes) == 1 and not tried.candidate.quantity.stops
-    if not (learner.speaks and one and tried.formulas is None):
+    if not learner.speaks or len(tried.candidate.axes) > 1:
         return False
-    tried.formulas = fitted_formulas(learner.ground, tried)
-    return _stands(learner, named, tried)
+    if not tried.candidate.quantity.stops and tried.formulas is None:
+        tried.formulas = fitted_formulas(learner.ground, tried)
+        if _stands(learner, named, tried):
+            return True
+    return len(curves) > 1 and any(_stands(learner, named, t) for _, t in curves[0].formulas or ())
 
 
 def _stands(learner: Learner, named: Tried, tried: Tried) -> bool:
