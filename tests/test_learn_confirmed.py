@@ -15,6 +15,7 @@ from vaneloop import Record, System, unknown
 from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.formulas import begin
 from vaneloop.discrepancy.library import FORCE_LAWS
+from vaneloop.discrepancy.models import confirmed
 from vaneloop.discrepancy.models.by_formula import earning_by_formula
 from vaneloop.discrepancy.models.confirmed import OTHER, moves, stands_before
 from vaneloop.discrepancy.models.learning import Learner
@@ -79,6 +80,34 @@ def test_what_fails_too_stands_before_names_where_another_log_confirms_it(
     named: float, learned: float, tests: dict[str, float], stands: bool
 ) -> None:
     assert stands_before(named, learned, tests) is stands
+
+
+@pytest.mark.parametrize(
+    ("formula_left", "on_test", "stands"), [(1.05, -0.1, True), (1.05, 0.2, False), (1.8, 0.0, False)]
+)
+def test_before_a_name_stands_the_formula_is_asked(
+    monkeypatch: pytest.MonkeyPatch, formula_left: float, on_test: float, stands: bool
+) -> None:
+    """A curve harms a test log at its ends; its formula may not, and must then itself be what stands."""
+
+    def tried(left: float, change: float) -> Any:
+        return SimpleNamespace(
+            judge=None, fit=left, formulas=None, change=change,
+            candidate=SimpleNamespace(axes=(None,), quantity=SimpleNamespace(stops=())),
+        )  # fmt: skip
+
+    named, curve, formula = tried(1.9, 0.0), tried(1.06, 0.2), tried(formula_left, on_test)
+    asked = []
+    monkeypatch.setattr(confirmed, "rms_of", lambda _, fit: fit)
+    monkeypatch.setattr(confirmed, "better_than", lambda *_: True)
+    monkeypatch.setattr(confirmed, "fitted_formulas", lambda _, t: asked.append(t) or [(None, formula)])
+    learner: Any = SimpleNamespace(
+        speaks=True, ground=SimpleNamespace(tests={"test"}), _change=lambda _, t: {"test": t.change, "fitted": 0.0}
+    )
+    assert confirmed.instead_of(learner, named, [curve]) is stands
+    assert asked == [curve]
+    learner.speaks = False
+    assert not confirmed.instead_of(learner, named, [tried(1.06, 0.2)])
 
 
 @pytest.mark.parametrize("name", [f.name for f in FORMS if f.inner and f.name not in ("step", "Arrhenius", "quotient")])

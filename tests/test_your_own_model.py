@@ -18,6 +18,8 @@ from tests.browser import open_to_all
 from vaneloop.base.spline_rates import SplineRates
 from vaneloop.cli.main import main
 from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
+from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.models.curved import candidates
 from vaneloop.discrepancy.models.data import Data
 from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
 
@@ -379,6 +381,95 @@ def test_the_answer_does_not_turn_on_units(time: float, size: float) -> None:
     )  # fmt: skip
     answer = diagnose([record("a", u)], system, test=[record("b", v)])
     assert sorted(n.rpartition(".")[2] for n in named(answer)) == ["dead_time", "saturation"]
+
+
+def draining(x: Any, u: Any, p: Any) -> Any:
+    return p.inflow * u.pump + p.spring - p.outflow * x.level
+
+
+def drained(seed: int, volt: float, cm: float, spring: float = 0.0) -> Record:
+    """A tank whose outflow grows with the square of its level, in units of which one is ``volt`` and ``cm`` large."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 800.0, 2.0)
+    pump = np.repeat(rng.uniform(0.0, 8.0, 16), 25)
+    level, rows = 10.0, []
+    for k in range(len(t)):
+        rows.append(level)
+        for _ in range(10):
+            level += 0.2 * (0.2 * pump[k] + spring - 0.02 * level - 0.003 * level * abs(level))
+    y = np.array(rows) + 0.03 * rng.standard_normal(len(t))
+    return Record(f"run {seed}", t, {"pump": volt * pump, "level": cm * y})
+
+
+def tank_of(volt: float, cm: float, *more: Parameter) -> System:
+    """A tank that knows nothing of the square."""
+    return System(
+        "tank", "simulate", draining, inputs={"pump": "V"}, states={"level": "cm"}, outputs={"level": "cm"},
+        parameters=[
+            unknown("inflow", 0.1 * cm / volt, "cm/(V s)", low=0.0), unknown("outflow", 0.05, "1/s", low=0.0),
+            *(more or (Parameter("spring", 0.0, "cm/s"),)),
+        ],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("volt", "cm"), [(1e7, 1e-6), (1e-7, 1e6)])
+def test_a_parameter_may_be_tiny_or_huge_in_its_unit(volt: float, cm: float) -> None:
+    """As flow gains in m^3/(s Pa^0.5) and compliances in 1/Pa are: a unit says nothing of a usual size."""
+    left = {}
+    for v, c in ((1.0, 1.0), (volt, cm)):
+        answer = diagnose([drained(1, v, c)], tank_of(v, c), test=[drained(2, v, c)])
+        assert named(answer) == ["level.quadratic_drag"]
+        left[v, c] = answer.diagnosis.stages[0].excess
+    assert left[volt, cm] == pytest.approx(left[1.0, 1.0], rel=0.01)
+
+
+@pytest.mark.parametrize("cm", [1e-12, 1.0, 1e9])
+def test_an_unknown_that_begins_at_0_has_the_size_that_moves_an_output(cm: float) -> None:
+    system = tank_of(1.0, cm, unknown("spring", 0.0, "cm/s"))
+    bound = system.bind([drained(3, 1.0, cm, spring=0.0)])
+    spring = next(p for p in bound.stage.parameters if p.name == "spring")
+    spread = float(np.std(bound.measured))
+    away = bound.stage.neutral()
+    away[2] += spring.scale
+    moved = float(np.sqrt(np.mean((bound.run(away[None])[0] - bound.run(bound.stage.neutral()[None])[0]) ** 2)))
+    assert 0.01 * spread < moved < 10.0 * spread
+
+
+def test_a_law_of_a_model_file_that_is_0_can_be_fitted() -> None:
+    """What flows over into another tank, with a share of 0: how large it may be the file does not say."""
+    system = System(
+        "tanks", "simulate", cascade, inputs={"pump": "V"}, states={"upper": "cm", "lower": "cm"},
+        outputs={"upper": "cm", "lower": "cm"},
+        parameters=[Parameter("inflow", 0.25, "cm/(V s)"), Parameter("down", 0.35, "cm^0.5/s"),
+                    Parameter("out", 0.3, "cm^0.5/s")],
+    )  # fmt: skip
+    nothing = {"upper.overflow_to_lower": {"level": 10.0, "share": 0.0}}
+    bound = system.bind([tanks(1, True)], present=nothing)
+    share = next(p for p in bound.stage.parameters if p.name.endswith(".share"))
+    assert share.tolerance > 0.1
+    judge = Judge(bound.stage, bound.floor)
+    fit = judge.fit((), bound.stage.neutral(), 12)
+    at = [p.name for p in bound.stage.parameters].index(share.name)
+    assert fit.theta[at] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("value", [0.0, 21.5])
+def test_a_channel_that_stands_still_has_curves_of_a_finite_size(value: float) -> None:
+    t = T[:400]
+    system = System(
+        "tank", "simulate", lambda x, u, p: (p.inflow * u.pump - p.outflow * x.level + 0.0 * u.oil, 0.0 * x.lid),
+        inputs={"pump": "V", "oil": "degC"}, states={"level": "cm", "lid": "cm"}, outputs={"level": "cm"},
+        parameters=[unknown("inflow", 0.2, "cm/(V s)"), unknown("outflow", 0.05, "1/s")],
+    )  # fmt: skip
+    record = Record("run", t, {"pump": wave(3)[:400], "oil": np.full(400, value), "level": wave(5)[:400]})
+    bound = system.bind([record])
+    found = candidates(bound, bound.stage.neutral()[: len(bound.stage.parameters)])
+    assert {c.at for c in found} >= {"oil", "lid", "level"}
+    for c in found:
+        for p in c.effect(1.0).parameters:
+            assert 1e-12 < p.tolerance < 1e12, (c.name, p)
+    for e in bound.effects:
+        assert all(v == 0.0 or 1e-12 < abs(v) < 1e12 for start in e.starts for v in start), e.name
 
 
 def test_a_law_that_harms_a_test_log_is_not_named() -> None:

@@ -18,7 +18,7 @@ from vaneloop.base.errors import InputError
 
 __all__ = [
     "KNOWN_TO", "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "noise_of", "reach_of",
-    "without_jumps",
+    "size_of", "without_jumps",
 ]  # fmt: skip
 
 Array = np.ndarray
@@ -236,6 +236,13 @@ def without_jumps(stage: Stage, error: Array) -> Array:
             error[first - 1] - error[first - 2] + error[np.minimum(first + 1, len(error) - 1)] - error[first]
         )
     return np.asarray(error - np.cumsum(np.where(np.isfinite(step), step, 0.0)))
+
+
+def size_of(*tries: float) -> float:
+    """The first size that says anything: finite, and not 0; 1 in its unit where none does, as of a channel that is 0
+    all along.
+    """
+    return next((abs(float(v)) for v in tries if np.isfinite(v) and v != 0.0), 1.0)
 
 
 def noise_of(stage: Stage, theta: Array) -> Array:

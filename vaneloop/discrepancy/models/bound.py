@@ -16,13 +16,14 @@ from vaneloop.discrepancy.models.places import places
 from vaneloop.discrepancy.models.runner import Placed, Runner
 from vaneloop.discrepancy.models.stairs import steps_seen
 from vaneloop.discrepancy.models.system import Record, System
-from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError
+from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage, StageError, size_of
 
 __all__ = ["Bound", "rms_of_rows"]
 
 # Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
 # that the user gave, which may be wrong by a factor of ten.
 WIDE, GIVEN = 4.0, 12.0
+SLIGHT, MOST_SHRUNK = 0.3, 8  # what a small step may move of an output's spread; tries at ever smaller ones
 DRAWS = 3  # of the noise that the model starts from
 FORGOTTEN = 0.2  # of an output's noise: what noise in a reading that a state starts at may do to it, and not be fitted
 TRIED = 0.1  # of the noise: by so much a start is moved to see what it does
@@ -160,12 +161,12 @@ class Bound:
         searched = []
         for q, e in both:
             if e.name in self.present:
-                for w in e.parameters:
+                for j, w in enumerate(e.parameters):
                     v = self.present[e.name].get(w.name, w.value if w.shape else None)
                     if v is None or not np.isfinite(v):
                         raise StageError(f"model file: effect {e.name!r} needs a number for {w.name}")
                     v = float(np.clip(v, w.low, w.high))
-                    size = w.scale or max(abs(v), 1e-300)
+                    size = size_of(w.scale, v, max((abs(start[j]) for start in e.starts), default=0.0))
                     parameters.append(
                         Parameter(f"{e.name}.{w.name}", v, w.unit, w.low, w.high, WIDE * size, scale=0.1 * size)
                     )
@@ -510,22 +511,25 @@ class Bound:
         out = [0.0] * len(parameters)
         if not zero:
             return out
-        thetas = np.repeat(values[None], 1 + len(zero), axis=0)
-        for row, i in enumerate(zero, 1):
-            thetas[row, i] += 1e-3 * max(abs(values[i]), 1e-3 * self._unit_size(parameters[i]))
-        y = self.run(thetas)
-        spread = np.nanstd(self.measured, axis=1)
-        for row, i in enumerate(zero, 1):
-            moved = np.sqrt(np.mean((y[row] - y[0]) ** 2, axis=1)) / np.where(spread > 0.0, spread, 1.0)
-            felt = float(np.nanmax(moved)) / float(thetas[row, i] - values[i])
-            out[i] = 1.0 / felt if np.isfinite(felt) and felt > 0.0 else 0.0
+        y, spread = self.run(values[None])[0], np.nanstd(self.measured, axis=1)
+        for i in zero:
+            step = 1e-3 * max(abs(values[i]), 1e-3 * self._unit_size(parameters[i]))
+            for _ in range(MOST_SHRUNK):  # a unit may be far larger than a usual size: slopes are of small steps
+                theta = values.copy()
+                theta[i] += step
+                moved = np.sqrt(np.mean((self.run(theta[None])[0] - y) ** 2, axis=1))
+                most = float(np.nanmax(moved / np.where(spread > 0.0, spread, 1.0)))
+                if np.isfinite(most) and most <= SLIGHT:
+                    out[i] = step / most if most > 0.0 else 0.0
+                    break
+                step *= 1e-2
         return out
 
     def _fixed(self, p: Parameter, value: float, felt: float) -> Parameter:
         """An unknown parameter, once fitted, may move by a few of its own sizes, or by what is ``felt`` (`_felt`)."""
         if np.isfinite(p.tolerance):
             return p
-        size = max(abs(value), abs(p.value), 1e-3 * self._unit_size(p), felt)
+        size = size_of(max(abs(value), abs(p.value), felt), 1e-3 * self._unit_size(p))
         if p.name.startswith("start_"):
             size = max(size, self._unit_size(p))
         wide = max(WIDE * size, GIVEN * abs(p.value))

@@ -7,13 +7,14 @@ already, another law that is not the truth either does not stand before them for
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vaneloop.discrepancy.error_share import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, UNKNOWN
-from vaneloop.discrepancy.models.by_formula import better_than, leaves
+from vaneloop.discrepancy.models.by_formula import better_than
+from vaneloop.discrepancy.models.formula_fits import fitted_formulas
 from vaneloop.discrepancy.models.memory import swings
 from vaneloop.discrepancy.models.tried import Tried, step_without
 from vaneloop.discrepancy.stage import Array
@@ -69,16 +70,33 @@ def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
     return True
 
 
-def instead_of(learner: Learner, named: Tried, tried: Tried) -> bool:
-    """Whether a curve stands instead of the laws with names: it must earn that as a second law must before the first,
-    and be the law, or be confirmed (`stands_before`).
+def instead_of(learner: Learner, named: Tried, curves: Sequence[Tried]) -> bool:
+    """Whether curves, of which the last stands beside the others, are taken instead of the laws with names: they must
+    earn that as a second law must before the first, and be the law, or be confirmed (`stands_before`). So may a formula
+    in place of either: a test log that goes further tells what splines say at their ends, and what they do not follow
+    of a first law is not the second's to follow. The user gets the formula.
     """
+    tried = curves[-1]
+    if _stands(learner, named, tried):
+        return True
+    if not learner.speaks or len(tried.candidate.axes) > 1:
+        return False
+    if not tried.candidate.quantity.stops and tried.formulas is None:
+        tried.formulas = fitted_formulas(learner.ground, tried)
+        if _stands(learner, named, tried):
+            return True
+    return len(curves) > 1 and any(_stands(learner, named, t) for _, t in curves[0].formulas or ())
+
+
+def _stands(learner: Learner, named: Tried, tried: Tried) -> bool:
     if not better_than(learner, named, tried):
         return False
-    said = [learner._change(named, t) for t in (tried, *(f for _, f in tried.formulas or ()))]
-    on_tests = [{log: c for log, c in change.items() if log in learner.ground.tests} for change in said]
     was = rms_of(named.judge, named.fit)
-    return any(stands_before(was, leaves(tried), change) for change in on_tests)
+    for t in (tried, *(f for _, f in tried.formulas or ())):
+        tests = {log: c for log, c in learner._change(named, t).items() if log in learner.ground.tests}
+        if stands_before(was, rms_of(t.judge, t.fit), tests):
+            return True
+    return False
 
 
 def stands_before(named: float, learned: float, tests: Mapping[str, float]) -> bool:

@@ -24,7 +24,7 @@ from vaneloop.discrepancy.models.periods import Course
 from vaneloop.discrepancy.models.quantities import TIME, every
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import System
-from vaneloop.discrepancy.stage import Array, Effect, Stage
+from vaneloop.discrepancy.stage import Array, Effect, Stage, size_of
 
 __all__ = ["Candidate", "OwnGround", "candidates", "on_logs", "with_curves"]
 
@@ -277,7 +277,7 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
 
     def half(rows: Array) -> float:
         good = rows[np.isfinite(rows)]
-        return max(0.5 * float(np.ptp(good)) if len(good) else 0.0, 1e-300)
+        return size_of(0.5 * np.ptp(good), np.max(np.abs(good))) if len(good) else 1.0
 
     for i, p in enumerate(s.parameters):
         if s.allows("parameter", p.name):
@@ -288,15 +288,13 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
                 continue
             if s.allows("force" if name in s.rates else "state", name):
                 pairs = zip(states[i], bound.data.records, strict=True)
-                rate = max(
-                    float(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2))), 1e-300
-                )
+                rate = size_of(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2)))
                 mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 own = [s.rates[name]] if name in s.rates else []  # a force on what moves is one of its position, too
                 put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass, near=own)
     if s.kind == "force" and s.allows("force", "force"):
         y = bound.measured[0]
-        size = 0.5 * float(np.sqrt(np.nanmean(y**2)))
+        size = size_of(0.5 * np.sqrt(np.nanmean(y**2)))
         put("force adds", 0, "force", next(iter(s.outputs.values())), size, near=("position", "velocity"))
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):

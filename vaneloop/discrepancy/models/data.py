@@ -17,6 +17,7 @@ from vaneloop.discrepancy.models.motion import (
     uses,
 )
 from vaneloop.discrepancy.models.quantities import column_of
+from vaneloop.discrepancy.models.spikes import spikes
 from vaneloop.discrepancy.models.system import Record, System
 from vaneloop.discrepancy.stage import Array, StageError
 
@@ -99,6 +100,15 @@ class Data:
                     v = np.interp(t, t[~bad], v[~bad])
                     self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
             columns[c] = v
+        drives = [columns[c] for c in (*s.inputs, s.position, s.velocity) if c in columns]
+        for c in s.outputs:
+            if c in columns and (away := spikes(columns[c], drives)).any():
+                k = int(np.argmax(away))
+                self.notes.append(
+                    f"{r.name}: {c}: {int(away.sum())} samples left out that jump away from their neighbours and back, "
+                    f"first {columns[c][k]:.4g} at {t[k]:.6g} s"
+                )
+                columns[c] = np.where(away, np.nan, columns[c])
         return Record(r.name, t - t[0], columns, r.begin)
 
     def _prepare(self) -> None:

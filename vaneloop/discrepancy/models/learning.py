@@ -47,6 +47,7 @@ from vaneloop.discrepancy.models.memory import dissipates
 from vaneloop.discrepancy.models.quantities import TIME
 from vaneloop.discrepancy.models.screening import screened
 from vaneloop.discrepancy.models.smoothness import SCREENED, smoothed
+from vaneloop.discrepancy.models.spoken import tell_each_by_its_formula
 from vaneloop.discrepancy.models.surface_search import put_surface
 from vaneloop.discrepancy.models.tried import (
     MEASURED,
@@ -175,6 +176,8 @@ class Learner:
                 break
         if len(out.tried) > 1:
             self._spare_first(out)
+        if len(out.tried) > 1:
+            tell_each_by_its_formula(self, *out.tried)
         put_surface(self, out)
         return self._concluded(out, named)
 
@@ -230,7 +233,7 @@ class Learner:
         share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
         if left > UNKNOWN and share > MOST_LEFT:
             out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
-        elif named and self.d.effects and not instead_of(self, self._as_tried(last.candidate, *named), last):
+        elif named and self.d.effects and not instead_of(self, self._as_tried(last.candidate, *named), out.tried):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
         else:

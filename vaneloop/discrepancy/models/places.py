@@ -13,7 +13,7 @@ from vaneloop.discrepancy.models.dispatch import Dispatch, try_law
 from vaneloop.discrepancy.models.nominal import Course
 from vaneloop.discrepancy.models.runner import Placed
 from vaneloop.discrepancy.models.system import Record
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect, size_of
 
 __all__ = ["places"]
 
@@ -52,12 +52,12 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
     if s.kind == "force" and s.allows("force", "force"):
         v = np.concatenate([u[1] for u in data.u])
         x = np.concatenate([u[0] for u in data.u])
-        force = float(np.sqrt(np.nanmean(data.measured[0] ** 2)))
+        force = size_of(np.sqrt(np.nanmean(data.measured[0] ** 2)))
         unit = s.units.get("position", "m")
         size = _size(
             data.records, [u[0] for u in data.u], unit, force=force, force_unit=next(iter(s.outputs.values())),
-            speed=max(float(np.sqrt(np.mean(v**2))), 1e-300), speed_unit=f"{unit}/s",
-            travel=max(0.5 * float(np.ptp(x)), 1e-300), travel_unit=unit,
+            speed=size_of(np.sqrt(np.mean(v**2))), speed_unit=f"{unit}/s",
+            travel=size_of(np.ptp(x) / 2, np.max(np.abs(x))), travel_unit=unit,
         )  # fmt: skip
         add("force", "force", "force", 0, "force", size)
     if s.kind in ("simulate", "closed_loop"):
@@ -74,10 +74,10 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 force_unit = s.force_unit if name in s.masses else f"({unit})/s"
                 size = _size(
-                    data.records, values, unit, force=max(float(np.sqrt(np.nanmean(rates**2))) * m, 1e-300),
+                    data.records, values, unit, force=size_of(np.sqrt(np.nanmean(rates**2)) * m),
                     force_unit=force_unit,
-                    speed=max(float(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), 1e-300), speed_unit=unit,
-                    travel=max(0.5 * float(np.ptp(np.concatenate(z))), 1e-300), travel_unit=s.states[s.rates[name]],
+                    speed=size_of(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), speed_unit=unit,
+                    travel=size_of(np.ptp(np.concatenate(z)) / 2), travel_unit=s.states[s.rates[name]],
                 )  # fmt: skip
                 add(name, "force", name, i, "force", size)
             else:

@@ -20,7 +20,7 @@ from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.formulas import Formula, text_of
 from vaneloop.discrepancy.models.curve import runs
 from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.formula_fits import effect_of, goes_on
+from vaneloop.discrepancy.models.formula_fits import effect_of, fitted_formulas, goes_on
 from vaneloop.discrepancy.models.held_out import with_held_out
 from vaneloop.discrepancy.models.learned import LearnedLaw
 from vaneloop.discrepancy.models.tried import Ground, Tried
@@ -30,7 +30,7 @@ from vaneloop.discrepancy.stage_answer import rms_of
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learning import Learner
 
-__all__ = ["more_left", "spoken", "takes_mean_back"]
+__all__ = ["more_left", "spoken", "takes_mean_back", "tell_each_by_its_formula"]
 
 LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
 
@@ -76,6 +76,34 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
     if now is not curves[-1]:
         out[-1] = replace(out[-1], error_after=rms_of(now.judge, now.fit))
     return now, out
+
+
+def tell_each_by_its_formula(learner: Learner, first: Tried, second: Tried) -> None:
+    """Formulas of two curves that stand beside each other: alone, what the second one says is in the first one's error,
+    and leads its formulas astray. Where a formula of the first leaves less than both curves do, the second one has its
+    formulas beside that.
+    """
+    if first.candidate.quantity.stops:
+        return
+    first.formulas = _formulas_beside(learner, first, second)
+    said = [second, *(t for _, t in first.formulas)]
+    best = min(said, key=lambda t: learner._score(t, said))
+    if best is not second and learner.fails(second) and learner.speaks and not second.candidate.quantity.stops:
+        second.formulas = _formulas_beside(learner, second, best)
+
+
+def _formulas_beside(learner: Learner, tried: Tried, pair: Tried) -> list[tuple[Formula, Tried]]:
+    """Formulas of a curve as it is in a model with another one."""
+    name = tried.candidate.name
+    curves = (*(c for c in pair.curves if c[1].name != name), *(c for c in pair.curves if c[1].name == name))
+    judge = Judge(learner.ground.stage((), curves), learner.ground.floor, pair.settled)
+    theta, index = judge.stage.neutral(), judge.stage.index()
+    own = len(judge.stage.parameters)
+    theta[:own] = pair.fit.theta[:own]
+    for effect, at in pair.judge.stage.index().items():
+        theta[index[effect]] = pair.fit.theta[at]
+    fit = with_held_out(judge, judge.fit(tuple(e.name for _, e in curves), theta, 1))
+    return fitted_formulas(learner.ground, tried.refitted(judge, fit, curves))
 
 
 def more_left(learner: Learner, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
