@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
 
-__all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution"]
+__all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution", "resolution_before"]
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,7 @@ DESIGN_POINT = (99.0, 100.0)  # % of design speed, open interval: the range of t
 
 WINDOW_S = 1.0  # s; long against sensor lags (milliseconds), short against a dwell of an engine run (several seconds)
 WINDOW_SAMPLES = (64, 2048)  # fewest: a stable mean square; most: bounded work on fast rasters
+LEVELS, MOST_PARTS = 100, 20  # of a channel that was rounded twice: fewest levels; most small steps in a large one
 MAX_WINDOWS = 600  # a mean of this many windows is known to better than 1 %
 PLATEAU_GROWTH = 1.08  # growth per doubling of the lag below which the noise counts as uncorrelated
 MOTION_GROWTH = (
@@ -167,6 +168,30 @@ def resolution(values: ArrayLike) -> float:
     q *= float(np.mean(multiples[multiples < 1.5]))  # rounding averages out
     off_grid = np.abs(gaps / q - np.round(gaps / q))
     return q if np.mean(off_grid < 0.05) > 0.95 else 0.0
+
+
+def resolution_before(values: ArrayLike) -> float:
+    """Step q of a quantised channel that was rounded once more, to a step r of less than q: its values are multiples of
+    q but for r / 2, and multiples of r. A bus, or a file's last digit, rounds so. 0 where there is none.
+    """
+    y = np.asarray(values, dtype=float)
+    levels = np.unique(y[np.isfinite(y)])
+    gaps = np.diff(levels)
+    apart = gaps > 1e-6 * np.abs(levels).max(initial=0.0)
+    gaps, levels = gaps[apart], levels[np.append(True, apart)] if len(gaps) else levels
+    if gaps.size < LEVELS:
+        return 0.0
+    least = float(np.quantile(gaps, 0.01))
+    parts = (least / m for m in range(1, MOST_PARTS + 1))
+    r = next((p for p in parts if np.mean(np.abs(gaps / p - np.round(gaps / p)) < 0.05) > 0.95), 0.0)
+    if r == 0.0:
+        return 0.0
+    q = float(np.mean(gaps[gaps < 1.51 * least]))
+    for _ in range(2):  # the more levels, the better is q known, and how many steps lie between two of them
+        number = np.concatenate([[0.0], np.cumsum(np.round(gaps / q))])
+        q, start = np.polyfit(number, levels, 1)
+    off = np.abs(levels - start - q * number)
+    return float(q) if q > 1.5 * r and np.mean(off < 0.55 * r) > 0.95 else 0.0
 
 
 def _level(windows: Array, k: int) -> float:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from hil.figures import SignalError, error_figures, noise_floor, resolution
+from hil.figures import SignalError, error_figures, noise_floor, resolution, resolution_before
 from vaneloop.base.errors import InputError
 
 
@@ -170,6 +170,22 @@ def test_smooth_motion_without_noise_has_almost_no_floor():
     t = raster()
     assert noise_floor(t, rises_and_falls(t)) < 0.005
     assert noise_floor(t, 10 * np.sin(2 * np.pi * 0.2 * t)) < 0.001
+
+
+@pytest.mark.parametrize("q", [2.4, 3.7, 4.49, 9.3])
+def test_a_step_is_found_behind_a_smaller_one(q: float) -> None:
+    rng = np.random.default_rng(3)
+    for spread in (800.0, 20_000.0):  # with most levels between the ends, and with few of them
+        y = np.round(q * np.round(np.cumsum(rng.standard_normal(5000)) * spread / 70.0 / q))
+        assert resolution_before(0.001 * y + 7.0) == pytest.approx(0.001 * q, rel=1e-3)
+
+
+def test_no_step_is_found_behind_one_or_in_noise() -> None:
+    y = np.random.default_rng(4).normal(size=5000)
+    assert resolution_before(y) == 0.0
+    assert resolution_before(np.round(y, 2)) == 0.0
+    assert resolution_before(np.round(100.0 * y) / 8.0) == 0.0
+    assert resolution_before(np.zeros(10)) == 0.0 == resolution_before([])
 
 
 def test_a_channel_without_steps_has_no_resolution():

@@ -314,3 +314,13 @@ def test_a_stroke_in_steps_of_many_of_its_converter_s_lacks_bits_and_a_logger_s_
     t = np.arange(2000) * 0.01
     x = step * np.round((24.0 + 10.0 * np.sin(t)) / step)
     assert bool(_lost_bits(Log("rig", {"x_lvdt": Channel(t, x)}), build_plant())) == lost
+
+
+@pytest.mark.parametrize(("step", "lost"), [(0.00076, False), (0.0026, False), (0.0037, True), (0.00449, True)])
+def test_bits_are_seen_to_be_lost_through_the_frame_s_own_rounding(step: float, lost: bool) -> None:
+    """Frames have the stroke in steps of 1 um; four steps of the converter are 3.05 um."""
+    t = np.arange(20_000) * 0.01
+    x = 24.0 + 10.0 * np.sin(t) + 0.002 * np.random.default_rng(1).standard_normal(len(t))
+    x = 0.001 * np.round(step * np.round(x / step) / 0.001)
+    said = _lost_bits(Log("rig", {"x_lvdt": Channel(t, x)}), build_plant())
+    assert bool(said) == lost and (not lost or f"{step:.3g}" in said)

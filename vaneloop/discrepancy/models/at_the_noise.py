@@ -10,7 +10,8 @@ that nothing was fitted to must say so by themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +22,10 @@ from vaneloop.discrepancy.noise_floor import LEAST_SHARE, NATS, SPREADS, NoiseFl
 from vaneloop.discrepancy.stage import Array
 
 if TYPE_CHECKING:
-    from vaneloop.discrepancy.models.tried import Ground
+    from vaneloop.discrepancy.models.learning import Learner
+    from vaneloop.discrepancy.models.tried import Ground, Tried
 
-__all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "unconfirmed"]
+__all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "told_in_nats", "unconfirmed"]
 
 
 def above_the_noise(judge: Judge, fit: Fit) -> bool:
@@ -45,6 +47,20 @@ def in_grains(ground: Ground, grain: float, judges: Iterable[Judge]) -> None:
     ground.in_grains(grain)
     for judge in judges:
         judge.stage.grain = grain
+
+
+@contextmanager
+def told_in_nats(learner: Learner, tried: Tried) -> Iterator[None]:
+    """Compare errors in nats meanwhile, if a curve leaves nothing but a noise that is known: 1 % of the error there can
+    be a hundred nats.
+    """
+    grain = learner.judge.stage.grain
+    if learner.ground.noise_known and grain == 1.0 and not learner.fails(tried):
+        in_grains(learner.ground, grain_of(tried.judge, tried.fit), [learner.judge])
+    try:
+        yield
+    finally:
+        in_grains(learner.ground, grain, [learner.judge])
 
 
 def promises(bare: float, best: float) -> bool:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from vaneloop.base.side_by_side import side_by_side
 from vaneloop.discrepancy.error_share import MOST_LEFT
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas
-from vaneloop.discrepancy.models.tried import Ground, Tried, strange
+from vaneloop.discrepancy.models.tried import MEASURED, Ground, Tried, strange
+from vaneloop.discrepancy.noise_floor import correlation_of, rival_nats
 from vaneloop.discrepancy.stage_answer import rms_of
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ __all__ = [
     "earning_by_formula",
     "harmless",
     "leaves",
+    "said_first",
     "without_memory",
 ]
 
@@ -85,6 +87,40 @@ def without_memory(learner: Learner, before: Tried, good: list[Tried]) -> list[T
     plain = [t for t in good if not t.candidate.quantity.remembers]
     enough = any(not learner.fails(t) and not learner._harmful(before, t) for t in plain)
     return plain if enough else good
+
+
+def with_and_without_mean(ground: Ground, tried: Tried) -> list[Tried]:
+    """The model with each formula in a curve's place, those that have the curve's mean and slope, and those of which
+    parameters of the model may have them.
+    """
+    strict = [f for _, f in fitted_formulas(ground, tried)]
+    if tried.loose is None:
+        tried.loose = [f for _, f in fitted_formulas(ground, tried, loose=True)] or strict
+    return [*strict, *(f for f in tried.loose if f not in strict)]
+
+
+def said_first(learner: Learner, near: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+    """Those that do as well, plainest first, but before all others the plainest that a formula says, where the best of
+    measured channels leaves nothing but a noise that is known. A channel that follows the right one has a curve that
+    does as well, and seldom a formula.
+
+    A formula says a curve where it does as well as the best of all these curves and formulas: within the nats by which
+    one law of the library beats another.
+    """
+    among = [t for t in near if strange(t.candidate) <= MEASURED]
+    if not learner.ground.noise_known or len(among) < 2 or among[0] is not near[0]:
+        return near
+    if learner.fails(min(among, key=lambda t: left[t.candidate.name])):
+        return near
+    formulas = [(t, f) for t in among for f in with_and_without_mean(learner.ground, t)]
+    every = [*among, *(f for _, f in formulas)]
+    squares = {id(t): float(learner._judged(t, every)[1].held_out.sum()) for t in every}
+    best = min(every, key=lambda t: squares[id(t)])
+    judge, correlation = learner._judged(best, every)[0], correlation_of(best.judge, best.fit)
+    nats = rival_nats(judge, squares[id(best)], correlation)
+    said = {id(t) for t, f in formulas if squares[id(f)] - squares[id(best)] <= 2.0 * correlation * nats}
+    first = next((t for t in among if id(t) in said), near[0])
+    return [first, *(t for t in near if t is not first)]
 
 
 def leaves(tried: Tried) -> float:

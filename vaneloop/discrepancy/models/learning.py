@@ -29,7 +29,7 @@ from vaneloop.discrepancy.error_share import (
 )
 from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.locate import agrees
-from vaneloop.discrepancy.models.at_the_noise import earns, grain_of, in_grains, promises, unconfirmed
+from vaneloop.discrepancy.models.at_the_noise import earns, grain_of, in_grains, promises, told_in_nats, unconfirmed
 from vaneloop.discrepancy.models.bound import rms_of_rows
 from vaneloop.discrepancy.models.by_formula import (
     all_in_their_place,
@@ -37,6 +37,7 @@ from vaneloop.discrepancy.models.by_formula import (
     earning_by_formula,
     harmless,
     leaves,
+    said_first,
     without_memory,
 )
 from vaneloop.discrepancy.models.confirmed import another_confirms, instead_of
@@ -151,7 +152,7 @@ class Learner:
             good = harmless(self, current, good, left)
             good = without_memory(self, current, good)
             self._tell_apart(good, left)
-            near = self._near(current, good, left)
+            near = said_first(self, self._near(current, good, left), left)
             best, harms = None, []
             for chosen in (t for t in near if another_confirms(self, current, t)):  # what harms makes way for the next
                 last, why = self._as_learned(current, chosen)
@@ -406,9 +407,12 @@ class Learner:
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
             bends = [found[k] for k in c.parts]
-            fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
-            simpler = min(fits, key=self._score)
-            if self._score(simpler) <= self._score(best) + BETTER:
+            with told_in_nats(self, best):
+                fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
+                simpler = min(fits, key=self._score)
+                as_well = self._score(simpler) <= self._score(best) + BETTER
+            if as_well:
+                simpler.judge.stage.grain = best.judge.stage.grain
                 return replace(simpler, told=best.fit)
         return best
 
@@ -423,6 +427,9 @@ class Learner:
         for k, t in enumerate(self.each(few, promising)):
             quick.append(t)
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
+        short = len(quick[0].judge.stage.t) < len(self.judge.stage.t) if quick else False
+        if short and not all(self.fails(t) for t in quick):  # where an excerpt does not tell them apart, all samples do
+            quick = [self._fitted(current, t.candidate, SCREENED, t.fit.theta, 1) for t in quick]
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
         quick, done = one_constant(quick), []

@@ -25,7 +25,7 @@ from scipy.ndimage import binary_propagation
 
 from controller import Calibration, load_calibration
 from controller.records import RUN
-from hil.figures import noise_floor, resolution
+from hil.figures import noise_floor, resolution, resolution_before
 from hil.logs import Log, LogError
 from hil.loop.tick import flashed
 from plant import Plant, build_plant
@@ -259,7 +259,8 @@ def _lost_bits(log: Log, machine: Plant) -> str:
     """
     if "x_lvdt" not in log.channels:
         return ""
-    sensors, step = machine.table.sensors, resolution(log.channels["x_lvdt"].values)
+    sensors, x = machine.table.sensors, log.channels["x_lvdt"].values
+    step = resolution(x) or resolution_before(x)
     own = sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value
     if step < 4.0 * own:
         return ""
