@@ -116,6 +116,4 @@ def test_a_log_with_lost_samples_has_the_same_answer() -> None:
     errors = [a.diagnosis.stages[0].excess for a in answers]
     assert errors[1] == pytest.approx(errors[0], rel=0.1)  # the noise is estimated from the samples, too
     said = [n for n in answers[1].bound.notes if "left out" in n]
-    assert said == [
-        "run 1: level: 2 samples left out that jump away from their neighbours and back, first 0 at 240 s"
-    ]  # fmt: skip
+    assert said == ["run 1: level: 2 samples left out that jump away and back, first 0 at 240 s"]

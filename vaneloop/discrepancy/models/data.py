@@ -103,11 +103,9 @@ class Data:
         drives = [columns[c] for c in (*s.inputs, s.position, s.velocity) if c in columns]
         for c in s.outputs:
             if c in columns and (away := spikes(columns[c], drives)).any():
-                k = int(np.argmax(away))
-                self.notes.append(
-                    f"{r.name}: {c}: {int(away.sum())} samples left out that jump away from their neighbours and back, "
-                    f"first {columns[c][k]:.4g} at {t[k]:.6g} s"
-                )
+                k, n = int(np.argmax(away)), int(away.sum())
+                said = "1 sample left out that jumps" if n == 1 else f"{n} samples left out that jump"
+                self.notes.append(f"{r.name}: {c}: {said} away and back, first {columns[c][k]:.4g} at {t[k]:.6g} s")
                 columns[c] = np.where(away, np.nan, columns[c])
         return Record(r.name, t - t[0], columns, r.begin)
 
