@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vaneloop.discrepancy import Record, System, unknown
+from tests.test_your_own_model import drained, tank_of
 from vaneloop.discrepancy.models.spikes import LONGEST, spikes
 from vaneloop.verbs.search import diagnose
 
@@ -90,27 +90,11 @@ def test_where_the_input_jumps_again_and_again_the_reading_may(width: int) -> No
     assert np.flatnonzero(spikes(voltage, [current])).tolist() == [550, 800]
 
 
-def drained(seed: int) -> Record:
-    rng = np.random.default_rng(seed)
-    t = np.arange(0.0, 800.0, 2.0)
-    pump = np.repeat(rng.uniform(0.0, 8.0, 16), 25)
-    level, rows = 10.0, []
-    for k in range(len(t)):
-        rows.append(level)
-        for _ in range(10):
-            level += 0.2 * (0.2 * pump[k] - 0.02 * level - 0.003 * level * abs(level))
-    return Record(f"run {seed}", t, {"pump": pump, "level": np.array(rows) + 0.03 * rng.standard_normal(len(t))})
-
-
 def test_a_log_with_lost_samples_has_the_same_answer() -> None:
-    system = System(
-        "tank", "simulate", lambda x, u, p: p.inflow * u.pump - p.outflow * x.level, inputs={"pump": "V"},
-        states={"level": "cm"}, outputs={"level": "cm"},
-        parameters=[unknown("inflow", 0.1, "cm/(V s)", low=0.0), unknown("outflow", 0.05, "1/s", low=0.0)],
-    )  # fmt: skip
-    whole, lossy = drained(1), drained(1)
+    system = tank_of(1.0, 1.0)
+    whole, lossy = drained(1, 1.0, 1.0), drained(1, 1.0, 1.0)
     lossy.columns["level"][[120, 311]] = 0.0, 1e6
-    answers = [diagnose([r], system, test=[drained(2)]) for r in (whole, lossy)]
+    answers = [diagnose([r], system, test=[drained(2, 1.0, 1.0)]) for r in (whole, lossy)]
     for a in answers:
         assert [f.effect for f in a.diagnosis.stages[0].effects] == ["level.quadratic_drag"]
     errors = [a.diagnosis.stages[0].excess for a in answers]
