@@ -97,13 +97,18 @@ def _formulas_beside(learner: Learner, tried: Tried, pair: Tried) -> list[tuple[
     name = tried.candidate.name
     curves = (*(c for c in pair.curves if c[1].name != name), *(c for c in pair.curves if c[1].name == name))
     judge = Judge(learner.ground.stage((), curves), learner.ground.floor, pair.settled)
-    theta, index = judge.stage.neutral(), judge.stage.index()
-    own = len(judge.stage.parameters)
-    theta[:own] = pair.fit.theta[:own]
-    for effect, at in pair.judge.stage.index().items():
-        theta[index[effect]] = pair.fit.theta[at]
-    fit = with_held_out(judge, judge.fit(tuple(e.name for _, e in curves), theta, 1))
+    fit = with_held_out(judge, judge.fit(tuple(e.name for _, e in curves), _as_in(pair, judge), 1))
     return fitted_formulas(learner.ground, tried.refitted(judge, fit, curves))
+
+
+def _as_in(tried: Tried, judge: Judge, but: str = "") -> Array:
+    """Parameters of ``judge``'s model, with what a fit gave to those of the same name; ``but``: a curve that is not."""
+    theta, index, own = judge.stage.neutral(), judge.stage.index(), len(judge.stage.parameters)
+    theta[:own] = tried.fit.theta[:own]
+    for name, at in tried.judge.stage.index().items():
+        if name != but:
+            theta[index[name]] = tried.fit.theta[at]
+    return theta
 
 
 def more_left(learner: Learner, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
@@ -147,11 +152,8 @@ def _in_place(
     curves = list(now.curves)
     curves[k] = (c.placed_as(table, len(numbers), reach, jump), effect)
     judge = Judge(ground.stage((), tuple(curves)), ground.floor, now.settled)
-    theta, index = judge.stage.neutral(), judge.stage.index()
+    theta, index = _as_in(now, judge, c.name), judge.stage.index()
     theta[: len(own)] = own
-    for name, at in now.judge.stage.index().items():
-        if name != c.name:
-            theta[index[name]] = now.fit.theta[at]
     theta[index[c.name]] = numbers
     names = tuple(e.name for e in judge.stage.effects)
     theta = judge.fit(tuple(n for n in names if n != c.name), theta, 8).theta
