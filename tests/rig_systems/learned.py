@@ -2,7 +2,8 @@
 
 A curve is named by its place and its quantity, as the product names it. Several can be one: an outflow that grows with
 the level is a gain of the outflow over the level, and a curve taken off the level's derivative. Empty: the law is no
-function of one quantity that is known (a product of two, a ripple that no log resolves).
+function of one quantity that is known (a product of two, a ripple that no log resolves). `tests/test_rig_learned.py`
+holds each against the family's equations.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ __all__ = ["LEARNED"]
 LEARNED: dict[tuple[str, str], frozenset[str]] = {
     (family, law): frozenset(names.split())
     for family, law, names in (
-        ("tanks", "spill", ""),  # out of one tank and into the other
+        ("tanks", "spill", "upper_outflow.gain_of_upper"),  # what flows out of the one flows into the other
         ("tanks", "clogging", "lower_outflow.gain_of_time"),
         ("flow_loop", "stiction", ""),
         ("flow_loop", "equal_percentage", "valve.curve_of_valve gain.gain_of_valve flow.curve_of_valve"),
@@ -33,7 +34,7 @@ LEARNED: dict[tuple[str, str], frozenset[str]] = {
         ("battery", "cold", "r0.gain_of_time"),
         ("levitation", "saturates", ""),
         ("levitation", "eddies", ""),
-        ("pneumatic_cylinder", "seal", ""),  # pressure times direction
+        ("pneumatic_cylinder", "seal", "area.gain_of_speed"),  # pressure times area times a function of the speed
         ("pneumatic_cylinder", "vents", "fill.gain_of_direction_of_pressure"),
         ("spool", "sluggish", "spool_lag.gain_of_speed"),
         ("spool", "fouled", "exhaust.curve_of_time"),
