@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lsim, lti
 
 from hil.logs import Channel, Log
 from plant import Model, build_plant, load_model
@@ -109,6 +110,29 @@ def test_a_gain_that_swings_is_found_beside_the_motion_that_it_acts_on(seed: int
     c = plain._replace(error=plain.error + motion * np.sin(2.0 * np.pi * f * plain.t))
     found = Lines([c]).periods([motion[None]])
     assert any(abs(p - 1.0 / f) * f * f * 40.0 < 0.2 for p in found)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_gain_that_swings_faster_than_the_model_answers_is_found(seed: int) -> None:
+    """A spring that swings, in an oscillator of 0.7 Hz: what it does lags, and is not what a steady one does."""
+    rng = np.random.default_rng(seed)
+    t, own = np.arange(4000) * 0.01, 2.0 * np.pi * 0.7
+    f, lag = rng.uniform(1.5, 6.0), rng.random()
+    oscillator = lti([1.0], [1.0, 0.4 * own, own**2])
+    pushed = rng.uniform(-1.0, 1.0, 40)[np.searchsorted(np.sort(rng.uniform(0.0, 40.0, 39)), t)]
+    at = lsim(oscillator, pushed, t)[1]
+    more = lsim(oscillator, at * np.sin(2.0 * np.pi * (f * t + lag)), t)[1]
+    noise = 0.05 * np.std(more) * rng.standard_normal(len(t))
+    c = Course(t, (more + noise)[None], pushed[None], at[None])
+    assert any(abs(p - 1.0 / f) * f * f * 40.0 < 0.3 for p, _ in Lines([c]).fast())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_has_no_fast_gain(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = np.cumsum(rng.standard_normal((2, 4000)), axis=1)
+    assert Lines([course(seed, 0.0, 1.0)._replace(said=said)]).fast() == []
+    assert Lines([course(seed, 2.0, 1.0)]).fast() == []  # nothing is known of what the model says
 
 
 @given(st.integers(0, 10_000), st.floats(0.5, 5.0), st.integers(1, 5))

@@ -439,7 +439,8 @@ class OwnGround:
     def courses(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> list[Course]:
         """The error of every sample of the logs that are fitted."""
         bound = with_curves(self.logs.fitted, (), curves)
-        error = (bound.run(theta[None])[0] - bound.measured) / self.floor[:, None]
+        said = bound.run(theta[None])[0]
+        error = (said - bound.measured) / self.floor[:, None]
         error[~np.isfinite(error)] = 0.0
         parts = zip(bound.data.records, bound.logs.values(), bound.data.u, strict=True)
-        return [Course(r.t, error[:, at], u) for r, at, u in parts]
+        return [Course(r.t, error[:, at], u, said[:, at]) for r, at, u in parts]

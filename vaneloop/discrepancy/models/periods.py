@@ -2,8 +2,10 @@
 
 A ripple, a hum or a shaken base is a curve of the time within its period. Its period is where the error's spectrum has
 a line. Where it multiplies, a gain that swings at 50 Hz shows at 50 Hz beside the motion that it acts on. There a wave
-is fitted as that gain, alone and with its multiples: a gain that dips for a moment has many, and none stands out. Lines
-of what drives the model, and multiples of them, are the model's own: they say nothing of time.
+is fitted as that gain, alone and with its multiples: a gain that dips for a moment has many, and none stands out. What
+swings faster than the model answers is no wave times what a constant does. It is nearly a wave times what the gain acts
+on, and that is much like a signal that drives the model, or one that it gives. Lines of what drives the model, and
+multiples of them, are the model's own: they say nothing of time.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ __all__ = ["Course", "Lines"]
 MOST = 2  # periods of one place that are tried
 CLEAR = 40.0  # times the median power about it: a line; the highest of 100,000 of white noise is 17 times it
 CLEAR_COMB = 15.0  # the same of three harmonics, of which noise has 6.5 times the median
+ALONE = (1, CLEAR)  # a wave without multiples
+WAVES = ((FINE_HARMONICS, np.inf), (HARMONICS, CLEAR_COMB), ALONE)
 ABOUT = 50  # lines each way that "about" means
 CYCLES, SAMPLES = 6.0, 2.5  # least of the first in a log, of the second in a period
 ORDERS = 6  # multiples of a driven line that are the model's own
@@ -38,11 +42,13 @@ class Course(NamedTuple):
 
     t        s, float64[samples]; ``error``: of each output, in noise floors, 0 where there is none
     drivers  what drives the model, float64[channels, samples]
+    said     what the model itself gives, float64[signals, samples]; of none nothing is asked that is faster than it
     """
 
     t: Array
     error: Array
     drivers: Array
+    said: Array = np.zeros((0, 0))
 
 
 class _Even(NamedTuple):
@@ -50,6 +56,15 @@ class _Even(NamedTuple):
 
     t: Array
     rows: Array
+
+
+class _Line(NamedTuple):
+    """A line at ``f`` (Hz) in ``parts``, of so many harmonics; ``share``: of the sum of squares that it takes off."""
+
+    f: float
+    parts: list[_Even]
+    harmonics: int
+    share: float
 
 
 def _even(t: Array, rows: Array, straight: bool = True) -> _Even:
@@ -157,12 +172,26 @@ class Lines:
         if not len(self.f):
             return []
         if len(times):
-            found = self._swings(times)
-        else:
-            parts = [_even(c.t, c.error) for c in self.courses]
-            found = [(_highest(parts, f, self.longest), parts, 1) for f in self._lines(parts)]
+            return self._own(self._swings([c.error for c in self.courses], times))
+        parts = [_even(c.t, c.error) for c in self.courses]
+        return self._own([_Line(_highest(parts, f, self.longest), parts, 1, 0.0) for f in self._lines(parts)])
+
+    def fast(self) -> list[tuple[float, int]]:
+        """The same of a gain at any place that swings faster than the model answers, by its first wave."""
+        if not len(self.f):
+            return []
+        signals = [np.concatenate([c.drivers, c.said]) if len(c.said) else c.said for c in self.courses]
+        lines: list[_Line] = []
+        for j in range(len(self.courses[0].error)):
+            for i in range(len(signals[0])):
+                times = [detrended(rows[i : i + 1]) for rows in signals]
+                lines += self._swings([c.error[j : j + 1] for c in self.courses], times, (ALONE,))
+        return self._own(sorted(lines, key=lambda line: -line.share))
+
+    def _own(self, lines: Sequence[_Line]) -> list[tuple[float, int]]:
+        """Of lines, the first ones that say something of time."""
         out: list[tuple[float, int]] = []
-        for g, parts, harmonics in found:
+        for g, parts, harmonics, _ in lines:
             # a line that is driven, too, may be one of time where it has the same phase in every log
             driven = any(d.has(g, harmonics == 1) for d in self.driven)
             own = not driven or (len(parts) > 1 and _coherence(parts, g) > ALIKE)
@@ -182,22 +211,26 @@ class Lines:
         own = np.array([_spectrum(part, self.f) for part in parts])
         return self._peaks(own.sum(axis=0), CLEAR * np.array([_about(o) for o in own]).sum(axis=0))
 
-    def _swings(self, times: Sequence[Array]) -> list[tuple[float, list[_Even], int]]:
-        """Of what swings where a constant would do ``times`` to the error: a wave of each frequency, and one with all
-        `HARMONICS`, fitted. Beside a product's line, what a swing does elsewhere would stand as noise.
+    def _swings(
+        self, errors: Sequence[Array], times: Sequence[Array], waves: Sequence[tuple[int, float]] = WAVES
+    ) -> list[_Line]:
+        """Of what swings where a constant would do ``times`` to the errors, log by log: ``waves`` of each frequency,
+        with so many harmonics and so clear, fitted. Beside a product's line, what a swing does elsewhere would stand as
+        noise.
         """
-        logs = list(zip(self.courses, times, strict=True))
-        both = [_even(c.t, np.concatenate([c.error, w]), straight=False) for c, w in logs]
+        logs = list(zip(self.courses, errors, times, strict=True))
+        both = [_even(c.t, np.concatenate([e, w]), straight=False) for c, e, w in logs]
         products = [part._replace(rows=detrended(np.array([np.sum(_taken(part), axis=0)]))) for part in both]
         whole = sum(float(np.sum(part.rows[: len(part.rows) // 2] ** 2 * np.hanning(len(part.t)))) for part in both)
-        out: list[tuple[float, list[_Even], int]] = []
-        for harmonics, clear in ((FINE_HARMONICS, np.inf), (HARMONICS, CLEAR_COMB), (1, CLEAR)):
+        out: list[_Line] = []
+        for harmonics, clear in waves:
             below = self.numbers[harmonics * self.numbers <= self.numbers[-1]]
             if len(below) > 2 * ABOUT:
                 falls = _fitted(both, harmonics, below, self.apart)
                 least = np.minimum(clear * _about(falls), MOSTLY * whole)
                 many = None if harmonics == 1 else 1  # the next ones are multiples, and parts, of the first
-                out += [(f, products, harmonics) for f in self._peaks(falls, least)[:many]]
+                share = dict(zip(self.f[: len(falls)].tolist(), (falls / max(whole, 1e-300)).tolist(), strict=True))
+                out += [_Line(f, products, harmonics, share[f]) for f in self._peaks(falls, least)[:many]]
         return out
 
 

@@ -63,7 +63,7 @@ def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
     fit, ground = current.fit, learner.ground
     courses = ground.courses(current.curves, fit.theta)
     lines = Lines(courses)
-    out, plain = [], lines.found()
+    out, plain, fast = [], lines.found(), lines.fast()
     for c in over_time:
         periods = plain
         if c.how.endswith("times"):
@@ -73,6 +73,8 @@ def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
             curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
             moved = ground.courses(curves, np.concatenate([fit.theta, values]))
             periods = lines.found([m.error - w.error for m, w in zip(moved, courses, strict=True)])
+            if not c.how.startswith("output"):
+                periods += [p for p in fast if all(abs(p[0] / q[0] - 1.0) > 1e-3 for q in periods)]
         out += [c.every(*p) for p in periods]
     return out
 
