@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vaneloop.base.durations import folded
 from vaneloop.base.signals import heading
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
@@ -19,7 +20,7 @@ from vaneloop.pages.story import floors
 from vaneloop.pages.style import Tone, capital, number
 from vaneloop.pages.surface import BEYOND, map_figure, sections_figure
 
-__all__ = ["ABOUT", "COLUMNS", "HOW", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
+__all__ = ["COLUMNS", "HOW", "about", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
 
 TONES: dict[str, Tone] = {
     "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",
@@ -28,15 +29,19 @@ MORE = 0.15  # of the range, drawn beyond its ends
 
 
 def curve_figure(law: LearnedLaw) -> Figure:
-    """The curve with its band; dashed where no log has been."""
+    """The curve with its band; dashed where no log has been, or where it repeats itself."""
     span = float(law.x[-1] - law.x[0])
     below = np.array([law.x[0] - MORE * span, law.x[0]])
     above = np.array([law.x[-1], law.x[-1] + MORE * span])
+    left, right, beyond = np.full(2, law.y[0]), np.full(2, law.y[-1]), "beyond the logs"
+    if folded(law.of):
+        last, first = law.x >= law.x[-1] - MORE * span, law.x <= law.x[0] + MORE * span
+        below, left, above, right = law.x[last] - span, law.y[last], law.x[first] + span, law.y[first]
+        beyond = "the same again"
     lines = [
         Line("from", law.x, law.low, "other", 1.0), Line("90 % band", law.x, law.high, "other", 1.0),
         Line("learned", law.x, law.y, "model", 2.0),
-        Line("beyond the logs", below, np.full(2, law.y[0]), "model", 1.4, "dash"),
-        Line("beyond the logs", above, np.full(2, law.y[-1]), "model", 1.4, "dash"),
+        Line(beyond, below, left, "model", 1.4, "dash"), Line(beyond, above, right, "model", 1.4, "dash"),
     ]  # fmt: skip
     out = loop(lines, heading(law.of, law.of_unit), heading(law.name, law.unit))
     low, high, *_, above_all = out["data"]
@@ -58,10 +63,16 @@ def visited_figure(law: LearnedLaw) -> Figure:
 COLUMNS = ["formula", "held-out error, noise floors", "law of the library"]
 HOW = "Formulas that come within 5 % of the best, fitted in the curve's place; simplest first."
 BAND = "The band holds the curve, as a whole, in 90 % of draws of the log's blocks."
-ABOUT = (
-    f"{BAND} Dashed: no log has been there, and the curve stays as at its end. A formula that is the law goes on; the "
-    f"notes say how far."
-)
+
+
+def about(law: LearnedLaw) -> str:
+    """What the figure of its curve shows."""
+    if folded(law.of):
+        return f"{BAND} Dashed: it repeats itself."
+    return (
+        f"{BAND} Dashed: no log has been there, and the curve stays as at its end. A formula that is the law goes on; "
+        f"the notes say how far."
+    )
 
 
 def formula_rows(law: LearnedLaw) -> list[list[str]]:
@@ -92,7 +103,7 @@ def learned_page(
             if law.formulas:
                 page.table(COLUMNS, formula_rows(law), HOW)
             continue
-        page.section(law.name, f"{capital(law.sentence())}. {ABOUT}")
+        page.section(law.name, f"{capital(law.sentence())}. {about(law)}")
         page.plot(curve_figure(law), "The curve, inside the simulation, with the model's own parameters refitted.")
         page.plot(visited_figure(law), f"Where the logs have been: {heading(law.of, law.of_unit)}.")
         if law.formulas:

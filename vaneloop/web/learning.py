@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from vaneloop.base.signals import heading
-from vaneloop.pages.learned import ABOUT, COLUMNS, HOW, curve_figure, formula_rows, visited_figure
+from vaneloop.pages.learned import COLUMNS, HOW, about, curve_figure, formula_rows, visited_figure
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital
 from vaneloop.web.charts import figure as figure_of
@@ -95,9 +95,8 @@ class LearnedPart:
             with ui.element("div").classes("verdict fell good"):
                 ui.label(f"{floors(law.error_before)} → {floors(law.error_after)} noise floors").classes("v law-error")
                 ui.label(f"{law.name}: held-out error before and after").classes("l")
-            ui.label(f"{capital(law.sentence())}. {ABOUT} Bars: {heading(law.of, law.of_unit)} of the log.").classes(
-                "note"
-            )
+            bars = f"Bars: {heading(law.of, law.of_unit)} of the log."
+            ui.label(f"{capital(law.sentence())}. {about(law)} {bars}").classes("note")
             with ui.element("div").classes("half"):
                 figure_of(curve_figure(law), dark(s), height=300)
                 figure_of(visited_figure(law), dark(s), height=300)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
+from vaneloop.base.durations import folded
 from vaneloop.base.forms import Form
 from vaneloop.discrepancy.models.memory import STOPS, of_stops
 from vaneloop.discrepancy.models.quantities import MINUS
@@ -96,6 +97,12 @@ class Curve:
         return (self.of, self.quantity.removesuffix(f"{MINUS}{self.less[1]}")), self.less
 
     @property
+    def period(self) -> float:
+        """After which it repeats itself along a channel that no column has folded; 0: it does not."""
+        found = folded(self.quantity) if self.of < COLUMN else None
+        return found[1] if found else 0.0
+
+    @property
     def simulated(self) -> bool:
         """Whether its quantity is a state, or the difference to one."""
         return any(of < INPUT for of, _ in self.quantities)
@@ -103,7 +110,8 @@ class Curve:
     def value(self, one: Callable[[int, str], Array]) -> Array:
         """Its quantity, where ``one`` says what each number and name stands for."""
         first, *other = (one(*of) for of in self.quantities)
-        return np.asarray(first - other[0] if other else first)
+        q = np.asarray(first - other[0] if other else first)
+        return q % self.period if self.period else q
 
     def values(self, data: Data, log: int, u: Array, y: Array | None = None) -> Array:
         """Its quantity on a log, of a model that is not simulated; of a surface, float64[2, samples]."""
@@ -157,7 +165,7 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
         table, half, place = c.parts(row)
         speed = float(smalls[c.of]) if c.of < INPUT and c.less is None else 0.0
         small = (speed or AT_ONCE * (b - a)) if c.simulated else 0.0
-        jumps.append((half, place, max(small, 1e-300)))
+        jumps.append((half, place, max(small, 1e-300), c.period))
         numbers = [NOTHING, NOTHING]
         for k, (number, name) in enumerate(c.quantities):
             numbers[k] = number
@@ -177,6 +185,6 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
         np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64).reshape(-1, 2),
-        np.array(low), np.array(high), np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 3),
+        np.array(low), np.array(high), np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 4),
         np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from plant.model import Learned
-from vaneloop.base.durations import period_of
+from vaneloop.base.durations import folded
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.curves import LEVEL
@@ -53,8 +53,10 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     shaped = {prefix + c for c in columns for prefix in prefixes}
 
     def number(of: str, where: str = "") -> int:
-        lag, found = named_lag(of), known.get(of, COLUMN)
-        column = of in (TIME, *columns, *shaped) or period_of(of) or lag and lag[0] in columns
+        lag, found, period = named_lag(of), known.get(of, COLUMN), folded(of)
+        if found == COLUMN and period and of not in columns:
+            return number(period[0], where)
+        column = of in (TIME, *columns, *shaped) or lag and lag[0] in columns
         if found == COLUMN and not column:
             raise wrong("of", of, ", ".join([*known, TIME, *sorted(columns - set(known))]), where)
         return found

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
-from vaneloop.base.durations import period_of
+from vaneloop.base.durations import folded, within_no_period
 from vaneloop.discrepancy.curves import COUNT, FINE_HARMONICS, HARMONICS, Basis, basis_of, waves_of
 from vaneloop.discrepancy.models.bound import MOST_SAMPLES, Bound
 from vaneloop.discrepancy.models.by_log import Logs
@@ -138,17 +138,19 @@ class Candidate:
         return basis.zeroed() if basis is not None and "zero" in shape else basis
 
     def every(self, period: float, harmonics: int = HARMONICS) -> Candidate:
-        """The same of the time within each ``period`` (s), of a candidate of time, with so many harmonics."""
-        time = self.quantity
-        span = float(np.ptp(time.visited))
+        """The same of its quantity within each ``period``, in its unit, with so many harmonics."""
+        whole = self.quantity
+        span = float(np.ptp(whole.visited))
 
         def within(period: float) -> Quantity:
-            name = every(period, span / period)
-            said = period_of(name)
-            return replace(time, name=name, visited=time.visited % said, slower=lambda times: within(said * times))
+            name = every(period, span / period, whole.name)
+            found = folded(name)
+            assert found is not None
+            said, further = found[1], lambda times: within(found[1] * times)
+            return replace(whole, name=name, visited=whole.visited % said, slower=further, span=span)
 
         q = within(period)
-        name = self.name.removesuffix(time.name) + q.name
+        name = self.name.removesuffix(whole.name) + q.name
         return replace(self, name=name, quantity=q, basis=waves_of(q.period, harmonics))
 
     def slower(self, times: float) -> Candidate | None:
@@ -422,7 +424,10 @@ class OwnGround:
         assert test is not None
         if q.name in self._in_tests:
             return self._in_tests[q.name]
-        if q.less is not None:
+        if q.period and q.of != COLUMN:
+            whole = replace(q, name=within_no_period(q.name))
+            self._in_tests[q.name] = self._tested(whole) % q.period
+        elif q.less is not None:
             one, other = q.sides
             sides = replace(q, name=one, less=None), replace(q, name=other, of=q.less[0], less=None)
             self._in_tests[q.name] = difference(test, *(self._tested(side) for side in sides))
@@ -440,7 +445,11 @@ class OwnGround:
         """The error of every sample of the logs that are fitted."""
         bound = with_curves(self.logs.fitted, (), curves)
         said = bound.run(theta[None])[0]
-        error = (said - bound.measured) / self.floor[:, None]
+        read = np.where(np.isfinite(bound.measured), bound.measured, said)
+        error = (said - read) / self.floor[:, None]
         error[~np.isfinite(error)] = 0.0
         parts = zip(bound.data.records, bound.logs.values(), bound.data.u, strict=True)
-        return [Course(r.t, error[:, at], u, said[:, at]) for r, at, u in parts]
+        names = list(bound.system.outputs)
+        return [
+            Course(r.t, error[:, at], u, said[:, at], dict(zip(names, read[:, at], strict=True))) for r, at, u in parts
+        ]

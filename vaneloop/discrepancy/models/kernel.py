@@ -150,7 +150,8 @@ if len(code) > 0:
 
 # curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of; beside it
 # what is taken off that, below 0: nothing), from low to high, the jump of each (half its height, where, within how much
-# of the quantity), and the other columns that they may be of
+# of the quantity; behind it after how much of that it repeats itself, 0: never), and the other columns that they may be
+# of
 _PLAIN = "outputs(x, u, p, y)"
 _CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, c_jump, columns"
 _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
@@ -179,6 +180,8 @@ def of_both(of, x, u, y, columns, k):
 
 @inline
 def on_curve(q, low, high, table, jump):
+    if jump[3] > 0.0:
+        q -= np.floor(q / jump[3]) * jump[3]
     c = on_table(q, low, high, table)
     if jump[0] != 0.0:
         c += jump[0] * min(max((q - jump[1]) / jump[2], -1.0), 1.0)

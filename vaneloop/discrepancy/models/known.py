@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from vaneloop.base.durations import period_of
+from vaneloop.base.durations import folded
 from vaneloop.discrepancy.error_share import FORM
 from vaneloop.discrepancy.models.bound import Bound
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
@@ -38,6 +38,7 @@ class Quantity:
     course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag, or a period, so
             many times as long
     less    of a difference, number and name of what is taken off; ``of`` is then that of what it is taken off from
+    span    of what is within each period, how far its channel has been from one end to the other
     """
 
     name: str
@@ -47,6 +48,7 @@ class Quantity:
     course: tuple[Array, ...] = ()
     slower: Callable[[float], Quantity | None] | None = None
     less: tuple[int, str] | None = None
+    span: float = 0.0
 
     @property
     def stops(self) -> bool:
@@ -55,8 +57,9 @@ class Quantity:
 
     @property
     def period(self) -> float:
-        """Of the time within each period (s): this period; 0: it is another quantity."""
-        return period_of(self.name)
+        """Of time, or of a channel, within each period: this period (s, or in its unit); 0: it is another quantity."""
+        found = folded(self.name)
+        return found[1] if found else 0.0
 
     @property
     def sides(self) -> tuple[str, ...]:

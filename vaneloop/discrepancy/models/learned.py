@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vaneloop.base.curve import POINTS
-from vaneloop.base.durations import period_of, within_no_period
+from vaneloop.base.durations import folded, within_no_period
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas, likely
 from vaneloop.discrepancy.models.memory import STOPS, named_lag
+from vaneloop.discrepancy.models.quantities import TIME
 from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.stage import Array
 from vaneloop.discrepancy.stage_answer import rms_of
@@ -92,7 +93,7 @@ class LearnedLaw:
     def range_note(self) -> str:
         """Where its quantity has been, what it does beyond, and what the law file has of it, in words."""
         has = "the formula, which does as well as the curve" if self.spoken else "the curve"
-        if period_of(self.of) or self.constant:
+        if folded(self.of) or self.constant:
             return f"{self.name}: the law file has {has}"
         been = f"{self.name}: {self.of} has been in {range_of(self.x, self.of_unit)}; the law file has {has}"
         if not self.spoken:
@@ -106,8 +107,9 @@ class LearnedLaw:
         what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of_what}"
         if lag:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
-        if period := period_of(self.of):
-            what = f"a function of the time within each {period:.6g} s"
+        if period := folded(self.of):
+            of = "the time" if period[0] == TIME else period[0]
+            what = f"a function of {of} within each {period[1]:.6g} {self.of_unit.strip('-')}".rstrip()
         if self.constant:
             what = "a constant"
         does = {

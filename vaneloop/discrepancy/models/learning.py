@@ -79,7 +79,7 @@ OVER_TIME = 2  # of these of time: with its many splines it imitates much
 PLAINER = 2  # more that are fitted to the end, where they are plainer than the best; and as many at their place itself
 NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
 TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
-TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole time
+TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole way
 FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
 SPLINES = 28  # of the best finalists where they still fail
 
@@ -364,9 +364,8 @@ class Learner:
     def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
         """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""
         q = best.candidate.quantity
-        if q.period:  # by so many turns over the whole time
-            span = float(np.ptp(best.judge.stage.t))
-            steps = [1.0 + turns * q.period / span for turns in TURNS]
+        if q.period:  # by so many turns over the whole way
+            steps = [1.0 + turns * q.period / q.span for turns in TURNS]
         for times in steps if q.slower is not None else ():
             for factor in (times, 1.0 / times):
                 while (more := self._slower(current, best, factor)) is not None:

@@ -10,7 +10,7 @@ multiples of them, are the model's own: they say nothing of time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,12 +43,14 @@ class Course(NamedTuple):
     t        s, float64[samples]; ``error``: of each output, in noise floors, 0 where there is none
     drivers  what drives the model, float64[channels, samples]
     said     what the model itself gives, float64[signals, samples]; of none nothing is asked that is faster than it
+    read     what its sensors read, by the names of its outputs
     """
 
     t: Array
     error: Array
     drivers: Array
     said: Array = np.zeros((0, 0))
+    read: Mapping[str, Array] = {}
 
 
 class _Even(NamedTuple):

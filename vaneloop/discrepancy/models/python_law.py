@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vaneloop.base.durations import folded, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
-from vaneloop.discrepancy.models.quantities import sides_of
+from vaneloop.discrepancy.models.quantities import TIME, sides_of
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.models.learned import LearnedLaw
@@ -42,7 +43,7 @@ import math
 
 def curve(q):
     """The curve at ``q``."""
-    q = min(max(q, {low!r}), {high!r})
+    q = {within}
     return {code}
 
 {law}
@@ -105,15 +106,20 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
     code, constants, equation = _code(law)
     curve: dict[str, object] = {}
     exec(f"import math\n{constants}\ndef curve(q):\n    return {code}", curve)  # our own text
-    held = [(float(q), float(curve["curve"](q))) for q in np.linspace(low, high, HELD)]  # type: ignore[operator]
     parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
     sentence = law.sentence().rstrip(".")
     been = f"{law.x[0]:.6g}, {law.x[-1]:.6g}"
+    channel, period = folded(law.of) or (law.of, 0.0)
+    along = period > 0.0 and channel != TIME  # what the file is given is the whole way, not that within a period
+    within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
+    of = f"{channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
+    places = np.linspace(low, high, HELD, endpoint=not along)
+    held = [(float(q), float(curve["curve"](q))) for q in places]  # type: ignore[operator]
     goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
     return FILE.format(
-        sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=law.of, of_unit=law.of_unit or "-",
+        sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=of, of_unit=law.of_unit or "-",
         unit=law.unit or "-", low=low, high=high, been=been, goes=goes, before=law.error_before, after=law.error_after,
-        code=code, constants=constants, held=held, **parts,
+        code=code, constants=constants, held=held, within=within, **parts,
     )  # fmt: skip
 
 
@@ -150,11 +156,12 @@ def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
     on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
     if on == "state" and law.at in system.rates:
         on = "force"
+    channel = within_no_period(law.of)
     way = "position" if law.how == "force adds" else system.rates.get(law.at, "")
     speed = "velocity" if law.how == "force adds" else law.at
     of = {
         "signal": {own: "u"}, "state": {own: "x"}, "force": {speed: "v", **({way: "x"} if way else {})},
-    }.get(on or "", {}).get(law.of)  # fmt: skip
+    }.get(on or "", {}).get(channel)  # fmt: skip
     if on is None or of is None:
         raise InputError(
             f"--python: {law.name} is a function of {law.of} at {law.at}; a Law of your own can be one of the signal, "

@@ -9,7 +9,7 @@ from collections.abc import Collection
 import numpy as np
 
 from plant.curve import TURN, turns
-from vaneloop.base.durations import in_name, period_of
+from vaneloop.base.durations import folded, in_name, period_in_name
 from vaneloop.discrepancy.models.memory import STOPS, lagged, named_lag
 from vaneloop.discrepancy.models.motion import smoothed
 from vaneloop.discrepancy.models.system import Record
@@ -22,9 +22,12 @@ MINUS = "_minus_"
 WAY, DISTANCE, SINCE = "direction_of_", "distance_since_reversal_of_", "time_since_reversal_of_"
 
 
-def every(period: float, cycles: float) -> str:
-    """Name of the time within each ``period`` (s), to as many digits as so many ``cycles`` tell."""
-    return f"{TIME}_every_{in_name(period, max(int(np.ceil(np.log10(200.0 * cycles))), 4))}"
+def every(period: float, cycles: float, channel: str = TIME) -> str:
+    """Name of what a channel is within each ``period`` (s, or in its unit), to as many digits as so many ``cycles``
+    tell.
+    """
+    digits = max(int(np.ceil(np.log10(200.0 * cycles))), 4)
+    return f"{channel}_every_{(in_name if channel == TIME else period_in_name)(period, digits)}"
 
 
 def sides_of(name: str, known: Collection[str]) -> tuple[str, str] | None:
@@ -42,8 +45,8 @@ def column_of(record: Record, t: Array, name: str) -> Array:
     """Values of a quantity on a record, float64[samples]; ``t``: s, as the log counts."""
     if name == TIME:
         return t
-    if name not in record.columns and (period := period_of(name)):
-        return np.asarray(t % period)
+    if name not in record.columns and (found := folded(name)):
+        return column_of(record, t, found[0]) % found[1]
     for prefix, which in ((WAY, 0), (DISTANCE, 1), (SINCE, 2)):
         if name.startswith(prefix) and name not in record.columns:
             return _turns(t, _filled(record.columns[name.removeprefix(prefix)]))[which]

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vaneloop.base.durations import within_no_period
 from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.periods import Lines
+from vaneloop.discrepancy.models.periods import Course, Lines
 from vaneloop.discrepancy.models.quantities import TIME
 from vaneloop.discrepancy.models.smoothness import SCREENED
 from vaneloop.discrepancy.models.steps import best_step, starts_of
-from vaneloop.discrepancy.models.tried import Placings, Tried, channel_of, stands
+from vaneloop.discrepancy.models.tried import Placings, Tried, channel_of, stands, strange
+from vaneloop.discrepancy.models.turns import periods_along
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["screened"]
 
+FEW = 8  # steps of a fit
+OFF = (0.0, -0.25, 0.25)  # turns over the whole way by which a period along a channel may be off
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
 Promise = tuple[float, Candidate, Array]  # what a candidate would leave, and parameters to begin from
 Starts = Sequence[tuple[Array, Slopes]]
@@ -56,12 +60,39 @@ def _its_lag(learner: Learner, current: Tried, one: Promise, starts: Starts, apa
 
 
 def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
-    """Every curve over time that may repeat itself, with the periods of the error; none where a shape is known."""
+    """Every curve that may repeat itself, over time or along another channel, with the periods of the error; none where
+    a shape is known.
+    """
     over_time = [c for c in learner.candidates if c.quantity.name == TIME and not c.shape]
     if not over_time:
         return []
+    courses = learner.ground.courses(current.curves, current.fit.theta)
+    return [*_in_time(learner, current, over_time, courses), *_along(learner, courses)]
+
+
+def _along(learner: Learner, courses: Sequence[Course]) -> list[Candidate]:
+    """Along a state, a motion or another signal, where the ground tells what the model says."""
+    out: list[Candidate] = []
+    found: dict[str, list[float]] = {}
+    ends = np.cumsum([len(c.t) for c in courses])
+    for c in learner.candidates if all(len(c.said) for c in courses) else ():
+        q = c.quantity
+        if strange(c) > 1 or q.less is not None or len(q.visited) != ends[-1] or not np.isfinite(q.visited).all():
+            continue
+        if q.name not in found:
+            # a model that lacks a law has not come quite as far as its machine
+            ways = [k.read.get(q.name, w) for k, w in zip(courses, np.split(q.visited, ends[:-1]), strict=True)]
+            signals = [np.concatenate([c.drivers, c.said]) for c in courses]
+            times, errors = [c.t for c in courses], [c.error for c in courses]
+            found[q.name] = periods_along(ways, times, errors, signals)
+        out += [c.every(period) for period in found[q.name]]
+    return out
+
+
+def _in_time(
+    learner: Learner, current: Tried, over_time: Sequence[Candidate], courses: Sequence[Course]
+) -> list[Candidate]:  # fmt: skip
     fit, ground = current.fit, learner.ground
-    courses = ground.courses(current.curves, fit.theta)
     lines = Lines(courses)
     out, plain, fast = [], lines.found(), lines.fast()
     for c in over_time:
@@ -90,4 +121,13 @@ def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Sta
     slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
     steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
     left, theta = min(steps, key=lambda s: s[0])
+    if candidate.quantity.period and within_no_period(candidate.quantity.name) != TIME:
+        # along what the model simulates a wave shifts its own phase: one whole step may leave more than none
+        begin = np.append(current.fit.theta, np.zeros(len(effect.parameters)))
+        best = (left, candidate, theta)
+        for turns in OFF:  # nor is the model where it was, so that its period is not quite the one that was found
+            c = candidate.slower(1.0 + turns * candidate.quantity.period / candidate.quantity.span) or candidate
+            few = learner._fitted(current, c, SCREENED, begin, FEW, True).fit
+            best = min(best, (float(few.cost.sum()), c, few.theta), key=lambda o: o[0])
+        return best
     return left, candidate, theta
