@@ -19,7 +19,7 @@ __all__ = ["periods_along"]
 
 DERIVATIVES = 2
 EVEN = 0.5  # periods by which a channel must leave a straight course in time
-BINS = 8  # along a channel for each of the finest cycles that are looked for
+BINS = 4  # along a channel for each of the finest cycles that are looked for
 
 
 def periods_along(
