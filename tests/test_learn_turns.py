@@ -16,6 +16,7 @@ from vaneloop.base.durations import folded, period_in_name, within_no_period
 from vaneloop.base.tables import read
 from vaneloop.discrepancy import StageError
 from vaneloop.discrepancy.models.curve_file import from_file
+from vaneloop.discrepancy.models.known import quantities
 from vaneloop.discrepancy.models.python_law import python_law
 from vaneloop.discrepancy.models.quantities import every
 from vaneloop.discrepancy.models.turns import periods_along
@@ -183,6 +184,16 @@ def test_its_figure_goes_on_as_it_began(eccentric) -> None:
         x, y = (unpack(line[k]) for k in ("x", "y"))
         assert np.interp(x % turn, law.x, law.y) == pytest.approx(y, abs=0.01 * np.ptp(law.y))
     assert "stays as at its end" not in about(law) and "repeats itself" in about(law)
+
+
+def test_a_channel_that_is_only_named_so_is_no_period() -> None:
+    """A user's own channel, such as a counter that is read on every fifth cycle."""
+    one = turned(1, "one", 0.02)
+    told = Record(one.name, one.t, {**one.columns, "count_every_5": np.linspace(0.0, 100.0, len(one.t))})
+    bound = MOTOR.bind([told])
+    (q,) = [q for q in quantities(bound, bound.stage.neutral()) if q.name == "count_every_5"]
+    assert q.period == 0.0
+    assert bound.data.column(0, "count_every_5")[-1] == 100.0
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vaneloop.base.durations import folded
 from vaneloop.base.signals import heading
 from vaneloop.discrepancy.models.by_log import ByLog
 from vaneloop.discrepancy.models.learned import LearnedLaw
@@ -34,7 +33,7 @@ def curve_figure(law: LearnedLaw) -> Figure:
     below = np.array([law.x[0] - MORE * span, law.x[0]])
     above = np.array([law.x[-1], law.x[-1] + MORE * span])
     left, right, beyond = np.full(2, law.y[0]), np.full(2, law.y[-1]), "beyond the logs"
-    if folded(law.of):
+    if law.period:
         last, first = law.x >= law.x[-1] - MORE * span, law.x <= law.x[0] + MORE * span
         below, left, above, right = law.x[last] - span, law.y[last], law.x[first] + span, law.y[first]
         beyond = "the same again"
@@ -67,7 +66,7 @@ BAND = "The band holds the curve, as a whole, in 90 % of draws of the log's bloc
 
 def about(law: LearnedLaw) -> str:
     """What the figure of its curve shows."""
-    if folded(law.of):
+    if law.period:
         return f"{BAND} Dashed: it repeats itself."
     return (
         f"{BAND} Dashed: no log has been there, and the curve stays as at its end. A formula that is the law goes on; "

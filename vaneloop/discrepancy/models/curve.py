@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
-from vaneloop.base.durations import folded
 from vaneloop.base.forms import Form
 from vaneloop.discrepancy.models.memory import STOPS, of_stops
 from vaneloop.discrepancy.models.quantities import MINUS
@@ -56,6 +55,7 @@ class Curve:
     low, high the range in which it bends
     table     from its parameters to the curve, less its jump, at points evenly from low to high
     jump      from its parameters to half the height of its jump, and where that is; None: it has none
+    period    after which it repeats itself along a channel that no column has within it; 0: it does not
     """
 
     how: str
@@ -67,6 +67,7 @@ class Curve:
     table: Table
     jump: Jump | None = None
     less: tuple[int, str] | None = None
+    period: float = 0.0
 
     def row(self, values: Array) -> Array:
         """What runs with these parameters: its table, behind it the jump that it may have."""
@@ -95,12 +96,6 @@ class Curve:
         if self.less is None:
             return ((self.of, self.quantity),)
         return (self.of, self.quantity.removesuffix(f"{MINUS}{self.less[1]}")), self.less
-
-    @property
-    def period(self) -> float:
-        """After which it repeats itself along a channel that no column has folded; 0: it does not."""
-        found = folded(self.quantity) if self.of < COLUMN else None
-        return found[1] if found else 0.0
 
     @property
     def simulated(self) -> bool:

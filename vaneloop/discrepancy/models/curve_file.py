@@ -72,7 +72,9 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
     if law.jump and not form:
         smooth = law.model_copy(update={"jump": False}).table()
         table, jump = (lambda v: smooth(v[:-1])), (lambda v: (float(v[-1]), 0.0))
-    curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump, less)
+    within = folded(law.of) if of < COLUMN and law.of not in known else None
+    period = within[1] if within else 0.0
+    curve = Curve(law.how, named.index(law.at), of, law.of, *law.ends, table, jump, less, period)
     if (two := law.second) is not None:
         curve = Surface(
             curve.how, curve.place, of, law.of, law.low, law.high, table, of_second=number(two.of, ".second"),

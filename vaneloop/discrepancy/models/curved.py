@@ -209,7 +209,8 @@ class Candidate:
                 return y - y[0]
 
         low, high = reach or (self.basis.low, self.basis.high)
-        curve = Curve(self.how, self.place, q.of, q.name, low, high, table, jump, q.less)
+        period = q.period if q.of < COLUMN else 0.0
+        curve = Curve(self.how, self.place, q.of, q.name, low, high, table, jump, q.less, period)
         return Placed(self.name, CURVE_LAW, "curve", -1, 0.0, neutral=np.zeros(parameters), curve=curve)
 
     def effect(self, wiggle: float) -> Effect:

@@ -38,7 +38,7 @@ class Quantity:
     course  of what remembers, the channel that it follows, log by log; ``slower``: the same with a lag, or a period, so
             many times as long
     less    of a difference, number and name of what is taken off; ``of`` is then that of what it is taken off from
-    span    of what is within each period, how far its channel has been from one end to the other
+    span    of what is within each period, how far its channel has been from one end to the other; 0: of all others
     """
 
     name: str
@@ -58,7 +58,7 @@ class Quantity:
     @property
     def period(self) -> float:
         """Of time, or of a channel, within each period: this period (s, or in its unit); 0: it is another quantity."""
-        found = folded(self.name)
+        found = folded(self.name) if self.span else None
         return found[1] if found else 0.0
 
     @property

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vaneloop.base.curve import POINTS
-from vaneloop.base.durations import folded, within_no_period
+from vaneloop.base.durations import within_no_period
 from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
 from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
@@ -43,6 +43,7 @@ class LearnedLaw:
     rivals   curves at other places or of other quantities that do as well
     spoken   the formula that is the law, as it does as well as the curve; None: the curve is. ``reach``: from where to
              where it goes on
+    period   along its channel, after which it repeats itself; 0: it does not
     """
 
     name: str
@@ -66,6 +67,7 @@ class LearnedLaw:
     rivals: list[str] = field(default_factory=list)
     spoken: Formula | None = None
     reach: tuple[float, float] = (0.0, 0.0)
+    period: float = 0.0
 
     def of_the_kind_of(self, other: LearnedLaw) -> bool:
         """Whether it does the same, at the same place and of the same quantity, whatever its curve and its period."""
@@ -93,7 +95,7 @@ class LearnedLaw:
     def range_note(self) -> str:
         """Where its quantity has been, what it does beyond, and what the law file has of it, in words."""
         has = "the formula, which does as well as the curve" if self.spoken else "the curve"
-        if folded(self.of) or self.constant:
+        if self.period or self.constant:
             return f"{self.name}: the law file has {has}"
         been = f"{self.name}: {self.of} has been in {range_of(self.x, self.of_unit)}; the law file has {has}"
         if not self.spoken:
@@ -107,9 +109,10 @@ class LearnedLaw:
         what = f"a hysteresis of {self.of.removeprefix(STOPS)}" if stops else f"a function of {self.of_what}"
         if lag:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
-        if period := folded(self.of):
-            of = "the time" if period[0] == TIME else period[0]
-            what = f"a function of {of} within each {period[1]:.6g} {self.of_unit.strip('-')}".rstrip()
+        if self.period:
+            channel = within_no_period(self.of)
+            of = "the time" if channel == TIME else channel
+            what = f"a function of {of} within each {self.period:.6g} {self.of_unit.strip('-')}".rstrip()
         if self.constant:
             what = "a constant"
         does = {
@@ -150,7 +153,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
-        formulas, c.untold, _trades(tried), list(tried.rivals),
+        formulas, c.untold, _trades(tried), list(tried.rivals), period=c.quantity.period,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.base.durations import folded, within_no_period
+from vaneloop.base.durations import within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.models.quantities import TIME, sides_of
@@ -109,7 +109,7 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
     parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
     sentence = law.sentence().rstrip(".")
     been = f"{law.x[0]:.6g}, {law.x[-1]:.6g}"
-    channel, period = folded(law.of) or (law.of, 0.0)
+    channel, period = within_no_period(law.of) if law.period else law.of, law.period
     along = period > 0.0 and channel != TIME  # what the file is given is the whole way, not that within a period
     within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
     of = f"{channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
@@ -156,7 +156,7 @@ def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
     on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
     if on == "state" and law.at in system.rates:
         on = "force"
-    channel = within_no_period(law.of)
+    channel = within_no_period(law.of) if law.period else law.of
     way = "position" if law.how == "force adds" else system.rates.get(law.at, "")
     speed = "velocity" if law.how == "force adds" else law.at
     of = {
