@@ -54,6 +54,10 @@ def columns(model: Model, plant: str = "plant.toml") -> np.ndarray:
 # a curve, and the effect of the library that it is
 SAME = {
     "null": (law("valve.current adds", "n_r", "constant", 0.7), {"valve_null_bias": {"bias": 0.7}}),
+    "overlap": (
+        law("valve.opening adds", "i_cmd", "limit", -1.0, 0.33, low=-3.0, high=3.0),
+        {"valve_dead_band": {"half_width": 0.33}},
+    ),
     "viscosity": (
         law("actuator.flow_gain times", "t_oil", "above", 0.004, 40.0, low=40.0, high=140.0),
         {"oil_viscosity": {"coefficient": 0.004}},

@@ -450,7 +450,7 @@ CURVES_OF: dict[str, set[str]] = {
     "supply_dips": _of("actuator.flow_gain", "time"),
     "pot_cross_talk": _of("sensors.vigv", STROKE),
     "pot_track_wear": _of("sensors.vigv", STROKE),
-    "piston_cushion": _of("actuator.load valve.current actuator.flow_gain", SPEED),
+    "piston_cushion": _of("actuator.load valve.current valve.opening actuator.flow_gain", SPEED),
     "speed_dependent_lag": _of("engine.lag", "n_r n_dem"),
     "ring_snag": _of("linkage.vigv_ring sensors.vigv", STROKE),
     "return_spring": _of("actuator.load", STROKE),
