@@ -207,8 +207,15 @@ def _drive_step(
     extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
     d, z = drive.prepare(p, j), drive.taken(s, j)
     feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), load, 0.5 * d.per_area / p_s)
+    h, loaded, shut = dt / substeps, p[DRIVE_LOADED, j] != 0.0, 0.0
+    bent = p[CURVES, j] != 0.0 and curve.acts(p, j, curve.OPENING_ADDS)
+    i_logged = s[curve.S_CURRENT, j]
     for _ in range(substeps):
-        z = drive.step(z, d, feed, i, p_s, dt / substeps, p[DRIVE_LOADED, j] != 0.0, True, True, True)
+        if bent:  # of the current that holds the spool where it comes to
+            s[curve.S_CURRENT, j] = (z.spool + h * z.spool_rate) * d.rated
+            shut = -curve.bend(s, p, j, curve.OPENING_ADDS) / d.rated
+        z = drive.step(z, d, feed, i, p_s, h, loaded, True, True, True, shut)
+    s[curve.S_CURRENT, j] = i_logged
     drive.stored(s, j, z)
     s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
 

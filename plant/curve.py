@@ -5,7 +5,8 @@ at a `PLACES` of the machine, of one of `plant.layout.SIGNALS`. What adds, adds 
 so with 1 + its value. Beyond the table's range a curve stays as at its end. Rows of a curve: `plant.layout`.
 
 The signals are what the machine itself has at the last tick: a curve of the stroke is one of the true stroke. Where a
-stage is held against a log, they are what the log says (`take`). A curve may have its signal through a first-order lag
+stage is held against a log, they are what the log says (`take`). The opening's current is the one that would hold the
+spool where it is: a valve's lands know nothing else. A curve may have its signal through a first-order lag
 of its own, which starts settled. Or it is the virgin curve of a hysteresis (`vaneloop.base.hysteresis`) of its signal,
 which starts at rest.
 """
@@ -44,15 +45,15 @@ from vaneloop.base.vanes import MOST, VANES
 
 __all__ = [
     "CRANK_ADDS", "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS",
-    "LVDT_ADDS", "LVDT_TIMES", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES", "RING_ADDS", "RISE_TIMES",
-    "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin", "bend", "factor", "follow",
-    "quantity_of", "take", "turn", "turns",
+    "LVDT_ADDS", "LVDT_TIMES", "OPENING_ADDS", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES",
+    "RING_ADDS", "RISE_TIMES", "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin",
+    "bend", "factor", "follow", "quantity_of", "take", "turn", "turns",
 ]  # fmt: skip
 
 (
     DEMAND_ADDS, SERVO_ADDS, SERVO_TIMES, ENGINE_ADDS, LAG_TIMES, RISE_TIMES, CURRENT_ADDS, FLOW_TIMES, LOAD_ADDS,
-    LVDT_ADDS, LVDT_TIMES, CRANK_ADDS,
-) = range(1, 13)  # fmt: skip
+    LVDT_ADDS, LVDT_TIMES, CRANK_ADDS, OPENING_ADDS,
+) = range(1, 14)  # fmt: skip
 # of all stages; of each stage k: the number behind it and k
 RING_ADDS, PLAY_ADDS, POT_ADDS, POT_TIMES = (100 * n for n in range(1, 5))
 LEAST = 0.05  # a factor 1 + c is not less
@@ -136,6 +137,7 @@ PLACES = {
         Place("engine.lag", "times", ("engine",), "-", 1.0, LAG_TIMES),
         Place("engine.acceleration", "times", ("engine",), "-", 1.0, RISE_TIMES),
         Place("valve.current", "adds", ("actuator",), "mA", 1e-3, CURRENT_ADDS),
+        Place("valve.opening", "adds", ("actuator",), "mA", 1e-3, OPENING_ADDS, kinds=HYDRAULIC),
         Place("actuator.flow_gain", "times", ("actuator",), "-", 1.0, FLOW_TIMES, kinds=HYDRAULIC),
         Place("actuator.load", "adds", ("actuator",), "N", 1.0, LOAD_ADDS),
         Place("sensors.lvdt", "adds", ("linkage", "actuator"), "mm", 1e-3, LVDT_ADDS),

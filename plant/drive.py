@@ -206,6 +206,7 @@ def step(
     lossy: bool,
     sticky: bool,
     limited: bool,
+    shut: float = 0.0,
 ) -> DriveState:
     """One plant step ``dt`` (s) under the valve's current ``i`` (A) at the supply pressure ``p_s`` (Pa).
 
@@ -216,7 +217,7 @@ def step(
     """
     lagged = valve_lag.step(z.lagged, i, d.valve_share) if limited else i
     spool, spool_rate = valve_step(z.spool, z.spool_rate, lagged / d.rated, d.a11, d.a12, d.a21, d.a22)
-    opening = valve_dead_band.step(spool, d.overlap)
+    opening = valve_dead_band.step(spool, d.overlap) - shut
     gain = f.extending if opening > 0.0 else f.retracting
     force, off_centre, give = z.force, z.off_centre, z.give
     if loaded:

@@ -202,3 +202,21 @@ def test_a_lag_is_right_at_its_place_of_its_channel_and_with_its_time(name, righ
     said = {"verdict": "learned", "laws": [{"names": [name]}]}
     row = {"truth": ["ring_creep"], "sizes": json.dumps([{"share": 0.06, "time": 15.0}]), "learned": json.dumps(said)}
     assert learned_right(row) == right
+
+
+@pytest.mark.parametrize(
+    ("steps", "names", "right"),
+    [
+        ({"x_lvdt": 0.0487}, [], True),
+        ({"x_lvdt": 0.0537}, [], False),  # another step
+        ({}, [], False),
+        ({"vigv": 0.0487}, [], False),
+        ({"x_lvdt": 0.0487, "vigv": 0.1}, [], False),
+        ({"x_lvdt": 0.0487}, ["servo.current.gain_of_n_dem"], False),  # what the steps look like from elsewhere
+    ],
+)
+def test_lost_bits_are_right_by_their_step_alone(steps, names, right):
+    laws = [{"names": names}] if names else []
+    said = {"verdict": "learned" if laws else "unknown", "laws": laws, "steps": steps}
+    row = {"truth": ["lvdt_lost_bits"], "sizes": json.dumps([{"step": 4.87e-5}]), "learned": json.dumps(said)}
+    assert learned_right(row) == right

@@ -5,6 +5,7 @@ in the loop and in the stages of the search; the file, and the command from a lo
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,7 +22,8 @@ from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
 from vaneloop.discrepancy.models.vane_stages.ground import VaneGround, remade, reversals
-from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.verbs.learn import learned
 
 N = 3000
 WIDE = {"low": 0.0, "high": 150.0}
@@ -52,6 +54,10 @@ def columns(model: Model, plant: str = "plant.toml") -> np.ndarray:
 # a curve, and the effect of the library that it is
 SAME = {
     "null": (law("valve.current adds", "n_r", "constant", 0.7), {"valve_null_bias": {"bias": 0.7}}),
+    "overlap": (
+        law("valve.opening adds", "i_cmd", "limit", -1.0, 0.33, low=-3.0, high=3.0),
+        {"valve_dead_band": {"half_width": 0.33}},
+    ),
     "viscosity": (
         law("actuator.flow_gain times", "t_oil", "above", 0.004, 40.0, low=40.0, high=140.0),
         {"oil_viscosity": {"coefficient": 0.004}},
@@ -263,3 +269,26 @@ def test_nothing_missing_nothing_learned(tmp_path) -> None:
     assert main(["learn", str(tmp_path / "l.parquet"), "--json", str(tmp_path / "l.json")]) == 0
     assert json.loads((tmp_path / "l.json").read_text())["verdict"] == "none"
     assert read_log(tmp_path / "l.parquet")
+
+
+def rig_chain(hidden: list[rig.Hidden], n_dem: np.ndarray | None = None) -> Chain:
+    test = rig.manoeuvre(5, 60.0)
+    run = rig.simulate(test if n_dem is None else replace(test, n_dem=n_dem), firmware(), hidden, seed=5, rate=100)
+    return build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
+
+
+def test_of_a_reading_that_lacks_bits_the_step_is_learned_and_nothing_of_what_it_drives() -> None:
+    """The controller sees the stairs, too: a gain of its current had been learned of them."""
+    step = 0.1843
+    said = learned(rig_chain([rig.Hidden("lvdt_lost_bits", {"step": 1e-3 * step})]), "rig", Model(), 1)
+    assert said.verdict == "unknown" and not said.laws
+    assert said.to_dict()["steps"]["x_lvdt"] == pytest.approx(step, rel=0.01)
+    assert said.sentence().startswith("A reading lacks bits") and "0.184" in said.sentence()
+
+
+def test_pieces_of_a_log_whose_stroke_hardly_moves_count_as_the_log_does() -> None:
+    """Where it never crosses the play all of it counts; so it had been for the log, but not for pieces of it."""
+    stage = rig_chain([], np.full_like(rig.manoeuvre(5, 60.0).n_dem, 75.0)).stage("linkage")
+    part = stage.excerpt(np.arange(3000, 5000))
+    assert np.isfinite(stage.measured[:, 3000:4990]).all()
+    assert np.isfinite(part.measured[:, :1990]).all()

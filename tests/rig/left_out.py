@@ -69,12 +69,16 @@ LINE = ("line", "straight line")
 LEFT_OUT: Mapping[str, Truth] = MappingProxyType(
     {
         "valve_dead_band": Truth(
-            _of("valve.current", ("i_cmd",)),
+            (*_of("valve.opening", ("i_cmd",)), *_of("valve.current", ("i_cmd",))),
             lambda v, i: -np.clip(i, -1e3 * v["half_width"], 1e3 * v["half_width"]),
             ("limit", "limit to one side"),
         ),
         "valve_gain_asymmetry": Truth(
-            (*_of("valve.current", ("i_cmd",)), *_of("actuator.flow_gain", ("i_cmd",), "gain")),
+            (
+                *_of("valve.opening", ("i_cmd",)),
+                *_of("valve.current", ("i_cmd",)),
+                *_of("actuator.flow_gain", ("i_cmd",), "gain"),
+            ),
             _asymmetry,
             ("magnitude", "above", "below"),
             {"actuator.flow_gain.gain_of_i_cmd": ("step",)},

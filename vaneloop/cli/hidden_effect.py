@@ -11,7 +11,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -193,7 +193,7 @@ def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any
             forms = left_out.LEFT_OUT[hidden.name].forms_of(law.name, hidden)
             row |= {"found": True, **as_curve(law, partial(np.interp, xp=law.x, fp=curve), forms)}
     return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
-            "nearest": answer.outcome.nearest, "processor_s": spent}  # fmt: skip
+            "nearest": answer.outcome.nearest, "steps": dict(answer.steps), "processor_s": spent}  # fmt: skip
 
 
 def _named_where(effect: str, d: Any) -> set[str]:
@@ -216,7 +216,8 @@ def _sizes(hidden: Any) -> dict[str, float]:
 
 def learned_right(row: dict[str, Any]) -> bool:
     """Whether a curve that was learned, or a rival of it, is at the place of what is hidden and of its quantity; or an
-    effect of the library is named that has its law, and its cause is said.
+    effect of the library is named that has its law, and its cause is said; or, of a reading that lost its low bits, no
+    law, but the step.
     """
     said = json.loads(row["learned"])
     names = {within_no_period(n) for law in said["laws"] for n in law["names"]}
@@ -227,7 +228,14 @@ def learned_right(row: dict[str, Any]) -> bool:
         bool(names & CURVES_OF[truth])
         or any(1.0 / LAG_TOLD <= tau / sizes["time"] <= LAG_TOLD for _, tau in late)
         or (said["verdict"] == "named" and _told(row))
+        or (truth in STEPS_OF and not said["laws"] and _step_told(said.get("steps", {}), truth, sizes))
     )
+
+
+def _step_told(steps: Mapping[str, float], truth: str, sizes: Mapping[str, float]) -> bool:
+    """Whether the one channel that is said to come in steps is the one that does, in steps as large."""
+    channel, per_si = STEPS_OF[truth]
+    return set(steps) == {channel} and abs(steps[channel] / (per_si * sizes["step"]) - 1.0) <= STEP_TOLD
 
 
 def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -236,7 +244,7 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     if not asked:
         return {}
     outside = [r for r in asked if r["kind"] == "outside" and r["detectable"][0]]
-    plain = [r for r in outside if CURVES_OF[r["truth"][0]] or r["truth"][0] in LAGS_OF]
+    plain = [r for r in outside if CURVES_OF[r["truth"][0]] or r["truth"][0] in (*LAGS_OF, *STEPS_OF)]
     right = [r for r in outside if learned_right(r)]
     errors = [laws[-1]["after"] for r in right if (laws := json.loads(r["learned"])["laws"])]
     spent = sorted(json.loads(r["learned"])["processor_s"] for r in asked if json.loads(r["learned"])["laws"])
@@ -442,7 +450,7 @@ CURVES_OF: dict[str, set[str]] = {
     "supply_dips": _of("actuator.flow_gain", "time"),
     "pot_cross_talk": _of("sensors.vigv", STROKE),
     "pot_track_wear": _of("sensors.vigv", STROKE),
-    "piston_cushion": _of("actuator.load valve.current actuator.flow_gain", SPEED),
+    "piston_cushion": _of("actuator.load valve.current valve.opening actuator.flow_gain", SPEED),
     "speed_dependent_lag": _of("engine.lag", "n_r n_dem"),
     "ring_snag": _of("linkage.vigv_ring sensors.vigv", STROKE),
     "return_spring": _of("actuator.load", STROKE),
@@ -461,7 +469,10 @@ CURVES_OF: dict[str, set[str]] = {
 # crank. Of the stroke behind the lag, instead of its speed, the share of the ring itself is left to the links' lengths.
 LAGS_OF = {"ring_creep": _of("linkage.crank linkage.ring", "x_lvdt speed_of_x_lvdt")}
 LAG_TOLD = 1.25  # times the true time, or its inverse
-# what is no function of one quantity at one place: shaking, resonance, a spool that sticks, a signal's own clock
+# what is stairs of a reading itself: its channel, and border units of it in one of the rig's. The law is their step.
+STEPS_OF = {"lvdt_lost_bits": ("x_lvdt", 1e3)}
+STEP_TOLD = 0.05  # of the true step
+# what is no smooth function of one quantity at one place: shaking, resonance, a spool that sticks, stairs
 NO_CURVE = (
     "vane_vibration", "valve_silting", "ring_creep", "linkage_resonance", "stall_rumble", "lvdt_lost_bits",
 )  # fmt: skip

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,7 @@ class Learned(Answer):
     laws       in the order in which they were added; empty: none was learned
     by_log     errors before and after, log by log, where one was
     model      the model with them, to be written; None: none was learned
+    steps      channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
     """
 
     diagnosed: Diagnosed
@@ -44,6 +45,7 @@ class Learned(Answer):
     model: Model | None = None
     log: str = ""
     path: str = ""
+    steps: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -58,6 +60,8 @@ class Learned(Answer):
                 "named": "Laws with names say it",
                 "unknown": "No honest law of one quantity or two is there",
             }[self.verdict]
+            if self.verdict == "unknown" and self.steps:
+                said = "A reading lacks bits"
             return f"{said}: {self.outcome.why}."
         from vaneloop.pages.story import floors
         from vaneloop.pages.style import capital
@@ -73,6 +77,7 @@ class Learned(Answer):
             "laws": [law_json(law) for law in self.laws], "nearest": self.outcome.nearest, "model": self.path,
             "named": self.diagnosed.effects, "notes": self.notes,
         }  # fmt: skip
+        out |= {"steps": dict(self.steps)} if self.steps else {}
         return out | ({"logs": self.by_log.json()["logs"]} if self.by_log else {})
 
     @property
@@ -222,8 +227,10 @@ def learned(
     model, said, out = before, [], None
     for i, d in enumerate(open_ones):
         stage = chain.stage(d.stage)
-        if stage.coarse and any(o in stage.coarse for o in stage.outputs):
-            said.append(f"{d.stage}: {'; '.join(stage.coarse.values())}")
+        if stage.coarse:  # what it would learn is how the steps look from there
+            explains = any(o in stage.coarse for o in stage.outputs)
+            driven = f"not asked, as it is driven by {', '.join(stage.coarse)}"
+            said.append(f"{d.stage}: {'; '.join(stage.coarse.values()) if explains else driven}")
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
         ground = VaneGround(stage, d.floor, test)
@@ -260,7 +267,7 @@ def learned(
         model = with_fits(model, [s for s in stages if s.verdict == "missing"])
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
-    return Learned(found, outcome, laws, None, model if laws else None, log)
+    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps)
 
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:

@@ -79,6 +79,7 @@ class Chain:
     stages        the stages that can be judged
     not_observed  stage -> what the log lacks
     columns       channel -> values on the common raster ``t`` (border units), for plots
+    steps         channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
     test          the stages on a part of the log that nothing is fitted to; None: there is none
     whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
     plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
@@ -92,6 +93,7 @@ class Chain:
     built: Calibration
     calibration: Calibration
     notes: list[str] = field(default_factory=list)
+    steps: dict[str, float] = field(default_factory=dict)
     test: Chain | None = None
     whole: Any = None
 
@@ -198,6 +200,7 @@ def build_chain(
         turns = lru_cache(partial(reversals, t, stroke, full))
     regimes, units = regimes_of(t, columns)
     bits = _lost_bits(log, machine)
+    steps = {"x_lvdt": _lost_step(log, machine)} if bits else {}
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
         "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
@@ -249,22 +252,35 @@ def build_chain(
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
-    return Chain(t, stages, absent, columns, machine, tables, cal, notes)
+    return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps)
 
 
-def _lost_bits(log: Log, machine: Plant) -> str:
-    """What is to be said of a stroke in steps of at least four of the LVDT's converter; "": it is not.
+def _lost_step(log: Log, machine: Plant) -> float:
+    """Step (mm) of a stroke in steps of at least four of the LVDT's converter; 0: it is not.
 
     Steps that end in 1, 2, 2.5 or 5 are some logger's last digit and say nothing of the machine.
     """
     if "x_lvdt" not in log.channels:
-        return ""
-    sensors, x = machine.table.sensors, log.channels["x_lvdt"].values
+        return 0.0
+    x = log.channels["x_lvdt"].values
     step = resolution(x) or resolution_before(x)
-    own = sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value
-    if step < 4.0 * own:
-        return ""
+    if step < 4.0 * _converter_step(machine):
+        return 0.0
     digits = step / 10.0 ** np.floor(np.log10(step))
     if np.min(np.abs(digits / np.array([1.0, 2.0, 2.5, 5.0, 10.0]) - 1.0)) < 1e-3:
+        return 0.0
+    return float(step)
+
+
+def _converter_step(machine: Plant) -> float:
+    sensors = machine.table.sensors
+    return float(sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value)
+
+
+def _lost_bits(log: Log, machine: Plant) -> str:
+    """What is to be said of such a stroke; "": nothing."""
+    step = _lost_step(log, machine)
+    if not step:
         return ""
-    return f"x_lvdt comes in steps of {step:.4g} mm, {step / own:.0f} of its converter's: low bits are lost"
+    many = step / _converter_step(machine)
+    return f"x_lvdt comes in steps of {step:.4g} mm, {many:.0f} of its converter's: low bits are lost"

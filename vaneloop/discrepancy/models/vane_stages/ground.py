@@ -53,7 +53,8 @@ LOG, REST, TEST = "log", "rest of the log", "test"
 OWN = {"sensors.lvdt": "x_lvdt", "servo.current": "i_cmd", "controller.demand": "x_dem"}
 # quantities that are at a place itself
 NEAR = {
-    "valve.current": ("i_cmd",), "actuator.load": ("x_lvdt", "speed_of_x_lvdt"), "sensors.lvdt": ("x_lvdt",),
+    "valve.current": ("i_cmd",), "valve.opening": ("i_cmd",), "actuator.load": ("x_lvdt", "speed_of_x_lvdt"),
+    "sensors.lvdt": ("x_lvdt",),
     "servo.current": ("i_cmd",), "actuator.flow_gain": ("x_lvdt", "t_oil"), "linkage.ring": ("x_lvdt",),
     "controller.demand": ("n_r",), "engine.lag": ("n_r",), "engine.acceleration": ("n_r",),
 }  # fmt: skip
@@ -86,12 +87,13 @@ def _says_more(place: Place, q: Quantity) -> bool:
     """Whether a curve of a quantity at a place is not the same as another one that is plainer.
 
     In the linkage what the crank adds to the stroke is what the LVDT takes off it. A reading has no memory of the
-    machine's, and a crank that gives at once is a reading.
+    machine's, and a crank that gives at once is a reading. A valve's opening is behind the valve's own lag.
     """
     if q.stops:
         return SLIPS.get(place.at) == stops_of(q.name)
     if q.remembers:
-        return place.at != "sensors.lvdt" and not (place.at.startswith("sensors.") and place.how == "times")
+        multiplied = place.at.startswith("sensors.") and place.how == "times"
+        return place.at not in ("sensors.lvdt", "valve.opening") and not multiplied
     return place.at != "linkage.crank"
 
 
@@ -330,6 +332,8 @@ class VaneGround:
         if stage == "actuator":
             if place.at == "sensors.lvdt":  # a reading's curve of what the drive does is one of the drive
                 return q not in ("time", "p_s")
+            if place.at == "valve.opening":  # of all else a current says the same
+                return q != "i_cmd"
             return q in VANES or q == "x_dem"
         return q in ("i_cmd", "x_dem", "n_dem")
 
@@ -339,6 +343,7 @@ class VaneGround:
             return 0.3
         p = self.driven.machine.p[:, 0]
         return {
-            "engine.demand": 5.0, "valve.current": 1.0, "actuator.load": 0.2 * float(p[AREA] * p[P_REF]),
+            "engine.demand": 5.0, "valve.current": 1.0, "valve.opening": 1.0,
+            "actuator.load": 0.2 * float(p[AREA] * p[P_REF]),
             "linkage.play": 0.3, "sensors.lvdt": max(error, 0.05),
         }.get(place.at, 0.3 if place.at.endswith("_play") else error)  # fmt: skip

@@ -46,7 +46,8 @@ def linkage_stage(driven: Driven) -> Stage:
     for piece in pieces_of(c["machine_spell"]):
         counts = np.flatnonzero((first_spell | settled)[piece]) + piece.start
         known[counts] = _crossed(c["x_lvdt"][counts])
-    if known.any():
+    moved = known.any()
+    if moved:
         run = run & known
     measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
     stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
@@ -63,7 +64,8 @@ def linkage_stage(driven: Driven) -> Stage:
     def kept(at: Array) -> Array:
         keep, last = run[at], speed_reach(dt)
         for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
-            keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
+            if moved:
+                keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
             if at[piece[-1]] < len(t) - 1:  # the stroke's speed there is that of a leap to the next piece
                 keep[piece[-last:]] = False
         return keep
