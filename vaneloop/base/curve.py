@@ -8,7 +8,18 @@ import numpy as np
 
 from vaneloop.base.compiled import inlined
 
-__all__ = ["DEGREE", "FINE", "FINE_SIDE", "POINTS", "SIDE", "between_points", "on_grid", "on_table", "splines"]
+__all__ = [
+    "DEGREE",
+    "FINE",
+    "FINE_SIDE",
+    "POINTS",
+    "SIDE",
+    "between_points",
+    "on_even",
+    "on_grid",
+    "on_table",
+    "splines",
+]
 
 DEGREE = 3  # of its splines
 POINTS = 257  # of a table, evenly spaced from its lowest to its highest argument
@@ -24,6 +35,18 @@ def on_table(x: float, low: float, high: float, table: np.ndarray) -> float:
     """
     k, share = between_points(x, low, high, len(table))
     return table[k] + share * (table[k + 1] - table[k])
+
+
+@inlined
+def on_even(x: float, low: float, per: float, table: np.ndarray) -> float:
+    """`on_table` where so many points stand ``per`` one of ``x``."""
+    z, last = (x - low) * per, len(table) - 1
+    if not z > 0.0:
+        return table[0]
+    if z >= last:
+        return table[last]
+    k = int(z)
+    return table[k] + (z - k) * (table[k + 1] - table[k])
 
 
 @inlined

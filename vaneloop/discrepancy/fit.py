@@ -18,11 +18,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from vaneloop.discrepancy.carried import NOT_KNOWN, Known, LatestSlopes
+from vaneloop.discrepancy.descent import EVIDENCE, STILL, Begin, End, carries, descent
 from vaneloop.discrepancy.latest import Latest
 from vaneloop.discrepancy.stage import Array, Stage
 from vaneloop.discrepancy.whiten import whiten
 
-__all__ = ["Fit", "Judge", "Task", "bounded_step", "finished", "recalibrate"]
+__all__ = ["Fit", "Judge", "Task", "finished", "recalibrate"]
 
 Answer = TypeVar("Answer")
 Task = Generator[
@@ -35,12 +37,6 @@ MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stret
 BLOCKS, MOST_BLOCKS = 24, 60  # blocks of a stage of unknown memory; at most
 MAX_SETS = 64  # parameter sets in one call of run
 MAX_VALUES = 8_000_000  # errors of several tasks held at one time
-# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
-# error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
-# often as they say (docs/diagnosis.md).
-EVIDENCE = 200.0
-STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
-MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
 DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
@@ -56,6 +52,7 @@ class Fit:
     low, high 90 % interval of each free parameter; of one that repeats itself it may reach beyond the turn that the
     value is in
     stalled   no step along the slope, however short, brought what the slope promises: it stands at a kink
+    near      where its slopes may still be found
     """
 
     effects: tuple[str, ...]
@@ -69,22 +66,15 @@ class Fit:
     low: Array
     high: Array
     stalled: bool = False
+    near: LatestSlopes | None = None
 
 
-class _End(NamedTuple):
-    """Where a descent has come to.
+class Led(NamedTuple):
+    """Where the first steps of a fit lead: what it has minimised there, parameters, and slopes near them."""
 
-    total   what it minimises there
-    errors  whitened errors there; ``linear``: costs, gradients and normals of the blocks; None: they are not known
-    """
-
-    theta: Array
     total: float
-    free: Array
-    prior: Array
-    errors: Array | None
-    linear: tuple[Array, Array, Array] | None
-    stalled: bool
+    theta: Array
+    slopes: Known
 
 
 class Judge:
@@ -95,6 +85,7 @@ class Judge:
         ones).
         """
         self.stage, self.floor, self._latest, self.keep = stage, np.asarray(floor, dtype=float), Latest(), keep
+        self._near = LatestSlopes()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
         self.sparing = False  # one ends when a step takes off less than `STILL` of what it leaves beyond noise
@@ -226,14 +217,16 @@ class Judge:
         return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.neutral())[fit.free] ** 2))
 
     def fit(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None
-    ) -> Fit:
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None,
+        slopes: Known = NOT_KNOWN,
+    ) -> Fit:  # fmt: skip
         """Fit the nominal parameters and those of ``effects`` from ``start``.
 
         start    parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
         weights  of every block, default 1; 0 leaves a block out
+        slopes   near the start, as far as they are known
         """
-        return self.together([self.fitting(effects, start, iterations, weights)])[0]
+        return self.together([self.fitting(effects, start, iterations, weights, slopes)])[0]
 
     def together(self, tasks: Sequence[Task[Answer]]) -> list[Answer]:
         """Run tasks side by side; return what each returns, in their order.
@@ -267,99 +260,43 @@ class Judge:
         return answers
 
     def fitting(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None
-    ) -> Task[Fit]:
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None,
+        slopes: Known = NOT_KNOWN,
+    ) -> Task[Fit]:  # fmt: skip
         """`fit` as a task for `together`."""
-        end = yield from self._descent(effects, start, iterations, weights)
+        end = yield from self._descent(effects, start, iterations, weights, slopes)
         s, free, scale, linear = self.stage, end.free, self.scale[end.free], end.linear
         low, high = self.bounds()
         if linear is None:
             thetas, derivative = self._differences(end.theta, free, scale, high, end.errors)
-            linear = self._blocks(*derivative((yield thetas)))
+            error, rows = derivative((yield thetas))
+            linear = self._blocks(error, rows)
+            if carries(self, free):
+                self._near.put(end.theta, free, error, rows)
         fit = self._finish(effects, end.theta, free, end.prior, scale, s.neutral(), low, high, *linear)
-        return replace(fit, stalled=end.stalled)
+        return replace(fit, stalled=end.stalled, near=self._near)
 
-    def leading(self, effects: tuple[str, ...], start: Array, iterations: int) -> Task[tuple[float, Array]]:
-        """Where the first steps of a `fitting` lead: what it has minimised there, and the parameters.
+    def leading(self, effects: tuple[str, ...], start: Array, iterations: int, slopes: Known = NOT_KNOWN) -> Task[Led]:
+        """Where the first steps of a `fitting` lead.
 
         What a fit is judged by, its derivatives at its end, costs as much as a step. Here it is left out.
         """
-        end = yield from self._descent(effects, start, iterations)
-        return end.total, end.theta
+        end = yield from self._descent(effects, start, iterations, slopes=slopes)
+        return Led(end.total, end.theta, end.near)
 
     def _descent(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int, weights: Array | None = None
-    ) -> Task[_End]:
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int, weights: Array | None = None,
+        slopes: Known = NOT_KNOWN,
+    ) -> Task[End]:  # fmt: skip
         """The steps of a `fitting`."""
-        s = self.stage
         free = self.columns(effects)
-        low, high = self.bounds()
-        linear: tuple[Array, Array, Array] | None = None  # costs, gradients and normals of the blocks at theta
-        if isinstance(start, Fit):
-            if start.effects == effects and np.array_equal(start.free, free):
-                linear = start.cost, start.gradients, start.normals
-            start = start.theta
-        theta = self.wrapped(np.clip(np.array(start, dtype=float), low, high))
-        nominal = s.neutral()
-        prior = self._prior[free]
-        scale = self.scale[free]
-        block_weights = np.ones(self.n_blocks) if weights is None else weights
-
-        def total(cost: Array, thetas: Array) -> Array:
-            return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
-
-        damping = 1e-3
-        stalled = False
-        best: float | None = None
-        known: Array | None = None  # errors at theta
-        reached = np.inf
-        for _ in range(iterations):
-            if linear is None:
-                thetas, derivative = self._differences(theta, free, scale, high, known)
-                linear = self._blocks(*derivative((yield thetas)))
-            cost, gradients, normals = linear
-            here = reached = float(total(cost[None], theta[None])[0])
-            little = 0.2 * len(free)
-            if self.roughly:
-                little *= 1.0 + max(here - self.n, 0.0) / EVIDENCE
-            if best is not None and best - here < little and best >= here:
-                break
-            first, best = best is None, here
-            if len(free) == 0:
-                break
-            a = np.tensordot(block_weights, normals, 1) + np.diag(prior * scale**2)
-            g = block_weights @ gradients - prior * scale * (theta[free] - nominal[free])
-            limits = [(b[free] - theta[free]) / scale for b in (low, high)]
-            if self.roughly and not first:
-                step = bounded_step(a + 1e-9 * np.diag(np.maximum(np.diag(a), 1e-9)), g, *limits)
-                if 2.0 * float(step @ g) - float(step @ a @ step) < little:  # not even the slope promises more
-                    break
-            for _ in range(MOST_DAMPED):
-                trials = []
-                for factor in (0.01, 1.0, 300.0):
-                    lam = damping * factor
-                    damped = a + lam * np.diag(np.maximum(np.diag(a), 1e-9))
-                    step = bounded_step(damped, g, *limits)
-                    trial = theta.copy()
-                    trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
-                    trials.append((lam, self.wrapped(trial)))
-                thetas = np.array([t for _, t in trials])
-                errors = yield thetas
-                costs = total(self.block_costs(errors), thetas)
-                k = int(np.argmin(costs))
-                # the last step is the shortest: where even it promises much and nothing came of it, the slope is not
-                # to be trusted so far away
-                stalled = not costs[k] < here and 2.0 * float(step @ g) - float(step @ a @ step) > little
-                if not stalled:
-                    break
-                damping *= 1e5
-            if not costs[k] < here:
-                break
-            damping, theta, known, linear = max(trials[k][0], 1e-9), thetas[k], errors[k].copy(), None
-            reached = float(costs[k])
-            if here - costs[k] < (max(little, STILL * (here - self.n)) if self.sparing else little):
-                break
-        return _End(theta, reached, free, prior, known, linear, stalled)
+        if not isinstance(start, Fit):
+            return (yield from descent(self, free, Begin(start, None, None, slopes, weights), iterations))
+        begin = Begin(start.theta, None, None, slopes, weights)
+        if start.effects == effects and np.array_equal(start.free, free):
+            at_start = start.near.get(start.theta, free) if start.near is not None else None
+            begin = begin._replace(linear=(start.cost, start.gradients, start.normals), slopes=at_start)
+        return (yield from descent(self, free, begin, iterations))
 
     def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives
@@ -380,8 +317,14 @@ class Judge:
         """Whitened error at ``theta`` (outputs, samples); minus its derivative by each scaled parameter (free, outputs,
         samples).
         """
+        if (found := self._near.get(theta, free)) is not None:
+            return found
         thetas, derivative = self._differences(theta, free, self.scale[free], self.bounds()[1])
         return derivative(self.errors(thetas))
+
+    def lead(self, effects: tuple[str, ...], start: Array, iterations: int, slopes: Known = NOT_KNOWN) -> Led:
+        """Where the first steps of a `fit` lead."""
+        return self.together([self.leading(effects, start, iterations, slopes)])[0]
 
     def _differences(
         self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
@@ -412,6 +355,24 @@ class Judge:
             return here, jac
 
         return thetas if known is None else thetas[1:], derivative
+
+    def _begun(self, theta: Array, free: Array, slopes: Known) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+        """Parameter sets whose errors tell, beside slopes that are known near ``theta``, those that are not; and the
+        function from them to the error there and all slopes.
+        """
+        new = free[~np.isin(free, slopes.columns)]
+        thetas, derivative = self._differences(theta, new, self.scale[new], self.bounds()[1])
+
+        def whole(e: Array) -> tuple[Array, Array]:
+            here, own = derivative(e)
+            rows = np.zeros((len(free), *here.shape))
+            rows[np.isin(free, new)] = own
+            for i, c in enumerate(free):
+                if c in slopes.columns:
+                    rows[i] = slopes.rows[int(np.flatnonzero(slopes.columns == c)[0])].reshape(here.shape)
+            return here, rows
+
+        return thetas, whole
 
     def _sharing(self, free: Array) -> tuple[Array, int]:
         """The simulation of each of these, which it shares with what moves other outputs or logs; and how many."""
@@ -503,29 +464,6 @@ class Judge:
 def _apart(one: Moves, other: Moves) -> bool:
     """Whether what two parameters move is not the same output, or not the same log."""
     return any(None not in (a, b) and a != b for a, b in zip(one, other, strict=True))
-
-
-def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
-    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest
-    is solved again.
-
-    A step that is only cut off at the bounds is no descent where parameters can stand in for each other.
-    """
-    step = np.zeros(len(g))
-    moves = np.ones(len(g), dtype=bool)
-    for _ in range(len(g)):
-        if moves.all():
-            step = np.linalg.solve(a, g)
-        else:
-            step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
-        beyond = moves & ((step < low) | (step > high))
-        if not beyond.any():
-            break
-        step[beyond] = np.clip(step[beyond], low[beyond], high[beyond])
-        moves &= ~beyond
-        if not moves.any():
-            break
-    return step
 
 
 def finished(judge: Judge, task: Task[Fit], go_on: bool = True) -> Task[Fit]:

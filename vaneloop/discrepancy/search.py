@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from vaneloop.discrepancy.fit import Fit, Judge, Task, bounded_step, finished, recalibrate
-from vaneloop.discrepancy.promise import Slopes, along, followed, onward, out_of, within
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.carried import NOT_KNOWN, Known
+from vaneloop.discrepancy.fit import Fit, Judge, Led, Task, finished, recalibrate
+from vaneloop.discrepancy.promise import Slopes, along, followed, onward, out_of, turned, within
+from vaneloop.discrepancy.stage import Array
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.stage_answer import Candidate, Found, StageDiagnosis
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Criterion", "Search"]
 
 SCREENED = 32  # starts simulated at one time
-DIRECTIONS = 12  # from which a fit of an effect with a direction may start
+SCREENS = 3  # times as many effects are fitted quickly as go on, of those that the slopes promise most of
 
 
 class Criterion(Protocol):
@@ -91,7 +92,7 @@ class Search:
         self.tick = tick or (lambda: None)
         self.fits: dict[frozenset[str], Fit] = {}
         self.finished: set[frozenset[str]] = set()
-        self.begun: dict[frozenset[str], list[tuple[float, Array]]] = {}
+        self.begun: dict[frozenset[str], list[Led]] = {}
         self.passed: set[frozenset[str]] = set()  # what the screening left out
         # of fits: effect that could be added -> what the best of its starts would leave, and that start
         self.promises: dict[frozenset[str], dict[str, tuple[float, Array]]] = {}
@@ -123,9 +124,10 @@ class Search:
         thetas: list[Array] = []
         owner: list[str] = []
         costs: list[float] = []
-        base_cost, plain = 0.0, 0
+        base_cost, plain, beside = 0.0, 0, NOT_KNOWN
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
             slopes = Slopes(judge, nominal, self.base.free, self.base.prior)
+            beside = beside if k else slopes.known
             first = len(thetas)
             for e in stage.effects:
                 for s in e.starts[-2:] if self.quiet else e.starts:
@@ -136,15 +138,16 @@ class Search:
             if k == 0:
                 base_cost = float(np.sum(slopes.error * slopes.error))
                 for e in stage.effects if not self.quiet else ():
-                    turned = self._turned(e, slopes.error, slopes.jac)
-                    thetas += turned
-                    owner += [e.name] * len(turned)
+                    around = turned(judge, e, self.base, slopes.error, slopes.jac)
+                    thetas += around
+                    owner += [e.name] * len(around)
                 plain = len(thetas)  # so many are tried beside the base
             some = thetas[first:]
             left, better = self._tried(slopes, nominal, some, owner[first:])
             thetas[first:] = [*some, *(theta for _, theta in better.values())]
             costs += [*left, *(cost for cost, _ in better.values())]
             owner += better
+        self.near = beside
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         self.level: dict[str, float] = {}
@@ -199,43 +202,6 @@ class Search:
         left = slopes.left(judge.errors(np.array(list(again.values())))) if again else []
         return costs, {name: (c, t) for (name, t), c in zip(again.items(), left, strict=True)}
 
-    def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
-        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
-        are best there.
-
-        Size and direction are polar coordinates: from a wrong direction the way is long. In a fixed direction the sizes
-        act linearly near neutral, so that their best values follow from one simulation.
-
-        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
-        """
-        judge, at = self.judge, self.stage.index()[effect.name]
-        turning = [i for i, p in enumerate(effect.parameters) if p.period]
-        sizes = np.array([at.start + i for i, p in enumerate(effect.parameters) if not p.shape], dtype=int)
-        if not turning or len(turning) + len(sizes) < len(effect.parameters):
-            return []
-        p, (low, high) = effect.parameters[turning[0]], judge.bounds()
-        columns = np.concatenate([self.base.free, sizes])
-        scale = judge.scale[columns]
-        prior = np.concatenate([self.base.prior, np.zeros(len(sizes))]) * scale**2
-        thetas, asked, derivatives = [], [], []
-        for k in range(DIRECTIONS):
-            theta = self.base.theta.copy()
-            theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
-            moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
-            thetas.append(theta)
-            asked.append(moved)
-            derivatives.append(derivative)
-        errors = judge.errors(np.concatenate(asked))
-        for k, (theta, derivative) in enumerate(zip(thetas, derivatives, strict=True)):
-            own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
-            flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
-            a = flat @ flat.T + np.diag(prior + 1e-9)
-            step = bounded_step(
-                a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale
-            )
-            theta[columns] += step * scale
-        return thetas
-
     def single(self, name: str) -> Fit:
         """Fit with one effect, from its best starts."""
         return self.singles([name])[name]
@@ -243,6 +209,7 @@ class Search:
     def singles(self, names: Sequence[str]) -> dict[str, Fit]:
         """Fits with one effect each, side by side; of a model that roams, of those that promise most."""
         if self.criterion.roams:
+            names = sorted(names, key=lambda n: self.level[n])[: SCREENS * self.criterion.fitted]
             followed = dict(zip(names, self.judge.together([self._followed(n) for n in names]), strict=True))
             names = sorted(names, key=lambda n: followed[n])[: self.criterion.fitted]
         return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
@@ -253,24 +220,24 @@ class Search:
         """
         led = []
         for start in self.starts[name]:
-            led.append((yield from self.judge.leading((), start, 2)))
-        led.sort(key=lambda of: of[0])
-        left, theta = yield from self.judge.leading((name,), led[0][1], 2)
-        self.starts[name] = [theta, *(theta for _, theta in led[1:])]
-        return left
+            led.append((yield from self.judge.leading((), start, 2, self.near)))
+        led.sort(key=lambda of: of.total)
+        best = yield from self.judge.leading((name,), led[0].theta, 2, led[0].slopes)
+        self.starts[name] = [best.theta, *(of.theta for of in led[1:])]
+        return best.total
 
     def _begun(self, name: str) -> Task[Fit]:
         """The best of quick fits of an effect, one from each start."""
         return (yield from self._best((name,), self.starts[name]))
 
-    def _best(self, effects: tuple[str, ...], starts: Sequence[Array]) -> Task[Fit]:
-        """The best of quick fits from these starts."""
+    def _best(self, effects: tuple[str, ...], starts: Sequence[Array], slopes: Sequence[Known] = ()) -> Task[Fit]:
+        """The best of quick fits from these starts; ``slopes`` near each, where they are known."""
         if len(starts) == 1:
-            return (yield from self.judge.fitting(effects, starts[0], 3))
+            return (yield from self.judge.fitting(effects, starts[0], 3, slopes=slopes[0] if slopes else NOT_KNOWN))
         led = []
-        for start in starts:
-            led.append((yield from self.judge.leading(effects, start, 3)))
-        return (yield from self.judge.fitting(effects, min(led, key=lambda of: of[0])[1], 0))
+        for start, near in zip(starts, slopes or [NOT_KNOWN] * len(starts), strict=True):
+            led.append((yield from self.judge.leading(effects, start, 3, near)))
+        return (yield from self.judge.fitting(effects, min(led, key=lambda of: of.total).theta, 0))
 
     def _steps(self, effects: Sequence[str]) -> int:
         """How many steps finish a fit; more of one effect with a direction: a curve leads from one to the next."""
@@ -377,7 +344,7 @@ class Search:
         """Fit with several effects, started from the fits with one fewer."""
         return self.judge.together([self._joined(effects, True)])[0] if effects else self.base
 
-    def _begins(self, effects: tuple[str, ...]) -> Task[list[tuple[float, Array]]]:
+    def _begins(self, effects: tuple[str, ...]) -> Task[list[Led]]:
         """Where a fit with several effects may begin, each with what it would minimise there; best first."""
         index, judge = self.stage.index(), self.judge
         single: dict[str, Array] = {}
@@ -410,14 +377,14 @@ class Search:
         costs = judge.totals(errors, thetas)
         if not self.criterion.roams:
             k = int(np.argmin(costs))
-            return [(float(costs[k]), begins[k][1])]
+            return [Led(float(costs[k]), begins[k][1], NOT_KNOWN)]
         left = [self._left(frozenset(rest), e) for (rest, _), e in zip(begins, errors, strict=True)]
         out = []
         for k in np.argsort(left, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
             rest, theta = begins[k]
-            _, theta = yield from judge.leading(rest, theta, 2)
-            out.append((yield from judge.leading(effects, theta, 2)))
-        return sorted(out, key=lambda c: c[0])
+            led = yield from judge.leading(rest, theta, 2, self._slopes(frozenset(rest)).known)
+            out.append((yield from judge.leading(effects, led.theta, 2, led.slopes)))
+        return sorted(out, key=lambda of: of.total)
 
     def _left(self, rest: frozenset[str], errors: Array) -> float:
         """What is left of a set's errors when the parameters of the fit with one effect fewer have followed; without
@@ -442,8 +409,9 @@ class Search:
             return (yield from self._single(effects[0]))
         key = frozenset(effects)
         if key not in self.fits:
-            begins = self.begun.get(key) or (yield from self._begins(effects))
-            self.fits[key] = yield from self._best(tuple(effects), [theta for _, theta in begins])
+            begins = self.begun.pop(key, None) or (yield from self._begins(effects))
+            thetas, slopes = [of.theta for of in begins], [of.slopes for of in begins]
+            self.fits[key] = yield from self._best(tuple(effects), thetas, slopes)
             self.tick()
         if finished and key not in self.finished:
             task = self.judge.fitting(tuple(effects), self.fits[key], 8)
@@ -464,12 +432,13 @@ class Search:
             return known
         at = self.stage.index()[drop]
         first, neutral = fit.theta[at], self.stage.neutral()[at]
-        theta = fit.theta
+        led = Led(np.inf, fit.theta, NOT_KNOWN)
         for share in (0.25, 0.5, 0.75, 1.0):  # by and by, so that the others can follow
-            theta = theta.copy()
+            theta = led.theta.copy()
             theta[at] = first + share * (neutral - first)
-            _, theta = self.judge.together([self.judge.leading(rest, theta, 5)])[0]
-        other = self.judge.together([self._finished(self.judge.fitting(rest, theta, 8))])[0]
+            led = self.judge.together([self.judge.leading(rest, theta, 5, led.slopes)])[0]
+        task = self.judge.fitting(rest, led.theta, 8, slopes=led.slopes)
+        other = self.judge.together([self._finished(task)])[0]
         if self.judge.total_of(other) < 0.99 * self.judge.total_of(known):
             self.fits[frozenset(rest)] = known = other
             if not rest:
@@ -500,8 +469,9 @@ class Search:
         leading = sorted(new, key=lambda s: promise[s])[: most + most // 2]
         for s, begins in zip(leading, self.judge.together([self._begins(s) for s in leading]), strict=True):
             self.begun[frozenset(s)] = begins
-        kept = sorted(leading, key=lambda s: self.begun[frozenset(s)][0][0])[:most]
+        kept = sorted(leading, key=lambda s: self.begun[frozenset(s)][0].total)[:most]
         self.passed |= {frozenset(s) for s in new if s not in kept}
+        self.begun = {frozenset(s): self.begun[frozenset(s)] for s in kept}
 
     def _promise(self, effects: tuple[str, ...]) -> float:
         """What is left with the last effect, at the best of its starts, on top of the others as they are fitted, when

@@ -118,6 +118,7 @@ class Stage:
     begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
               what it lacks may have lost its way to; None: there are none
     quick     a run costs next to nothing: slopes are taken at every start
+    carries   slopes are carried along the steps of a fit (`vaneloop.discrepancy.carried`)
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
     grain     log error that counts as much as 1 does far from the noise: less, where a known noise tells laws apart
@@ -148,6 +149,7 @@ class Stage:
     memory: float | None = None
     begins: Array | None = None
     quick: bool = False
+    carries: bool = False
     excerpt: Callable[[Array], Stage] | None = None
     grain: float = 1.0
     made: object = None

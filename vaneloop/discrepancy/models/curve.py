@@ -177,9 +177,10 @@ def curves_for_kernel(curves: Active, data: Data, log: int, n: int, smalls: Arra
         tables.append(table)
     most = max((len(t) for t in tables), default=POINTS)
     tables = [t if len(t) == most else np.interp(np.linspace(0, 1, most), np.linspace(0, 1, len(t)), t) for t in tables]
+    per = (most - 1) / (np.array(high) - np.array(low))  # points of a table for one of its quantity
     return (
         np.array([HOW[c.how] for c, _ in curves], dtype=np.int64),
         np.array([c.place for c, _ in curves], dtype=np.int64), np.array(of, dtype=np.int64).reshape(-1, 2),
-        np.array(low), np.array(high), np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 4),
+        np.array(low), per, np.array(tables).reshape(len(tables), most), np.array(jumps).reshape(-1, 4),
         np.array(columns).reshape(len(columns), n),
     )  # fmt: skip

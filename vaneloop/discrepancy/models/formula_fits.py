@@ -205,8 +205,8 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
     names = tuple(e.name for e in judge.stage.effects)
-    theta = judge.fit(names[:-1], theta, 8).theta  # first the rest of the model with the formula as it stands
-    fit = with_held_out(judge, judge.fit(names, theta, 12))
+    led = judge.lead(names[:-1], theta, 8, tried.slopes())  # first the rest of the model with the formula as it stands
+    fit = with_held_out(judge, judge.fit(names, led.theta, 12, slopes=led.slopes))
     if not np.isfinite(score(judge, fit)):
         return None
     values = form.plain(plain(fit.theta[-len(numbers) :]))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.base.curve import on_grid, on_table
+from vaneloop.base.curve import on_even, on_grid
 from vaneloop.base.kept import kept_njit
 from vaneloop.discrepancy import laws
 from vaneloop.discrepancy.models.curve import COLUMN, INPUT, OUTPUT
@@ -50,7 +50,11 @@ def build_kernels(
     source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
     source = source.replace("{own}", _OWN_HELD if dispatch.rate is not None else "")
     source = source.replace("{curved}", _CURVED_FUNCTIONS if curved else "")
-    source = source.replace("{more}", f", {_CURVED}" if curved else "").replace("{rooms}", _ROOMS if curved else "")
+    source = source.replace("{more}", f", rough, {_CURVED}" if curved else "").replace(
+        "{rooms}", _ROOMS if curved else ""
+    )
+    source = source.replace("{tries}", _TRIES if curved else "").replace("{stays}", _STAYS if curved else "")
+    source = source.replace("{rough}", "rough" if curved else "steps")
     source = source.replace("shown(x, u, p, y)", f"shown(x, u, p, k, {_CURVED}, ub, pb, add, y)" if curved else _PLAIN)
     source = source.replace("{as it is}", _AS_IT_IS if surfaces else "")
     source = source.replace("{bend more}", _BEND_MORE if surfaces else "")
@@ -70,7 +74,7 @@ def build_kernels(
             "output": returned(s.output) if s.output else None,
             "control": returned(s.control) if s.control else None,
             "force_of": laws.force_of, "state_rate": laws.state_rate, "transform": dispatch.transform,
-            "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_table": on_table, "on_grid": on_grid,
+            "own_rate": dispatch.rate, "MEMORY": dispatch.memory, "on_even": on_even, "on_grid": on_grid,
             "LOOP": s.kind == "closed_loop", "INPUT": INPUT, "OUTPUT": OUTPUT, "COLUMN": COLUMN,
             "STATE_LIMIT": laws.STATE_LIMIT, "STATE_RATE_LIMIT": laws.STATE_RATE_LIMIT,
             "STATE_OVERFLOW": laws.STATE_OVERFLOW,
@@ -149,15 +153,32 @@ if len(code) > 0:
 {bent}"""
 
 # curves: what each does (how: see `bend`) with which signal, state or parameter (at), of which quantity (of; beside it
-# what is taken off that, below 0: nothing), from low to high, the jump of each (half its height, where, within how much
-# of the quantity; behind it after how much of that it repeats itself, 0: never), and the other columns that they may be
-# of
+# what is taken off that, below 0: nothing), from low on with so many points of its table per one of that, the jump of
+# each (half its height, where, within how much of the quantity; behind it after how much of that the curve repeats
+# itself, 0: never), and the other columns that they may be of
 _PLAIN = "outputs(x, u, p, y)"
-_CURVED = "c_how, c_at, c_of, c_low, c_high, c_table, c_jump, columns"
+_CURVED = "c_how, c_at, c_of, c_low, c_per, c_table, c_jump, columns"
 _BEND = f"bend(AT, u, p, k, {_CURVED}, ub, pb, add, bent)\n"
 _BENT = "for w in range(m):\n    if add[w] != 0.0:\n        dx[w] -= add[w] / mass[w]\n"
 # what no curve moves stays as it is for a whole simulation: only what drives the model is new at each step
-_ROOMS = "ub, pb, add, bent = np.zeros(len(u)), p.copy(), np.zeros(m), np.zeros(len(out))"
+_ROOMS = """ub, pb, add, bent = np.zeros(len(u)), p.copy(), np.zeros(m), np.zeros(len(out))
+    before, side, now_side = np.zeros(m), np.zeros(len(c_how)), np.zeros(len(c_how))"""
+# between two samples, ``rough`` steps are tried first where a curve jumps: only an interval that a jump is met in needs
+# its many
+_TRIES = f"""tries = rough > 0 and not holds
+        if tries:
+            sides(x, u, p, k, {_CURVED}, bent, side)
+            for w in range(m):
+                before[w] = x[w]"""
+_STAYS = f"""if attempt == 0:
+                sides(x, u, p, k, {_CURVED}, bent, now_side)
+                met = False
+                for i in range(len(c_how)):
+                    met |= c_jump[i, 0] != 0.0 and (side[i] == 0.0 or now_side[i] != side[i])
+                if not met:
+                    break
+                for w in range(m):
+                    x[w] = before[w]"""
 _CURVED_FUNCTIONS = f"""
 @inline
 def quantity(of, x, u, y, columns, k):
@@ -179,13 +200,29 @@ def of_both(of, x, u, y, columns, k):
 
 
 @inline
-def on_curve(q, low, high, table, jump):
-    if jump[3] > 0.0:
-        q -= np.floor(q / jump[3]) * jump[3]
-    c = on_table(q, low, high, table)
+def within(q, period):
+    if period > 0.0:
+        q -= np.floor(q / period) * period
+    return q
+
+
+@inline
+def on_curve(q, low, per, table, jump):
+    q = within(q, jump[3])
+    c = on_even(q, low, per, table)
     if jump[0] != 0.0:
         c += jump[0] * min(max((q - jump[1]) / jump[2], -1.0), 1.0)
     return c
+
+
+@inline
+def sides(x, u, p, k, {_CURVED}, y, side):
+    for i in range(len(c_how)):
+        if c_jump[i, 0] != 0.0:
+            if OUTPUT <= c_of[i, 0] < COLUMN:
+                outputs(x, u, p, y)
+            past = within(of_both(c_of[i], x, u, y, columns, k), c_jump[i, 3]) - c_jump[i, 1]
+            side[i] = 1.0 if past > c_jump[i, 2] else -1.0 if past < -c_jump[i, 2] else 0.0
 
 
 @inline
@@ -228,7 +265,7 @@ def bend(x, u, p, k, {_CURVED}, ub, pb, add, y):
             continue
         if OUTPUT <= c_of[i, 0] < COLUMN:
             outputs(x, u, p, y)
-        c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
+        c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_per[i], c_table[i], c_jump[i])
         put_in(c_how[i], c_at[i], c, ub, pb, add)
 {{bend more}}
 
@@ -238,7 +275,7 @@ def shown(x, u, p, k, {_CURVED}, ub, pb, add, y):
     outputs(x, ub, pb, y)
     for i in range(len(c_how)):
         if c_how[i] > 4:
-            c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_high[i], c_table[i], c_jump[i])
+            c = on_curve(of_both(c_of[i], x, u, y, columns, k), c_low[i], c_per[i], c_table[i], c_jump[i])
             put_on(c_how[i], c_at[i], c, y)
 {{show more}}
 
@@ -271,10 +308,10 @@ _OWN_RATE = """if c > 100:
                 dx[w] -= own_rate(c, AT[w], AT[position[w]], now, 1.0, rows[i], none) / mass[w]
         el"""
 _OWN_HELD = """if memory[i] and code[i] > 100:
-                    w = where[i]
-                    since = 0.0 if first else h
-                    held[w] += own_rate(code[i], x[w], x[position[w]], now, since, rows[i], remembered[i]) / mass[w]
-                el"""
+                        w = where[i]
+                        since = 0.0 if first else h
+                        held[w] += own_rate(code[i], x[w], x[position[w]], now, since, rows[i], remembered[i]) / mass[w]
+                    el"""
 
 _SOURCE = """
 @inline_own
@@ -348,47 +385,52 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                 out[j, k] = y[j]
         if k == n - 1:
             break
-        h = (t[k + 1] - t[k]) / steps
-        for q in range(steps):
-            now = t[k] + q * h
-            if holds:
-                for w in range(m):
-                    held[w] = 0.0
-            for i in range(len(code) if holds else 0):
-                {own}if memory[i] and code[i] <= 40:
-                    w = where[i]
-                    f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
-                                 remembered[i])
-                    held[w] += f / mass[w]
-            first = False
-            # the four slopes of Runge and Kutta; written out four times, they took 2.4 times as long to compile
-            for j in range(4):
-                part = q + 0.5 * ((j + 1) // 2)
-                now = t[k] + part * h
-                if line and not LOOP:
-                    for i in range(len(inputs)):
-                        u[i] = inputs[i, k] + (inputs[i, k + 1] - inputs[i, k]) * part / steps
-                        if len(slopes) > 0:
-                            u[i] += between(inputs[i], slopes[i], t, k, part / steps)
-                for w in range(m):
-                    z[w] = x[w] + 0.5 * ((j + 1) // 2) * h * dx[w] if j > 0 else x[w]
-                rhs z dx
-                for w in range(m):
-                    if j == 0:
-                        total[w] = dx[w]
-                    elif j < 3:
-                        total[w] += 2.0 * dx[w]
-                    else:
-                        x[w] += h / 6.0 * (total[w] + dx[w])
-            for i in range(len(code) if limits else 0):
-                if code[i] == STATE_LIMIT:
-                    w = where[i]
-                    x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
-                elif code[i] == STATE_OVERFLOW:  # what is cut off goes into another state, the row's constant
-                    w = where[i]
-                    over = max(x[w] - rows[i, 0], 0.0)
-                    x[w] -= over
-                    x[int(rows[i, 2])] += rows[i, 1] * over
+        tries = False
+        {tries}
+        for attempt in range(0 if tries else 1, 2):
+            many = {rough} if attempt == 0 else steps
+            h = (t[k + 1] - t[k]) / many
+            for q in range(many):
+                now = t[k] + q * h
+                if holds:
+                    for w in range(m):
+                        held[w] = 0.0
+                for i in range(len(code) if holds else 0):
+                    {own}if memory[i] and code[i] <= 40:
+                        w = where[i]
+                        f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
+                                     remembered[i])
+                        held[w] += f / mass[w]
+                first = False
+                # the four slopes of Runge and Kutta; written out four times, they took 2.4 times as long to compile
+                for j in range(4):
+                    part = q + 0.5 * ((j + 1) // 2)
+                    now = t[k] + part * h
+                    if line and not LOOP:
+                        for i in range(len(inputs)):
+                            u[i] = inputs[i, k] + (inputs[i, k + 1] - inputs[i, k]) * part / many
+                            if len(slopes) > 0:
+                                u[i] += between(inputs[i], slopes[i], t, k, part / many)
+                    for w in range(m):
+                        z[w] = x[w] + 0.5 * ((j + 1) // 2) * h * dx[w] if j > 0 else x[w]
+                    rhs z dx
+                    for w in range(m):
+                        if j == 0:
+                            total[w] = dx[w]
+                        elif j < 3:
+                            total[w] += 2.0 * dx[w]
+                        else:
+                            x[w] += h / 6.0 * (total[w] + dx[w])
+                for i in range(len(code) if limits else 0):
+                    if code[i] == STATE_LIMIT:
+                        w = where[i]
+                        x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
+                    elif code[i] == STATE_OVERFLOW:  # what is cut off goes into another state, the row's constant
+                        w = where[i]
+                        over = max(x[w] - rows[i, 0], 0.0)
+                        x[w] -= over
+                        x[int(rows[i, 2])] += rows[i, 1] * over
+            {stays}
         for w in range(m):
             if not np.isfinite(x[w]) or abs(x[w]) > 1e150:
                 return

@@ -11,7 +11,8 @@ import numpy as np
 
 from vaneloop.base.curve import POINTS
 from vaneloop.base.durations import within_no_period
-from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.carried import bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import Formula, values_of
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.formula_fits import fitted_formulas, likely

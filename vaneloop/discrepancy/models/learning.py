@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from vaneloop.base.side_by_side import Answer, Item, side_by_side
+from vaneloop.discrepancy.carried import NOT_KNOWN, Known
 from vaneloop.discrepancy.error_share import (
     BETTER,
     HARM,
@@ -374,10 +375,9 @@ class Learner:
 
     def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
         """The curve with a lag so many times as long; None where that is no better."""
-        slower = best.candidate.slower(times)
-        if slower is None or stands(current, slower):
+        if (slower := best.candidate.slower(times)) is None or stands(current, slower):
             return None
-        more = self._fitted(current, slower, best.wiggle, self._begun(best, slower), 12)
+        more = self._fitted(current, slower, best.wiggle, self._begun(best, slower), 12, slopes=best.slopes())
         (judge, now), (_, was) = (self._judged(t, [more, best]) for t in (more, best))
         worse = score(judge, now) - score(judge, was)
         # within the noise the score does not tell: what is left there still does
@@ -400,14 +400,14 @@ class Learner:
         """
         whole = best.candidate
         found = dict(zip(whole.parts, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
-        nominal = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]]
+        nominal, near = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]], best.slopes()
         for untold in ((0, 1), (1,), (0,)) if whole.basis.straight == 2 else ((0,),):
             c = replace(whole, untold=untold)
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
             bends = [found[k] for k in c.parts]
             with told_in_nats(self, best):
-                fits = [self._fitted(current, c, best.wiggle, np.concatenate([n, bends]), 16) for n in nominal]
+                fits = [self._fitted(current, c, best.wiggle, np.append(n, bends), 16, False, near) for n in nominal]
                 simpler = min(fits, key=self._score)
                 as_well = self._score(simpler) <= self._score(best) + BETTER
             if as_well:
@@ -419,10 +419,11 @@ class Learner:
 
     def _finalists(self, current: Tried) -> list[Tried]:
         """The candidates that promise most, fitted; best first."""
-        quick, (bare, promising) = [], screened(self, current, QUICK, TIMES[0])
+        near, (bare, promising) = current.slopes(beside=False), screened(self, current, QUICK, TIMES[0])
+        quick: list[Tried] = []
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
-        few = lambda p: self._fitted(current, p[1], SCREENED, p[2], 3, True)  # noqa: E731
+        few = lambda p: self._fitted(current, p[1], SCREENED, p[2], 3, True, near)  # noqa: E731
         for k, t in enumerate(self.each(few, promising)):
             quick.append(t)
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
@@ -488,10 +489,9 @@ class Learner:
 
     def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
         """The same curve with `SPLINES` splines."""
-        fine = coarse.candidate.finer(SPLINES)
-        if fine is None:
+        if (fine := coarse.candidate.finer(SPLINES)) is None:
             return None
-        return self._fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12)
+        return self._fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
 
     def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
         """The same curve with a jump where its quantity is 0."""
@@ -503,17 +503,17 @@ class Learner:
 
     def _fitted(
         self, current: Tried, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
-        quick: bool = False,
+        quick: bool = False, slopes: Known = NOT_KNOWN,
     ) -> Tried:  # fmt: skip
         """A candidate fitted beside the model and its curves; ``begin``: parameters, or its fit as smooth as another
-        ``wiggle`` makes it, on the same samples.
+        ``wiggle`` makes it, on the same samples; ``slopes`` near there, as far as they are known.
         """
         curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
         settled = [s for s in (current.settled, candidate.settled) if s is not None and not quick]
         judge = self._judge((), curves, quick, np.logical_and.reduce(settled) if settled else None)
         judge.sparing = True
         names = tuple(e.name for _, e in curves)
-        fit = with_held_out(judge, judge.fit(names, begin, iterations))
+        fit = with_held_out(judge, judge.fit(names, begin, iterations, slopes=slopes))
         return Tried(candidate, wiggle, judge, fit, curves)
 
     # ---- other logs --------------------------------------------------------------------------------------------------

@@ -394,8 +394,11 @@ class Runner:
         restart, at_restart = self.data.restarts(log, len(t))
         curves = [(q.curve, row) for q, row in active if q.curve is not None]
         plain, surfaces = apart(curves)
-        if any(c.simulated and c.parts(row)[1] for c, row in plain):
-            steps = max(steps, SWITCHED)
+        rough = 0
+        jumping = [c for c, row in plain if c.simulated and c.parts(row)[1]]
+        if jumping and steps < SWITCHED:  # of a speed it is friction, and runs as that of the library does
+            rough = 0 if any(name in s.rates for c in jumping for _, name in c.quantities) else steps
+            steps = SWITCHED
         kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves(bool(surfaces))
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments: tuple[Any, ...] = (
@@ -405,7 +408,7 @@ class Runner:
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip
         if curves:
-            arguments += curves_for_kernel(plain, self.data, log, len(t), self.smalls)
+            arguments += (rough, *curves_for_kernel(plain, self.data, log, len(t), self.smalls))
         if surfaces:
             arguments += surfaces_for_kernel(surfaces, self.data, log, len(t))
         try:

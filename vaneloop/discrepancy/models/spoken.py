@@ -156,8 +156,8 @@ def _in_place(
     theta[: len(own)] = own
     theta[index[c.name]] = numbers
     names = tuple(e.name for e in judge.stage.effects)
-    theta = judge.fit(tuple(n for n in names if n != c.name), theta, 8).theta
-    fit = with_held_out(judge, judge.fit(names, theta, 12))
+    led = judge.lead(tuple(n for n in names if n != c.name), theta, 8)
+    fit = with_held_out(judge, judge.fit(names, led.theta, 12, slopes=led.slopes))
     values: Array = form.plain(fit.theta[index[c.name]])
     if not np.all(np.isfinite(values)):
         return None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.carried import bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array, Effect
 

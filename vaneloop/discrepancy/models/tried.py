@@ -8,8 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from vaneloop.discrepancy.carried import NOT_KNOWN, Known, bounded_step
 from vaneloop.discrepancy.error_share import LEAST_FALL, LEAST_OF_NOISE
-from vaneloop.discrepancy.fit import Fit, Judge, bounded_step
+from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.formulas import Formula
 from vaneloop.discrepancy.models.curved import Candidate
 from vaneloop.discrepancy.models.held_out import Blocks
@@ -114,6 +115,12 @@ class Tried:
     def settled(self) -> Array | None:
         """Samples at which none of its curves remembers what was before the log; None: all."""
         return self.judge.keep
+
+    def slopes(self, beside: bool = True) -> Known:
+        """Slopes where its fit ended, as far as they are kept; ``beside``: of what is fitted beside the new curve."""
+        fit = self.fit
+        before = self.judge.stage.index()[self.candidate.name].start if beside else np.inf
+        return fit.near.of(fit.theta, fit.free, before) if fit.near is not None else NOT_KNOWN
 
     def forgotten(self) -> Array | None:
         """Of a hysteresis, the samples at which it has forgotten what was before the log; None: all, or hardly any."""
