@@ -204,7 +204,7 @@ def test_quick_steps_lead_where_the_fit_goes_with_fewer_simulations(iterations: 
             start = judge.stage.neutral()
             start[:2] *= 0.6
             sims.append((judge.together([task(effects, start, iterations)])[0], sum(asked)))
-        (fit, whole), ((total, theta), fewer) = sims
+        (fit, whole), ((total, theta, _), fewer) = sims
         np.testing.assert_array_equal(theta, fit.theta)
         assert total == pytest.approx(judge.total_of(fit), rel=1e-9)
         assert fewer <= whole and (iterations > 1 or fewer == whole - len(fit.free))
