@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["Criterion", "Search"]
 
 SCREENED = 32  # starts simulated at one time
-SCREENS = 3  # times as many effects are fitted quickly as go on, of those that the slopes promise most of
 
 
 class Criterion(Protocol):
@@ -209,7 +208,6 @@ class Search:
     def singles(self, names: Sequence[str]) -> dict[str, Fit]:
         """Fits with one effect each, side by side; of a model that roams, of those that promise most."""
         if self.criterion.roams:
-            names = sorted(names, key=lambda n: self.level[n])[: SCREENS * self.criterion.fitted]
             followed = dict(zip(names, self.judge.together([self._followed(n) for n in names]), strict=True))
             names = sorted(names, key=lambda n: followed[n])[: self.criterion.fitted]
         return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))

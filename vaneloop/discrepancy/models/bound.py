@@ -182,7 +182,7 @@ class Bound:
         self.stage = Stage(
             s.name, tuple(s.outputs), tuple(s.outputs.values()), tuple(parameters), tuple(searched), self.run, self.t,
             self.measured,
-            regimes=regimes, regime_units=units, carries=True,
+            regimes=regimes, regime_units=units,
         )  # fmt: skip
         if self.like is None:
             unknowns = len(s.parameters) + len(starts)
@@ -201,7 +201,7 @@ class Bound:
             s.name, self.stage.outputs, self.stage.units, self.stage.parameters, self.stage.effects,
             lambda thetas: self.run(thetas, stride), self.t[::stride], self.measured[:, ::stride],
             regimes={k: v[::stride] for k, v in regimes.items()}, regime_units=units, floor=self.stage.floor,
-            begins=self.stage.begins, quick=s.kind in ("static", "force"), carries=True,
+            begins=self.stage.begins, quick=s.kind in ("static", "force"),
         )  # fmt: skip
 
         self.stages: list[Stage] = [self.thinned]

@@ -359,10 +359,9 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     # a gain and a curve nearly make up for each other: what tells them apart is small beside how the model bends over
     # a step of a parameter that is far too large
     own = tuple(replace(p, scale=(FINER if k < first else 1.0) * p.scale) for k, p in enumerate(bound.stage.parameters))
-    out.stage = replace(bound.stage, parameters=own, effects=effects, run=runner.run, begins=None)
-    out.thinned = replace(
-        bound.thinned, parameters=own, effects=effects, run=lambda thetas: runner.run(thetas, stride), begins=None
-    )
+    rest = {"parameters": own, "effects": effects, "begins": None, "carries": True}
+    out.stage = replace(bound.stage, run=runner.run, **rest)  # type: ignore[arg-type]
+    out.thinned = replace(bound.thinned, run=lambda thetas: runner.run(thetas, stride), **rest)  # type: ignore[arg-type]
     out.stages = [out.thinned]
     return out
 
