@@ -207,9 +207,8 @@ def _fitted(
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
     effects = tuple(e.name for e in judge.stage.effects)
-    led = judge.lead(
-        effects[:-1], theta, 8, tried.slopes()
-    )  # first the rest of the model with the formula as it stands
+    # first the rest of the model with the formula as it stands
+    led = judge.lead(effects[:-1], theta, 8, tried.slopes())
     fit = with_held_out(judge, judge.fit(effects, led.theta, 16, slopes=led.slopes))
     values = fit.theta[-count:].copy()
     if not np.isfinite(score(judge, fit)) or not np.all(np.isfinite(values)):
