@@ -46,6 +46,7 @@ TARGETS = (
     Target(
         "search",
         (
+            "vaneloop/discrepancy/descent.py",
             "vaneloop/discrepancy/diagnose.py",
             "vaneloop/discrepancy/fit.py",
             "vaneloop/discrepancy/noise_floor.py",
