@@ -4,6 +4,7 @@ to a file that another log and the loop take.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from tests import rig
 from tests.firmware_on_rig import firmware
 from tests.test_learn import TANK
 from tests.test_learn_vanes import columns, curved, law
-from vaneloop import Record
+from vaneloop import Record, System
 from vaneloop.base.durations import in_name, of_name, period_of, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
@@ -200,6 +201,12 @@ def hummed(seed: int, name: str, size: float, drift: float = 0.0, n: int = 1500)
 HELD = replace(TANK, between="hold")
 
 
+def left_by(system: System, model: Model, log: Record, values: Mapping[str, float]) -> float:
+    """RMS of what a model with these ``values`` of its parameters leaves of the first output."""
+    bound = system.bind([log], values=values, present=model.effects, curves=model.curves)
+    return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
+
+
 @pytest.fixture(scope="module")
 def humming():
     return learn([hummed(1, "one", 1.0)], HELD, test=[hummed(2, "two", 1.0)])
@@ -228,11 +235,8 @@ def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
     placed, _ = from_file(name, model.curves[name], data)
     assert np.allclose(data.column(0, placed.curve.quantity), other.t % period_of(placed.curve.quantity))
 
-    def left(m: Model) -> float:
-        bound = HELD.bind([other], values=m.parameters, present=m.effects, curves=m.curves)
-        return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
-
-    before, after = left(Model(parameters=model.parameters)), left(model)
+    plain = Model(parameters=model.parameters)
+    before, after = (left_by(HELD, m, other, model.parameters) for m in (plain, model))
     assert before > 0.15 and after < 0.06
     wrong = model.curves[name].model_copy(update={"of": "time_every_0_s"})
     with pytest.raises(StageError, match="time_every_0_s"):

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plant import Model
+from tests.test_learn_periods import left_by
 from tests.test_page import unpack
 from vaneloop import Record, System, unknown
 from vaneloop.base.durations import folded, period_in_name, within_no_period
@@ -157,11 +158,7 @@ def test_its_file_says_the_same_to_another_log_and_in_python(eccentric, tmp_path
     other = turned(3, "three", 0.02)
     own = {k: v for k, v in model.parameters.items() if not k.startswith("start_")}
 
-    def left(m: Model) -> float:
-        bound = MOTOR.bind([other], values=own, present=m.effects, curves=m.curves)
-        return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
-
-    before, after = left(Model()), left(model)
+    before, after = (left_by(MOTOR, m, other, own) for m in (Model(), model))
     assert before > 0.01 and after < 0.5 * before
     data = MOTOR.bind([other]).data
     wrong = model.curves[name].model_copy(update={"of": "shaft_every_6p283"})

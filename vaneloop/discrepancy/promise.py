@@ -11,14 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vaneloop.discrepancy.carried import Known, bounded_step
-from vaneloop.discrepancy.fit import Fit, Judge
+from vaneloop.discrepancy.fit import Judge
 from vaneloop.discrepancy.stage import Array, Effect, Stage
 
-__all__ = ["LINE", "Slopes", "along", "followed", "out_of", "turned", "within"]
+__all__ = ["LINE", "Slopes", "along", "followed", "out_of", "within"]
 
 LINE = (0.02, 5.0)  # times the size tried, within which a better size is looked for
-DIRECTIONS = 12  # from which a fit of an effect with a direction may start
 TOGETHER = 16  # sets whose slopes are simulated at one time
 SAME = (0.8, 1.25)  # times a size that count as that size
 
@@ -33,16 +31,10 @@ class Slopes:
 
     def __init__(self, judge: Judge, theta: Array, free: Array, prior: Array, known: tuple[Array, Array] | None = None):
         """Simulate the fit and its difference steps, where they are not known."""
-        self._free = free
         self.error, self.jac = known if known is not None else judge.linearise(theta, free)
         self._flat = self.jac.reshape(len(free), self.error.size)
         self._normal = self._flat @ self._flat.T + np.diag(prior * judge.scale[free] ** 2 + 1e-9)
         self._room = [(b[free] - theta[free]) / judge.scale[free] for b in judge.bounds()]
-
-    @property
-    def known(self) -> Known:
-        """The slopes, for a fit that begins near."""
-        return Known(self._free, self.jac)
 
     def left(self, errors: Array) -> list[float]:
         """Sum of squares that is left of each set of errors when the free parameters have followed, within their
@@ -206,42 +198,3 @@ def along(effect: Effect, start: Array, share: float, low: Array, high: Array) -
     sizes = np.array([not p.shape for p in effect.parameters])
     neutral = np.array([p.value for p in effect.parameters])
     return np.asarray(np.clip(np.where(sizes, neutral + share * (start - neutral), start), low, high))
-
-
-def turned(judge: Judge, effect: Effect, base: Fit, e0: Array, jac: Array) -> list[Array]:
-    """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
-    are best there.
-
-    Size and direction are polar coordinates: from a wrong direction the way is long. In a fixed direction the sizes
-    act linearly near neutral, so that their best values follow from one simulation.
-
-    base     the fitted nominal model
-    e0, jac  its error, and the derivatives by the nominal parameters, of `Judge.linearise`
-    """
-    at = judge.stage.index()[effect.name]
-    turning = [i for i, p in enumerate(effect.parameters) if p.period]
-    sizes = np.array([at.start + i for i, p in enumerate(effect.parameters) if not p.shape], dtype=int)
-    if not turning or len(turning) + len(sizes) < len(effect.parameters):
-        return []
-    p, (low, high) = effect.parameters[turning[0]], judge.bounds()
-    columns = np.concatenate([base.free, sizes])
-    scale = judge.scale[columns]
-    prior = np.concatenate([base.prior, np.zeros(len(sizes))]) * scale**2
-    thetas, asked, derivatives = [], [], []
-    for k in range(DIRECTIONS):
-        theta = base.theta.copy()
-        theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
-        moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
-        thetas.append(theta)
-        asked.append(moved)
-        derivatives.append(derivative)
-    errors = judge.errors(np.concatenate(asked))
-    for k, (theta, derivative) in enumerate(zip(thetas, derivatives, strict=True)):
-        own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
-        flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
-        a = flat @ flat.T + np.diag(prior + 1e-9)
-        step = bounded_step(
-            a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale
-        )
-        theta[columns] += step * scale
-    return thetas

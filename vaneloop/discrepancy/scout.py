@@ -15,8 +15,7 @@ import numpy as np
 
 from vaneloop.discrepancy.fit import Fit, Judge, Task
 from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, rival_nats
-from vaneloop.discrepancy.promise import DIRECTIONS
-from vaneloop.discrepancy.search import SCREENED, Criterion, Search
+from vaneloop.discrepancy.search import DIRECTIONS, SCREENED, Criterion, Search
 from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["Scouted", "excerpt_of", "searched", "spread"]

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from vaneloop.discrepancy.carried import NOT_KNOWN, Known
+from vaneloop.discrepancy.carried import NOT_KNOWN, bounded_step
 from vaneloop.discrepancy.fit import Fit, Judge, Led, Task, finished, recalibrate
-from vaneloop.discrepancy.promise import Slopes, along, followed, onward, out_of, turned, within
-from vaneloop.discrepancy.stage import Array
+from vaneloop.discrepancy.promise import Slopes, along, followed, onward, out_of, within
+from vaneloop.discrepancy.stage import Array, Effect
 
 if TYPE_CHECKING:
     from vaneloop.discrepancy.stage_answer import Candidate, Found, StageDiagnosis
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Criterion", "Search"]
 
 SCREENED = 32  # starts simulated at one time
+DIRECTIONS = 12  # from which a fit of an effect with a direction may start
 
 
 class Criterion(Protocol):
@@ -123,10 +124,9 @@ class Search:
         thetas: list[Array] = []
         owner: list[str] = []
         costs: list[float] = []
-        base_cost, plain, beside = 0.0, 0, NOT_KNOWN
+        base_cost, plain = 0.0, 0
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
             slopes = Slopes(judge, nominal, self.base.free, self.base.prior)
-            beside = beside if k else slopes.known
             first = len(thetas)
             for e in stage.effects:
                 for s in e.starts[-2:] if self.quiet else e.starts:
@@ -137,16 +137,15 @@ class Search:
             if k == 0:
                 base_cost = float(np.sum(slopes.error * slopes.error))
                 for e in stage.effects if not self.quiet else ():
-                    around = turned(judge, e, self.base, slopes.error, slopes.jac)
-                    thetas += around
-                    owner += [e.name] * len(around)
+                    turned = self._turned(e, slopes.error, slopes.jac)
+                    thetas += turned
+                    owner += [e.name] * len(turned)
                 plain = len(thetas)  # so many are tried beside the base
             some = thetas[first:]
             left, better = self._tried(slopes, nominal, some, owner[first:])
             thetas[first:] = [*some, *(theta for _, theta in better.values())]
             costs += [*left, *(cost for cost, _ in better.values())]
             owner += better
-        self.near = beside
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         self.level: dict[str, float] = {}
@@ -201,6 +200,43 @@ class Search:
         left = slopes.left(judge.errors(np.array(list(again.values())))) if again else []
         return costs, {name: (c, t) for (name, t), c in zip(again.items(), left, strict=True)}
 
+    def _turned(self, effect: Effect, e0: Array, jac: Array) -> list[Array]:
+        """Starts of an effect with a direction (a parameter that repeats itself), all round: each with the sizes that
+        are best there.
+
+        Size and direction are polar coordinates: from a wrong direction the way is long. In a fixed direction the sizes
+        act linearly near neutral, so that their best values follow from one simulation.
+
+        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
+        """
+        judge, at = self.judge, self.stage.index()[effect.name]
+        turning = [i for i, p in enumerate(effect.parameters) if p.period]
+        sizes = np.array([at.start + i for i, p in enumerate(effect.parameters) if not p.shape], dtype=int)
+        if not turning or len(turning) + len(sizes) < len(effect.parameters):
+            return []
+        p, (low, high) = effect.parameters[turning[0]], judge.bounds()
+        columns = np.concatenate([self.base.free, sizes])
+        scale = judge.scale[columns]
+        prior = np.concatenate([self.base.prior, np.zeros(len(sizes))]) * scale**2
+        thetas, asked, derivatives = [], [], []
+        for k in range(DIRECTIONS):
+            theta = self.base.theta.copy()
+            theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
+            moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
+            thetas.append(theta)
+            asked.append(moved)
+            derivatives.append(derivative)
+        errors = judge.errors(np.concatenate(asked))
+        for k, (theta, derivative) in enumerate(zip(thetas, derivatives, strict=True)):
+            own = derivative(errors[k * len(asked[k]) : (k + 1) * len(asked[k])])[1]
+            flat = np.concatenate([jac, own]).reshape(len(columns), e0.size)
+            a = flat @ flat.T + np.diag(prior + 1e-9)
+            step = bounded_step(
+                a, flat @ e0.ravel(), (low[columns] - theta[columns]) / scale, (high[columns] - theta[columns]) / scale
+            )
+            theta[columns] += step * scale
+        return thetas
+
     def single(self, name: str) -> Fit:
         """Fit with one effect, from its best starts."""
         return self.singles([name])[name]
@@ -218,9 +254,9 @@ class Search:
         """
         led = []
         for start in self.starts[name]:
-            led.append((yield from self.judge.leading((), start, 2, self.near)))
+            led.append((yield from self.judge.leading((), start, 2)))
         led.sort(key=lambda of: of.total)
-        best = yield from self.judge.leading((name,), led[0].theta, 2, led[0].slopes)
+        best = yield from self.judge.leading((name,), led[0].theta, 2)
         self.starts[name] = [best.theta, *(of.theta for of in led[1:])]
         return best.total
 
@@ -228,13 +264,13 @@ class Search:
         """The best of quick fits of an effect, one from each start."""
         return (yield from self._best((name,), self.starts[name]))
 
-    def _best(self, effects: tuple[str, ...], starts: Sequence[Array], slopes: Sequence[Known] = ()) -> Task[Fit]:
-        """The best of quick fits from these starts; ``slopes`` near each, where they are known."""
+    def _best(self, effects: tuple[str, ...], starts: Sequence[Array]) -> Task[Fit]:
+        """The best of quick fits from these starts."""
         if len(starts) == 1:
-            return (yield from self.judge.fitting(effects, starts[0], 3, slopes=slopes[0] if slopes else NOT_KNOWN))
+            return (yield from self.judge.fitting(effects, starts[0], 3))
         led = []
-        for start, near in zip(starts, slopes or [NOT_KNOWN] * len(starts), strict=True):
-            led.append((yield from self.judge.leading(effects, start, 3, near)))
+        for start in starts:
+            led.append((yield from self.judge.leading(effects, start, 3)))
         return (yield from self.judge.fitting(effects, min(led, key=lambda of: of.total).theta, 0))
 
     def _steps(self, effects: Sequence[str]) -> int:
@@ -380,8 +416,8 @@ class Search:
         out = []
         for k in np.argsort(left, kind="stable")[:2]:  # the model's own parameters and the other effects' follow first
             rest, theta = begins[k]
-            led = yield from judge.leading(rest, theta, 2, self._slopes(frozenset(rest)).known)
-            out.append((yield from judge.leading(effects, led.theta, 2, led.slopes)))
+            led = yield from judge.leading(rest, theta, 2)
+            out.append((yield from judge.leading(effects, led.theta, 2)))
         return sorted(out, key=lambda of: of.total)
 
     def _left(self, rest: frozenset[str], errors: Array) -> float:
@@ -407,9 +443,8 @@ class Search:
             return (yield from self._single(effects[0]))
         key = frozenset(effects)
         if key not in self.fits:
-            begins = self.begun.pop(key, None) or (yield from self._begins(effects))
-            thetas, slopes = [of.theta for of in begins], [of.slopes for of in begins]
-            self.fits[key] = yield from self._best(tuple(effects), thetas, slopes)
+            begins = self.begun.get(key) or (yield from self._begins(effects))
+            self.fits[key] = yield from self._best(tuple(effects), [of.theta for of in begins])
             self.tick()
         if finished and key not in self.finished:
             task = self.judge.fitting(tuple(effects), self.fits[key], 8)
@@ -430,13 +465,12 @@ class Search:
             return known
         at = self.stage.index()[drop]
         first, neutral = fit.theta[at], self.stage.neutral()[at]
-        led = Led(np.inf, fit.theta, NOT_KNOWN)
+        theta = fit.theta
         for share in (0.25, 0.5, 0.75, 1.0):  # by and by, so that the others can follow
-            theta = led.theta.copy()
+            theta = theta.copy()
             theta[at] = first + share * (neutral - first)
-            led = self.judge.together([self.judge.leading(rest, theta, 5, led.slopes)])[0]
-        task = self.judge.fitting(rest, led.theta, 8, slopes=led.slopes)
-        other = self.judge.together([self._finished(task)])[0]
+            theta = self.judge.lead(rest, theta, 5).theta
+        other = self.judge.together([self._finished(self.judge.fitting(rest, theta, 8))])[0]
         if self.judge.total_of(other) < 0.99 * self.judge.total_of(known):
             self.fits[frozenset(rest)] = known = other
             if not rest:
@@ -469,7 +503,6 @@ class Search:
             self.begun[frozenset(s)] = begins
         kept = sorted(leading, key=lambda s: self.begun[frozenset(s)][0].total)[:most]
         self.passed |= {frozenset(s) for s in new if s not in kept}
-        self.begun = {frozenset(s): self.begun[frozenset(s)] for s in kept}
 
     def _promise(self, effects: tuple[str, ...]) -> float:
         """What is left with the last effect, at the best of its starts, on top of the others as they are fitted, when

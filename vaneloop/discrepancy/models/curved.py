@@ -7,6 +7,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -359,9 +360,9 @@ def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed
     # a gain and a curve nearly make up for each other: what tells them apart is small beside how the model bends over
     # a step of a parameter that is far too large
     own = tuple(replace(p, scale=(FINER if k < first else 1.0) * p.scale) for k, p in enumerate(bound.stage.parameters))
-    rest = {"parameters": own, "effects": effects, "begins": None, "carries": True}
-    out.stage = replace(bound.stage, run=runner.run, **rest)  # type: ignore[arg-type]
-    out.thinned = replace(bound.thinned, run=lambda thetas: runner.run(thetas, stride), **rest)  # type: ignore[arg-type]
+    as_here = partial(replace, parameters=own, effects=effects, begins=None, carries=True)
+    out.stage = as_here(bound.stage, run=runner.run)
+    out.thinned = as_here(bound.thinned, run=lambda thetas: runner.run(thetas, stride))
     out.stages = [out.thinned]
     return out
 

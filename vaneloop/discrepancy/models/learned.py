@@ -81,6 +81,11 @@ class LearnedLaw:
         return self.spoken is not None and self.spoken.form == "constant"
 
     @property
+    def channel(self) -> str:
+        """Its quantity; of what repeats itself, the channel along which it does."""
+        return within_no_period(self.of) if self.period else self.of
+
+    @property
     def of_what(self) -> str:
         """Of which quantity it is a function."""
         return self.of
@@ -111,8 +116,7 @@ class LearnedLaw:
         if lag:
             what = f"a function of {lag[0]} (lagged by {lag[1]:.4g} s)"
         if self.period:
-            channel = within_no_period(self.of)
-            of = "the time" if channel == TIME else channel
+            of = "the time" if self.channel == TIME else self.channel
             what = f"a function of {of} within each {self.period:.6g} {self.of_unit.strip('-')}".rstrip()
         if self.constant:
             what = "a constant"

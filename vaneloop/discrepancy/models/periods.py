@@ -18,7 +18,7 @@ import numpy as np
 from vaneloop.discrepancy.curves import FINE_HARMONICS, HARMONICS
 from vaneloop.discrepancy.stage import Array
 
-__all__ = ["Course", "Lines"]
+__all__ = ["Course", "Lines", "about", "detrended"]
 
 MOST = 2  # periods of one place that are tried
 CLEAR = 40.0  # times the median power about it: a line; the highest of 100,000 of white noise is 17 times it
@@ -134,12 +134,12 @@ def _spectrum(part: _Even, f: Array) -> Array:
     return np.interp(f, np.arange(len(lines)) * (n - 1) / span / size, lines)
 
 
-def _about(power: Array) -> Array:
+def about(power: Array) -> Array:
     """The median about each line."""
     from scipy.ndimage import median_filter
 
-    about = median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
-    return np.asarray(np.maximum(about, 1e-12 * max(float(power.max()), 1e-300)))
+    middle = median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
+    return np.asarray(np.maximum(middle, 1e-12 * max(float(power.max()), 1e-300)))
 
 
 def _coherent(parts: Sequence[_Even], f: float) -> float:
@@ -211,7 +211,7 @@ class Lines:
     def _lines(self, parts: Sequence[_Even]) -> list[float]:
         """Of the error itself."""
         own = np.array([_spectrum(part, self.f) for part in parts])
-        return self._peaks(own.sum(axis=0), CLEAR * np.array([_about(o) for o in own]).sum(axis=0))
+        return self._peaks(own.sum(axis=0), CLEAR * np.array([about(o) for o in own]).sum(axis=0))
 
     def _swings(
         self, errors: Sequence[Array], times: Sequence[Array], waves: Sequence[tuple[int, float]] = WAVES
@@ -229,10 +229,11 @@ class Lines:
             below = self.numbers[harmonics * self.numbers <= self.numbers[-1]]
             if len(below) > 2 * ABOUT:
                 falls = _fitted(both, harmonics, below, self.apart)
-                least = np.minimum(clear * _about(falls), MOSTLY * whole)
+                least = np.minimum(clear * about(falls), MOSTLY * whole)
                 many = None if harmonics == 1 else 1  # the next ones are multiples, and parts, of the first
-                share = dict(zip(self.f[: len(falls)].tolist(), (falls / max(whole, 1e-300)).tolist(), strict=True))
-                out += [_Line(f, products, harmonics, share[f]) for f in self._peaks(falls, least)[:many]]
+                for f in self._peaks(falls, least)[:many]:
+                    fall = float(np.interp(f, self.f[: len(falls)], falls))
+                    out.append(_Line(f, products, harmonics, fall / max(whole, 1e-300)))
         return out
 
 
@@ -292,7 +293,7 @@ def _driven(c: Course, highest: float) -> _Driven:
         power = _spectrum(part, fine)
         share = np.convolve(power, np.ones(2 * FINE + 1), mode="same") / power.sum()
         pieces = [_Even(part.t[k], part.rows[:, k]) for k in np.array_split(np.arange(len(part.t)), PIECES)]
-        for k in find_peaks(power * (share > SHARE), CLEAR * _about(power))[0]:
+        for k in find_peaks(power * (share > SHARE), CLEAR * about(power))[0]:
             f = _highest([part], fine[k], span)
             if _coherence(pieces, f) > STEADY:
                 most = share[k] > MAIN

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.base.durations import within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.models.quantities import TIME, sides_of
@@ -109,10 +108,10 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
     parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
     sentence = law.sentence().rstrip(".")
     been = f"{law.x[0]:.6g}, {law.x[-1]:.6g}"
-    channel, period = within_no_period(law.of) if law.period else law.of, law.period
-    along = period > 0.0 and channel != TIME  # what the file is given is the whole way, not that within a period
+    period = law.period
+    along = period > 0.0 and law.channel != TIME  # what the file is given is the whole way, not that within a period
     within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
-    of = f"{channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
+    of = f"{law.channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
     places = np.linspace(low, high, HELD, endpoint=not along)
     held = [(float(q), float(curve["curve"](q))) for q in places]  # type: ignore[operator]
     goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
@@ -156,12 +155,11 @@ def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
     on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
     if on == "state" and law.at in system.rates:
         on = "force"
-    channel = within_no_period(law.of) if law.period else law.of
     way = "position" if law.how == "force adds" else system.rates.get(law.at, "")
     speed = "velocity" if law.how == "force adds" else law.at
     of = {
         "signal": {own: "u"}, "state": {own: "x"}, "force": {speed: "v", **({way: "x"} if way else {})},
-    }.get(on or "", {}).get(channel)  # fmt: skip
+    }.get(on or "", {}).get(law.channel)  # fmt: skip
     if on is None or of is None:
         raise InputError(
             f"--python: {law.name} is a function of {law.of} at {law.at}; a Law of your own can be one of the signal, "

@@ -75,15 +75,17 @@ def _along(learner: Learner, courses: Sequence[Course]) -> list[Candidate]:
     out: list[Candidate] = []
     found: dict[str, list[float]] = {}
     ends = np.cumsum([len(c.t) for c in courses])
-    for c in learner.candidates if all(len(c.said) for c in courses) else ():
+    if not all(len(c.said) for c in courses):
+        return out
+    signals = [np.concatenate([c.drivers, c.said]) for c in courses]
+    times, errors = [c.t for c in courses], [c.error for c in courses]
+    for c in learner.candidates:
         q = c.quantity
         if strange(c) > 1 or q.less is not None or len(q.visited) != ends[-1] or not np.isfinite(q.visited).all():
             continue
         if q.name not in found:
             # a model that lacks a law has not come quite as far as its machine
             ways = [k.read.get(q.name, w) for k, w in zip(courses, np.split(q.visited, ends[:-1]), strict=True)]
-            signals = [np.concatenate([c.drivers, c.said]) for c in courses]
-            times, errors = [c.t for c in courses], [c.error for c in courses]
             found[q.name] = periods_along(ways, times, errors, signals)
         out += [c.every(period) for period in found[q.name]]
     return out

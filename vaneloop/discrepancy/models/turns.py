@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vaneloop.discrepancy.models.periods import ABOUT, CLEAR, CYCLES, FINE, MOST, SAMPLES, detrended
+from vaneloop.discrepancy.models.periods import CLEAR, CYCLES, FINE, MOST, SAMPLES, about, detrended
 from vaneloop.discrepancy.stage import Array
 
 __all__ = ["periods_along"]
@@ -31,7 +31,7 @@ def periods_along(
     errors   of each output, float64[outputs, samples], 0 where there is none
     signals  that what repeats itself may multiply, float64[signals, samples]
     """
-    low, span = min(float(w.min()) for w in ways), 0.0
+    low = min(float(w.min()) for w in ways)
     span = max(float(w.max()) for w in ways) - low
     steps = np.abs(np.concatenate([np.diff(w) for w in ways]))
     most = span / max(SAMPLES * float(np.median(steps)), 1e-300)  # cycles from end to end
@@ -78,12 +78,10 @@ def _power(where: Array, row: Array, cells: int) -> Array:
 
 def _peaks(power: Array, span: float, most: float) -> list[tuple[float, float]]:
     """How clear lines are, and their frequencies (1 over the channel's unit)."""
-    from scipy.ndimage import median_filter
     from scipy.signal import find_peaks
 
     first, last = int(FINE * CYCLES), min(int(FINE * most), len(power) - 1)
-    about = median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
-    clear = power / np.maximum(about, 1e-12 * max(float(power.max()), 1e-300))
+    clear = power / about(power)
     at = find_peaks(clear[first:last], CLEAR, distance=2 * FINE)[0] + first
     return [(float(clear[k]), float((k + _between(*power[k - 1 : k + 2])) / (FINE * span))) for k in at]
 

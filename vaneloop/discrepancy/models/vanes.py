@@ -199,8 +199,9 @@ def build_chain(
         stroke = have.get("stroke", columns["x_lvdt"])
         turns = lru_cache(partial(reversals, t, stroke, full))
     regimes, units = regimes_of(t, columns)
-    bits = _lost_bits(log, machine)
-    steps = {"x_lvdt": _lost_step(log, machine)} if bits else {}
+    step = _lost_step(log, machine)
+    bits = _lost_bits(step, machine)
+    steps = {"x_lvdt": step} if step else {}
     makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
         "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
         "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
@@ -277,9 +278,8 @@ def _converter_step(machine: Plant) -> float:
     return float(sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value)
 
 
-def _lost_bits(log: Log, machine: Plant) -> str:
-    """What is to be said of such a stroke; "": nothing."""
-    step = _lost_step(log, machine)
+def _lost_bits(step: float, machine: Plant) -> str:
+    """What is to be said of a stroke in such steps; "": nothing."""
     if not step:
         return ""
     many = step / _converter_step(machine)
