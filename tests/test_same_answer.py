@@ -26,7 +26,7 @@ from vaneloop.discrepancy import locate as core
 from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
 from vaneloop.discrepancy.models.vane_stages import current, stroke
 from vaneloop.discrepancy.models.vane_stages.raster import rms
-from vaneloop.discrepancy.models.vanes import Chain, _lost_bits, build_chain
+from vaneloop.discrepancy.models.vanes import Chain, _lost_bits, _lost_step, build_chain
 from vaneloop.discrepancy.workflow import compare_stages, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
@@ -313,7 +313,8 @@ def test_a_stroke_in_steps_of_many_of_its_converter_s_lacks_bits_and_a_logger_s_
 ) -> None:
     t = np.arange(2000) * 0.01
     x = step * np.round((24.0 + 10.0 * np.sin(t)) / step)
-    assert bool(_lost_bits(Log("rig", {"x_lvdt": Channel(t, x)}), build_plant())) == lost
+    machine = build_plant()
+    assert bool(_lost_bits(_lost_step(Log("rig", {"x_lvdt": Channel(t, x)}), machine), machine)) == lost
 
 
 @pytest.mark.parametrize(("step", "lost"), [(0.00076, False), (0.0026, False), (0.0037, True), (0.00449, True)])
@@ -322,5 +323,6 @@ def test_bits_are_seen_to_be_lost_through_the_frame_s_own_rounding(step: float, 
     t = np.arange(20_000) * 0.01
     x = 24.0 + 10.0 * np.sin(t) + 0.002 * np.random.default_rng(1).standard_normal(len(t))
     x = 0.001 * np.round(step * np.round(x / step) / 0.001)
-    said = _lost_bits(Log("rig", {"x_lvdt": Channel(t, x)}), build_plant())
+    machine = build_plant()
+    said = _lost_bits(_lost_step(Log("rig", {"x_lvdt": Channel(t, x)}), machine), machine)
     assert bool(said) == lost and (not lost or f"{step:.3g}" in said)
