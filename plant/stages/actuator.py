@@ -6,6 +6,7 @@ import numpy as np
 
 from plant import chain, curve, electromechanical
 from plant.chain import bent_reading, measured_stroke, straightened, true_stroke
+from plant.curve_lanes import alike
 from plant.effects import CURVES, aero_load, oil_compressibility, valve_flow_saturation, valve_null_bias
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
 from plant.places import (
@@ -73,23 +74,26 @@ def actuator_run(
         p[share] = h / (h + np.maximum(p[tau], 0.0))
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
     motor = p[KIND, 0] != 0.0  # all lanes are of one machine
-    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED) | (p[CURVES] != 0.0)
+    curved = p[CURVES] != 0.0
+    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED)
+    alone |= curved & ~alike(p)
     loaded, memory, sticky = (p[row] != 0.0 for row in (DRIVE_LOADED, VALVE_HYSTERESIS, PISTON_STICTION))
     lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0) | (p[VALVE_FLOW_SATURATION + 1] != 0.0)
     limited = (p[VALVE_SHARE] < 1.0) | (p[LVDT_SHARE] < 1.0) | (p[VALVE_NULL_BIAS] != 0.0)
     limited |= p[VALVE_FLOW_SATURATION] < valve_flow_saturation.OFF
     # neighbours are those that cost little more together
     need = np.where(loaded, 4 + 8 * lossy + 2 * limited + 4 * sticky - memory, limited + 2 * memory)
-    order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, alone))
+    order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, curved, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
 
     def run(part: range) -> None:
         some = order[part.start : part.stop]
         if part.start < wide and motor:
-            motor_blocks.run(current, n_r, t_oil, dt, p, s, out.T, x, window, some, np.empty(1, motor_blocks.BLOCK))
+            block = np.empty(1, motor_blocks.BLOCK)
+            motor_blocks.run(current, n_r, t_oil, dt, p, s, out.T, x, window, some, block, known)
         elif part.start < wide:
             block = np.empty(1, hydraulic_blocks.BLOCK)
-            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block)
+            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known)
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from plant import chain, curve, places
+from plant.curve_lanes import OWN_SPEED, alike, gives, gives_each, of_signal, site_of, tables_of
 from plant.effects import CURVES, acceleration_limit_error, rotor_lag_error
 from plant.engine import engine_step
 from plant.parameters import ACCELERATION, DECELERATION, LAG
@@ -28,7 +29,9 @@ def engine_run(
     known  signals of curves (`plant.curve.take`); the speed's is the rotor's own
     """
     steps = max(1, math.ceil(dt / ENGINE_STEP - 1e-6))
-    if p[CURVES].any():  # lane by lane, through the chain
+    if p[CURVES].any() and alike(p).all():
+        _engine_curved(np.ascontiguousarray(n_dem), dt, steps, p, s, out, known)
+    elif p[CURVES].any():  # lane by lane, through the chain
         _engine_lanes(np.ascontiguousarray(n_dem), dt, steps, p, s, out, known)
     else:
         _engine_run(np.ascontiguousarray(n_dem), dt, steps, p, s, out)
@@ -66,6 +69,46 @@ def _engine_run(n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.n
                 for _ in range(steps):
                     for j in range(W):
                         b[0, j] = engine_step(b[0, j], n_dem[k - 1], b[1, j], b[2, j], b[3, j], h)
+            for j in range(last):
+                out[k, j0 + j] = b[0, j]
+        for j in range(last):
+            s[N_R, j0 + j] = b[0, j]
+
+
+@compiled_free
+def _engine_curved(
+    n_dem: np.ndarray, dt: float, steps: int, p: np.ndarray, s: np.ndarray, out: np.ndarray, known: np.ndarray
+) -> None:
+    """`_engine_run` of lanes with curves, which are alike."""
+    h = dt / steps
+    b = np.empty((4, W))
+    bent = np.empty((3, W))  # by site
+    sites = (curve.ENGINE_ADDS, curve.LAG_TIMES, curve.RISE_TIMES)
+    for j0 in range(0, p.shape[1], W):
+        last = min(W, p.shape[1] - j0)
+        lanes = np.arange(j0, j0 + last)
+        tables = tables_of(p, 0, lanes, W)
+        for j in range(W):
+            q = j0 + min(j, last - 1)
+            b[0, j] = s[N_R, q]
+            b[1, j] = rotor_lag_error.step(p[LAG, q], p[places.ROTOR_LAG_ERROR, q])
+            b[2, j] = acceleration_limit_error.step(p[ACCELERATION, q], p[places.ACCELERATION_LIMIT_ERROR, q])
+            b[3, j] = p[DECELERATION, q]
+        for k in range(len(n_dem)):
+            for _ in range(steps if k > 0 else 0):
+                bent[...] = 0.0
+                for c in range(len(tables)):
+                    for i, site in enumerate(sites):
+                        if site_of(p, 0, c) != site:
+                            continue
+                        if of_signal(p, 0, c, OWN_SPEED):
+                            gives_each(bent[i], p, 0, c, b[0], tables)
+                        else:
+                            gives(bent[i], p, 0, c, known, k - 1, k - 1, tables, lanes)
+                for j in range(W):
+                    lag = b[1, j] * max(1.0 + bent[1, j], curve.LEAST)
+                    rise = b[2, j] * max(1.0 + bent[2, j], curve.LEAST)
+                    b[0, j] = engine_step(b[0, j], n_dem[k - 1] + bent[0, j], lag, rise, b[3, j], h)
             for j in range(last):
                 out[k, j0 + j] = b[0, j]
         for j in range(last):

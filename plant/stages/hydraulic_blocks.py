@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plant import chain, drive, lanes
+from plant import chain, curve, drive, lanes
 from plant.actuator import speed_factor
 from plant.chain import true_stroke
+from plant.curve_lanes import CURRENT as OF_CURRENT
+from plant.curve_lanes import first_curved, gives, gives_each, of_signal, site_of, tables_of
 from plant.effects import (
     aero_load,
     lvdt_nonlinearity,
@@ -44,6 +46,7 @@ from plant.places import (
     VALVE_HYSTERESIS,
     VALVE_NULL_BIAS,
 )
+from plant.stages.bends import BENT, bend_drive, bend_reading
 from plant.stages.blocks import W, between, put_where_seen
 from vaneloop.base.compiled import compiled_free, inlined
 
@@ -74,7 +77,9 @@ class Around(NamedTuple):
 
 
 _MEMORY = ("y1", "y2", "y3", "y4")  # A, of the valve's hysteresis
-BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, Around, more=(*_MEMORY, "logged"))
+# flow gain and load without curves; the current that would hold the spool, and by how much curves shut its lands
+_BESIDE = ("logged", "gain", "bare_load", "holds", "shut")
+BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, Around, more=(*_MEMORY, *_BESIDE, *BENT))
 _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
 _rated_drive = lanes.getter(drive.Drive, rated=1.0)  # for currents that are shares of the rated one
@@ -113,15 +118,18 @@ def run(
     window: int,
     order: np.ndarray,
     block: np.ndarray,
+    known: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`."""
+    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`; ``known``:
+    signals of curves (`plant.curve.take`).
+    """
     n, substeps = current.shape
     h = dt / substeps
     b = block[0]
     rated = p[RATED_CURRENT, 0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
-        loaded = lossy = sticky = memory = limited = viscous = sensed = curved = False
+        loaded = lossy = sticky = memory = limited = viscous = sensed = bent = False
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             loaded |= p[DRIVE_LOADED, q] != 0.0
@@ -141,18 +149,21 @@ def run(
             )
             viscous |= p[OIL_VISCOSITY, q] != 0.0
             sensed |= p[DRIVE_EFFECTS, q] != 0.0
-            curved |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
+            bent |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
             _put_state(b, j, drive.taken(s, q))
             _put_drive(b, j, drive.prepare(p, q))
             _put_around(b, j, around(p, q))
             b.y1[j], b.y2[j], b.y3[j], b.y4[j] = s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q]
+        some = order[j0 : j0 + last]
+        first = first_curved(p, some)
+        tables = tables_of(p, max(first, 0), some, W)
         for k in range(n):
             if k > 0:
                 supply, warm, speed = between(p_s, k), between(t_oil, k), between(n_r, k)
                 if viscous or k == 1:
                     for j in range(W):
-                        gain = oil_viscosity.step(b.flow[j], warm, b.viscosity[j])
-                        b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(gain, b.asymmetry[j])
+                        b.gain[j] = oil_viscosity.step(b.flow[j], warm, b.viscosity[j])
+                        b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(b.gain[j], b.asymmetry[j])
                 if loaded:
                     for j in range(W):
                         b.load[j] = aero_load.step(speed, b.aero[j])
@@ -160,7 +171,16 @@ def run(
                 else:
                     for j in range(W):
                         b.root[j] = speed_factor(supply, 0.0, b.p_ref[j])
-                if loaded and (lossy and (memory or sticky) or memory and (sticky or limited)):
+                if first >= 0:
+                    for j in range(W):
+                        b.bare_load[j] = b.load[j]
+                if first >= 0 and loaded and (lossy or sticky or memory):
+                    _curved_substeps(b, current, k, supply, h, True, True, True, p, first, known, tables, some)
+                elif first >= 0 and loaded:
+                    _curved_substeps(b, current, k, supply, h, True, False, False, p, first, known, tables, some)
+                elif first >= 0:
+                    _curved_substeps(b, current, k, supply, h, False, False, True, p, first, known, tables, some)
+                elif loaded and (lossy and (memory or sticky) or memory and (sticky or limited)):
                     _substeps(b, current, k, rated, supply, h, True, True, True, True, True)
                 elif lossy:
                     _substeps(b, current, k, rated, supply, h, True, True, False, False, True)
@@ -182,12 +202,17 @@ def run(
                     _substeps(b, current, k, rated, supply, h, False, False, False, True, False)
                 else:
                     _substeps(b, current, k, rated, supply, h, False, False, False, False, False)
+            if first >= 0:
+                bend_reading(b, p, first, known, k, tables, some)
             if window > 0 and k % window == 0:
                 for j in range(last):
-                    put_where_seen(b, j, true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k]), k == 0)
+                    seen = x_lvdt[k]
+                    if first >= 0:
+                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                    put_where_seen(b, j, true_stroke(seen, p, order[j0 + j], t_oil[k]), k == 0)
             for j in range(W):
                 b.logged[j] = b.reading[j]
-            if curved:
+            if bent:
                 for j in range(last):
                     q = order[j0 + j]
                     b.logged[j] = lvdt_nonlinearity.step(
@@ -198,13 +223,16 @@ def run(
                     b.logged[j] = chain.straight_reading(
                         b.logged[j], b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[k]
                     )
+            if first >= 0:
+                for j in range(W):
+                    b.logged[j] = b.logged[j] * max(1.0 + b.lvdt_times[j], curve.LEAST) + b.lvdt_adds[j]
             for j in range(last):
                 out[order[j0 + j], k] = b.logged[j]
         if n > 1 and not memory:  # what steps without these do not keep
             for j in range(W):
                 i = valve_null_bias.step(current[n - 1, substeps - 1], b.bias[j])
                 b.y1[j], b.y2[j], b.y3[j], b.y4[j] = i, i, i, i
-                b.lagged[j] = b.lagged[j] if limited else i
+                b.lagged[j] = b.lagged[j] if limited or first >= 0 else i
         for j in range(last):
             q = order[j0 + j]
             drive.stored(s, q, _state(b, j))
@@ -245,4 +273,54 @@ def _substeps(
                 i = valve_hysteresis.mean(y1, y2, y3, y4)
                 b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
             z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky, limited)
+            _put_state(b, j, z)
+
+
+@inlined
+def _curved_substeps(
+    b: Any,
+    current: np.ndarray,
+    k: int,
+    p_s: float,
+    h: float,
+    loaded: bool,
+    lossy: bool,
+    memory: bool,
+    p: np.ndarray,
+    q: int,
+    known: np.ndarray,
+    tables: np.ndarray,
+    some: np.ndarray,
+) -> None:
+    """`_substeps` of the lanes ``some`` with curves, of which ``q`` is one that has them; ``lossy``: or sticky."""
+    opens = False
+    for c in range(len(tables)):
+        opens |= site_of(p, q, c) == curve.OPENING_ADDS
+    for m in range(current.shape[1]):
+        i_cmd = current[k, m]
+        bend_drive(b, p, q, known, k, i_cmd, tables, some)
+        for j in range(W):
+            gain = b.gain[j] * max(1.0 + b.flow_times[j], curve.LEAST)
+            b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(gain, b.asymmetry[j])
+            b.load[j] = b.bare_load[j] + b.load_adds[j]
+            b.shut[j] = 0.0
+        if opens:
+            for j in range(W):
+                b.holds[j] = (b.spool[j] + h * b.spool_rate[j]) * b.rated[j]
+            for c in range(len(tables)):
+                if site_of(p, q, c) == curve.OPENING_ADDS:
+                    if of_signal(p, q, c, OF_CURRENT):
+                        gives_each(b.shut, p, q, c, b.holds, tables)
+                    else:
+                        gives(b.shut, p, q, c, known, k - 1, k, tables, some)
+            for j in range(W):
+                b.shut[j] = -b.shut[j] / b.rated[j]
+        for j in range(W):
+            i = valve_null_bias.step(i_cmd, b.bias[j])
+            if memory:
+                y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
+                i = valve_hysteresis.mean(y1, y2, y3, y4)
+                b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+            i += b.current_adds[j]
+            z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, lossy, True, b.shut[j])
             _put_state(b, j, z)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from plant import chain, curve, lanes, linkage_lanes, stem
 from plant.chain import straight_reading, straightened, true_stroke
+from plant.curve_lanes import alike, first_curved, gives, site_of, tables_of
 from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
@@ -66,12 +67,14 @@ def linkage_run(
         np.maximum(np.arange(len(x_lvdt)) - reach, 0),
     )
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
-    alone = elsewhere(p, ("linkage", "pot"), CALLED) | (p[CURVES] != 0.0)
+    curved = p[CURVES] != 0.0
+    alone = elsewhere(p, ("linkage", "pot"), CALLED) | (curved & ~alike(p))
     # what one lane of a block needs is computed for all of them: those that need the same are put side by side
     stages = range(out.shape[1])
     rubbed = (p[[LINKAGE_FRICTION + k for k in stages]] != 0.0).any(axis=0)
     eccentric = (p[[RING_ECCENTRICITY + k for k in stages]] != 0.0).any(axis=0)
-    order = np.lexsort((eccentric, rubbed, (p[LVDT_NONLINEARITY : LVDT_NONLINEARITY + 2] != 0.0).any(axis=0), alone))
+    bent = (p[LVDT_NONLINEARITY : LVDT_NONLINEARITY + 2] != 0.0).any(axis=0)
+    order = np.lexsort((eccentric, rubbed, bent, curved, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     to = out.transpose(2, 1, 0)
     to = to if to.flags.c_contiguous else np.empty(to.shape)
@@ -80,7 +83,7 @@ def linkage_run(
         some = order[part.start : part.stop]
         if part.start < wide:
             block = np.empty(1, _linkage(out.shape[1]))
-            _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, block)
+            _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, block, known)
         else:
             _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, known)
 
@@ -152,13 +155,18 @@ class _Lvdt(NamedTuple):
     lvdt_bias: float
 
 
-_OF_STAGE = ((stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever", "span", "half"))
+# what curves give: to the reading, the crank, and of each stage
+_BENT = ("lvdt_adds", "lvdt_times", "crank_adds")
+_BENT_OF_STAGE = ("ring_adds", "play_adds", "pot_adds", "pot_times")
+_OF_STAGE = (
+    (stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever", "span", "half", *_BENT_OF_STAGE),
+)  # fmt: skip
 
 
 @lru_cache
 def _linkage(stages: int) -> np.dtype[np.void]:
     """Block for that many stages: the compiler knows how often its loops over them go."""
-    return lanes.block(WIDE, linkage_lanes.Crank, _Lvdt, more=("stroke", "c", "d"), each=(stages, *_OF_STAGE))
+    return lanes.block(WIDE, linkage_lanes.Crank, _Lvdt, more=("stroke", "c", "d", *_BENT), each=(stages, *_OF_STAGE))
 
 
 _crank, _put_crank = lanes.getter(linkage_lanes.Crank), lanes.putter(linkage_lanes.Crank)
@@ -179,6 +187,7 @@ def _linkage_blocks(
     out: np.ndarray,
     order: np.ndarray,
     block: np.ndarray,
+    known: np.ndarray,
 ) -> None:
     """The lanes of ``order``, `WIDE` at a time; out[lane, stage, m]. ``block``: memory for one record `_linkage`."""
     g = GEOMETRY
@@ -203,17 +212,29 @@ def _linkage_blocks(
                 b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
                 rubbed |= d.friction != 0.0
                 eccentric |= d.amplitude != 0.0
+        some = order[j0 : j0 + last]
+        first = first_curved(p, some)
+        tables = tables_of(p, max(first, 0), some, WIDE)
         for m in range(len(x_lvdt)):
-            if bent:
+            if first >= 0:
+                _bend(b, p, first, known, m, tables, some)
+            if bent or first >= 0:
                 for j in range(WIDE):
                     q = order[j0 + min(j, last - 1)]
-                    b.stroke[j] = true_stroke(x_lvdt[m] + b.late[j] * speed[m], p, q, t_oil[m])
+                    seen = x_lvdt[m] + b.late[j] * speed[m]
+                    if first >= 0:
+                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                    b.stroke[j] = true_stroke(seen, p, q, t_oil[m])
             else:
                 for j in range(WIDE):
                     off = straight_reading(0.0, b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[m])
                     b.stroke[j] = (x_lvdt[m] + b.late[j] * speed[m] - off) / b.lvdt_gain[j]
-            for j in range(WIDE):
-                b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j], _crank(b, j))
+            if first >= 0:
+                for j in range(WIDE):
+                    b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j] + b.crank_adds[j], _crank(b, j))
+            else:
+                for j in range(WIDE):
+                    b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j], _crank(b, j))
             for k in range(b.pot.shape[0]):
                 for j in range(WIDE):
                     b.theta[k, j] = linkage_lanes.ring_angle(
@@ -225,24 +246,21 @@ def _linkage_blocks(
                 else:
                     for j in range(WIDE):
                         b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], False)
-                if rubbed:
+                if first >= 0:
                     for j in range(WIDE):
-                        z, b.theta[k, j] = stem.follow(
-                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], True
-                        )
-                        _put_stem_state(b, k, j, z)
+                        b.theta[k, j] += b.ring_adds[k, j]
+                if first >= 0 and rubbed:
+                    _follow(b, k, t_oil[m], t[m], True, True)
+                elif first >= 0:
+                    _follow(b, k, t_oil[m], t[m], False, True)
+                elif rubbed:
+                    _follow(b, k, t_oil[m], t[m], True, False)
                 else:
-                    for j in range(WIDE):
-                        z, b.theta[k, j] = stem.follow(
-                            _stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil[m], t[m], False
-                        )
-                        _put_stem_state(b, k, j, z)
-                for j in range(WIDE):
-                    vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]))
-                    before = vane if m == 0 else b.before[k, j]
-                    slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
-                    b.pot[k, j] = b.pot[k, j] if m == 0 else slow
-                    b.before[k, j] = vane
+                    _follow(b, k, t_oil[m], t[m], False, False)
+                if first >= 0:
+                    _read(b, k, m, True)
+                else:
+                    _read(b, k, m, False)
                 for j in range(last):
                     out[order[j0 + j], k, m] = b.pot[k, j]
         for j in range(last):
@@ -251,3 +269,54 @@ def _linkage_blocks(
             for k in range(b.pot.shape[0]):
                 stem.stored(s, q, k, _stem_state(b, k, j))
                 s[POT + k, q] = b.pot[k, j]
+
+
+@inlined
+def _follow(b: Any, k: int, t_oil: float, t: float, rubbed: bool, curved: bool) -> None:
+    """Let the rings of stage ``k`` follow their drives."""
+    for j in range(WIDE):
+        more = b.play_adds[k, j] if curved else 0.0
+        z, b.theta[k, j] = stem.follow(_stem_state(b, k, j), _stem(b, k, j), b.theta[k, j], t_oil, t, rubbed, more)
+        _put_stem_state(b, k, j, z)
+
+
+@inlined
+def _read(b: Any, k: int, m: int, curved: bool) -> None:
+    """Let the potentiometers of stage ``k`` follow their vanes at sample ``m``."""
+    for j in range(WIDE):
+        vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]))
+        if curved:
+            vane = vane * max(1.0 + b.pot_times[k, j], curve.LEAST) + b.pot_adds[k, j]
+        before = vane if m == 0 else b.before[k, j]
+        slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
+        b.pot[k, j] = b.pot[k, j] if m == 0 else slow
+        b.before[k, j] = vane
+
+
+@inlined
+def _bend(
+    b: Any, p: np.ndarray, q: int, known: np.ndarray, m: int, tables: np.ndarray, lanes: np.ndarray
+) -> None:  # fmt: skip
+    """What the curves of these ``lanes`` give at sample ``m``; ``q``: one of them that has any."""
+    for j in range(WIDE):
+        b.lvdt_adds[j] = b.lvdt_times[j] = b.crank_adds[j] = 0.0
+    for k in range(b.pot.shape[0]):
+        for j in range(WIDE):
+            b.ring_adds[k, j] = b.play_adds[k, j] = b.pot_adds[k, j] = b.pot_times[k, j] = 0.0
+    for c in range(len(tables)):
+        site = site_of(p, q, c)
+        if site == curve.LVDT_ADDS:
+            gives(b.lvdt_adds, p, q, c, known, m, m, tables, lanes)
+        elif site == curve.LVDT_TIMES:
+            gives(b.lvdt_times, p, q, c, known, m, m, tables, lanes)
+        elif site == curve.CRANK_ADDS:
+            gives(b.crank_adds, p, q, c, known, m, m, tables, lanes)
+        for k in range(b.pot.shape[0]):
+            if site in (curve.RING_ADDS, curve.RING_ADDS + 1 + k):
+                gives(b.ring_adds[k], p, q, c, known, m, m, tables, lanes)
+            elif site in (curve.PLAY_ADDS, curve.PLAY_ADDS + 1 + k):
+                gives(b.play_adds[k], p, q, c, known, m, m, tables, lanes)
+            elif site == curve.POT_ADDS + 1 + k:
+                gives(b.pot_adds[k], p, q, c, known, m, m, tables, lanes)
+            elif site == curve.POT_TIMES + 1 + k:
+                gives(b.pot_times[k], p, q, c, known, m, m, tables, lanes)

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from plant import electromechanical, lanes
+from plant import curve, electromechanical, lanes
 from plant.chain import measured_stroke, true_stroke
+from plant.curve_lanes import first_curved, tables_of
 from plant.effects import aero_load
 from plant.parameters import motor_steps
 from plant.places import AERO_LOAD, SCREW_PITCH_ERROR, TACHO_THERMAL_DRIFT
+from plant.stages.bends import BENT, bend_drive, bend_reading
 from plant.stages.blocks import W, between, put_where_seen
 from vaneloop.base.compiled import compiled_free, inlined
 
@@ -22,8 +24,9 @@ CALLED = (
     "motor_torque_constant_error", "screw_friction", "screw_pitch_error", "tacho_thermal_drift",
 )  # fmt: skip
 BLOCK = lanes.block(
-    W, electromechanical.MotorState, electromechanical.Motor, more=("aero", "torque_of_load", "most", "logged")
-)
+    W, electromechanical.MotorState, electromechanical.Motor,
+    more=("aero", "i_cmd", "torque_of_load", "most", "logged", *BENT),
+)  # fmt: skip
 _motor_state, _put_motor_state = (
     lanes.getter(electromechanical.MotorState),
     lanes.putter(electromechanical.MotorState),
@@ -44,8 +47,11 @@ def run(
     window: int,
     order: np.ndarray,
     block: np.ndarray,
+    known: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`."""
+    """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`; ``known``:
+    signals of curves (`plant.curve.take`).
+    """
     n, substeps = current.shape
     many = motor_steps(dt / substeps)
     h = dt / (substeps * many)
@@ -60,6 +66,9 @@ def run(
             b.aero[j] = p[AERO_LOAD, q]
             _put_motor_state(b, j, electromechanical.taken(s, q))
             _put_motor(b, j, electromechanical.prepare(p, q, t_oil[0]))
+        some = order[j0 : j0 + last]
+        first = first_curved(p, some)
+        tables = tables_of(p, max(first, 0), some, W)
         for k in range(n):
             if k > 0:
                 speed, warm = between(n_r, k), between(t_oil, k)
@@ -69,27 +78,42 @@ def run(
                 for j in range(W):
                     force = aero_load.step(speed, b.aero[j])
                     b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
-                if swaying:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], many, h, True)
-                else:
-                    for m in range(substeps):
-                        _substep(b, current[k, m], many, h, False)
+                for m in range(substeps):
+                    for j in range(W):
+                        b.i_cmd[j] = current[k, m]
+                    if first >= 0:
+                        bend_drive(b, p, first, known, k, current[k, m], tables, some)
+                        for j in range(W):
+                            b.i_cmd[j] += b.current_adds[j]
+                            force = aero_load.step(speed, b.aero[j]) + b.load_adds[j]
+                            b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
+                    if swaying:
+                        _substep(b, many, h, True)
+                    else:
+                        _substep(b, many, h, False)
+            if first >= 0:
+                bend_reading(b, p, first, known, k, tables, some)
             if window > 0 and k % window == 0:
                 for j in range(last):
-                    put_where_seen(b, j, true_stroke(x_lvdt[k], p, order[j0 + j], t_oil[k]), k == 0)
+                    seen = x_lvdt[k]
+                    if first >= 0:
+                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                    put_where_seen(b, j, true_stroke(seen, p, order[j0 + j], t_oil[k]), k == 0)
             for j in range(last):
-                out[order[j0 + j], k] = measured_stroke(b.reading[j], p, order[j0 + j], t_oil[k])
+                reading = measured_stroke(b.reading[j], p, order[j0 + j], t_oil[k])
+                if first >= 0:
+                    reading = reading * max(1.0 + b.lvdt_times[j], curve.LEAST) + b.lvdt_adds[j]
+                out[order[j0 + j], k] = reading
         for j in range(last):
             electromechanical.stored(s, order[j0 + j], _motor_state(b, j))
 
 
 @inlined
-def _substep(b: Any, i_cmd: float, many: int, h: float, swaying: bool) -> None:
+def _substep(b: Any, many: int, h: float, swaying: bool) -> None:
     """One plant step of every lane of the block, in ``many`` steps of the motor."""
     for _ in range(many):
         for j in range(W):
             z, d = _motor_state(b, j), _motor(b, j)
-            _put_motor_state(b, j, electromechanical.step(z, d, i_cmd, b.torque_of_load[j], b.most[j], h, swaying))
+            _put_motor_state(b, j, electromechanical.step(z, d, b.i_cmd[j], b.torque_of_load[j], b.most[j], h, swaying))
     for j in range(W):
         _put_motor_state(b, j, electromechanical.sense(_motor_state(b, j), _motor(b, j)))
