@@ -26,7 +26,7 @@ from plant.linkage import (
     ring_angle_of_vane,
     vane_angle,
 )
-from plant.parameters import GEOMETRY, PLAY, POT_BIAS, AnyPlantTable, Supply, derive, load_plant
+from plant.parameters import GEOMETRY, PLAY, POT_BIAS, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
 from vaneloop.base.vanes import own_rows, same_stages
 
 if TYPE_CHECKING:
@@ -66,6 +66,11 @@ class Plant:
     def vanes(self) -> tuple[str, ...]:
         """The machine's stages, in order."""
         return self.geometry.vanes
+
+    @cached_property
+    def nominal(self) -> list[Nominal]:
+        """Every named parameter (`plant.parameters.nominal`)."""
+        return nominal(self.table, self.geometry)
 
     @cached_property
     def rows(self) -> np.ndarray:

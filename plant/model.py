@@ -42,7 +42,7 @@ from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
-from plant.parameters import Nominal, derive, nominal
+from plant.parameters import Nominal, derive
 from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
@@ -240,7 +240,7 @@ class Model(Table):
         if system := self.meta.get("system"):
             raise InputError(f"{source}: is a model of the system {system!r}; --system says where that is")
         self._check_curves(plant, source)
-        known = {n.name: n for n in nominal(plant.table, plant.geometry)}
+        known = {n.name: n for n in plant.nominal}
         for name, value in self.parameters.items():
             if name not in known:
                 raise InputError(
@@ -312,7 +312,7 @@ class Model(Table):
         machine = base or build_plant()
         self.check(machine)
         p = machine.p.copy()
-        known = {n.name: n for n in nominal(machine.table, machine.geometry)}
+        known = {n.name: n for n in machine.nominal}
         for name, value in self.parameters.items():
             row = known[name].row
             p[row] = value * known[name].si

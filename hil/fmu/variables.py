@@ -20,7 +20,6 @@ from plant import Model, Plant
 from plant.effects import EFFECTS
 from plant.layout import PLAY
 from plant.model import allowed_of
-from plant.parameters import nominal
 from vaneloop.base.vanes import MOST
 
 __all__ = ["FIXED", "INPUT", "OUTPUT", "PARTS", "REAL", "TIME", "TRUTH", "TUNABLE", "WHOLE", "Variable", "variables_of"]
@@ -146,7 +145,7 @@ def _signals(part: str, plant: Plant, memory: np.ndarray, shape: Shape) -> Itera
 def _machine(plant: Plant, model: Model, shape: Shape) -> Iterator[Variable]:
     """The nominal machine's numbers, as a model file's [parameters] has them."""
     p = places_of(shape)["p"].at
-    for n in nominal(plant.table, plant.geometry):
+    for n in plant.nominal:
         low, high = allowed_of(plant, n)
         section, key = n.name.split(".", 1)
         ratio = 1.0

@@ -36,7 +36,6 @@ from hil.inject.actions import Replay
 from hil.inject.scenario import Scenario, library, load_scenario
 from plant import Model, Plant, load_model
 from plant.effects import EFFECTS
-from plant.parameters import nominal
 from vaneloop.base.errors import InputError, meant
 from vaneloop.base.tables import Finite, Table, read
 from vaneloop.verbs.machine import Machine
@@ -208,7 +207,7 @@ def scenario_of(files: dict[str, str], g: Group) -> Scenario:
 
 def varied(plan: Plan, plant: Plant, source: str | Path) -> list[Varied]:
     """What a plan varies, with units and limits. Raises InputError for what the machine does not have."""
-    known = {n.name: n for n in nominal(plant.table, plant.geometry)}
+    known = {n.name: n for n in plant.nominal}
     effects = {f"{e}.{p.name}": p for e, effect in EFFECTS.items() if plant.kind in effect.kinds
                for p in plant.parameters_of(e).values()}  # fmt: skip
     out = []

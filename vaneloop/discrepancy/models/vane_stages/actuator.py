@@ -80,7 +80,8 @@ def actuator_stage(driven: Driven) -> Stage:
     stage.raster_error = np.array([SIMPLER[machine.kind]])
     if others is not i:
         stage.hidden = hidden
-        stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
+        if not driven.again:
+            stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
 
     def kept(at: Array) -> Array:
         keep = run[at]

@@ -12,7 +12,6 @@ from plant import chain
 from plant.curve import PLACES, Place, at_curve, quantity_of
 from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
-from plant.parameters import nominal
 from plant.stages import run_bends
 from vaneloop.base.vanes import VANES, vane_in
 from vaneloop.discrepancy.models.curve import Curve
@@ -57,7 +56,7 @@ def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[E
     to SI. Its curves are the last effects; they have no rows.
     """
     machine = driven.machine
-    known = {n.name: n for n in nominal(machine.table, machine.geometry)}
+    known = {n.name: n for n in machine.nominal}
     parameters, rows, si = [], [], []
     for name in FREE[stage]:
         if name not in known:

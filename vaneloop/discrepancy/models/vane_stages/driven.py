@@ -36,6 +36,7 @@ class Driven(NamedTuple):
     curves               what may be tried besides: curves as they run, and as the search has them
     turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
     part_of              of an excerpt: the whole, and which of its rows these are
+    again                whether the stage has been made of this log before: its noise is taken over from there
     """
 
     t: Array
@@ -49,6 +50,7 @@ class Driven(NamedTuple):
     curves: tuple[tuple[Placed, Effect], ...] = ()
     turns: Callable[[], dict[str, Array]] = dict
     part_of: tuple[Driven, Array | slice] | None = None
+    again: bool = False
 
     def at(self, rows: Array | slice, columns: dict[str, Array], run: Array) -> Driven:
         """Some of the rows, with their ``columns``, and which of them count."""
@@ -157,7 +159,7 @@ def excerpts(
 
     def excerpt(at: Array) -> Stage:
         columns = {k: v[at] for k, v in driven.columns.items()}
-        part = make(driven.at(at, columns, keep(at)))
+        part = make(driven.at(at, columns, keep(at))._replace(again=True))
         part.floor, part.quiet, part.noise = stage.floor, stage.quiet, stage.noise
         part.raster_error, part.memory = stage.raster_error, stage.memory
         return part

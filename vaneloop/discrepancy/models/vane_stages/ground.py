@@ -118,7 +118,7 @@ def remade(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, Eff
     """A stage of the vane chain with only these laws of the library, and these curves, as effects."""
     assert isinstance(stage.made, Made)
     make, driven = stage.made
-    out = make(driven._replace(laws=tuple(laws), curves=tuple(curves)))
+    out = make(driven._replace(laws=tuple(laws), curves=tuple(curves), again=True))
     for name in ("floor", "quiet", "noise", "raster_error", "memory", "regimes", "regime_units", "grain"):
         setattr(out, name, getattr(stage, name))
     return out
@@ -158,7 +158,7 @@ class VaneGround:
 
     points, jumps = POINTS, False  # as the plant's rows have them
     noise_known = True
-    shares = False  # its stages run many lanes at one time themselves
+    shares = True
     surfaces = False  # a curve is rows of the plant's parameters, of one signal
 
     def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):

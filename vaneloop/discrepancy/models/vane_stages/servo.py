@@ -46,6 +46,10 @@ def servo_stage(driven: Driven) -> Stage:
         np.where(run & near, c["i_cmd"], np.nan)[None],
         window=WINDOW,
     )
+    stage.lost = hidden[:, None]
+    stage.made = Made(servo_stage, driven)
+    if driven.again:
+        return stage
     # the part of the hidden error that moves too slowly to be seen as noise in the stage's error; two estimates of one
     # noise are one noise
     drawn = float(np.mean([noise_floor(t, h) for h in hidden]))
@@ -53,6 +57,4 @@ def servo_stage(driven: Driven) -> Stage:
     seen = own if own < (1.0 + KNOWN_TO) * drawn else drawn
     whole = np.mean([rms(stage, h[None]) ** 2 for h in hidden], axis=0)
     stage.raster_error = np.sqrt(np.maximum(whole - seen**2, 0.0))
-    stage.lost = hidden[:, None]
-    stage.made = Made(servo_stage, driven)
     return stage
