@@ -47,8 +47,13 @@ BESIDE = {
 }  # fmt: skip
 
 
-def random_signals(rng: np.random.Generator, of: list[str]) -> np.ndarray:
-    """What curves are of, SI: smooth, and of each channel's size."""
+def size_of(place: Place) -> float:
+    """How large a curve there may be, in its unit."""
+    return {"-": 0.4, "mm": 0.3, "deg": 0.4, "mA": 1.0, "N": 800.0, "%": 3.0}[place.unit]
+
+
+def random_signals(rng: np.random.Generator, at: list[Place], of: list[str]) -> np.ndarray:
+    """What curves are of, and what hystereses give, SI: smooth, and of each channel's size."""
     curves, slipping = len(of), any("stops" in name for name in of)
     rows = KNOWN + (LANES * curves if slipping else curves)
     phase, pace = rng.uniform(0.0, 6.0, (rows, 1)), rng.uniform(1.0, 9.0, (rows, 1))
@@ -56,8 +61,10 @@ def random_signals(rng: np.random.Generator, of: list[str]) -> np.ndarray:
     si = np.ones((rows, 1))
     for q in QUANTITIES.values():
         si[q.of] = q.si
-    if slipping:  # a lag is the same in all lanes
-        for c in (c for c, name in enumerate(of) if "stops" not in name):
+    for c, (place, name) in enumerate(zip(at, of, strict=True)):
+        if "stops" in name:
+            si[KNOWN + c :: curves] = size_of(place) * place.si
+        else:  # a lag is the same in all lanes
             wave[KNOWN + c :: curves] = wave[KNOWN + c]
     return wave * si
 
@@ -71,8 +78,9 @@ def machines(rng: np.random.Generator, kind: str, at: list[Place], of: list[str]
         q = quantity_of(name)
         assert q is not None
         low, high = (0.0, 1.3) if q.stops else (-0.8, 0.9)
-        size = {"-": 0.4, "mm": 0.3, "deg": 0.4, "mA": 1.0, "N": 800.0, "%": 3.0}[place.unit]
-        at_curve(p, place, q, low, high, size * rng.standard_normal((POINTS, LANES)).cumsum(axis=0) / POINTS**0.5)
+        at_curve(
+            p, place, q, low, high, size_of(place) * rng.standard_normal((POINTS, LANES)).cumsum(axis=0) / POINTS**0.5
+        )
     p[CURVES:, bare] = plant.p[CURVES:]
     for name in effects:
         for row, q in plant.parameters_of(name).items():
@@ -127,7 +135,7 @@ def test_side_by_side_as_lane_by_lane(stage: str, kind: str, data: st.DataObject
 
     def run() -> list[np.ndarray]:
         rng = np.random.default_rng(seed)
-        known = random_signals(rng, of)
+        known = random_signals(rng, at, of)
         return outputs(stage, machines(rng, kind, at, of, effects), kind, rng, known)
 
     together = run()
@@ -149,7 +157,7 @@ def test_lanes_with_other_curves_run_alone() -> None:
     p[row, 4] *= 2.0
     curved = p[CURVES] != 0.0
     assert (actuator.alike(p) == (curved & (np.arange(LANES) != 4))).all()
-    known = random_signals(rng, ["i_cmd"])
+    known = random_signals(rng, [place], ["i_cmd"])
     got = outputs("actuator", p, "hydraulic", np.random.default_rng(1), known)[0]
     for j in (3, 4, 5):
         one = np.repeat(p[:, j : j + 1], LANES, axis=1)
