@@ -293,7 +293,7 @@ def test_what_a_bound_stops_the_curve_takes_over(size: float, sign: float) -> No
     low, high = before.bounds()
     at_bound = bool(np.any(np.minimum(fit.theta - low, high - fit.theta) <= 1e-7))
     assert len(starts) == 1 + at_bound
-    left, theta = min((best_step(fit, curve, judge((curve,)), *s) for s in starts), key=lambda s: s[0])
+    left, theta, _ = min((best_step(fit, curve, judge((curve,)), *s) for s in starts), key=lambda s: s[0])
     assert np.all(np.abs(theta[:2] - (1.0, 0.5)) <= 0.1 + 1e-12)
     assert left - len(t) < 0.01 * float(np.sum(before.errors(fit.theta[None]) ** 2))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,8 @@ __all__ = ["screened"]
 FEW = 8  # steps of a fit
 OFF = (0.0, -0.25, 0.25)  # turns over the whole way by which a period along a channel may be off
 PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
+KEPT = 0.5  # of what slopes promise that a step must bring; else a place is too crooked to be ranked by it
+CROOKED = 24  # of such candidates, those that are promised most are fitted for `FEW` steps
 Promise = tuple[float, Candidate, Array]  # what a candidate would leave, and parameters to begin from
 Starts = Sequence[tuple[Array, Slopes]]
 
@@ -39,20 +41,46 @@ def screened(learner: Learner, current: Tried, many: int, apart: float) -> tuple
     starts = starts_of(learner._judge((), current.curves, True), current.fit)
     bare = starts[0][1].left(starts[0][1].error)[0]
     every = [c for c in (*learner.candidates, *_periodic(learner, current)) if not stands(current, c)]
-    out = sorted(learner.each(lambda c: _promise(learner, current, c, starts), every), key=lambda o: o[0])
+    steps = list(learner.each(lambda c: _promise(learner, current, c, starts), every))
+    out = _straightened(learner, current, bare, steps, many)
+    first = learner.each(lambda one: _its_lag(learner, current, one, starts, apart), _one_lag(out)[:many])
+    return bare, sorted(first, key=lambda o: o[0])
+
+
+def _one_lag(promises: Iterable[Promise]) -> list[Promise]:
+    """The first of several lags of a channel at one place, and the channel itself."""
     best: dict[tuple[str, str, str, bool], Promise] = {}
-    for one in out:  # of several lags of a channel, one
+    for one in promises:
         c = one[1]
         best.setdefault((c.how, c.at, channel_of(c), channel_of(c) == c.quantity.name), one)
-    first = learner.each(lambda one: _its_lag(learner, current, one, starts, apart), list(best.values())[:many])
-    return bare, sorted(first, key=lambda o: o[0])
+    return list(best.values())
+
+
+def _straightened(
+    learner: Learner, current: Tried, bare: float, steps: Sequence[tuple[Promise, float]], many: int
+) -> list[Promise]:
+    """All candidates, best first; those fitted for some steps that one step does no justice. A tank's level goes with
+    one over its outflow: where that is off by half, no step by slopes brings what its gain can.
+    """
+    out = sorted((p for p, _ in steps), key=lambda o: o[0])
+    limit = out[min(many, len(out)) - 1][0] if out else 0.0
+    poor = [(said, p) for p, said in steps if said < limit and bare - p[0] < KEPT * (bare - said)]
+    chosen = _one_lag(p for _, p in sorted(poor, key=lambda o: o[0]))[:CROOKED]
+
+    def fitted(p: Promise) -> Promise:
+        begin = p[2] if p[0] < bare else np.append(current.fit.theta, np.zeros(len(p[2]) - len(current.fit.theta)))
+        few = learner._fitted(current, p[1], SCREENED, begin, FEW, True).fit
+        return min(p, (float(few.cost.sum()), p[1], few.theta), key=lambda o: o[0])
+
+    gone = {id(p) for p in chosen}
+    return sorted([*learner.each(fitted, chosen), *(p for p in out if id(p) not in gone)], key=lambda o: o[0])
 
 
 def _its_lag(learner: Learner, current: Tried, one: Promise, starts: Starts, apart: float) -> Promise:
     """A candidate with the lag that promises most."""
     for factor in (apart, 1.0 / apart) if one[1].quantity.remembers else ():
         while (c := one[1].slower(factor)) is not None and not stands(current, c):
-            other = _promise(learner, current, c, starts)
+            other, _ = _promise(learner, current, c, starts)
             if other[0] >= one[0]:
                 break
             one = other
@@ -112,9 +140,9 @@ def _in_time(
     return out
 
 
-def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Starts) -> Promise:
+def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Starts) -> tuple[Promise, float]:
     """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from where
-    that leaves least.
+    that leaves least; and what the slopes there say that it leaves.
 
     Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
     """
@@ -122,7 +150,7 @@ def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Sta
     judge = learner._judge((), (*current.curves, (candidate.placed(), effect)), True)
     slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
     steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
-    left, theta = min(steps, key=lambda s: s[0])
+    left, theta, promised = min(steps, key=lambda s: s.left)
     if candidate.quantity.period and within_no_period(candidate.quantity.name) != TIME:
         # along what the model simulates a wave shifts its own phase: one whole step may leave more than none
         begin = np.append(current.fit.theta, np.zeros(len(effect.parameters)))
@@ -131,5 +159,5 @@ def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Sta
             c = candidate.slower(1.0 + turns * candidate.quantity.period / candidate.quantity.span) or candidate
             few = learner._fitted(current, c, SCREENED, begin, FEW, True).fit
             best = min(best, (float(few.cost.sum()), c, few.theta), key=lambda o: o[0])
-        return best
-    return left, candidate, theta
+        return best, best[0]
+    return (left, candidate, theta), promised

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vaneloop.discrepancy.carried import bounded_step
@@ -9,9 +11,17 @@ from vaneloop.discrepancy.fit import Fit, Judge
 from vaneloop.discrepancy.promise import Slopes
 from vaneloop.discrepancy.stage import Array, Effect
 
-__all__ = ["best_step", "starts_of"]
+__all__ = ["Step", "best_step", "starts_of"]
 
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
+
+
+class Step(NamedTuple):
+    """What the best step leaves, where it leads, and what the slopes say that the boldest step leaves."""
+
+    left: float
+    theta: Array
+    promised: float
 
 
 def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
@@ -31,11 +41,8 @@ def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
     return [(theta, Slopes(judge, theta, fit.free, fit.prior)) for theta in starts]
 
 
-def best_step(
-    fit: Fit, effect: Effect, judge: Judge, begin: Array, slopes: Slopes, cut_off: bool = False
-) -> tuple[float, Array]:
-    """What the best step from ``begin`` with ``effect``, the last of the judge's stage, leaves; and the parameters
-    then.
+def best_step(fit: Fit, effect: Effect, judge: Judge, begin: Array, slopes: Slopes, cut_off: bool = False) -> Step:
+    """The best step from ``begin`` with ``effect``, the last of the judge's stage.
 
     cut_off  a step beyond bounds ends there; else what a bound stops, others take over
     """
@@ -50,7 +57,8 @@ def best_step(
     prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
     deviation = (theta - judge.stage.neutral())[free] / scale
     a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
-    trials = np.repeat(theta[None], len(DAMPED), axis=0)
+    trials, promised = np.repeat(theta[None], len(DAMPED), axis=0), np.inf
+    here = float(judge.totals(slopes.error[None], theta[None])[0])
     low, high = judge.bounds()
     for row, damping in zip(trials, DAMPED, strict=True):
         stiff, room = a + damping * np.diag(np.diag(a)), [(b - theta)[free] / scale for b in (low, high)]
@@ -58,6 +66,8 @@ def best_step(
         if not cut_off and np.any((step < room[0]) | (step > room[1])):
             step = bounded_step(stiff, g, *room)
         row[free] = np.clip(row[free] + step * scale, low[free], high[free])
+        gone = (row[free] - theta[free]) / scale
+        promised = min(promised, here - 2.0 * float(g @ gone) + float(gone @ a @ gone))
     left = judge.totals(judge.errors(trials), trials)
     k = int(np.argmin(left))
-    return float(left[k]), trials[k]
+    return Step(float(left[k]), trials[k], promised)
