@@ -273,7 +273,7 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
     monkeypatch.setattr(diagnose, "Judge", judge)
     monkeypatch.setattr(diagnose, "recalibrate", lambda _: nothing)
     for n in (59_999, 60_000, 200_000):
-        whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, coarse={})
+        whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, coarse={}, counted=None)
         whole.excerpt = lambda at: SimpleNamespace(t=at)
         diagnose.diagnose_stage(whole, np.ones(1))
     assert seen == [59_999, 40_000, 40_000]

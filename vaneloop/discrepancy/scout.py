@@ -16,11 +16,12 @@ import numpy as np
 from vaneloop.discrepancy.fit import Fit, Judge, Task
 from vaneloop.discrepancy.noise_floor import NATS, NoiseFloor, rival_nats
 from vaneloop.discrepancy.search import DIRECTIONS, SCREENED, Criterion, Search
-from vaneloop.discrepancy.stage import Array, Effect
+from vaneloop.discrepancy.stage import Array, Effect, Stage
 
 __all__ = ["Scouted", "excerpt_of", "searched", "spread"]
 
 AHEAD = 8_000  # samples of the excerpt, about
+LITTLE = 0.5  # of what counts in the best piece: a piece with less tells little
 PIECE = 500  # samples in a row: many short pieces are more like the log than few long ones
 ALONE, BESIDE = 12, 8  # effects that are fitted alone, and beside others: those that promise most on the whole log
 LEAST = 0.5  # share of what an effect must gain (`NATS`) that it must promise, or it is not fitted
@@ -275,21 +276,33 @@ def _tried(effect: Effect) -> list[tuple[float, ...]]:
 
 def excerpt_of(judge: Judge, fit: Fit | None, piece: int, searched: int) -> Array:
     """Samples to search on, about ``searched``: pieces of whole windows, about ``piece`` long, half of them evenly
-    spaced, the others where ``fit`` fails most; without a fit the first half only.
+    spaced, the others where ``fit`` fails most; without a fit the first half only. Pieces of which little counts tell
+    little, such as those of a linkage that stands.
     """
     stage = judge.stage
     n = len(stage.t)
     dt = float(np.median(np.diff(stage.t)))
     window = max(1, round((stage.window or dt) / dt))
     length = max(1, round(piece / window)) * window
-    pieces = n // length
+    pieces, many = n // length, max(2, searched // length)
+    told = _telling(stage, length, pieces, many)
     worst: list[int] = []
     if fit is not None:
         squares = np.sum(judge.errors(fit.theta[None])[0] ** 2, axis=0)
         cost = squares[: pieces * length].reshape(pieces, length).sum(axis=1)
-        worst = np.argsort(-cost).tolist()
-    chosen = spread(pieces, max(2, searched // length), worst)
-    return (np.array(chosen)[:, None] * length + np.arange(length)).reshape(-1)
+        worst = np.argsort(-cost[told]).tolist()
+    chosen = told[spread(len(told), many, worst)]
+    return np.asarray((chosen[:, None] * length + np.arange(length)).reshape(-1))
+
+
+def _telling(stage: Stage, length: int, pieces: int, many: int) -> Array:
+    """Those pieces of so many samples that count for at least half as much as the best; at least ``many``."""
+    if stage.counted is None:
+        return np.arange(pieces)
+    rows = np.arange(length)
+    counts = np.array([np.count_nonzero(stage.counted(k * length + rows)) for k in range(pieces)])
+    least = min(LITTLE * counts.max(), np.sort(counts)[-min(many, pieces)])
+    return np.flatnonzero(counts >= least)
 
 
 def spread(pieces: int, many: int, wanted: Iterable[int]) -> list[int]:

@@ -121,6 +121,7 @@ class Stage:
     carries   slopes are carried along the steps of a fit (`vaneloop.discrepancy.carried`)
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
+    counted   function from such indices to bool[samples]: which of them count in an excerpt of them, where not all do
     grain     log error that counts as much as 1 does far from the noise: less, where a known noise tells laws apart
     made      how and from what it was made, for who makes others like it
     """
@@ -151,6 +152,7 @@ class Stage:
     quick: bool = False
     carries: bool = False
     excerpt: Callable[[Array], Stage] | None = None
+    counted: Callable[[Array], Array] | None = None
     grain: float = 1.0
     made: object = None
 

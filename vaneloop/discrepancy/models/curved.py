@@ -378,6 +378,7 @@ class OwnGround:
 
     points, jumps, surfaces = FINE, True, True
     noise_known = False
+    measured: frozenset[str] = frozenset()  # states are as the model simulates them
 
     def __init__(self, logs: Logs):
         self.shares = logs.fitted.system.kind in ("simulate", "closed_loop")

@@ -34,6 +34,7 @@ DEGREES = ("degC", "°C", "C")
 FAR = 100.0  # times the curve's range that a formula's may be
 SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
 MEANT = 2_000  # values of a quantity of which a formula's mean is taken
+NOTHING = 1e-200  # RMS of a formula where the logs have been, below which it says nothing there
 STEEPER = 10.0  # times the steepest slope where the logs have been: beyond, a formula runs away
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
@@ -179,10 +180,11 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
 
     def size(inner: Array) -> float:
         y = form.value(been, np.concatenate([[1.0], inner]))
-        return max(float(np.sqrt(np.mean(y * y))), 1e-300)
+        return float(np.sqrt(np.mean(y * y)))
 
     def plain(n: Array) -> Array:
-        return np.concatenate([[n[0] / size(n[1:])], n[1:]])
+        of = size(n[1:])  # 0 where a corner has left the logs
+        return np.concatenate([[n[0] / of if of > NOTHING else 0.0], n[1:]])
 
     reach = goes_on(ground, c, form, numbers)  # what a model says to a reading may lie beyond what the logs show of it
     numbers = np.concatenate([[numbers[0] * size(numbers[1:])], numbers[1:]])

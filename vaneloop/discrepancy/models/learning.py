@@ -326,7 +326,7 @@ class Learner:
         where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
         little more.
         """
-        plain_ones = [t for t in good if strange(t.candidate) <= MEASURED]
+        plain_ones = [t for t in good if strange(t.candidate) <= MEASURED and not self._echoes(t.candidate)]
         best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
         if best is None or self.fails(best):
             return
@@ -334,6 +334,12 @@ class Learner:
             (_, worse), (_, fit) = (self._judged(one, [t, best]) for one in (t, best))
             if surely_more((worse.held_out - fit.held_out)[self.judge.samples > 0]):
                 left[t.candidate.name] = max(left[t.candidate.name], left[best.candidate.name] + 2.0 * RIVAL)
+
+    def _echoes(self, candidate: Candidate) -> bool:
+        """Whether a curve is of what the stage itself gives elsewhere, as measured: with that goes its noise, and a
+        little of that off the error.
+        """
+        return channel_of(candidate) in self.ground.measured and strange(candidate) > 0
 
     def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and

@@ -50,12 +50,14 @@ class Ground(Protocol):
     tests  names of the logs that nothing is fitted to
     points of the table of a formula; ``jumps``: whether curves may jump; ``surfaces``: whether functions of two
            quantities can run; ``noise_known``: whether the model may come down to a noise that is known;
+           ``measured``: outputs of which curves may be a function, as they were measured;
            ``shares``: whether it runs in compiled loops, which threads can share out among candidates
     """
 
     whole: Stage
     floor: Array
     tests: frozenset[str]
+    measured: frozenset[str]
     points: int
     jumps: bool
     surfaces: bool

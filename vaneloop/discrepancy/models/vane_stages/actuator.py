@@ -89,6 +89,7 @@ def actuator_stage(driven: Driven) -> Stage:
             keep[b : b + window] = False
         return keep
 
+    stage.counted = kept
     stage.excerpt, stage.made = excerpts(actuator_stage, driven, stage, kept), Made(actuator_stage, driven)
     return stage
 

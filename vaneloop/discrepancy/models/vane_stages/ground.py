@@ -166,6 +166,7 @@ class VaneGround:
         self.driven, self.all, self.test = stage.made.driven, stage, test
         self.floor = stage.floor if floor is None else floor
         self.tests: frozenset[str] = frozenset()
+        self.measured = frozenset(stage.outputs) & frozenset(VANES)
         self.whole = stage
         judge = Judge(stage, stage.floor)
         fit = judge.fit((), stage.neutral(), 1)

@@ -70,6 +70,7 @@ def linkage_stage(driven: Driven) -> Stage:
                 keep[piece[-last:]] = False
         return keep
 
+    stage.counted = kept
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage
 
