@@ -271,8 +271,8 @@ def test_nothing_missing_nothing_learned(tmp_path) -> None:
     assert read_log(tmp_path / "l.parquet")
 
 
-def rig_chain(hidden: list[rig.Hidden], n_dem: np.ndarray | None = None) -> Chain:
-    test = rig.manoeuvre(5, 60.0)
+def rig_chain(hidden: list[rig.Hidden], n_dem: np.ndarray | None = None, duration: float = 60.0) -> Chain:
+    test = rig.manoeuvre(5, duration)
     run = rig.simulate(test if n_dem is None else replace(test, n_dem=n_dem), firmware(), hidden, seed=5, rate=100)
     return build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
 

@@ -34,7 +34,8 @@ Starts = Sequence[tuple[Array, Slopes]]
 
 
 def screened(learner: Learner, current: Tried, many: int, apart: float) -> tuple[float, list[Promise]]:
-    """What a step of the model's own parameters leaves; and the ``many`` best candidates, best first.
+    """What a step of the model's own parameters leaves; and the ``many`` best candidates, and the best at each other
+    place, best first.
 
     apart  by which times a lag is changed: those that are tried first are far apart
     """
@@ -43,8 +44,21 @@ def screened(learner: Learner, current: Tried, many: int, apart: float) -> tuple
     every = [c for c in (*learner.candidates, *_periodic(learner, current)) if not stands(current, c)]
     steps = list(learner.each(lambda c: _promise(learner, current, c, starts), every))
     out = _straightened(learner, current, bare, steps, many)
-    first = learner.each(lambda one: _its_lag(learner, current, one, starts, apart), _one_lag(out)[:many])
+    each = _one_lag(out)
+    chosen = each[:many] if learner.ground.noise_known else [*each[:many], *_best_elsewhere(each[:many], each[many:])]
+    first = learner.each(lambda one: _its_lag(learner, current, one, starts, apart), chosen)
     return bare, sorted(first, key=lambda o: o[0])
+
+
+def _best_elsewhere(chosen: Sequence[Promise], others: Sequence[Promise]) -> list[Promise]:
+    """The best of each place that none of the ``chosen`` is at: one step says which quantity suits a place, and less
+    which of two places will do more, of which one is crooked and the other is not.
+    """
+    best: dict[tuple[str, str], Promise] = {}
+    for one in (*chosen, *others):
+        best.setdefault((one[1].how, one[1].at), one)
+    have = {id(one) for one in chosen}
+    return [one for one in best.values() if id(one) not in have]
 
 
 def _one_lag(promises: Iterable[Promise]) -> list[Promise]:
