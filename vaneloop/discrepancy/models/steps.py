@@ -13,7 +13,6 @@ from vaneloop.discrepancy.stage import Array, Effect
 
 __all__ = ["Step", "best_step", "starts_of"]
 
-FAR = 3.0  # times its nominal value, or its inverse: so far a parameter is not what its model meant
 DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 
 
@@ -27,7 +26,7 @@ class Step(NamedTuple):
 
 def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
     """Parameters from which a candidate's step is taken, with their slopes: those of the fit; and where what is missing
-    has pulled one of the model's own to a bound, or to `FAR` times its size or less, those that are nominal, too.
+    has pulled one of the model's own to a bound, those that are nominal, too.
 
     Far from the truth a model without what it lacks is bent out of shape, and no step brings it back.
 
@@ -37,9 +36,7 @@ def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
     nominal[:own] = judge.stage.neutral()[:own]
     free = fit.free[fit.free < own]
     room = [np.abs(b - fit.theta)[free] for b in judge.bounds()]
-    ratio = fit.theta[free] / np.where(nominal[free] == 0.0, np.inf, nominal[free])
-    far = (ratio > FAR) | ((ratio < 1.0 / FAR) & (nominal[free] != 0.0))
-    if np.any(far | (np.minimum(*room) <= 1e-6 * judge.scale[free])):
+    if np.any(np.minimum(*room) <= 1e-6 * judge.scale[free]):
         starts.append(nominal)
     return [(theta, Slopes(judge, theta, fit.free, fit.prior)) for theta in starts]
 
