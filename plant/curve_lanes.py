@@ -101,12 +101,21 @@ def on_curve(p: np.ndarray, r: int, q: int, x: float) -> tuple[int, float]:
 
 
 @inlined
+def gives_at(into: Any, p: np.ndarray, q: int, c: int, x: float, tables: np.ndarray) -> None:
+    """Add to ``into`` [lane] what curve ``c`` of lane ``q`` gives where its signal is ``x`` in all lanes."""
+    at, share = on_curve(p, CURVES + 1 + c * CURVE_ROWS, q, x)
+    for j in range(len(into)):
+        a = tables[c, at, j]
+        into[j] += a + share * (tables[c, at + 1, j] - a)
+
+
+@inlined
 def gives(
     into: Any, p: np.ndarray, q: int, c: int, known: np.ndarray, before: int, k: int, tables: np.ndarray,
     lanes: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add to ``into`` [lane] what curve ``c`` gives these ``lanes`` at the mean of samples ``before`` and ``k`` of what
-    is ``known``. ``q``: a lane that has it.
+    """`gives_at` the mean of samples ``before`` and ``k`` of what is ``known``; of a hysteresis, what it gives each of
+    these ``lanes``.
     """
     r = CURVES + 1 + c * CURVE_ROWS
     if p[r + C_STOPS, q] != 0.0:
@@ -115,24 +124,12 @@ def gives(
                 into[j] += known[signal_of(p, lanes[j], c, len(known)), k]
         return
     row = signal_of(p, q, c, len(known))
-    at, share = on_curve(p, r, q, 0.5 * (known[row, before] + known[row, k]))
-    for j in range(len(into)):
-        a = tables[c, at, j]
-        into[j] += a + share * (tables[c, at + 1, j] - a)
-
-
-@inlined
-def gives_at(into: Any, p: np.ndarray, q: int, c: int, x: float, tables: np.ndarray) -> None:
-    """`gives` of a signal that is ``x`` in all lanes."""
-    at, share = on_curve(p, CURVES + 1 + c * CURVE_ROWS, q, x)
-    for j in range(len(into)):
-        a = tables[c, at, j]
-        into[j] += a + share * (tables[c, at + 1, j] - a)
+    gives_at(into, p, q, c, 0.5 * (known[row, before] + known[row, k]), tables)
 
 
 @inlined
 def gives_each(into: Any, p: np.ndarray, q: int, c: int, x: Any, tables: np.ndarray) -> None:
-    """`gives` of a signal that each lane has of its own, ``x`` [lane]."""
+    """`gives_at` of a signal that each lane has of its own, ``x`` [lane]."""
     r = CURVES + 1 + c * CURVE_ROWS
     for j in range(len(into)):
         at, share = on_curve(p, r, q, x[j])
