@@ -74,7 +74,7 @@ __all__ = ["Learner"]
 MOST_CURVES = 2
 WIGGLES = (0.1, SCREENED, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
 QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
-FEW_STEPS, MANY_STEPS = 3, 12  # of the former
+FEW_STEPS, MANY_STEPS = 3, 12  # of the former; on an excerpt more would only suit the excerpt
 FAR_OFF = 5.0  # noise floors: a model that is further off has a crooked way to go, the more so in the right place
 SURE = 3  # of the latter that are chosen by data left out
 SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
@@ -431,7 +431,7 @@ class Learner:
         quick: list[Tried] = []
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
-        steps = MANY_STEPS if bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
+        steps = MANY_STEPS if not self.ground.noise_known and bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
         few = lambda p: self._fitted(current, p[1], SCREENED, p[2], steps, True, near)  # noqa: E731
         for k, t in enumerate(self.each(few, promising)):
             quick.append(t)
