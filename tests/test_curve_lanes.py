@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 
 from plant import build_plant
 from plant.curve import KNOWN, PLACES, QUANTITIES, Place, at_curve, quantity_of
+from plant.curve_lanes import tables_of
 from plant.effects import CURVES, EFFECTS
 from plant.layout import C_LOW, CURVE_ROWS, MOST_CURVES
 from plant.parameters import derive
@@ -37,6 +36,9 @@ SITES = {  # of each stage: where its curves may act, and channels that they may
     "engine": ("engine.",),
     "controller": ("controller.", "servo."),
 }
+ONE_BY_ONE = (
+    (actuator, "_actuator_lanes"), (linkage, "_linkage_lanes"), (engine, "_engine_lanes"), (bends, "_lane_by_lane"),
+)  # fmt: skip
 OF = [q for q in QUANTITIES if q not in VANES]
 # what makes a lane of a block need more than the others
 BESIDE = {
@@ -69,11 +71,15 @@ def random_signals(rng: np.random.Generator, at: list[Place], of: list[str]) -> 
     return wave * si
 
 
-def machines(rng: np.random.Generator, kind: str, at: list[Place], of: list[str], effects: list[str]) -> np.ndarray:
-    """Lanes with the same curves and other tables; every fifth has none, every other one an effect beside."""
+def machines(
+    rng: np.random.Generator, kind: str, at: list[Place], of: list[str], effects: list[str], bare: int = 5
+) -> np.ndarray:
+    """Lanes with the same curves and other tables; one of every ``bare`` has none (0: all have them), every other one
+    an effect beside.
+    """
     plant = build_plant(MACHINES[kind])
     p = np.repeat(plant.p, LANES, axis=1)
-    bare = np.arange(LANES) % 5 == 3
+    none = np.arange(LANES) % bare == 3 if bare else np.zeros(LANES, dtype=bool)
     for place, name in zip(at, of, strict=True):
         q = quantity_of(name)
         assert q is not None
@@ -81,7 +87,7 @@ def machines(rng: np.random.Generator, kind: str, at: list[Place], of: list[str]
         at_curve(
             p, place, q, low, high, size_of(place) * rng.standard_normal((POINTS, LANES)).cumsum(axis=0) / POINTS**0.5
         )
-    p[CURVES:, bare] = plant.p[CURVES:]
+    p[CURVES:, none] = plant.p[CURVES:]
     for name in effects:
         for row, q in plant.parameters_of(name).items():
             if q.name in ("phase", "distance", "spread", "speed"):
@@ -92,8 +98,8 @@ def machines(rng: np.random.Generator, kind: str, at: list[Place], of: list[str]
     return p
 
 
-def outputs(stage: str, p: np.ndarray, kind: str, rng: np.random.Generator, known: np.ndarray) -> list[np.ndarray]:
-    """What a stage gives, and the states that it leaves."""
+def outputs(stage: str, p: np.ndarray, kind: str, rng: np.random.Generator, known: np.ndarray) -> np.ndarray:
+    """What a stage gives."""
     plant = build_plant(MACHINES[kind])
     s = np.repeat(plant.start(0.024, 60.0), LANES, axis=1)
     n_r, t_oil, p_s = 60.0 + 5.0 * np.sin(T), 30.0 + T, 21e6 - 1e5 * np.cos(T)
@@ -113,7 +119,7 @@ def outputs(stage: str, p: np.ndarray, kind: str, rng: np.random.Generator, know
         for site, one in zip((1, 2, 3), gives, strict=True):
             run_bends(known, p, s, site, one)
         out = np.array(gives)
-    return [out, s]
+    return out
 
 
 @pytest.mark.parametrize("stage", SITES)
@@ -133,19 +139,25 @@ def test_side_by_side_as_lane_by_lane(stage: str, kind: str, data: st.DataObject
     effects = data.draw(st.lists(st.sampled_from(own), max_size=2, unique=True))
     seed = data.draw(st.integers(0, 2**32 - 1))
 
-    def run() -> list[np.ndarray]:
+    # blocks mix lanes with curves and without; engine and controller run side by side where all lanes have them
+    bare = 5 if stage in ("actuator", "linkage") else 0
+
+    def run() -> np.ndarray:
         rng = np.random.default_rng(seed)
         known = random_signals(rng, at, of)
-        return outputs(stage, machines(rng, kind, at, of, effects), kind, rng, known)
+        return outputs(stage, machines(rng, kind, at, of, effects, bare), kind, rng, known)
 
-    together = run()
+    with pytest.MonkeyPatch.context() as m:  # no lane with curves is run alone
+        for module, name in ONE_BY_ONE:
+            m.setattr(module, name, lambda *_: pytest.fail("a lane ran alone"))
+        together = run()
     with pytest.MonkeyPatch.context() as m:
         for module in (actuator, linkage, engine, bends):
             m.setattr(module, "alike", lambda p: np.zeros(p.shape[1], dtype=bool))
         alone = run()
-    scale = max(float(np.nanmax(np.abs(alone[0]))), 1e-6)
-    assert np.isfinite(together[0]).all()
-    assert np.allclose(together[0], alone[0], rtol=0.0, atol=1e-9 * scale)
+    scale = max(float(np.nanmax(np.abs(alone))), 1e-6)
+    assert np.isfinite(together).all()
+    assert np.allclose(together, alone, rtol=0.0, atol=1e-9 * scale)
 
 
 def test_lanes_with_other_curves_run_alone() -> None:
@@ -158,20 +170,16 @@ def test_lanes_with_other_curves_run_alone() -> None:
     curved = p[CURVES] != 0.0
     assert (actuator.alike(p) == (curved & (np.arange(LANES) != 4))).all()
     known = random_signals(rng, [place], ["i_cmd"])
-    got = outputs("actuator", p, "hydraulic", np.random.default_rng(1), known)[0]
+    got = outputs("actuator", p, "hydraulic", np.random.default_rng(1), known)
     for j in (3, 4, 5):
         one = np.repeat(p[:, j : j + 1], LANES, axis=1)
-        alone = outputs("actuator", one, "hydraulic", np.random.default_rng(1), known)[0][:, 0]
+        alone = outputs("actuator", one, "hydraulic", np.random.default_rng(1), known)[:, 0]
         assert np.allclose(got[:, j], alone, rtol=0.0, atol=1e-12)
     assert np.abs(got[:, 4] - got[:, 5]).max() > 1e-9 and np.abs(got[:, 3] - got[:, 5]).max() > 1e-9
 
 
 def test_tables_stand_lane_by_lane() -> None:
-    from plant.curve_lanes import tables_of
-
-    p = SimpleNamespace(
-        p=machines(np.random.default_rng(0), "hydraulic", [PLACES["actuator.load adds"]], ["n_r"], [])
-    ).p
+    p = machines(np.random.default_rng(0), "hydraulic", [PLACES["actuator.load adds"]], ["n_r"], [])
     lanes = np.array([6, 3, 1])
     tables = tables_of(p, 6, lanes, 8)
     assert tables.shape == (1, POINTS, 8)
