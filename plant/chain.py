@@ -327,7 +327,7 @@ def bent_reading(x: float, s: np.ndarray, p: np.ndarray, j: int) -> float:
     """What the LVDT's curves make of its reading ``x`` (m)."""
     if p[CURVES, j] == 0.0:
         return x
-    return x * curve.factor(s, p, j, curve.LVDT_TIMES) + curve.bend(s, p, j, curve.LVDT_ADDS)
+    return curve.bent(x, curve.bend(s, p, j, curve.LVDT_TIMES), curve.bend(s, p, j, curve.LVDT_ADDS))
 
 
 @inlined
@@ -335,7 +335,7 @@ def straightened(reading: float, s: np.ndarray, p: np.ndarray, j: int) -> float:
     """The inverse of `bent_reading` at the same signals."""
     if p[CURVES, j] == 0.0:
         return reading
-    return (reading - curve.bend(s, p, j, curve.LVDT_ADDS)) / curve.factor(s, p, j, curve.LVDT_TIMES)
+    return curve.unbent(reading, curve.bend(s, p, j, curve.LVDT_TIMES), curve.bend(s, p, j, curve.LVDT_ADDS))
 
 
 @in_place
@@ -372,8 +372,8 @@ def stem_angle(
     stem.stored(s, j, k, z)
     reading = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
     if p[CURVES, j] != 0.0:
-        reading *= curve.factor(s, p, j, curve.POT_TIMES + 1 + k)
-        reading += curve.bend(s, p, j, curve.POT_ADDS + 1 + k)
+        by, adds = curve.bend(s, p, j, curve.POT_TIMES + 1 + k), curve.bend(s, p, j, curve.POT_ADDS + 1 + k)
+        reading = curve.bent(reading, by, adds)
     return reading
 
 

@@ -47,7 +47,7 @@ __all__ = [
     "CRANK_ADDS", "CURRENT_ADDS", "DEMAND_ADDS", "ENGINE_ADDS", "FLOW_TIMES", "KNOWN", "LAG_TIMES", "LOAD_ADDS",
     "LVDT_ADDS", "LVDT_TIMES", "OPENING_ADDS", "PLACES", "PLAY_ADDS", "POT_ADDS", "POT_TIMES", "QUANTITIES",
     "RING_ADDS", "RISE_TIMES", "SERVO_ADDS", "SERVO_TIMES", "Place", "Quantity", "acts", "at_curve", "begin",
-    "bend", "factor", "follow", "quantity_of", "take", "turn", "turns",
+    "bend", "bent", "factor", "follow", "quantity_of", "take", "times", "turn", "turns", "unbent",
 ]  # fmt: skip
 
 (
@@ -212,9 +212,27 @@ def bend(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
 
 
 @inlined
+def times(by: float) -> float:
+    """Return the factor 1 + ``by``, above 0."""
+    return max(1.0 + by, LEAST)
+
+
+@inlined
+def bent(x: float, by: float, adds: float) -> float:
+    """What a curve that multiplies, and gives ``by``, and one that ``adds`` make of ``x``."""
+    return x * times(by) + adds
+
+
+@inlined
+def unbent(y: float, by: float, adds: float) -> float:
+    """The inverse of `bent`."""
+    return (y - adds) / times(by)
+
+
+@inlined
 def factor(s: np.ndarray, p: np.ndarray, j: int, site: int) -> float:
     """Return 1 + `bend`, above 0."""
-    return max(1.0 + bend(s, p, j, site), LEAST)
+    return times(bend(s, p, j, site))
 
 
 @in_place

@@ -18,7 +18,7 @@ from vaneloop.discrepancy.models.by_log import bind
 from vaneloop.discrepancy.models.curved import Candidate, OwnGround
 from vaneloop.discrepancy.models.learning import QUICK, TIMES, Learner
 from vaneloop.discrepancy.models.screening import screened
-from vaneloop.discrepancy.models.tried import Tried
+from vaneloop.discrepancy.models.tried import Ground, Tried
 from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
 from vaneloop.discrepancy.scout import LITTLE, excerpt_of
 
@@ -36,6 +36,13 @@ TANK = System(
 )  # fmt: skip
 
 
+def learner_on(ground: Ground) -> Learner:
+    """A search where no law of the library was found."""
+    fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
+    d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
+    return Learner(ground, d)
+
+
 def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
     """A search on a log of a tank whose outflow goes from one value to another as its oil warms."""
     rng = np.random.default_rng(seed)
@@ -50,10 +57,7 @@ def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
         for _ in range(10):
             level += 0.01 * (0.2 * pump[k] - out[k] * level)
     record = Record("log", t, {"pump": pump, "oil": oil, "level": y + 0.05 * rng.standard_normal(len(t))})
-    ground = OwnGround(bind(TANK, [record], []))
-    fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
-    d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    return Learner(ground, d)
+    return learner_on(OwnGround(bind(TANK, [record], [])))
 
 
 @pytest.mark.parametrize(("outflow", "seed"), [((0.1, 0.35), 3), ((0.06, 0.4), 5)])
@@ -106,10 +110,7 @@ def test_where_few_pieces_count_the_excerpt_is_no_shorter() -> None:
 
 def test_a_measured_angle_puts_no_other_quantity_behind() -> None:
     """What a stage gives, as it was measured, has the noise of its error in it: a curve takes a little of that off."""
-    ground = VaneGround(standing_chain(slice(0, 24_000)).stage("linkage"))
-    fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
-    d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    learner = Learner(ground, d)
+    learner = learner_on(VaneGround(standing_chain(slice(0, 24_000)).stage("linkage")))
     wanted = ("sensors.lvdt.curve_of_vgv1", "sensors.lvdt.curve_of_x_lvdt", "sensors.vgv1.curve_of_vgv1")
     echo, plain, own = (next(c for c in learner.candidates if c.name == name) for name in wanted)
     assert [learner._echoes(c) for c in (echo, plain, own)] == [True, False, False]

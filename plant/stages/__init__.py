@@ -4,7 +4,7 @@ Engine, actuator and linkage of `plant.chain`, with the same functions and effec
 and state are p[row, lane], s[row, lane]; a lane is one parameter set. A few lanes run one after the other, through the
 chain; more run in blocks, step by step together, so that the compiler can use vector instructions. Both ways agree to
 rounding. A lane with an effect that the blocks do not call, as one just added to `plant.chain`, runs alone: right, but
-some five times slower. SI; times in s.
+some five times slower. So does one whose curves differ from its neighbours' in more than their tables. SI; times in s.
 
 The derived rows of ``p`` must be those of the raster: ``derive(p, dt / substeps, dt)``.
 """

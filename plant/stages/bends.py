@@ -73,19 +73,25 @@ def bend_drive(
     for j in range(W):
         b.current_adds[j] = b.flow_times[j] = b.load_adds[j] = 0.0
     for c in range(len(tables)):
-        site, by_current = site_of(p, q, c), of_signal(p, q, c, CURRENT)
-        if site == curve.CURRENT_ADDS and by_current:
-            gives_at(b.current_adds, p, q, c, i_cmd, tables)
-        elif site == curve.CURRENT_ADDS:
-            gives(b.current_adds, p, q, c, known, k - 1, k, tables, some)
-        elif site == curve.FLOW_TIMES and by_current:
-            gives_at(b.flow_times, p, q, c, i_cmd, tables)
+        site = site_of(p, q, c)
+        if site == curve.CURRENT_ADDS:
+            _gives_in_step(b.current_adds, p, q, c, known, k, i_cmd, tables, some)
         elif site == curve.FLOW_TIMES:
-            gives(b.flow_times, p, q, c, known, k - 1, k, tables, some)
-        elif site == curve.LOAD_ADDS and by_current:
-            gives_at(b.load_adds, p, q, c, i_cmd, tables)
+            _gives_in_step(b.flow_times, p, q, c, known, k, i_cmd, tables, some)
         elif site == curve.LOAD_ADDS:
-            gives(b.load_adds, p, q, c, known, k - 1, k, tables, some)
+            _gives_in_step(b.load_adds, p, q, c, known, k, i_cmd, tables, some)
+
+
+@inlined
+def _gives_in_step(
+    into: Any, p: np.ndarray, q: int, c: int, known: np.ndarray, k: int, i_cmd: float, tables: np.ndarray,
+    some: np.ndarray,
+) -> None:  # fmt: skip
+    """What curve ``c`` gives in the step to sample ``k``: of the current, of that of this plant step."""
+    if of_signal(p, q, c, CURRENT):
+        gives_at(into, p, q, c, i_cmd, tables)
+    else:
+        gives(into, p, q, c, known, k - 1, k, tables, some)
 
 
 @inlined

@@ -208,7 +208,7 @@ def run(
                 for j in range(last):
                     seen = x_lvdt[k]
                     if first >= 0:
-                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                        seen = curve.unbent(seen, b.lvdt_times[j], b.lvdt_adds[j])
                     put_where_seen(b, j, true_stroke(seen, p, order[j0 + j], t_oil[k]), k == 0)
             for j in range(W):
                 b.logged[j] = b.reading[j]
@@ -225,7 +225,7 @@ def run(
                     )
             if first >= 0:
                 for j in range(W):
-                    b.logged[j] = b.logged[j] * max(1.0 + b.lvdt_times[j], curve.LEAST) + b.lvdt_adds[j]
+                    b.logged[j] = curve.bent(b.logged[j], b.lvdt_times[j], b.lvdt_adds[j])
             for j in range(last):
                 out[order[j0 + j], k] = b.logged[j]
         if n > 1 and not memory:  # what steps without these do not keep
@@ -237,6 +237,17 @@ def run(
             q = order[j0 + j]
             drive.stored(s, q, _state(b, j))
             s[CURRENT, q], s[CURRENT + 1, q], s[CURRENT + 2, q], s[CURRENT + 3, q] = b.y1[j], b.y2[j], b.y3[j], b.y4[j]
+
+
+@inlined
+def _moving_current(b: Any, j: int, i_cmd: float, memory: bool) -> float:
+    """The current (A) that moves the spool of lane ``j``; ``memory``: behind its hysteresis."""
+    i = valve_null_bias.step(i_cmd, b.bias[j])
+    if not memory:
+        return i
+    y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
+    b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+    return valve_hysteresis.mean(y1, y2, y3, y4)
 
 
 @inlined
@@ -267,11 +278,7 @@ def _substeps(
                 )
                 _put_state(b, j, z)
                 continue
-            i = valve_null_bias.step(i_cmd, b.bias[j])
-            if memory:
-                y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
-                i = valve_hysteresis.mean(y1, y2, y3, y4)
-                b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
+            i = _moving_current(b, j, i_cmd, memory)
             z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, sticky, limited)
             _put_state(b, j, z)
 
@@ -300,7 +307,7 @@ def _curved_substeps(
         i_cmd = current[k, m]
         bend_drive(b, p, q, known, k, i_cmd, tables, some)
         for j in range(W):
-            gain = b.gain[j] * max(1.0 + b.flow_times[j], curve.LEAST)
+            gain = b.gain[j] * curve.times(b.flow_times[j])
             b.extending[j], b.retracting[j] = valve_gain_asymmetry.step(gain, b.asymmetry[j])
             b.load[j] = b.bare_load[j] + b.load_adds[j]
             b.shut[j] = 0.0
@@ -316,11 +323,6 @@ def _curved_substeps(
             for j in range(W):
                 b.shut[j] = -b.shut[j] / b.rated[j]
         for j in range(W):
-            i = valve_null_bias.step(i_cmd, b.bias[j])
-            if memory:
-                y1, y2, y3, y4 = valve_hysteresis.step(b.y1[j], b.y2[j], b.y3[j], b.y4[j], i, b.width[j], b.spread[j])
-                i = valve_hysteresis.mean(y1, y2, y3, y4)
-                b.y1[j], b.y2[j], b.y3[j], b.y4[j] = y1, y2, y3, y4
-            i += b.current_adds[j]
+            i = _moving_current(b, j, i_cmd, memory) + b.current_adds[j]
             z = drive.step(_state(b, j), _drive(b, j), _feed(b, j), i, p_s, h, loaded, lossy, lossy, True, b.shut[j])
             _put_state(b, j, z)

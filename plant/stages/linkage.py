@@ -223,7 +223,7 @@ def _linkage_blocks(
                     q = order[j0 + min(j, last - 1)]
                     seen = x_lvdt[m] + b.late[j] * speed[m]
                     if first >= 0:
-                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                        seen = curve.unbent(seen, b.lvdt_times[j], b.lvdt_adds[j])
                     b.stroke[j] = true_stroke(seen, p, q, t_oil[m])
             else:
                 for j in range(WIDE):
@@ -286,7 +286,7 @@ def _read(b: Any, k: int, m: int, curved: bool) -> None:
     for j in range(WIDE):
         vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]))
         if curved:
-            vane = vane * max(1.0 + b.pot_times[k, j], curve.LEAST) + b.pot_adds[k, j]
+            vane = curve.bent(vane, b.pot_times[k, j], b.pot_adds[k, j])
         before = vane if m == 0 else b.before[k, j]
         slow = b.e[k, j] * b.pot[k, j] + ((b.b[k, j] - b.e[k, j]) * before + (1.0 - b.b[k, j]) * vane)
         b.pot[k, j] = b.pot[k, j] if m == 0 else slow

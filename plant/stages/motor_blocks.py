@@ -97,12 +97,12 @@ def run(
                 for j in range(last):
                     seen = x_lvdt[k]
                     if first >= 0:
-                        seen = (seen - b.lvdt_adds[j]) / max(1.0 + b.lvdt_times[j], curve.LEAST)
+                        seen = curve.unbent(seen, b.lvdt_times[j], b.lvdt_adds[j])
                     put_where_seen(b, j, true_stroke(seen, p, order[j0 + j], t_oil[k]), k == 0)
             for j in range(last):
                 reading = measured_stroke(b.reading[j], p, order[j0 + j], t_oil[k])
                 if first >= 0:
-                    reading = reading * max(1.0 + b.lvdt_times[j], curve.LEAST) + b.lvdt_adds[j]
+                    reading = curve.bent(reading, b.lvdt_times[j], b.lvdt_adds[j])
                 out[order[j0 + j], k] = reading
         for j in range(last):
             electromechanical.stored(s, order[j0 + j], _motor_state(b, j))
