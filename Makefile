@@ -13,15 +13,20 @@ JOBS ?= 3
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 # Many tests start Python: what it compiles of a module is kept, wherever this is switched off.
 unexport PYTHONDONTWRITEBYTECODE
-# Why tests were skipped: pytest writes it there, and the last lines of `make test` say it.
+PYTEST = $(PY) -m pytest -n $(JOBS) --dist worksteal
+TESTS ?=
+LONG_TESTS := -m '(slow or hypothesis) and not socketcan' --hypothesis-profile thorough \
+  --junitxml out/test-all.xml --durations=15
+# Why tests were skipped: pytest writes it there, and the last lines of `make test-all` say it.
 NOT_TESTED := out/not_tested.txt
 
 # An environment serves only the checkout that it was made in: a copied, moved or broken one is made anew.
 HOME_OF_VENV := $(VENV)/.made-in
 READY := $(VENV)/.ready-test
+READY_ALL := $(VENV)/.ready-test-all
 READY_BENCH := $(VENV)/.ready-bench
 ifneq ($(shell cat $(HOME_OF_VENV) 2>/dev/null && $(PY) -c '' 2>/dev/null && echo works),$(CURDIR) works)
-  $(shell rm -f $(HOME_OF_VENV) $(READY) $(READY_BENCH))
+  $(shell rm -f $(HOME_OF_VENV) $(VENV)/.ready-*)
 endif
 
 help:  ## list the targets
@@ -31,17 +36,18 @@ help:  ## list the targets
 demo: compiled  ## replay a recorded engine run and the long engine test; writes demo/*.html
 	@$(PY) -m vaneloop.cli.demo
 
-test: $(READY)  ## lint, types, and every test but the slow ones
+test: $(READY)  ## lint, types, and every capability once: some six minutes; TESTS='tests/test_xcp.py' only those files
 	@$(need_chromium)
 	@mkdir -p out
-	@rm -f $(NOT_TESTED)
-	@$(call tested,pytest,--durations=25 -m 'not slow and not socketcan')
+	@$(call tested,pytest,$(PYTEST) $(TESTS) -m 'not slow and not socketcan' --junitxml out/test.xml --durations=15)
 
-test-all: $(READY)  ## lint, types, and every test, with the slow campaigns
+test-all: $(READY_ALL)  ## all that `make test` leaves: long tests, more examples of each property, a real vcan0
 	@$(need_chromium)
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(call tested,pytest$(comma) with the slow campaigns,-m 'not socketcan')
+	@$(PY) -m vaneloop.cli.ahead
+	@$(SAY) 'pytest: the long tests'
+	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PYTEST) $(TESTS) $(LONG_TESTS)
 
 test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run
@@ -79,6 +85,10 @@ $(HOME_OF_VENV):
 
 $(READY): pyproject.toml constraints.txt | $(HOME_OF_VENV)
 	@$(call install,test)
+	@touch $@
+
+$(READY_ALL): $(READY) pyproject.toml constraints.txt
+	@$(call install,test-all)
 	@touch $@
 
 $(READY_BENCH): $(READY) pyproject.toml constraints.txt
@@ -137,8 +147,7 @@ define tested
 $(ruff); \
 $(SAY) 'mypy, beside the others'; \
 $(PY) -m mypy >out/mypy.txt 2>&1 & types=$$!; code=0; \
-{ $(PY) -m vaneloop.cli.ahead && $(SAY) '$(1)' && $(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run \
-  --beside $(PY) -m pytest -n $(JOBS) --dist worksteal $(2); } || code=$$?; \
+{ $(PY) -m vaneloop.cli.ahead && $(SAY) '$(1)' && $(ONE_THREAD) $(2); } || code=$$?; \
 wait $$types || { code=1; $(SAY) 'mypy:'; cat out/mypy.txt; }; \
 exit $$code
 endef

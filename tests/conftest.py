@@ -9,8 +9,9 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,17 @@ from tests.vcan.run import INTERFACE, is_up
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The first call of a compiled function takes seconds, so no single example has a time limit.
-settings.register_profile("vaneloop", deadline=None, print_blob=True)
-settings.load_profile("vaneloop")
+# The first call of a compiled function takes seconds, so no single example has a time limit. `make test-all` asks for
+# the other profile (--hypothesis-profile thorough).
+QUICK_EXAMPLES = 25
+settings.register_profile("quick", deadline=None, print_blob=True, max_examples=QUICK_EXAMPLES)
+settings.register_profile("thorough", deadline=None, print_blob=True, max_examples=100)
+settings.load_profile("quick")
+
+
+def examples(thorough: int) -> int:
+    """How many examples a property is tried on that asks for more than a profile's own: all in `make test-all` only."""
+    return min(thorough, QUICK_EXAMPLES) if settings.get_current_profile_name() == "quick" else thorough
 
 
 # The modules with the longest tests, longest first. Each worker of xdist begins with some of them, so that none is left
@@ -67,6 +76,29 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(skip)
 
 
+BEGAN = pytest.StashKey[tuple[float, float]]()
+
+
+def spent() -> tuple[float, float]:
+    """Processor time of this process and of children that have ended (s), and the wall clock (s)."""
+    return sum(os.times()[:4]), time.monotonic()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Note when a test began."""
+    item.stash[BEGAN] = spent()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, None, None]:
+    """Tell the JUnit report what a test cost, its fixtures included (tests/costs.py)."""
+    yield
+    cpu, wall = (now - then for now, then in zip(spent(), item.stash[BEGAN], strict=True))
+    item.user_properties += [("cpu_s", f"{cpu:.3f}"), ("wall_s", f"{wall:.3f}"), ("file", item.nodeid.split("::")[0])]
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection(session: pytest.Session) -> None:
     """Workers of xdist that collect all tests share what pytest makes of a module once, the assertions that explain
@@ -90,7 +122,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Write down what was skipped, and why, into the file VANELOOP_NOT_TESTED: the last lines of `make test` say it
+    """Write down what was skipped, and why, into the file VANELOOP_NOT_TESTED: the last lines of `make test-all` say it
     (tests/vcan/run.py).
     """
     if not (file := os.environ.get("VANELOOP_NOT_TESTED")) or hasattr(config, "workerinput"):

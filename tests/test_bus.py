@@ -342,6 +342,7 @@ class TestLocal(BusTests):
             a.send(data_frame(k))
             assert same(b.recv(PATIENCE), data_frame(k))
 
+    @pytest.mark.slow
     def test_two_that_start_at_once_are_on_one_bus(self, name: str) -> None:
         code = (
             f"from hil.bus.port import open_bus; import can, time; b = open_bus('local:{name}'); end = "

@@ -108,6 +108,7 @@ def run(plan: Path, out: Path) -> None:
     work(folder.path)
 
 
+@pytest.mark.slow
 def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: Path) -> None:
     plan, out = write(tmp_path), tmp_path / "run"
     run(plan, out)
@@ -133,6 +134,7 @@ def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: P
     open_to_all(tmp_path / "c.html", "campaign")
 
 
+@pytest.mark.slow
 def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path: Path) -> None:
     gcc = shutil.which("gcc")
     if gcc is None:

@@ -36,6 +36,7 @@ from tests.columns import (
     tick,
     trend_step,
 )
+from tests.conftest import examples
 from vaneloop.base.vanes import VANES
 
 CAL = load_calibration()
@@ -270,7 +271,7 @@ def test_insane_demand_never_reaches_the_filter():
 # ---- tables to stroke demand -----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.floats(-1e3, 1e3) | st.sampled_from([-np.inf, np.inf, *CAL.table[0]]), st.sampled_from([1, 2, 3]))
 def test_look_up_is_linear_interpolation_held_beyond_its_ends(v, row):
     expected = np.interp(v, CAL.table[0], CAL.table[row])
@@ -287,7 +288,7 @@ def test_look_up_is_exact_at_its_breakpoints_and_its_ends():
     assert look_up(0, 1, two, 0.25) == 0.5
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(
     st.lists(st.floats(0, 120), min_size=2, max_size=30, unique=True), st.floats(-10, 130), st.integers(0, 2**32 - 1)
 )
@@ -615,7 +616,7 @@ def test_a_constant_bias_leaves_no_steady_error(bias):
     assert np.abs(run[:, 0] - 0.020).max() < 0.06 * abs(bias)  # 0.06 mm for each mA
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.floats(-0.05, 0.1), st.floats(-0.001, 0.05), st.floats(-0.1, 0.1), st.floats(-0.04, 0.04), st.integers(1, 200)
 )
@@ -990,7 +991,7 @@ def test_any_calibration_of_the_compensation_keeps_the_invariants_under_insane_i
     assert campaign(100 + seed, 200_000, ADAPTIVE._replace(k=scalars), seen, 20, worst) == (OK, -1)
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(
     st.lists(st.tuples(*[st.floats(width=64)] * N_INPUTS), min_size=1, max_size=40),
     st.sampled_from([CAL, SINGLE, INVERSE, ADAPTIVE]),
@@ -1048,6 +1049,7 @@ for cal in (CAL, ADAPTIVE):
 """
 
 
+@pytest.mark.slow
 def test_compiled_and_interpreted_firmware_agree_bit_for_bit():
     import hashlib
 

@@ -122,6 +122,7 @@ def outputs(stage: str, p: np.ndarray, kind: str, rng: np.random.Generator, know
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", SITES)
 @pytest.mark.parametrize("kind", MACHINES)
 @settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))

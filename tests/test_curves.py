@@ -30,6 +30,7 @@ def said(seed: int, effect: str, parameters: Mapping[str, float], stage: str) ->
     return diagnose([build_chain(log).stage(stage)], workers=1).stages[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("exponent", "roundness"), [(2.0, (0.8, 1.0)), (20.0, (0.0, 0.2))])
 def test_a_passage_in_series_is_flow_saturation_whether_its_corner_is_round_or_sharp(exponent, roundness):
     d = said(51, "valve_flow_saturation", {"limit": 0.020, "exponent": exponent}, "actuator")
@@ -40,6 +41,7 @@ def test_a_passage_in_series_is_flow_saturation_whether_its_corner_is_round_or_s
     assert roundness[0] <= found["roundness"]["value"] <= roundness[1]
 
 
+@pytest.mark.slow
 def test_a_sharp_limit_is_found_wherever_it_lies_below_the_speeds_of_the_log() -> None:
     """Too high a start has no slope to follow, too low a one costs more than none: one of the starts must be near
     enough.
@@ -62,6 +64,7 @@ def test_a_sharp_limit_is_found_wherever_it_lies_below_the_speeds_of_the_log() -
         assert fit.theta[stage.index()["valve_flow_saturation"]][0] == pytest.approx(limit, rel=0.01), limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["amplitude", "cubic"])
 def test_an_lvdt_that_errs_with_a_sine_or_with_the_cube_of_its_stroke_is_nonlinear(shape):
     d = said(52, "lvdt_nonlinearity", {"amplitude": 0.0, shape: 0.8e-3}, "linkage")

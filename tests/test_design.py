@@ -75,6 +75,7 @@ def test_margins_of_the_sampled_loop_are_those_of_the_closed_form(gains: Gains, 
     assert m.disk_margin == pytest.approx(disk, abs=0.01)
 
 
+@pytest.mark.slow
 def test_sampled_response_is_numpys_own(result: DesignResult) -> None:
     """Zero-order hold by the matrix exponential and PI by its difference equation, in plain numpy."""
     from scipy.linalg import expm
@@ -146,6 +147,7 @@ def test_halving_the_plants_step_changes_nothing_that_matters() -> None:
     assert np.abs(a - b).max() < 0.5 * PLANT.lvdt_noise  # 1.5 um: at 50 mm/s, 0.03 ms of the LVDT's lag
 
 
+@pytest.mark.slow
 def test_simulation_is_the_products_plant() -> None:
     """The chain that lockstep runs, tick by tick with the same current, goes the same way."""
     from plant import build_plant, chain, places
@@ -268,6 +270,7 @@ def test_with_harmonics_the_prediction_holds_where_the_piston_grazes_the_gap(res
     assert p.predicted_hz == pytest.approx(p.simulated_hz, rel=0.5)  # frequency poor
 
 
+@pytest.mark.slow
 def test_the_limit_cycle_grows_with_the_gap_and_keeps_its_frequency() -> None:
     gains = Gains(10.0, 400.0, 0.0)
     small, large = oscillate(gains, 0.05e-3), oscillate(gains, 0.2e-3)
@@ -297,6 +300,7 @@ def test_play_outside_the_loop_does_not_oscillate_but_loses_motion(result: Desig
 # ---------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -> None:
     result, code = evaluate()
     design_page(result, tmp_path / "design.html")
@@ -310,6 +314,7 @@ def test_result_is_json_and_the_command_says_whether_the_limits_hold(tmp_path) -
     open_to_all(tmp_path / "design.html", "design")
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
     result, code = evaluate(kp=200.0)
     design_page(result, tmp_path / "unstable.html")
@@ -318,6 +323,7 @@ def test_an_unstable_loop_is_refused_and_still_reported(tmp_path) -> None:
     assert summary(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_mm", [0.0, 0.3])
 def test_play_inside_the_loop_is_an_option(gap_mm: float) -> None:
     result, code = evaluate(backlash_inside=gap_mm)

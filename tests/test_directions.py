@@ -105,6 +105,7 @@ def rig_chain(hidden: list[Hidden], seconds: float):
     return build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}, ()))
 
 
+@pytest.mark.slow
 def test_an_eccentric_ring_towards_the_cut_is_named_alone():
     """At -159 deg the phase once stopped at -180, and two other effects were named with certainty."""
     stage = rig_chain(

@@ -87,6 +87,7 @@ def test_a_force_with_the_other_sign_is_told() -> None:
     assert any("acts against the motion" in n for n in notes(vaneloop.compare(axis(sign=-1.0), model(low=-np.inf))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "law", "said"),
     [
@@ -102,6 +103,7 @@ def test_a_law_with_the_unusual_sign_is_told(given: dict[str, float], law: str, 
     assert not any("is negative" in n for n in notes(usual))
 
 
+@pytest.mark.slow
 def test_the_vane_chain_tells_a_parameter_at_the_end_of_its_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     from vaneloop.verbs.search import _at_limit
 
@@ -156,6 +158,7 @@ def mapped() -> tuple[Record, System]:
     return Record("map", T, {"u": u, "y": np.abs(2.0 * u + 0.3) + 0.02 * noise()}), STRAIGHT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [mapped, oscillator, cascaded])
 def test_compare_shows_the_error_that_diagnose_starts_from(made: Any) -> None:
     log, system = made()
@@ -175,6 +178,7 @@ def test_the_chain_s_stages_show_the_same_error_before_where_the_floor_was_too_h
     assert d.error_before.tolist() == [f.rms for f in compare_stages([high])]
 
 
+@pytest.mark.slow
 def test_the_vane_chain_s_compare_and_diagnose_show_the_same_error_before() -> None:
     log = vaneloop.read_log(ROOT / "examples" / "hidden_effect.parquet")
     compared = vaneloop.compare(log, fit=(0, 60))

@@ -79,7 +79,7 @@ from plant.stages import actuator, actuator_run, engine_run, hydraulic_blocks, l
 from plant.stages.blocks import W
 from plant.stages.linkage import SOME
 from tests import columns as fw
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from vaneloop.base.errors import InputError
 
 NAMES = tuple(EFFECTS)
@@ -276,7 +276,7 @@ IDENTITIES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(a=number, b=number, c=positive)
 def test_neutral_effect_is_an_exact_identity(name: str, a: float, b: float, c: float) -> None:
     neutral = [p.neutral * p.si for p in EFFECTS[name].parameters]
@@ -286,7 +286,7 @@ def test_neutral_effect_is_an_exact_identity(name: str, a: float, b: float, c: f
     assert result == expected
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(
     st.lists(st.floats(-0.045, 0.045), min_size=5, max_size=40),
     st.floats(0.0, 0.048),
@@ -576,6 +576,7 @@ print(lockstep(Stimulus.of(np.linspace(60.0, 63.0, 30)), seed=5, plant=everythin
 """
 
 
+@pytest.mark.slow
 def test_every_effect_on_gives_the_same_bits_without_compiling() -> None:
     run = partial(subprocess.run, [sys.executable, "-c", SHORT], cwd=ROOT, capture_output=True, text=True, check=True)
     found = [run(env={**os.environ, **env}).stdout for env in ({"NUMBA_DISABLE_JIT": "1"}, {})]
@@ -757,6 +758,7 @@ def test_friction_costs_speed_both_ways_and_motion_at_reversals() -> None:
     assert pushed == pytest.approx(2.0 * force / stiffness, abs=2e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x0", [0.004, 0.024, 0.044])
 def test_motion_lost_at_a_reversal_is_that_of_two_chambers_of_oil(x0: float) -> None:
     """The chain against both chambers' pressures integrated: the piston stands until their difference has

@@ -148,6 +148,7 @@ def test_without_friction_the_speed_follows_the_linear_response_of_its_loop() ->
     assert w[-1] == pytest.approx(linear[-1], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_finer_step_changes_next_to_nothing() -> None:
     current = 1e-3 * (2.0 * np.sin(0.02 * np.arange(3000)) + np.sin(0.13 * np.arange(3000)))
     coarse = drive(MACHINE, current, 3000)[:, places.X]

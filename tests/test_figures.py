@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from hil.figures import SignalError, error_figures, noise_floor, resolution, resolution_before
+from tests.conftest import examples
 from vaneloop.base.errors import InputError
 
 
@@ -77,7 +78,7 @@ def test_no_common_sample_is_refused_in_one_line():
         figures([1.0, 2.0], [1.0, 2.0, 3.0])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=200))
 def test_mean_never_exceeds_rms_and_rms_never_exceeds_max(error):
     f = figures(error, np.zeros(len(error)), noise_floor=0.0)

@@ -146,6 +146,7 @@ def test_growth_is_as_uncertain_as_its_logs_scatter_whatever_they_have_wrong_ali
     assert len(inside) > 350 and least <= np.mean(inside) <= most
 
 
+@pytest.mark.slow
 def test_the_time_to_a_limit_is_within_its_interval() -> None:
     inside = []
     for f, (t, _, _, onset, rate) in shares("growth", 50, 8.0, 150, 5):
@@ -374,6 +375,7 @@ def test_the_report_finds_what_is_in_the_fleet(folder: Folder) -> None:
     assert blind == ("coil_heating", "an oil temperature that changes by 20 K")
 
 
+@pytest.mark.slow
 def test_the_page_leads_to_the_logs_own_pages(folder: Folder, view: FleetView, tmp_path: Path) -> None:
     said = answers(folder, view.keys())
     write_pages(tmp_path / "fleet_logs", said)
@@ -546,6 +548,7 @@ system = System(
 """
 
 
+@pytest.mark.slow
 def test_logs_of_a_system_of_ones_own_are_followed_over_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two benches with a flow of 3 l/(min A), the flow meter of one drifts by 6 l/min a year from May on."""
     from vaneloop.cli import fleet

@@ -286,6 +286,7 @@ def test_a_pipe_or_a_dangling_link_among_the_logs_is_a_row(tmp_path: Path) -> No
 POINTS = ("take", "leased", "begin", "written:1", "written:5", "result", "result:7", "part", "part:2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", POINTS)
 def test_a_kill_at_any_point_loses_nothing(tmp_path: Path, point: str, undisturbed: list[tuple[str, ...]]) -> None:
     folder = fleet(tmp_path, many(40), in_chunk=5)
@@ -322,6 +323,7 @@ def test_fifty_kills_leave_the_same_table(tmp_path: Path, undisturbed: list[tupl
     assert [tuple(r.values()) for r in rows(folder)] == undisturbed
 
 
+@pytest.mark.slow
 def test_a_reader_ends_with_its_worker(tmp_path: Path) -> None:
     import psutil
 
@@ -335,6 +337,7 @@ def test_a_reader_ends_with_its_worker(tmp_path: Path) -> None:
     reader.wait()  # fails by the test's own limit, not by a time
 
 
+@pytest.mark.slow
 def test_sigterm_ends_a_worker_in_order(tmp_path: Path) -> None:
     folder = fleet(tmp_path, {"e1/a.csv": "hang"})
     p = process(folder)
@@ -364,6 +367,7 @@ def test_an_answer_that_comes_while_a_worker_is_told_to_stop_is_kept(
     assert work(folder.path) == {"done": 2} and len(rows(folder)) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("compiling", "says"), [("hangs", "is not ready after 2 s of compiling"), (3, "ended 3 times before it read any")]
 )
@@ -387,6 +391,7 @@ def test_a_machine_that_cannot_compile_is_one_line_and_no_log_s_fault(
         assert work(folder.path) == {"done": 1}
 
 
+@pytest.mark.slow
 def test_a_worker_that_stands_still_is_replaced_and_does_no_harm(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]
 ) -> None:
@@ -423,6 +428,7 @@ def test_a_worker_may_stand_still_at_any_moment(tmp_path: Path, monkeypatch: pyt
     assert not list((run.path / "leases").iterdir()) and not list((run.path / "results").iterdir())
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
     folder = fleet(tmp_path, many(40), in_chunk=5)
     p = process(folder, VANELOOP_FLEET_FULL="9")
@@ -433,6 +439,7 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path, undis
     assert [tuple(r.values()) for r in rows(folder)] == undisturbed
 
 
+@pytest.mark.slow
 def test_two_starters_make_one_run(tmp_path: Path, undisturbed: list[tuple[str, ...]]) -> None:
     for name, text in many(40).items():
         (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -558,6 +565,7 @@ def starter(tmp: Path, folder: Folder, on: str) -> subprocess.Popen[str]:
     return subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]
 ) -> None:
@@ -579,6 +587,7 @@ def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
     assert [r["status"] for r in rows(folder) if r["status"] != "done"] == ["unreadable"]
 
 
+@pytest.mark.slow
 def test_a_killed_rented_worker_has_a_successor_and_the_run_ends(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]
 ) -> None:
@@ -618,6 +627,7 @@ def test_without_the_extra_one_line_says_what_to_install() -> None:
     assert done.returncode == 2 and "pip install 'vaneloop[fleet]'" in done.stderr and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]
 ) -> None:

@@ -248,6 +248,7 @@ def test_a_parameter_tuned_while_it_runs_acts_from_then_on(fmus: dict[str, Path]
     assert (fmu.get("vigv")[0] - before) * DEG == pytest.approx(2.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_every_fmu_is_valid_and_names_its_units(fmus: dict[str, Path]) -> None:
     from fmpy.validation import validate_fmu
 
@@ -263,6 +264,7 @@ def test_every_fmu_is_valid_and_names_its_units(fmus: dict[str, Path]) -> None:
     assert (units["mA"].A, units["mA"].factor) == (1, 0.001)
 
 
+@pytest.mark.slow
 def test_a_hundred_instances_in_one_process_do_not_share_anything(fmus: dict[str, Path], tmp_path: Path) -> None:
     many = [Driven(fmus["loop3"], tmp_path, n_dem=50.0 + 0.4 * i) for i in range(100)]
     for k in range(20):

@@ -40,6 +40,7 @@ def held(campaign: Campaign, frames: int) -> None:
     } - by_sensor_only
 
 
+@pytest.mark.slow
 def test_three_hundred_thousand_frames_do_no_harm() -> None:
     held(fuzz.fuzz(300_000, seed=11), 300_000)
 
@@ -89,6 +90,7 @@ SCRIPT = (
 )
 
 
+@pytest.mark.slow
 def test_no_index_is_out_of_bounds_and_compiled_code_does_what_the_source_says() -> None:
     answers = [
         subprocess.run(

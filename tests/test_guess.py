@@ -20,7 +20,7 @@ from hil.logs.mapping import Bench, read_mapping, write_mapping
 from hil.logs.mdf import write_groups
 from hil.logs.names import is_time, meaning
 from hil.logs.survey import sparkline, survey
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from tests.test_logs import DATA, data
 from vaneloop.base.errors import InputError
 from vaneloop.base.signals import UNITS
@@ -285,7 +285,7 @@ SCALES: dict[str, list[tuple[str, float, float]]] = {
 FOREIGN = ["fuel_flow", "T3", "EGT", "room_temperature", "coolant_pressure", "wheel_speed", "motor_current", "op", "u"]
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(40), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(draw=st.data())
 def test_names_units_order_and_other_columns_do_not_change_what_is_read(
     tmp_path: Path, run: dict[str, np.ndarray], draw: st.DataObject
@@ -349,7 +349,7 @@ BESIDE: list[Callable[[str], tuple[str, str]]] = [  # unit -> what stands behind
 
 
 @given(st.data())
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=examples(600), deadline=None)
 def test_words_in_any_order_and_writing_with_a_unit_are_understood(draw: st.DataObject) -> None:
     signal = draw.draw(st.sampled_from(sorted(THINGS)))
     things, roles, units = THINGS[signal]
@@ -377,7 +377,7 @@ OUR_WORDS = sorted({w for things, roles, _ in THINGS.values() for x in (*things,
     st.sampled_from(sorted(KINDS)),
     st.sampled_from(BESIDE),
 )  # fmt: skip
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=examples(1500), deadline=None)
 def test_no_order_of_our_words_makes_a_signal_of_another_kind_or_role(
     words: list[str], unit: str, beside: Callable[[str], tuple[str, str]]
 ) -> None:

@@ -55,6 +55,7 @@ def demand_of(path: Path) -> StageDiagnosis:
 # ---- what is recorded fits ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("profile", "suffix"), [("slam", ".log"), ("staircase", ".parquet"), ("ramp", ".mf4"), ("sine", ".blf")]
 )
@@ -165,6 +166,7 @@ def test_a_loop_replayed_from_any_frame_of_the_record_on_is_as_near(first: int, 
 # ---- a delay that is there is found ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "phase"), [(0.01, 0), (0.01, 1), (0.01, 5), (0.01, 9), (0.03, 1)])
 def test_a_true_delay_is_named_at_any_phase(delay: float, phase: int, tmp_path: Path) -> None:
     plant = with_effect("can_delay", delay=delay)
@@ -173,6 +175,7 @@ def test_a_true_delay_is_named_at_any_phase(delay: float, phase: int, tmp_path: 
     assert said.effects[0].parameters["delay"]["value"] == pytest.approx(delay, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, 9.9])
 def test_a_true_delay_is_named_on_a_wire(phase: float, tmp_path: Path) -> None:
     said = demand_of(by_wire(tmp_path / "run.log", "slam", phase, plant=with_effect("can_delay", delay=0.01)))
@@ -204,6 +207,7 @@ def test_tables_and_channel_groups_do_not_come_in_frames(suffix: str, tmp_path: 
     assert not any(c.framed for c in read_log(path).channels.values())
 
 
+@pytest.mark.slow
 def test_channel_groups_that_were_taken_out_of_frames_came_in_frames(tmp_path: Path) -> None:
     import asammdf
 

@@ -172,6 +172,7 @@ def test_every_exception_is_an_example_of_some_help() -> None:
     assert [k for k in SMALLER if not any(k in x for x in lines)] == []
 
 
+@pytest.mark.slow
 def test_a_command_reads_can_without_asammdf_unless_it_is_given_mdf() -> None:
     """asammdf takes most of the time in which python-can is imported, and whoever else wants it gets it."""
     code = (

@@ -49,6 +49,7 @@ def test_the_same_seed_draws_the_same_case():
         assert repr(draw_case(3, i)) == repr(draw_case(3, i))
 
 
+@pytest.mark.slow
 def test_a_machine_with_a_motor_hides_what_it_can_have_and_is_judged_by_its_own_model():
     cases = [draw_case(7, i, 60.0, "electromechanical") for i in range(N)]
     single = {h.name for c in cases if c["kind"] in ("single", "pair") for h in c["hidden"]}
@@ -125,6 +126,7 @@ def test_what_is_left_out_is_an_effect_and_a_curve_that_the_plant_can_have():
             assert np.any(value(q) != 0.0) and np.all(truth.of(neutral)(q) == 0.0), name
 
 
+@pytest.mark.slow
 def test_a_left_out_effect_is_not_looked_for():
     case = draw_case(4, 0, 20.0, leave_out=True)
     assert case["kind"] == "left out" and case["hidden"][0].name in LEFT_OUT

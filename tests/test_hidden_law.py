@@ -83,6 +83,7 @@ QUICK = ("tanks", "battery", "heat_exchanger", "valve_bench", "servo_axis", "spo
 EVERY = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in FAMILIES]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("name", EVERY)
 def test_the_product_with_the_true_law_is_the_truth(name: str) -> None:
@@ -415,6 +416,7 @@ def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.Mon
     assert hidden_law.misses([got]) and hidden_law.summary([got])["diagnosed without an error"]["hits"] == 0
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "r.parquet"
     words = ["hidden-law", "--seed", "3", "--family", "valve_bench", "--workers", "1", "--out", str(out)]
@@ -465,6 +467,7 @@ def family_of(kind: str) -> Family:
     return next(f for f in FAMILIES.values() if f.kind == kind)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize(
     "name",

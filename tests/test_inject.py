@@ -421,6 +421,7 @@ def test_claims_too_much(sil):
 """
 
 
+@pytest.mark.slow
 def test_the_fixture_works_in_an_empty_folder(tmp_path: Path) -> None:
     (tmp_path / "test_own.py").write_text(OWN_SUITE)
     (tmp_path / "mine.toml").write_text('title = "my own"\nduration = 1.0\n[[expect]]\nmode = "RUN"\nby = 0.06\n')

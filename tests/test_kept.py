@@ -66,6 +66,7 @@ def run(folder: Path, *losses: str, **env: str) -> list[float]:
     return [float(word) for word in done.stdout.split()]
 
 
+@pytest.mark.slow
 def test_a_users_functions_are_compiled_once_and_two_of_one_name_are_told_apart(tmp_path: Path) -> None:
     *first, compiled = run(tmp_path, "0.5")
     assert first == [1.0] and compiled > 0
@@ -74,6 +75,7 @@ def test_a_users_functions_are_compiled_once_and_two_of_one_name_are_told_apart(
     assert run(tmp_path, "0.5", "2.0", "0.5") == [1.0, 4.0, 1.0, 0], "both from files, nothing compiled"
 
 
+@pytest.mark.slow
 def test_what_was_compiled_ahead_is_read_and_left_as_it_is(tmp_path: Path) -> None:
     run(tmp_path / "ahead", "0.5")
     before = sorted((tmp_path / "ahead").rglob("*"))
@@ -99,6 +101,7 @@ def test_after_the_set_up_the_first_replay_and_diagnosis_compile_nothing(tmp_pat
     assert not list((tmp_path / "user").rglob("*.nbc"))
 
 
+@pytest.mark.slow
 def test_a_damaged_file_counts_as_none(tmp_path: Path) -> None:
     run(tmp_path, "0.5")
     files = list(tmp_path.rglob("*.nbc"))
@@ -110,6 +113,7 @@ def test_a_damaged_file_counts_as_none(tmp_path: Path) -> None:
     assert run(tmp_path, "0.5") == [1.0, 0], "it was written anew"
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     *answer, compiled = run(tmp_path / "file" / "below", "0.5")

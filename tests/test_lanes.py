@@ -96,6 +96,7 @@ def test_every_machine_and_controller_is_run_in_the_order_asked_for(tmp_path: Pa
     assert_same(runs, [lockstep(stimulus, plant=p, calibration=c, every=5, hashed=False) for p, c in asked])
 
 
+@pytest.mark.slow
 def test_more_lanes_than_a_block_and_more_ticks_than_a_stimulus() -> None:
     generator, stimulus = np.random.default_rng(1), Stimulus.of(np.linspace(60.0, 70.0, 100))
     plants = [drawn(generator, build_plant(), 0) for _ in range(chain_lanes.W + 3)]

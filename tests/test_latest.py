@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from tests.conftest import ROOT
 from vaneloop.discrepancy import latest
@@ -37,6 +38,7 @@ def test_a_set_that_was_simulated_is_not_simulated_again(monkeypatch):
     assert kept.errors(np.empty((0, 1)), simulate).shape == (0, 1, 5)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_does_not_import_what_it_does_not_use():
     """Each of them takes up to half a second of processor time."""
     code = (

@@ -384,6 +384,7 @@ def vaneloop(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_the_command_learns_the_law_and_another_log_confirms_it(tmp_path: Path) -> None:
     logs_of_a_tank(tmp_path)
     own = ("--system", "tank.py")
@@ -440,6 +441,7 @@ def test_a_judge_of_a_curve_counts_its_amplitudes_as_effects(bound) -> None:
     assert len(judge.columns((c.name,))) == len(judge.columns(())) + len(c.effect(1.0).parameters)
 
 
+@pytest.mark.slow
 def test_a_slope_that_parameters_take_is_left_to_them_and_the_formula_is_found(tmp_path: Path) -> None:
     """A limit of a signal whose gain and offset are fitted; the library is not given the limit."""
     rng = np.random.default_rng(3)
@@ -473,6 +475,7 @@ def test_a_slope_that_parameters_take_is_left_to_them_and_the_formula_is_found(t
         learn(records[:1], limited, without=["u.satration"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["force.coulomb", "force.stribeck", "force.spring"])
 def test_a_law_is_searched_for_without_another_that_it_holds(law: str) -> None:
     """Each effect that says what it holds within it names one that is there; friction without its plain law is found
@@ -568,6 +571,7 @@ def run_of_a_valve(seed: int, name: str, ways: np.ndarray | None = None) -> Reco
     return Record(name, t, {"current": current, "flow": flow + 0.05 * rng.standard_normal(len(t))})
 
 
+@pytest.mark.slow
 def test_a_hysteresis_is_learned_and_helps_another_log(tmp_path: Path) -> None:
     answer = learn([run_of_a_valve(1, "one")], VALVE)
     (law,) = answer.laws
@@ -589,6 +593,7 @@ def test_a_hysteresis_is_learned_and_helps_another_log(tmp_path: Path) -> None:
     assert before > 0.5 and after < 0.06
 
 
+@pytest.mark.slow
 def test_a_hysteresis_that_one_amplitude_shows_is_not_learned() -> None:
     """Every way there and back is as long as the others: what imitates one imitates all."""
     answer = learn([run_of_a_valve(1, "one", np.append(0.0, np.tile([6.0, -6.0], 20)))], VALVE)
@@ -705,6 +710,7 @@ def test_a_reading_at_its_limit_does_not_hide_where_its_curve_bends() -> None:
     assert far["flow.curve_of_flow"].high < 20.0
 
 
+@pytest.mark.slow
 def test_a_jump_is_the_friction_of_the_library() -> None:
     """Bit for bit inside an integration, also of a law file; and the curve of a speed has it where that turns."""
     cart = System(
@@ -745,6 +751,7 @@ def hardening(seed: int, size: float) -> Record:
     return Record(f"slide {seed}", t, {"way": way, "force": force + 0.05 * rng.standard_normal(len(t))})
 
 
+@pytest.mark.slow
 def test_a_formula_that_does_as_well_as_its_curve_is_the_law(tmp_path: Path) -> None:
     """And holds on a log that goes further, where the curve is off."""
     system = System(
@@ -772,6 +779,7 @@ def weighed(seed: int, size: float) -> Record:
     return Record(run.name, run.t, {"way": way, "force": force - 90.0 * way**3 + 1.3})
 
 
+@pytest.mark.slow
 def test_a_constant_is_said_as_one_and_holds_on_a_log_that_goes_further() -> None:
     """A curve that is nearly one stays at its ends as chance has it: there it harms, and makes way."""
     system = System(
@@ -808,6 +816,7 @@ def boom(seed: int, size: float) -> Record:
     return Record(f"boom {seed}", t, {"angle": angle, "torque": torque + 0.01 * rng.standard_normal(len(t))})
 
 
+@pytest.mark.slow
 def test_a_force_is_not_said_as_a_gain_of_a_parameter() -> None:
     """The weight times a function of the angle is any function of the angle: what adds is said first."""
 

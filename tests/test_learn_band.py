@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from vaneloop.base.curve import POINTS
 from vaneloop.discrepancy.curves import basis_of
@@ -43,6 +44,7 @@ def a_fit(seed: int) -> tuple[Any, np.ndarray, np.ndarray]:
     return tried, true, design
 
 
+@pytest.mark.slow
 def test_in_nine_logs_of_ten_the_law_is_within_its_band_nearly_everywhere() -> None:
     """And the band is no wider than that takes: point by point 1.645 spreads to each side would do for nine points in
     ten, and 4 for all sums of ten functions at once (Scheffe).

@@ -39,6 +39,7 @@ def run_of_a_valve(seed: int) -> Record:
     return Record(f"log {seed}", t, {"lever": lever, "flow": flow})
 
 
+@pytest.mark.slow
 def test_a_curve_is_learned_behind_a_dead_time(tmp_path: Path) -> None:
     """Neither alone comes down to the noise: the curve of a lever that is late is none of the lever."""
     without = [f"lever.{law}" for law in ("lag", "second_order_lag", "play", "stiction", "stick_slip", "rate_limit")]

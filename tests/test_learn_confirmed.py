@@ -151,6 +151,7 @@ def test_a_curve_at_its_place_is_asked_by_its_formula_however_far_its_splines_go
     assert earning_by_formula(learner, before, every, every) == [home]
 
 
+@pytest.mark.slow
 def test_a_friction_is_tried_with_its_jump_though_its_splines_leave_more_than_another_curve(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -110,6 +110,7 @@ def test_a_difference_that_says_what_another_quantity_says_is_none() -> None:
     assert D not in differences(DRIVE.bind([logged]))
 
 
+@pytest.mark.slow
 def test_what_the_model_has_as_a_difference_comes_first_of_many() -> None:
     """A ring of ten bodies that exchange heat has 45 pairs; its links are among the differences."""
     names = [f"t{k}" for k in range(10)]
@@ -262,6 +263,7 @@ def law_of(name: str, of: str, end: float = 3.0, a: float = 0.1) -> LearnedLaw:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_python_file_gives_the_same_simulation(bound, tmp_path: Path) -> None:
     (tmp_path / "law.py").write_text(python_law(law_of(f"clutch.gain_of_{D}", D), DRIVE))
     own = runpy.run_path(str(tmp_path / "law.py"))
@@ -283,6 +285,7 @@ def test_the_python_file_gives_the_same_simulation(bound, tmp_path: Path) -> Non
     assert not np.allclose(theirs, plain_drive.run(np.array([[2.0, 0.8]])), atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "of", "same"), [("drum", D, True), ("drum", "motor", False), ("motor", D, False)])
 def test_the_judge_knows_a_difference_by_its_two_sides(bound, at: str, of: str, same: bool) -> None:
     true = replace(DRIVE, parameters=[replace(p, value=VALUES[p.name]) for p in DRIVE.parameters])
@@ -322,6 +325,7 @@ def windage(x, u, p):
     return (u.torque - torque) / 0.5, (torque - p.drag * x.drum * (1.0 + 0.15 * abs(x.drum))) / 2.0
 
 
+@pytest.mark.slow
 def test_a_cubic_coupling_of_the_difference_is_learned() -> None:
     answer = learn([run_of_a_drive(1, stiffer)], DRIVE, test=[run_of_a_drive(2, stiffer)])
     (law,) = answer.laws
@@ -331,6 +335,7 @@ def test_a_cubic_coupling_of_the_difference_is_learned() -> None:
     assert answer.model is not None and answer.model.curves[law.name].of == D
 
 
+@pytest.mark.slow
 def test_what_is_of_one_of_the_two_alone_is_learned_as_that() -> None:
     answer = learn([run_of_a_drive(1, windage)], DRIVE, test=[run_of_a_drive(2, windage)])
     assert answer.verdict in ("learned", "named")

@@ -50,6 +50,7 @@ def with_load(force: float) -> tuple[Learner, Tried, list[Tried]]:
     return learner, before, [learner._fitted(before, c, SCREENED, theta, 12) for c, theta in both]
 
 
+@pytest.mark.slow
 def test_what_a_formula_says_is_learned_and_not_the_channel_that_follows_it() -> None:
     """The stroke goes with the speed by its schedule. As a curve of it the load does as well, and as no formula."""
     learner, before, tried = with_load(-1500.0)
@@ -80,6 +81,7 @@ def test_what_formulas_of_two_channels_say_as_well_is_of_the_plainer(monkeypatch
         assert said_first(learner, near, {STROKE: 0.0, SPEED: 0.0}) == near
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("linkage.ring.curve_of_n_r", "linkage.ring.curve_of_x_lvdt")])
 def test_candidates_are_ranked_on_all_samples(names: tuple[str, ...]) -> None:
     """In half a minute the links' lengths make up for anything."""

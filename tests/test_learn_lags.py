@@ -48,6 +48,7 @@ def left(chain: Chain, stage: str) -> float:
     return float(np.sqrt(np.nanmean((s.run(s.neutral()[None])[0] - s.measured) ** 2)))
 
 
+@pytest.mark.slow
 @given(st.floats(0.005, 50.0), st.floats(-20.0, 20.0), st.integers(1, 400))
 def test_a_step_comes_through_a_lag_as_its_exponential(tau: float, step: float, ticks: int) -> None:
     name = f"i_cmd_lagged_by_{round(tau * 1e6)}_us"
@@ -127,6 +128,7 @@ def test_loop_and_stage_say_the_same_of_an_engine_that_remembers() -> None:
     assert without > 20.0 * with_it and with_it < 0.03
 
 
+@pytest.mark.slow
 def test_compiled_or_not_a_lag_has_the_same_bits() -> None:
     code = (
         "import hashlib; from tests.test_learn_lags import *; "
@@ -167,6 +169,7 @@ def test_an_excerpt_of_the_linkage_says_what_the_whole_log_says_there() -> None:
     assert np.abs(off)[counts].max() < 0.1 * float(np.min(stage.floor))
 
 
+@pytest.mark.slow
 def test_lags_are_of_what_drives_a_stage() -> None:
     _, whole = chain()
     for stage in whole.stages:

@@ -212,6 +212,7 @@ def humming():
     return learn([hummed(1, "one", 1.0)], HELD, test=[hummed(2, "two", 1.0)])
 
 
+@pytest.mark.slow
 def test_a_hum_is_learned_with_its_period_and_size(humming) -> None:
     assert humming.verdict == "learned"
     (found,) = humming.laws
@@ -274,6 +275,7 @@ def drifting():
         return learned_where_the_gain_drifts(), *diagnoses, found
 
 
+@pytest.mark.slow
 def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
     answer, *_ = drifting
     first, second = answer.laws
@@ -283,6 +285,7 @@ def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
     assert period_of(second.of) == pytest.approx(1.0 / 0.11, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting, monkeypatch) -> None:
     """The same logs, with the candidates that were found for them."""
     _, diagnosis, found = drifting
@@ -333,6 +336,7 @@ def test_what_no_machine_has_a_period_of_is_refused() -> None:
             build_plant(model=curved(law("sensors.lvdt adds", name, "line", 0.4)))
 
 
+@pytest.mark.slow
 def test_an_oscillating_driver_is_learned_from_a_log_of_the_rig(tmp_path) -> None:
     hidden = rig.draw("driver_oscillation", 3, np.random.default_rng(1))
     run = rig.simulate(rig.manoeuvre(12, 40.0), firmware(), [hidden], seed=12, rate=100, randomised=False)

@@ -60,6 +60,7 @@ def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
     return learner_on(OwnGround(bind(TANK, [record], [])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("outflow", "seed"), [((0.1, 0.35), 3), ((0.06, 0.4), 5)])
 def test_what_goes_with_one_over_a_parameter_is_among_what_is_fitted(outflow: tuple[float, float], seed: int) -> None:
     """Four times the outflow is a quarter of the level: no step by slopes shows it, and sums of the oil seemed more."""
@@ -83,6 +84,7 @@ def standing_chain(moves: slice) -> Any:
     return rig_chain([], n_dem, 240.0)
 
 
+@pytest.mark.slow
 def test_pieces_that_stand_are_not_searched() -> None:
     """Where the stroke stands nobody knows where in their play the rings are: such a piece counts for nothing."""
     stage = standing_chain(slice(14_000, 20_000)).stage("linkage")
@@ -97,6 +99,7 @@ def test_pieces_that_stand_are_not_searched() -> None:
     assert all(counts[k] >= LITTLE * max(counts) for k in chosen)
 
 
+@pytest.mark.slow
 def test_where_few_pieces_count_the_excerpt_is_no_shorter() -> None:
     stage = standing_chain(slice(14_000, 15_500)).stage("linkage")
     assert stage.floor is not None
@@ -108,6 +111,7 @@ def test_where_few_pieces_count_the_excerpt_is_no_shorter() -> None:
         assert len(at) == 8_000 and len(set(at.tolist())) == 8_000
 
 
+@pytest.mark.slow
 def test_a_measured_angle_puts_no_other_quantity_behind() -> None:
     """What a stage gives, as it was measured, has the noise of its error in it: a curve takes a little of that off."""
     learner = learner_on(VaneGround(standing_chain(slice(0, 24_000)).stage("linkage")))

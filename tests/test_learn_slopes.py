@@ -138,6 +138,7 @@ def relay(x: Any, u: Any, p: Any) -> Any:  # dx/dt
     return p.rate * (u.v - x.first), x.first - x.second
 
 
+@pytest.mark.slow
 def test_an_interval_that_no_jump_is_met_in_needs_no_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """A curve with a jump, in a state's rate: as with four steps everywhere, and exact between its jumps."""
     rng = np.random.default_rng(5)

@@ -23,6 +23,7 @@ def tank(x: Any, u: Any, p: Any) -> Any:  # dx/dt
     return p.inflow * u.pump - p.outflow * x.level
 
 
+@pytest.mark.slow
 def test_sets_in_two_threads_are_those_run_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit, with laws of the library and without."""
     rng = np.random.default_rng(11)
@@ -108,6 +109,7 @@ def seen_in_a_tuple(x: Any, u: Any, p: Any) -> Any:
     return x.second, x.first - x.second
 
 
+@pytest.mark.slow
 def test_models_that_return_a_list_run_as_those_that_return_a_tuple() -> None:
     """Bit for bit, also where the output asks the model, which then gives it a list."""
 
@@ -198,6 +200,7 @@ def test_a_set_of_the_model_s_own_parameters_has_no_law() -> None:
     assert np.array_equal(bound.run(whole[None, :own]), bound.run(whole[None]))
 
 
+@pytest.mark.slow
 def test_states_that_nobody_measures_are_walked_through_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two lags in a row, at rest, under a step: 1 - exp(-t) and 1 - (1 + t) exp(-t)."""
     walked = []

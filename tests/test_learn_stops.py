@@ -49,6 +49,7 @@ def ticks_of(model: Model, course: np.ndarray, site: int) -> np.ndarray:
     return np.array(out)
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(-20.0, 20.0), min_size=1, max_size=30))
 def test_in_the_plant_stops_are_those_of_their_definition(course: list[float]) -> None:
     """Each is the way since rest, kept within its radius at every tick; weights are the slopes' differences."""
@@ -182,6 +183,7 @@ def true_bushing(x: np.ndarray) -> np.ndarray:
     return np.asarray(-GIVE / 6.0 * np.minimum(x[:, None] / widths, 1.0).sum(axis=1))
 
 
+@pytest.mark.slow
 def test_of_what_a_bushing_may_be_the_hysteresis_at_the_crank_is_best(monkeypatch) -> None:
     """Of what all rings may have of the stroke's hysteresis, direction and way since it turned; another amplitude
     confirms it.

@@ -20,6 +20,7 @@ from scipy.integrate import solve_ivp
 from plant import Model, load_model, write_model
 from plant.model import Learned, Second
 from tests.browser import open_to_all
+from tests.conftest import examples
 from tests.rig_systems import draw_case
 from tests.rig_systems.surfaces import SHAPES, draw_surface
 from tests.test_learn import TANK, run_of_a_tank
@@ -69,6 +70,7 @@ def exact(law: Learned, x: float, z: float) -> float:
     return float(BSpline(np.array(law.second.knots), along, 3)(np.clip(z, law.second.low, law.second.high)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "at", "of", "second"),
     [
@@ -107,6 +109,7 @@ def test_a_surface_does_what_its_place_says(bound, how: str, at: str, of: str, s
     assert np.max(np.abs(ours - shown)) < 0.02
 
 
+@pytest.mark.slow
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.integers(0, 50))
 def test_a_surface_is_the_same_in_the_loop_and_beside_it(x: float, z: float, seed: int) -> None:
     """Straight between its points each way, and beyond its edges as at them."""
@@ -204,7 +207,7 @@ ANY = st.one_of(
 
 
 @given(st.sampled_from(["of", "low", "high", "knots", "form", "been"]), ANY, st.booleans(), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_no_law_file_ends_in_a_traceback(bound, key: str, value: Any, drop: bool, outer: bool) -> None:
     """Whatever one of its keys is: the file is refused in one line, or it runs."""
     as_file = json.loads(law(been=[(0.0, 20.0), (40.0, 20.0), (0.0, 60.0)]).model_dump_json())
@@ -235,6 +238,7 @@ def test_no_hidden_law_of_two_quantities_is_a_sum(shape: str) -> None:
     assert np.std(left) > 0.15 * np.std(z)
 
 
+@pytest.mark.slow
 def test_a_law_of_two_quantities_is_hidden_where_both_move() -> None:
     case, both = draw_surface(3, 0, ("valve_bench", "dc_motor"))
     assert case.family.name == "dc_motor"  # the other has one quantity only
@@ -336,6 +340,7 @@ def test_a_leak_that_grows_with_pressure_and_with_warmth_is_a_surface_and_a_prod
     open_to_all(page, "surface")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truth", ["one", "sum", "nothing"])
 def test_what_does_not_act_together_gets_no_surface(truth: str) -> None:
     answer = learned(truth)

@@ -140,6 +140,7 @@ def eccentric():
     return learn([turned(1, "one", 0.02)], MOTOR, test=[turned(2, "two", 0.02)])
 
 
+@pytest.mark.slow
 def test_an_encoder_out_of_centre_is_learned_with_its_turn_and_size(eccentric) -> None:
     assert eccentric.verdict == "learned"
     (found,) = eccentric.laws

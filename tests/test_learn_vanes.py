@@ -219,6 +219,7 @@ def logs(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_law_of_one_log_lets_the_error_of_another_fall(logs, capsys) -> None:
     one, two, file, better = (str(logs / n) for n in ("one.parquet", "two.parquet", "law.toml", "better.toml"))
     out, report = str(logs / "law.json"), str(logs / "law.html")
@@ -277,6 +278,7 @@ def rig_chain(hidden: list[rig.Hidden], n_dem: np.ndarray | None = None, duratio
     return build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
 
 
+@pytest.mark.slow
 def test_of_a_reading_that_lacks_bits_the_step_is_learned_and_nothing_of_what_it_drives() -> None:
     """The controller sees the stairs, too: a gain of its current had been learned of them."""
     step = 0.1843

@@ -160,6 +160,7 @@ def test_vgv1_passes_90_degrees_of_theta3_where_the_printed_arcsine_folds():
     assert max(theta3) > 90 > min(theta3)
 
 
+@pytest.mark.slow
 def test_uncompiled_functions_give_the_same_bits():
     if os.environ.get("NUMBA_DISABLE_JIT") == "1":
         pytest.skip("already uncompiled")

@@ -43,6 +43,7 @@ def test_same_run_gives_the_same_hash_in_another_process() -> None:
     assert hash_in_another_process(2.0) == hash_here(2.0)
 
 
+@pytest.mark.slow
 def test_same_run_gives_the_same_hash_under_load() -> None:
     alone = hash_here(2.0)
     with ThreadPoolExecutor(4) as pool:
@@ -104,6 +105,7 @@ def engine_tests():
     return n, engine_test(n, "single"), engine_test(n, "dual")
 
 
+@pytest.mark.slow
 def test_engine_test_is_as_long_as_the_papers(engine_tests) -> None:
     n, single, dual = engine_tests
     assert len(n) * 1e-2 > 3000.0

@@ -42,6 +42,7 @@ def clean(said: dict[str, tuple[str, float]]) -> bool:
     return all(verdict == "none" and excess < 1.05 for verdict, excess in said.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gaps", [[(40.0, 8.0)], [(20.0, 1.0), (55.3, 8.0), (90.0, 2.5)]])
 def test_stages_start_anew_after_a_gap(gaps):
     log = rows(41)

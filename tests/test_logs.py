@@ -28,6 +28,7 @@ from hil.logs.dbc import Message, load_dbc
 from hil.logs.frames import EXTENDED, Frames
 from hil.logs.signals import cut_signal, e2e_crc, encode, select
 from hil.logs.trc import read_trc
+from tests.conftest import examples
 from vaneloop.base import tables
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
@@ -297,7 +298,7 @@ def test_a_bus_log_gives_back_what_the_frames_carry(tmp_path: Path, suffix: str)
     st.lists(st.tuples(st.floats(0, 1e4), st.floats(-10, 75)), min_size=2, unique_by=lambda p: p[0]),
     st.sampled_from(TABLES),
 )
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(50))
 def test_any_samples_survive_a_table(tmp_path: Path, points: list[tuple[float, float]], suffix: str) -> None:
     t, values = np.array(sorted(points)).T
     write_log(tmp_path / f"any{suffix}", {"n_dem": Channel(t, values), "x_dem": Channel(t[:1] + 0.5, values[:1])})

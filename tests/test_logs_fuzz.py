@@ -108,6 +108,7 @@ def campaign(folder: Path, suffix: str, seeds: range, dbc: Path | None = None) -
             raise AssertionError(f"seed {seed} of {suffix}: {type(e).__name__}: {e}") from e
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs.FORMATS))
 def test_no_damage_takes_the_reader_down(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     campaign(tmp_path, suffix, range(QUICK[suffix]))
@@ -123,6 +124,7 @@ def test_long_campaign(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
 
 
+@pytest.mark.slow
 def test_a_damaged_mdf_ends_the_child_and_not_the_reader(tmp_path: Path) -> None:
     """Without any stand-in: the reader's own child on files that end it by a fault, and on one that it reads."""
     write_log(tmp_path / "a.mf4", run(50))
@@ -148,6 +150,7 @@ def test_a_child_that_never_answers_is_ended(tmp_path: Path, monkeypatch: pytest
         read_log(tmp_path / "a.mf4")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no processor time")
 def test_a_reader_that_never_ends_is_stopped_by_the_processor_time_it_takes(tmp_path: Path) -> None:
     """However busy the machine is: by the clock, a whole file would be called damaged there."""

@@ -41,6 +41,7 @@ def logs() -> tuple[Log, Log]:
     return tuple(Log("rig", {k: Channel(t, v) for k, v in c.items() if k != "t"}) for c in (columns[0], burst))  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 def test_rows_of_an_excerpt_are_those_of_the_log() -> None:
     log = logs()[0]
     grid = grid_of(log)
@@ -72,6 +73,7 @@ def test_errors_of_an_excerpt_are_those_that_the_log_has_there() -> None:
         assert np.allclose(stage.floor, full.floor, rtol=0.05), stage.name
 
 
+@pytest.mark.slow
 def test_errors_of_the_whole_log_are_those_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     log = logs()[1]
     monkeypatch.setattr(long, "STRETCH", 4)
@@ -90,6 +92,7 @@ def test_errors_of_the_whole_log_are_those_of_one_piece(monkeypatch: pytest.Monk
         assert held.sums[stage.name].samples.sum(axis=1) == pytest.approx(n, rel=0.02), stage.name
 
 
+@pytest.mark.slow
 def test_what_the_excerpt_has_not_seen_is_found_and_searched() -> None:
     """A dead band of one minute in ten, of which the excerpt has nothing at first."""
     log, laws = logs()[1], ("valve_dead_band", "valve_null_bias")
@@ -170,6 +173,7 @@ def test_a_clean_answer_does_not_stand_where_the_log_fails() -> None:
     assert of_whole(d, replace(sums, squares=1.5 * sums.squares), []).verdict == "unknown"
 
 
+@pytest.mark.slow
 def test_a_short_log_is_searched_whole() -> None:
     log = logs()[0]
     assert machine().bind(log).whole is None

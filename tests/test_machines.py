@@ -373,6 +373,7 @@ def worn(folder: Path, hidden: list[rig.Hidden], seconds: float = 90.0) -> Any:
     return Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "stage"), [(1, 0), (4, 3), (8, 6)])
 def test_the_rig_s_wear_is_named_with_its_stage(made: Any, n: int, stage: int) -> None:
     folder = made.folder(n)

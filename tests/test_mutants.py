@@ -75,6 +75,7 @@ def campaign(folder: Path, tests: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_a_campaign_tells_the_killed_from_the_survivors_and_ends_endless_loops(tmp_path: Path) -> None:
     run = campaign(tmp_path, TESTS)
     assert run.returncode == 0, run.stderr

@@ -192,6 +192,7 @@ def same_outcome(reference: str, name: str) -> None:
         np.testing.assert_array_equal(values, theirs.trace.signals[signal], err_msg=f"{name} {signal}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_a_scenario_is_the_same_to_the_bit(reference: str, name: str) -> None:
     same_outcome(reference, name)
@@ -212,6 +213,7 @@ def test_a_changed_table_is_the_same_to_the_bit_while_it_runs(reference: str) ->
         np.testing.assert_array_equal(values, traces[1].signals[signal], err_msg=signal)
 
 
+@pytest.mark.slow
 def test_a_fuzz_campaign_is_the_same(reference: str) -> None:
     ours, theirs = fuzz(20_000, 3), fuzz(20_000, 3, calibration=with_program(reference))
     assert ours.failure is None and theirs.failure is None

@@ -24,6 +24,7 @@ def test_there_are_three_notebooks() -> None:
     assert len(list(FOLDER.glob("*.ipynb"))) >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(FOLDER.glob("*.ipynb")), ids=lambda f: f.stem)
 def test_a_notebook_runs_and_prints_what_it_shows(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))

@@ -70,6 +70,7 @@ def map_with(*own: Law, **more: Any) -> System:
 # ---- the equations, against others -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_laws_on_signals_follow_their_closed_forms() -> None:
     d = dispatch_of([WEAR, CREEP])
     u = np.full(len(T), 2.0)
@@ -92,6 +93,7 @@ def test_a_force_that_grows_with_the_way_made_does_its_work() -> None:
     np.testing.assert_allclose(f, 2.0 * way * np.sign(np.cos(t)), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_simulation_with_a_law_of_ones_own_is_that_of_the_model_that_has_it() -> None:
     t = np.arange(0.0, 20.0, 0.05)
     u = wave(3, t)
@@ -140,6 +142,7 @@ def test_an_own_law_is_found_fitted_kept_in_the_model_file_and_shown(tmp_path: P
     assert compare([record("b", v)], system, added=model).located[0].signals[0].rms < 0.025
 
 
+@pytest.mark.slow
 def test_a_law_with_memory_is_found_in_a_sensor() -> None:
     d = dispatch_of([CREEP])
     u = np.sign(wave(5)) + 0.3 * wave(6)
@@ -151,6 +154,7 @@ def test_a_law_with_memory_is_found_in_a_sensor() -> None:
     assert float(str(found.parameters["after"]["value"])) == pytest.approx(2.5, rel=0.2)
 
 
+@pytest.mark.slow
 def test_an_own_force_is_found_in_measured_motion() -> None:
     t = np.arange(0.0, 20.0, 0.005)
     w, size = np.array([0.7, 1.9, 3.1, 5.3]), np.array([0.5, 0.3, 0.15, 0.05])
@@ -168,6 +172,7 @@ def test_an_own_force_is_found_in_measured_motion() -> None:
     assert float(str(found.parameters["force"]["value"])) == pytest.approx(3.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_own_law_of_a_state_is_found_in_a_simulation() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(0.0, 600.0, 1.0)
@@ -224,6 +229,7 @@ RIGHT = "    return 2.0 * half(p.inflow * u.pump - p.outflow * x.level)"
 MINE = "    return u * (1.0 - p.size)"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "law", "note"),
     [
@@ -363,6 +369,7 @@ OWN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "place", "law", "size", "window"),
     [

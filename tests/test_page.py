@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from hil.figures import error_figures
 from tests.browser import open_to_all
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from vaneloop.base.errors import InputError
 from vaneloop.discrepancy.locate import Regime
 from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
@@ -120,7 +120,7 @@ def test_hostile_names_stay_text():
     assert "<" not in trace["name"] and html.unescape(trace["name"]) == HOSTILE
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(st.text(max_size=40))
 def test_any_text_leaves_the_structure_of_the_page(name):
     page = Page(name, name, command=name, log=name)
@@ -210,7 +210,7 @@ def test_numbers_read_as_a_person_writes_them(value, text):
     assert number(value) == text
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(1, 40000), st.integers(10, 6000), st.integers(0, 2**32 - 1))
 def test_a_thinned_line_keeps_its_extremes_and_its_limit(n, limit, seed):
     y = np.random.default_rng(seed).normal(size=n)
@@ -229,7 +229,7 @@ def test_a_spike_of_one_sample_survives():
     assert v.max() == 1.0 and x[v.argmax()] == 1234.567
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.integers(-8000, 8000).map(lambda k: k / 8), min_size=1, max_size=60))
 def test_a_distribution_is_drawn_in_steps(values):
     """At every place the line stands at the share of values that are not above it, far values too."""

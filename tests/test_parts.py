@@ -66,6 +66,7 @@ def test_only_the_fitted_part_is_fitted() -> None:
     assert errors["run 20:"] == pytest.approx(np.sqrt(np.mean((3.0 * u - 1.3)[late] ** 2)), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_law_that_turns_on_time_keeps_counting_in_the_second_part() -> None:
     u = wave(2)
     record = Record("run", T + 100.0, {"u": u, "y": 2.0 * u * (1.0 + 0.05 * T) + 0.3 + 0.02 * noise()})
@@ -83,6 +84,7 @@ def test_a_law_that_turns_on_time_keeps_counting_in_the_second_part() -> None:
     assert list(by_log.together().values())[-1]["test"][0] < 0.03
 
 
+@pytest.mark.slow
 def test_the_vane_chain_is_fitted_to_a_part_and_tested_on_the_rest(tmp_path: Path) -> None:
     words = [str(LOG), "--fit", "0:110", "--test", "110:", "--quiet"]
     assert main(["diagnose", *words, "--json", str(tmp_path / "d.json"), "--report", str(tmp_path / "d.html")]) == 1

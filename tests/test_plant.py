@@ -15,6 +15,7 @@ from plant.parameters import BANDWIDTH, FLOW_GAIN, PLAY, VALVE_A11, VALVE_A22, d
 from plant.play import play_step
 from plant.sensors import lag_factor, quantise
 from plant.valve import valve_matrix, valve_step
+from tests.conftest import examples
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_reversal_loses_the_whole_gap(machine) -> None:
     assert play_step(y, 0.3 - width * 1.5, width) == pytest.approx(y - width * 0.5)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.lists(st.floats(-1, 1), min_size=2, max_size=50), st.floats(0, 0.5))
 def test_play_is_rate_independent_and_stays_in_its_gap(path, width) -> None:
     y = z = path[0]
@@ -151,6 +152,7 @@ def test_lvdt_converter_steps_are_its_range_over_two_to_the_bits(machine) -> Non
     assert lag_factor(0.0, 1e-3) == 1.0
 
 
+@pytest.mark.slow
 def test_halving_the_plant_step_changes_the_stroke_by_less_than_a_tenth_of_a_count() -> None:
     from scipy.signal import chirp
 

@@ -102,6 +102,7 @@ def test_what_is_linear_in_the_motion_holds_up_to_a_period_from_the_ends():
     assert np.max(error) > 0.1 * 25.0  # and not before
 
 
+@pytest.mark.slow
 def test_a_system_that_forgets_slowly_has_its_starts_fitted():
     """A pendulum that hardly loses: noise in the first sample would stay in the whole log."""
     rng = np.random.default_rng(0)
@@ -155,6 +156,7 @@ def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first
     assert judge.total_of(stiction) <= judge.total_of(play) * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "jump", "noise"), [(11.0, 0.5, 0.5), (11.0, 0.5, 1.0), (3.0, 0.6, 0.3)])
 def test_stiction_is_found_on_from_the_play_that_stands_in_for_it(width: float, jump: float, noise: float):
     n, every = 1500, 4  # the controller is four times slower than the log

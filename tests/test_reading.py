@@ -25,7 +25,7 @@ from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
 from hil.logs.signals import encode
 from hil.loop.ecu import read_profile
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from tests.test_logs import check, refused
 from vaneloop.base import tables, terminal
 from vaneloop.base.errors import InputError
@@ -161,7 +161,7 @@ def test_a_machine_that_stands_still_may_be_near_zero(tmp_path: Path) -> None:
 
 
 @given(st.data())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=40)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=examples(40))
 def test_a_few_wild_samples_are_left_out_with_a_note_and_the_rest_is_read(tmp_path: Path, draw: st.DataObject) -> None:
     good = a_run()
     signal = draw.draw(st.sampled_from(sorted(set(good) - {"state"})))
@@ -359,7 +359,7 @@ def test_of_two_stamps_at_an_end_the_one_that_fits_the_others_is_kept(
 
 
 @given(st.data())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=60)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=examples(60))
 def test_wrong_time_stamps_anywhere_are_left_out(tmp_path: Path, draw: st.DataObject) -> None:
     form = draw.draw(st.sampled_from(quick_formats()))
     n = draw.draw(st.integers(200, 600))
@@ -586,6 +586,7 @@ def blf(containers: list[bytes], stated: int | None = None) -> bytes:
     return out.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "what", [pytest.param("zeros", marks=pytest.mark.slow), "frames", pytest.param("a lie", marks=pytest.mark.slow)]
 )
@@ -604,6 +605,7 @@ def test_frames_that_never_change_are_no_bomb(tmp_path: Path) -> None:
     assert read_log(tmp_path / "a.blf").channels["n_dem"].t.size == t.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["rows", "pages"])
 def test_a_parquet_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, what: str) -> None:
     import pyarrow as pa
@@ -625,6 +627,7 @@ def test_a_parquet_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, what: st
     assert "allowed: up to" in line or "not numbers" in line
 
 
+@pytest.mark.slow
 def test_an_mdf_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
     import asammdf
 

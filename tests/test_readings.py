@@ -56,6 +56,7 @@ def test_a_mean_current_is_not_taken_for_a_sampled_one() -> None:
     assert not any("i_cmd" in n for n in chain_of(recorded([], 32, 100, 60.0)).notes)
 
 
+@pytest.mark.slow
 def test_a_mean_of_the_ticks_before_the_row_is_known_as_such_and_nothing_is_missing() -> None:
     chain = chain_of(dict(simulate(manoeuvre(37, 120.0), firmware(), [], seed=37, rate=100, mean_through=False).log))
     assert any("the mean of the ten ticks before the row" in n for n in chain.notes)
@@ -63,6 +64,7 @@ def test_a_mean_of_the_ticks_before_the_row_is_known_as_such_and_nothing_is_miss
         assert said(chain, name).verdict == "none", name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [38, 39])
 def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -> None:
     """The LVDT's noise is in the current too: a model driven by it must not be correlated with the noise that it has to
@@ -84,12 +86,14 @@ def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -
             )  # nats; 350 with the noise in all ten ticks
 
 
+@pytest.mark.slow
 def test_a_dead_band_much_smaller_than_the_noise_in_the_current_is_found() -> None:
     d = said(chain_of(recorded([Hidden("valve_dead_band", {"half_width": 1e-5})], 40, 100, 200.0)), "actuator")
     assert [e.effect for e in d.effects] == ["valve_dead_band"]
     assert float(d.effects[0].parameters["half_width"]["value"]) == pytest.approx(0.01, rel=0.1)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_null_bias_is_found_in_a_log_of_sampled_current() -> None:
     rows = recorded([Hidden("valve_null_bias", {"bias": 5e-4})], 33, 1000)
     d = said(chain_of(rows, slice(None, None, 10)), "actuator")
@@ -97,6 +101,7 @@ def test_a_null_bias_is_found_in_a_log_of_sampled_current() -> None:
     assert float(d.effects[0].parameters["bias"]["value"]) == pytest.approx(0.5, abs=0.01)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["engine", "actuator", "linkage"])
 def test_a_log_of_ten_rows_a_second_lacks_nothing(stage: str) -> None:
     assert said(chain_of(recorded([], 34, 10, 200.0)), stage).verdict == "none"
@@ -108,6 +113,7 @@ def test_play_is_found_in_a_log_of_ten_rows_a_second() -> None:
     assert float(d.effects[0].parameters["vigv"]["value"]) == pytest.approx(np.rad2deg(0.01), rel=0.15)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> None:
     chain = chain_of(recorded([Hidden("valve_hysteresis", {"width": 2e-3})], 36, 100))
     d = said(chain, "actuator")

@@ -100,6 +100,7 @@ def turbine(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     return answer("micro_gas_turbine", tuple(files[:6]), tuple(files[6:]), tmp_path_factory.getbasetemp())
 
 
+@pytest.mark.slow
 def test_coulomb_friction_and_offset_of_the_axis_are_found_at_their_published_sizes(emps: dict[str, Any]) -> None:
     assert [e["effect"] for e in emps["effects"]] == ["force.coulomb", "force.force_offset"]
     own = {p["parameter"]: p["value"] for p in emps["parameters"]}
@@ -115,6 +116,7 @@ def test_the_axis_is_left_with_the_published_force_error(emps: dict[str, Any]) -
     assert error(emps, "PULSES")["rms"] < 0.5 * error(emps, "PULSES", 0)["rms"]
 
 
+@pytest.mark.slow
 def test_the_gap_of_the_damper_is_found(damper: dict[str, Any]) -> None:
     assert {"force.elastic_plastic", "force.backlash_gap"} <= {e["effect"] for e in damper["effects"]}
     assert value(damper, "force.backlash_gap", "gap") == pytest.approx(5.0, rel=0.05)

@@ -497,6 +497,7 @@ def check_run_and_ecu(bus: str, seconds: float, folder: Path) -> tuple[dict, dic
     return said, heard
 
 
+@pytest.mark.slow
 def test_controller_and_ecu_as_two_processes_on_the_embedded_bus(own_bus: str, tmp_path: Path) -> None:
     check_run_and_ecu(own_bus, 2.0, tmp_path)
 
@@ -524,6 +525,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     yield folder
 
 
+@pytest.mark.slow
 def test_a_stalled_controller_times_the_ecu_out_in_one_line(recorded: Path) -> None:
     code, _, err = json.loads((recorded / "ended.json").read_text())["ecu"]
     assert code == 1
@@ -575,6 +577,7 @@ def heard(port: Port, what: dict[str, Any], seconds: float, until: Any = None) -
     return out
 
 
+@pytest.mark.slow
 def test_a_controller_stopped_for_five_seconds_says_so_and_takes_no_old_frame(own_bus: str, tmp_path: Path) -> None:
     record, told = tmp_path / "run.mf4", tmp_path / "run.json"
     run = start("run", "--bus", own_bus, "--record", str(record), "--json", str(told), *priority())
@@ -653,6 +656,7 @@ def test_an_ecu_that_stood_still_takes_no_old_frame() -> None:
     assert sync.tolist() == [2, 2, 2, 2, 0, 0]  # the angles of further stages are not sent
 
 
+@pytest.mark.slow
 def test_a_terminal_that_does_not_control_the_process_is_read_in_lines(own_bus: str) -> None:
     """As under an init, or in a container: the process has a session of its own, and this terminal is not its own."""
     ours, theirs = os.openpty()
@@ -667,6 +671,7 @@ def test_a_terminal_that_does_not_control_the_process_is_read_in_lines(own_bus: 
     assert "'up' is not known" in err and len(err.splitlines()) == 2
 
 
+@pytest.mark.slow
 def test_a_lost_demand_frame_changes_the_run(recorded: Path, tmp_path: Path) -> None:
     lines = (recorded / "run.log").read_text().splitlines(keepends=True)
     k = [i for i, line in enumerate(lines) if " 0A0#" in line]
@@ -736,12 +741,14 @@ def test_typed_demand_reaches_the_controller(own_bus: str, tmp_path: Path) -> No
     assert json.loads((tmp_path / "run.json").read_text())["n_dem"] == pytest.approx(75.5)
 
 
+@pytest.mark.slow
 def test_an_ecu_without_a_controller_gives_up_in_one_line(own_bus: str) -> None:
     code, _, err = ended(start("ecu", "--bus", own_bus, "--profile", "idle", "--wait", "0.3"))
     assert code == 1
     assert err == "vaneloop ecu: no good VGV_STATUS within 0.3 s: is a controller running?\n"
 
 
+@pytest.mark.slow
 def test_priority_that_is_not_allowed_is_one_line(own_bus: str) -> None:
     if os.geteuid() == 0:
         if shutil.which("setpriv") is None:

@@ -109,6 +109,7 @@ def test_the_file_is_whole_after_every_append(suffix: str, tmp_path: Path, quick
     assert recorder.frames == total
 
 
+@pytest.mark.slow
 def test_long_parquet_recordings_keep_every_row_in_order(tmp_path: Path) -> None:
     file = tmp_path / "run.parquet"
     recorder = Recorder(file)
@@ -172,6 +173,7 @@ def test_what_cannot_be_recorded_to_is_refused_in_one_line(name: str, says: str,
         assert "\n" not in str(e.value) and name in str(e.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"run{suffix}"
@@ -198,6 +200,7 @@ def test_a_full_disk_ends_the_recording_but_not_the_file(suffix: str, tmp_path: 
     assert len(read_record(file).ms) == int(frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str, tmp_path: Path) -> None:
     """Else the first frames wait in memory for as long as imports take, and are lost with the process."""
@@ -225,6 +228,7 @@ def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str
 # ---- kill -9 ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_killing_the_recorder_costs_at_most_a_second(suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"run{suffix}"
@@ -251,6 +255,7 @@ def test_killing_the_recorder_costs_at_most_a_second(suffix: str, tmp_path: Path
     assert "killed" in recorder.error
 
 
+@pytest.mark.slow
 def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> None:
     file = tmp_path / "run.mf4"
     code = f"""
@@ -276,6 +281,7 @@ def test_killing_the_loop_loses_nothing_that_it_handed_over(tmp_path: Path) -> N
     assert len(read_record(file).ms) == 500
 
 
+@pytest.mark.slow
 def test_vaneloop_record_survives_kill_9_in_every_format(tmp_path: Path) -> None:
     """Four recorders on one bus, killed while frames come; and one that is asked to end, which has them all."""
     name = f"local:record{os.getpid()}"

@@ -88,6 +88,7 @@ def test_model_agrees_with_a_log_that_it_made(own_log, name, tmp_path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_exceeded_tolerance_exits_1_and_says_which(own_log) -> None:
     done = vaneloop("compare", own_log / "biased.csv", "--tolerance", "vigv=0.4")
     assert done.returncode == 1
@@ -184,6 +185,7 @@ def test_real_car_log_drives_the_loop(data_dir) -> None:
     assert vigv["reference"] == "schedule" and vigv["mean_abs"] < 0.55
 
 
+@pytest.mark.slow
 def test_real_truck_recording_drives_the_loop(data_dir) -> None:
     folder = data_dir / "can_j1939"
     options = ["--map", "EngineSpeed=n_dem", "--unit", "n_dem=rpm", "--design-rpm", "1000", "--json", "-", "--quiet"]

@@ -214,6 +214,7 @@ def test_the_vane_loses_its_nominal_play_on_reversal():
         assert there - back == pytest.approx(width, rel=0.005)
 
 
+@pytest.mark.slow
 def test_the_engine_keeps_its_acceleration_limits():
     n = np.concatenate([np.full(300, 45.0), np.full(1200, 95.0), np.full(1200, 45.0)])
     test = Manoeuvre("slam", 0, n, np.full(len(n), 21e6), np.full(len(n), 40.0))

@@ -17,6 +17,7 @@ def said(hidden: list[Hidden], seed: int, stage: str) -> StageDiagnosis:
     return diagnose_stage(s, s.floor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sizes", "rivals"),
     [
@@ -33,6 +34,7 @@ def test_what_needs_least_freedom_is_named(name: str, sizes: dict[str, float], r
     assert found.effect == name and set(found.rivals) <= rivals
 
 
+@pytest.mark.slow
 def test_a_slow_valve_is_told_from_a_slow_lvdt_by_the_linkage() -> None:
     chain = chain_of(recorded([Hidden("valve_lag", {"time_constant": 0.01})], 52, 100, 200.0))
     actuator = chain.stage("actuator")
@@ -43,6 +45,7 @@ def test_a_slow_valve_is_told_from_a_slow_lvdt_by_the_linkage() -> None:
     assert [(e.effect, e.rivals) for e in together] == [("valve_lag", [])]
 
 
+@pytest.mark.slow
 def test_a_threshold_has_the_interval_of_the_sizes_that_fit_as_well() -> None:
     d = said([Hidden("trend_threshold_error", {"factor": 2.2})], 53, "demand")
     factor = d.effects[0].parameters["factor"]
@@ -50,6 +53,7 @@ def test_a_threshold_has_the_interval_of_the_sizes_that_fit_as_well() -> None:
     assert float(factor["high"]) - float(factor["low"]) < 0.4  # type: ignore[operator, arg-type]
 
 
+@pytest.mark.slow
 def test_friction_has_its_size_though_the_piston_stands_off_the_middle() -> None:
     d = said([Hidden("piston_friction", {"force": 4000.0})], 54, "actuator")
     assert "piston_friction" in [e.effect for e in d.effects]

@@ -107,6 +107,7 @@ def ratios(verb: str, j: Any) -> dict[str, float]:
     return {s["signal"]: s[before] / s["noise_floor"] for s in j["stages"] if s["signal"]}
 
 
+@pytest.mark.slow
 def test_the_example_s_actuator_starts_at_132_floors_whoever_is_asked(said: dict[str, Any]) -> None:
     for verb in ("compare", "locate", "diagnose", "extend", "web"):
         assert ratios(verb, said[verb])["x_lvdt"] == pytest.approx(132.0, rel=0.02), verb

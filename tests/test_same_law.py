@@ -47,6 +47,7 @@ def test_a_flow_that_is_rectified_is_a_curve_of_the_current_that_makes_it() -> N
     assert judged(right + 0.3 * x - 1.0, untold=(0, 1))["inside"] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "at", "of", "same"),
     [
@@ -69,6 +70,7 @@ def test_a_drag_is_a_gain_of_the_damping_and_no_gain_of_the_mass(how: str, at: s
     assert (said["inside"] > 0.95) == same
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("untold", [(), (0,), (1,), (0, 1)])
 @pytest.mark.parametrize(("flow", "same"), [(0.3, True), (0.4, False)])
 def test_a_bias_of_the_pump_is_a_constant_flow_into_its_tank_whatever_cannot_be_told(

@@ -235,6 +235,7 @@ def test_log_to_tables_to_engine_test_shows_small_errors(engine, capsys):
     open_to_all(report, "schedule")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 11])
 def test_a_log_of_the_independent_rig_gives_tables_that_serve_the_same_machine(seed):
     t = np.arange(0.0, 135.0, 0.01)

@@ -163,6 +163,7 @@ def test_the_loop_hides_what_the_stage_shows(nominal: Answer) -> None:
     assert stage > 10 * loop
 
 
+@pytest.mark.slow
 def test_the_extended_model_is_nearer_to_the_log_in_the_whole_loop(
     nominal: Answer, extension: tuple[Answer, Path], tmp_path: Path
 ) -> None:
@@ -195,6 +196,7 @@ def test_locate_names_the_actuator_and_no_other_stage(tmp_path: Path) -> None:
     assert stages["actuator"]["onset_s"] is None  # it was there from the start
 
 
+@pytest.mark.slow
 def test_locate_agrees_with_the_extended_model(extension: tuple[Answer, Path]) -> None:
     answer = vaneloop("locate", LOG, "--model", extension[1], "--json", "-", "--quiet")
     stages = {s["stage"]: s for s in answer.json()["stages"]}

@@ -221,6 +221,7 @@ def test_spatial_command_states_the_difference_and_draws_it(tmp_path, capsys):
     open_to_all(page, "spatial")
 
 
+@pytest.mark.slow
 def test_clearance_command_names_the_millimetres(tmp_path, capsys):
     page = tmp_path / "p.html"
     assert main(["clearance", "--json", "-", "--report", str(page)]) == 0

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import examples
 from tests.test_your_own_model import drained, tank_of
 from vaneloop.discrepancy.models.spikes import LONGEST, spikes
 from vaneloop.verbs.search import diagnose
@@ -20,7 +21,7 @@ def smooth(seed: int) -> np.ndarray:
                    for f in (0.03, 0.11, 0.24)], axis=0)  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([-1e9, -30.0, 30.0, 1e9]), run=st.integers(1, LONGEST),
        at=st.integers(2, len(T) - LONGEST - 3), noise=st.sampled_from([0.0, 0.02, 0.3]))  # fmt: skip
 def test_a_jump_away_and_back_is_found_and_nothing_else(
@@ -31,7 +32,7 @@ def test_a_jump_away_and_back_is_found_and_nothing_else(
     assert np.flatnonzero(spikes(y)).tolist() == list(range(at, at + run))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(seed=st.integers(0, 10_000), factor=st.sampled_from([1e-12, 1e-3, 1e6]), offset=st.sampled_from([0.0, -4.0]))
 def test_it_does_not_turn_on_units(seed: int, factor: float, offset: float) -> None:
     rng = np.random.default_rng(seed)
@@ -90,6 +91,7 @@ def test_where_the_input_jumps_again_and_again_the_reading_may(width: int) -> No
     assert np.flatnonzero(spikes(voltage, [current])).tolist() == [550, 800]
 
 
+@pytest.mark.slow
 def test_a_log_with_lost_samples_has_the_same_answer() -> None:
     system = tank_of(1.0, 1.0)
     whole, lossy = drained(1, 1.0, 1.0), drained(1, 1.0, 1.0)

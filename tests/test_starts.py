@@ -40,6 +40,7 @@ def errors(answer: Stages) -> dict[str, float]:
     return {log: float(v[0]) for log, v in answer.by_log.steps["model"].items()}
 
 
+@pytest.mark.slow
 def test_a_log_that_begins_in_motion_may_start_at_a_fitted_velocity() -> None:
     logs, test = [swing("a", 1, 0.5, -1.2), swing("b", 2, -0.3, 0.8)], [swing("c", 3, 0.1, 1.0)]
     free = compare(logs, pendulum(start={"v": "fitted"}), test=test)
@@ -102,6 +103,7 @@ def test_a_force_model_takes_the_velocity_alone() -> None:
     assert max(errors(answer).values()) < 0.01
 
 
+@pytest.mark.slow
 def test_a_spring_is_found_where_only_the_velocity_is_logged() -> None:
     answer = diagnose([drive("a", 1, 0.7)], axis(False), test=[drive("b", 2, -0.4)])
     assert named(answer) == ["force.spring"]

@@ -46,6 +46,7 @@ def ramps(*points: tuple[float, float]) -> np.ndarray:
 # ---- the comparison --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS)
 def test_adaptive_is_nowhere_worse_than_dual_and_travels_no_farther(row: str) -> None:
     mine, dual = outcome(row, "adaptive"), outcome(row, "dual")
@@ -55,6 +56,7 @@ def test_adaptive_is_nowhere_worse_than_dual_and_travels_no_farther(row: str) ->
     assert mine.reversals <= dual.reversals and mine.faults == dual.faults == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_with_everything_wrong_adaptive_is_three_times_better_than_dual(seed: int) -> None:
     mine, dual = outcome("all together", "adaptive", seed), outcome("all together", "dual", seed)
@@ -204,6 +206,7 @@ def test_a_potentiometer_is_believed_only_after_it_followed_the_linkage() -> Non
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     page, answer = tmp_path / "s.html", tmp_path / "s.json"
     assert main(["strategies", "--dwell", "0.1", "--report", str(page), "--json", str(answer)]) == 0
@@ -245,6 +248,7 @@ def test_bad_input_is_one_line_and_exit_code_2(words: list[str], said: str, caps
 # ---- on a machine of other equations ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_on_the_independent_rig_adaptive_is_three_times_better_than_dual_too() -> None:
     """A specimen within its tolerances, worn by 0.8 deg and growing by 0.01 deg/K, simulated by the rig with equations
     of its own.

@@ -22,6 +22,7 @@ from hil.engine_test import EngineTestTable
 from plant import build_plant
 from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
 from plant.parameters import ElectromechanicalTable, PlantTable, load_plant
+from tests.conftest import examples
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Bound, Quantity, path, read
 from vaneloop.design.schedule_files import write_stroke_tables, write_vane_angles
@@ -416,7 +417,7 @@ ODD = st.sampled_from(
 ) | st.floats(-100, 200)
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(150), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @pytest.mark.parametrize("name", MODELS)
 @given(data=st.data())
 def test_any_edit_of_a_table_gives_a_loaded_table_or_one_line(tmp_path, name, data):
@@ -448,7 +449,7 @@ def test_any_edit_of_a_table_gives_a_loaded_table_or_one_line(tmp_path, name, da
         assert len(str(e).splitlines()) == 1 and str(e).startswith(f"{file}: ")
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(200), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=300), st.integers(0, 3000))
 def test_a_table_with_bytes_overwritten_gives_a_loaded_table_or_one_line(tmp_path, junk, where):
     raw = path("calibration.toml").read_bytes()

@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import lzma
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -161,6 +162,7 @@ def test_a_whole_run_says_nothing_loud(ways, capsys: pytest.CaptureFixture[str])
     assert "NOT TESTED" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_skipped_and_left_out_tests_are_written_down_by_pytest(tmp_path: Path) -> None:
     """With the project's own conftest.py: what is skipped, and under the short list what is left out."""
     told, tests = tmp_path / "told", tmp_path / "test_it.py"
@@ -191,17 +193,26 @@ def test_skipped_and_left_out_tests_are_written_down_by_pytest(tmp_path: Path) -
     assert second.startswith("test_it.py::test_long: would judge time")
 
 
-def test_the_last_thing_make_test_does_is_to_say_what_was_not_tested() -> None:
+def test_the_last_thing_make_test_all_does_is_to_say_what_was_not_tested() -> None:
+    words = ["make", "--no-print-directory", "-n", "-o", "lint", "test-all"]
+    done = subprocess.run(words, cwd=run.ROOT, check=True, capture_output=True, text=True, timeout=600)
+    lines = done.stdout.strip().splitlines()
+    before, _, other_tests = lines[-1].partition(" -m tests.vcan.run --beside ")
+    assert "-m pytest " in other_tests, "what pytest does is run beside"
+    written = before.split("VANELOOP_NOT_TESTED=")[1].split()[0]  # pytest writes what is read there
+    assert any(line.startswith("rm -f") and line.endswith(written) for line in lines), (
+        "nothing of an earlier run is told again"
+    )
+
+
+def test_what_make_test_leaves_make_test_all_runs() -> None:
+    expressions = {}
     for target in ("test", "test-all"):
-        words = ["make", "--no-print-directory", "-n", "-o", "lint", target]
+        words = ["make", "--no-print-directory", "-n", target]
         done = subprocess.run(words, cwd=run.ROOT, check=True, capture_output=True, text=True, timeout=600)
-        lines = done.stdout.strip().splitlines()
-        before, _, other_tests = lines[-1].partition(" -m tests.vcan.run --beside ")
-        assert "-m pytest " in other_tests, "what pytest does is run beside"
-        written = before.split("VANELOOP_NOT_TESTED=")[1].split()[0]  # pytest writes what is read there
-        assert any(line.startswith("rm -f") and line.endswith(written) for line in lines), (
-            "nothing of an earlier run is told again"
-        )
+        expressions[target] = re.findall(r"-m pytest .* -m '([^']+)'", done.stdout)
+    assert expressions == {"test": ["not slow and not socketcan"],
+                           "test-all": ["(slow or hypothesis) and not socketcan"]}  # fmt: skip
 
 
 INSIDE = """

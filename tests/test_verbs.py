@@ -57,6 +57,7 @@ def command(folder: Path, *words: str) -> Any:
     return json.loads(out.read_text())
 
 
+@pytest.mark.slow
 def test_diagnose_says_in_a_notebook_what_the_command_says(diagnosed: Diagnosed, tmp_path: Path) -> None:
     assert diagnosed.effects == ["valve_dead_band", "aero_load"] and diagnosed.verdict == "missing"
     assert without_times(diagnosed.to_dict()) == without_times(command(tmp_path, "diagnose", str(LOG)))
@@ -77,6 +78,7 @@ def test_a_diagnosis_page_has_the_numbers_of_its_json(diagnosed: Diagnosed, tmp_
         assert {r["parameter"], number(r["value"])} <= there
 
 
+@pytest.mark.slow
 def test_extend_gives_a_model_with_which_the_log_agrees(diagnosed: Diagnosed, tmp_path: Path) -> None:
     answer = vaneloop.extend(vaneloop.read_log(LOG), diagnosed.effects)
     assert isinstance(answer, Extended) and answer.reached and not answer.refused

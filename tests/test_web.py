@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from hil.logs.survey import survey
 from tests.browser import AXE, CHROMIUM, COLOURS, LONG, WHY_NOT, look_at, shot, violations
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from tests.test_realtime import ON_TIME_US
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
@@ -227,6 +227,23 @@ def wait_ratio(page: Any, condition: str) -> None:
     )
 
 
+# ---- every page ------------------------------------------------------------------------------------------------------
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("place", "shows"),
+    [("", "Missing physics"), ("schedule", "Schedule"), ("run", "Run"), ("fleet", "Fleet")],
+    ids=["missing", "schedule", "run", "fleet"],
+)
+def test_every_page_opens_without_a_complaint_and_is_open_to_all(
+    server: Server, page: Any, place: str, shows: str
+) -> None:
+    page.goto(server.at(place))
+    page.get_by_role("heading", level=1, name=shows).wait_for(state="attached")
+    assert not violations(page, AXE)
+
+
 # ---- page 1: missing physics -----------------------------------------------------------------------------------------
 
 
@@ -313,6 +330,7 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     looks(page, "missing")
 
 
+@pytest.mark.slow
 @needs_browser
 def test_where_the_library_knows_nothing_a_law_is_learned_saved_and_added(
     server: Server, page: Any, tmp_path: Path
@@ -383,6 +401,7 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
     page.get_by_text("Names and units").first.wait_for(state="detached")
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path: Path) -> None:
     """In the browser what to do next, in the terminal the line of the defect; no traceback anywhere. The other parts
@@ -425,6 +444,7 @@ def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path
     assert any("ZeroDivisionError" in line for line in lines) and any("KeyError: 'gone'" in line for line in lines)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     page.goto(server.url)
@@ -525,6 +545,7 @@ def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is()
         assert len(asked) == before + 1, more
 
 
+@pytest.mark.slow
 def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_told(tmp_path: Path) -> None:
     import asyncio
     from concurrent.futures import ThreadPoolExecutor
@@ -577,6 +598,7 @@ def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
 IN_ONE_TEST = ("locate", "replay", "extend", "diagnose", "experiment")  # the others where they are made anyway
 
 
+@pytest.mark.slow
 @needs_browser
 def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path: Path) -> None:
     import vaneloop
@@ -628,6 +650,7 @@ def test_every_command_with_a_report_has_it_held_against_axe_core() -> None:
     assert written - held - set(IN_ONE_TEST) == set() and len(written) >= 14
 
 
+@pytest.mark.slow
 @needs_browser
 def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Server, page: Any) -> None:
     page.goto(server.url)
@@ -704,7 +727,7 @@ def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Se
 
 @needs_browser
 @given(st.lists(st.tuples(st.floats(0, 1000), st.sampled_from(["RUN", "DEGRADED", "a fault with a long name"]))))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(30), deadline=None)
 def test_names_in_a_chart_never_lie_over_each_other(page: Any, words: list[tuple[float, str]]) -> None:
     source = (ROOT / "vaneloop" / "web" / "chart.js").read_text(encoding="utf-8")
     script = re.sub(r"^import .*$", "", source, flags=re.M).replace("export default", "return")
@@ -726,6 +749,7 @@ def step(page: Any, name: str) -> None:
     page.get_by_role("heading", name=re.compile(f"Step .: {name}")).wait_for()
 
 
+@pytest.mark.slow
 @needs_browser
 def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page: Any, tmp_path: Path) -> None:
     page.goto(server.at("schedule"))
@@ -813,6 +837,7 @@ def states_in(record: Path) -> tuple[set[str], set[int]]:
 RECORD_IS_THERE = "!!document.querySelector('.open-record')"
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: Any, tmp_path: Path) -> None:
     """The page says what `fleet report` says, of what is done and then of all; a click leads to a log's own page."""
@@ -853,6 +878,7 @@ def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: A
     page.get_by_text("This is a campaign's run").wait_for()
 
 
+@pytest.mark.slow
 @needs_browser
 def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: Any) -> None:
     page.add_init_script(WATCH_LAMPS)
@@ -888,6 +914,7 @@ def test_run_the_loop_inject_a_fault_and_open_the_record(server: Server, page: A
     assert "noise" in page.locator(".verdict").first.inner_text()
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_loop_is_calibrated_while_it_runs(server: Server, page: Any) -> None:
     """All by keyboard: gains to nothing, and the stroke stays; the reference page, and it follows."""
@@ -935,6 +962,7 @@ def test_the_loop_is_calibrated_while_it_runs(server: Server, page: Any) -> None
     page.get_by_text("Start the loop: then its calibration is read.").wait_for()
 
 
+@pytest.mark.slow
 @needs_browser
 def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None:
     from playwright.sync_api import TimeoutError as Late
@@ -1122,6 +1150,7 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(server: Server) -> No
     )
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: Any) -> None:
     page.goto(server.at("run"))
@@ -1160,6 +1189,7 @@ def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: A
     page.get_by_role("button", name="Start", exact=True).wait_for()
 
 
+@pytest.mark.slow
 def test_only_a_page_that_a_browser_goes_to_makes_a_session_and_a_seventh_ends_none(tmp_path: Path) -> None:
     s = Server(tmp_path, TMPDIR=str(tmp_path))
     try:
@@ -1292,7 +1322,7 @@ GUARDED = st.sampled_from(["host", "origin", "cookie", "content-length", "sec-fe
     st.booleans(),
     st.booleans(),
 )
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 def test_nothing_that_is_asked_breaks_the_guard(
     kind: str, method: str, path: str, query: bytes, extra: list[tuple[str, str]], good: bool, known: bool
 ) -> None:
@@ -1391,7 +1421,7 @@ def test_no_odd_request_gets_a_server_error(server: Server) -> None:
                        max_size=20)), max_size=4),
     st.sampled_from(["/", "/curves/", "/saved/", "/_nicegui/", "/_nicegui/3.0/static/", "/_nicegui_ws/socket.io/?"]),
 )  # fmt: skip
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_requests_get_no_server_error(
     server: Server, method: str, tail: str, more: list[tuple[str, str]], path: str
 ) -> None:
@@ -1406,6 +1436,7 @@ def test_what_belongs_to_a_session_is_given_to_nobody_else(server: Server) -> No
         assert ask(server, path, Cookie=server.known)[0] == 404
 
 
+@pytest.mark.slow
 def test_elsewhere_than_on_loopback_the_token_is_the_users_own(tmp_path: Path) -> None:
     for host in ("0.0.0.0", "127.0.0.1"):
         words = [sys.executable, "-m", "vaneloop.cli.main", "web", "--host", host, "--port", "0", "--no-open"]
@@ -1462,6 +1493,7 @@ def test_the_browser_is_opened_with_a_word_that_works_once(
 # ---- temporary folders -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_uploads_are_private_and_gone_at_the_end_or_after_a_kill_at_the_next_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1616,6 +1648,7 @@ def test_the_live_loop_runs_another_machine(tmp_path: Path) -> None:
     assert known == set(VANES[:4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "told"),
     [("*(volatile int *)0 = 1;", "ended its process"), ("for (;;) {}", "did not come back within 1 s")],

@@ -80,6 +80,7 @@ def run_installed(installed: Path, folder: Path, *arguments: str) -> str:
     return run(sys.executable, "-S", *arguments, cwd=folder, PYTHONPATH=os.pathsep.join([str(installed), *libraries]))
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_source_and_table(wheel: Path) -> None:
     inside = set(zipfile.ZipFile(wheel).namelist())
     kept = [
@@ -98,21 +99,25 @@ def test_the_wheel_holds_every_source_and_table(wheel: Path) -> None:
         assert f"{name}/__init__.py" in inside
 
 
+@pytest.mark.slow
 def test_the_tables_are_data_only() -> None:
     assert not list((ROOT / "tables").rglob("*.py"))
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_nothing_else_at_its_top(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert {t for t in tops if not t.endswith(".dist-info")} == set(PACKAGES)
 
 
+@pytest.mark.slow
 def test_every_package_imports_from_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
     code = f"import {', '.join(PACKAGES)}\nfor m in [{', '.join(PACKAGES)}]: print(m.__file__)"
     for file in run_installed(installed, tmp_path, "-c", code).splitlines():
         assert Path(file).is_relative_to(installed), f"{file} is not from the wheel"
 
 
+@pytest.mark.slow
 def test_replay_starts_from_the_installed_wheel_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
     assert "LOG" in run_installed(installed, tmp_path, "-m", "hil.replay", "--help")
     assert "SCENARIO" in run_installed(installed, tmp_path, "-m", "hil.inject", "--help")
@@ -120,6 +125,7 @@ def test_replay_starts_from_the_installed_wheel_in_an_empty_folder(installed: Pa
     assert not list(tmp_path.iterdir()), "--help left files behind"
 
 
+@pytest.mark.slow
 def test_the_wheel_writes_over_no_file_of_an_installed_package(wheel: Path) -> None:
     inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     for other in metadata.distributions():
@@ -128,6 +134,7 @@ def test_the_wheel_writes_over_no_file_of_an_installed_package(wheel: Path) -> N
             assert not shared, f"{other.name} has these files too: {sorted(shared)[:5]}"
 
 
+@pytest.mark.slow
 def test_the_wheel_beside_pytables_leaves_both_in_order(wheel: Path, tmp_path: Path) -> None:
     pytest.importorskip("tables", reason="PyTables is not installed (the test extra brings it)")
     beside = tmp_path / "beside"  # PyTables first, then ours over it, as pip would

@@ -358,6 +358,7 @@ print(r.state_hash, r.vgv.fingerprint(), hash(r.rows.tobytes()), r.error_frames)
 """
 
 
+@pytest.mark.slow
 def test_compiled_and_interpreted_loops_give_the_same_bits() -> None:
     answers = {
         subprocess.run(

@@ -548,6 +548,7 @@ def save_kp(x: Any, value: float) -> None:
     x.setRequest(1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [6, pytest.param(60, marks=pytest.mark.slow)])
 def test_pyxcp_records_at_1_ms_bit_for_bit(seconds: int) -> None:
     pytest.importorskip("pyxcp")

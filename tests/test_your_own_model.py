@@ -130,6 +130,7 @@ def test_a_sensor_s_fault_is_named_and_a_sound_sensor_is_left_alone(law: str) ->
         assert last_test_error(answer) < 0.05
 
 
+@pytest.mark.slow
 def test_friction_and_offset_are_found_from_measured_force() -> None:
     t = np.arange(0.0, 20.0, 0.005)
     x = 0.05 * np.cumsum(wave(4, t)) * 0.005
@@ -291,6 +292,7 @@ def test_a_system_that_cannot_be_is_refused(change: dict[str, Any], said: str) -
         System(name="map", model=line, **given)
 
 
+@pytest.mark.slow
 def test_a_smooth_input_between_few_samples_is_followed() -> None:
     # y' = (u - y)/T under a sine of five samples a period: its closed form is amplitude and phase of a first-order lag
     step, late = 0.2, 0.3
@@ -342,6 +344,7 @@ def cascade(x: Any, u: Any, p: Any) -> Any:
     return p.inflow * u.pump - down, down - p.out * max(x.lower, 0.0) ** 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overflow", "wrong"),
     [(True, 8.0), (False, 0.12), *(pytest.param(*v, marks=pytest.mark.slow) for v in ((True, 0.12), (False, 8.0)))],
@@ -362,6 +365,7 @@ def test_an_overflow_into_the_next_tank_is_found_from_starts_far_off(overflow: b
         assert float(str(level)) == pytest.approx(10.0, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("time", "size"),
     [(0.05, 1e3), (20.0, 1e-3), *(pytest.param(*v, marks=pytest.mark.slow) for v in ((0.05, 1e-3), (20.0, 1e3)))],
@@ -412,6 +416,7 @@ def tank_of(volt: float, cm: float, *more: Parameter) -> System:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("volt", "cm"), [(1e7, 1e-6), (1e-7, 1e6)])
 def test_a_parameter_may_be_tiny_or_huge_in_its_unit(volt: float, cm: float) -> None:
     """As flow gains in m^3/(s Pa^0.5) and compliances in 1/Pa are: a unit says nothing of a usual size."""
@@ -453,6 +458,7 @@ def test_a_law_of_a_model_file_that_is_0_can_be_fitted() -> None:
     assert fit.theta[at] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 21.5])
 def test_a_channel_that_stands_still_has_curves_of_a_finite_size(value: float) -> None:
     t = T[:400]
@@ -472,6 +478,7 @@ def test_a_channel_that_stands_still_has_curves_of_a_finite_size(value: float) -
         assert all(v == 0.0 or 1e-12 < abs(v) < 1e12 for start in e.starts for v in start), e.name
 
 
+@pytest.mark.slow
 def test_a_law_that_harms_a_test_log_is_not_named() -> None:
     u, v = wave(8), 3.0 * wave(9)
     fitted = Record("fitted", T, {"u": u, "y": 2.0 * u + 0.5 * np.abs(u) + 0.02 * noise()})

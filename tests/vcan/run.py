@@ -12,7 +12,7 @@ allows that way only. Arguments are handed to pytest::
     python -m tests.vcan.run [-k EXPRESSION ...]
     python -m tests.vcan.run --beside COMMAND ...
 
-With ``--beside`` they are run while a command runs, which is `make test`'s other tests: they wait most of the time.
+With ``--beside`` they are run while a command runs, which is `make test-all`'s other tests: they wait most of the time.
 What they print is shown when the command has ended. That needs a kernel of their own which may go before ordinary work.
 Where none can be had, they are run after the command, if it succeeds.
 
@@ -536,7 +536,7 @@ def conclude(outcome: Outcome, before: list[str], *, forced: bool) -> int:
         sys.stdin.read()  # ends with the command that this ran beside
     earlier = lines_of(
         Path(os.environ.get("VANELOOP_NOT_TESTED") or os.devnull)
-    )  # what pytest skipped before, in `make test`
+    )  # what pytest skipped before, in `make test-all`
     lines: list[str] = []
     if outcome.code is None:
         lines += [
