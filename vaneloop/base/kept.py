@@ -36,8 +36,8 @@ __all__ = ["AHEAD", "Waiting", "digest_of", "is_kept", "keep", "kept_njit", "sou
 
 _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
-# What was compiled when the program was set up (`vaneloop.base.ahead`); here it is only read.
-AHEAD = Path(os.environ.get("VANELOOP_AHEAD") or Path(__file__).parent / "ahead")
+# What was compiled when the program was set up (`vaneloop.cli.ahead`), for each Python; here it is only read.
+AHEAD = Path(os.environ.get("VANELOOP_AHEAD") or Path(__file__).parent / "ahead" / str(sys.implementation.cache_tag))
 OWN = 1_000  # files of users' functions that are kept
 _unknown = itertools.count()
 _Result: Any = compiler.CompileResult  # what has no types
