@@ -2,9 +2,11 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-can mutants bench pictures docs lint clean compiled
+.PHONY: help demo test test-all test-short test-pythons test-can mutants bench pictures docs lint clean compiled
 
-VENV := .venv
+# `make test PYTHON=python3.13`: another Python, in an environment of its own. Without it, the first that fits.
+PYTHON :=
+VENV := .venv$(addprefix -,$(notdir $(PYTHON)))
 PY := $(VENV)/bin/python
 SAY := printf '[vaneloop] %s\n'
 # Tests of real time, of fleets and of pages wait for much of their time: three workers keep two cores busy.
@@ -17,6 +19,8 @@ PYTEST = $(PY) -m pytest -n $(JOBS) --dist worksteal
 TESTS ?=
 LONG_TESTS := -m '(slow or hypothesis) and not socketcan' --hypothesis-profile thorough \
   --junitxml out/test-all.xml --durations=15
+# What may differ from one Python to the next: how functions are compiled and kept, processes, the command line, packages.
+SHORT := imports controller plant frames bus node logs record kept discrepancy laws own_laws exit_codes
 # Why tests were skipped: pytest writes it there, and the last lines of `make test-all` say it.
 NOT_TESTED := out/not_tested.txt
 
@@ -31,7 +35,7 @@ endif
 
 help:  ## list the targets
 	@printf 'VaneLoop\n\n'
-	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 20
 
 demo: compiled  ## replay a recorded engine run and the long engine test; writes demo/*.html
 	@$(PY) -m vaneloop.cli.demo
@@ -48,6 +52,12 @@ test-all: $(READY_ALL)  ## all that `make test` leaves: long tests, more example
 	@$(PY) -m vaneloop.cli.ahead
 	@$(SAY) 'pytest: the long tests'
 	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PYTEST) $(TESTS) $(LONG_TESTS)
+
+test-short: $(READY)  ## imports and the quick tests of controller, plant, bus, logs and search; PYTHON=python3.13 names a Python
+	@$(ONE_THREAD) $(PY) -m pytest -q -n 2 --dist worksteal --durations=5 -m 'not slow and not socketcan' $(SHORT:%=tests/test_%.py)
+
+test-pythons: $(READY)  ## the same on every other Python that the package promises and this machine has
+	@$(PY) -m tests.pythons
 
 test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run
@@ -76,7 +86,7 @@ compiled: $(READY)
 	@$(PY) -m vaneloop.cli.ahead
 
 clean:  ## remove what the other targets made, the environment too
-	@rm -rf $(VENV) build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis vaneloop/base/ahead
+	@rm -rf .venv .venv-* build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis vaneloop/base/ahead
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(HOME_OF_VENV):
@@ -112,8 +122,8 @@ endef
 define make_venv
 can() { "$$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null; }; \
 whole() { "$$1" -c 'import ensurepip, venv' 2>/dev/null; }; \
-candidates="python3.13 python3.12 python3.11 python3.14"; \
-if python3 -c 'import sys; sys.exit(sys.version_info >= (3, 14))' 2>/dev/null; then candidates="python3 $$candidates"; fi; \
+candidates="$(or $(PYTHON),python3.13 python3.12 python3.11 python3.14)"; \
+if [ -z "$(PYTHON)" ] && python3 -c 'import sys; sys.exit(sys.version_info >= (3, 14))' 2>/dev/null; then candidates="python3 $$candidates"; fi; \
 found=; bare=; \
 for p in $$candidates; do \
   if can $$p; then if whole $$p; then found=$$p; break; fi; bare=$${bare:-$$p}; fi; \
@@ -129,7 +139,7 @@ if [ -z "$$found" ] && [ -n "$$bare" ]; then \
   if whole "$$bare"; then found=$$bare; \
   else $(SAY) "$$bare lacks its venv module: install the package python$$v-venv (Debian, Ubuntu) and try again"; exit 1; fi; \
 fi; \
-if [ -z "$$found" ]; then $(SAY) 'no Python 3.11 or newer found (looked for python3, python3.11 to python3.14): install one and try again'; exit 1; fi; \
+if [ -z "$$found" ]; then $(SAY) 'no Python 3.11 or newer found (looked for $(or $(PYTHON),python3$(comma) python3.11 to python3.14)): install one and try again'; exit 1; fi; \
 $(SAY) "making $(VENV) with $$("$$found" --version)"; \
 rm -rf $(VENV); "$$found" -m venv $(VENV)
 endef
