@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +11,8 @@ import pytest
 
 from tests.browser import open_to_all
 from vaneloop.base.errors import InputError
-from vaneloop.cli.main import main
 from vaneloop.design import trend as tf
 from vaneloop.design.limit_cycles import LimitCycle, Play, limit_cycles, play_describing_function
-from vaneloop.design.needs import needed
 from vaneloop.design.servo import (
     Gains,
     ServoPlant,
@@ -209,19 +206,6 @@ def test_textbook_servo_with_backlash() -> None:
         pytest.approx(seen.omega, rel=0.01),
     )
     assert limit_cycles(lambda w: 0.25 / (1j * w * (1j * w + 1.0)), 0.4, 0.01, 20.0) == []  # K = 1/4: none
-
-
-@pytest.mark.parametrize("package", ["control", "filterpy"])
-def test_without_the_extra_one_line_says_what_to_install(
-    package: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=rf"the package {package}: pip install 'vaneloop\[design\]'"):
-        needed(f"{package}.anything")
-    if package == "control":
-        assert main(["design", "--quiet"]) == 2
-        err = capsys.readouterr().err
-        assert "pip install 'vaneloop[design]'" in err and len(err.splitlines()) == 1
 
 
 def test_controls_own_search_finds_the_same_crossing() -> None:

@@ -208,11 +208,11 @@ def test_an_interval_is_no_narrower_than_what_all_logs_have_wrong_together() -> 
 def made(**tables: list[dict[str, Any]]) -> Any:
     """A database as `roll_up` gives it, of these rows."""
     import duckdb
-    import polars as pl
+    import pyarrow as pa
 
     db = duckdb.connect()
     for name, rows in tables.items():
-        db.register("rows", pl.DataFrame(rows).to_arrow())
+        db.register("rows", pa.Table.from_pylist(rows))
         db.execute(f"CREATE TABLE {name} AS SELECT * FROM rows")
     return db
 

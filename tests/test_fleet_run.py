@@ -616,17 +616,6 @@ def test_a_place_that_is_not_there_is_one_line(
         rent.rent(fleet(tmp_path, many(2)), on, 1, {}, 0.2, lambda n, of: None)
 
 
-def test_without_the_extra_one_line_says_what_to_install() -> None:
-    script = (
-        "import sys; sys.modules['psutil'] = None\n"
-        "import importlib.util; find = importlib.util.find_spec\n"
-        "importlib.util.find_spec = lambda n, *a: None if n == 'psutil' else find(n, *a)\n"
-        "from vaneloop.cli.main import main; sys.exit(main(['fleet', 'status', 'x']))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], env=ENV, capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and "pip install 'vaneloop[fleet]'" in done.stderr and done.stderr.count("\n") == 1
-
-
 @pytest.mark.slow
 def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
     tmp_path: Path, undisturbed: list[tuple[str, ...]]

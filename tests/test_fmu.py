@@ -27,7 +27,6 @@ from hil.loop.node import Node
 from plant import Model, build_plant
 from plant.model import Learned
 from tests.conftest import ROOT
-from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.cli.main import main
 
@@ -403,14 +402,6 @@ def test_an_fmu_that_cannot_be_the_plant_is_refused_in_one_line(
         assert main(["run", "--bus", "lockstep", "--duration", "1", "--plant", path]) == 2, name
         said = capsys.readouterr().err.strip().splitlines()
         assert len(said) == 1 and line in said[0], (name, said)
-
-
-def test_without_fmpy_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "fmpy", None)
-    with pytest.raises(InputError, match=r"pip install 'vaneloop\[fmu\]'"):
-        PlantFmu("plant.fmu", ("vigv",))
 
 
 def test_bad_words_of_the_export_are_refused(

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from tests.nominal_systems import NOMINAL, nominal
@@ -421,9 +422,9 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Captu
     out = tmp_path / "r.parquet"
     words = ["hidden-law", "--seed", "3", "--family", "valve_bench", "--workers", "1", "--out", str(out)]
     assert main([*words, "--systems", "1", "--quiet"]) == 0
-    first = pl.read_parquet(out).to_dicts()
+    first = pq.read_table(out).to_pylist()
     assert main([*words, "--systems", "2", "--json", str(tmp_path / "r.json")]) == 0
-    both = pl.read_parquet(out).to_dicts()
+    both = pq.read_table(out).to_pylist()
     assert [r["index"] for r in both] == [0, 1] and both[0] == first[0]
     assert "1 systems done before" in capsys.readouterr().out
     assert json.loads((tmp_path / "r.json").read_text())["summary"]["systems"] == 2
@@ -455,7 +456,7 @@ def test_bad_options_are_told_in_one_line(words: list[str], said: str, capsys: p
 
 def test_a_file_that_is_no_result_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = tmp_path / "bad.parquet"
-    pl.DataFrame({"a": [1]}).write_parquet(bad)
+    pq.write_table(pa.table({"a": [1]}), bad)
     assert main(["hidden-law", "--out", str(bad)]) == 2
     assert "not a result of hidden-law" in capsys.readouterr().err
 

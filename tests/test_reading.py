@@ -277,9 +277,10 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
         file.write_text("t,n_dem\n" + "".join(f"{a:.6f},{b:.6f}\n" for a, b in zip(t, n_dem, strict=True)))
         return
     if suffix == ".parquet":
-        import polars as pl
+        import pyarrow as pa
+        import pyarrow.parquet as pq
 
-        pl.DataFrame({"t": t, "n_dem": n_dem}).write_parquet(file)
+        pq.write_table(pa.table({"t": t, "n_dem": n_dem}), file)
         return
     if suffix == ".mf4" and not file.name.startswith("bus"):
         hil.logs.mdf.write_groups(file, [(t, {"n_dem": (n_dem, "%")})])

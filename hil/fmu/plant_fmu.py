@@ -21,6 +21,7 @@ from hil.loop.node import Node
 from plant import Plant, chain, places
 from plant.parameters import LVDT_STEP
 from vaneloop.base.errors import InputError, meant
+from vaneloop.base.extras import needs
 
 __all__ = ["INPUTS", "OUTPUTS", "PlantFmu", "PlantNode"]
 
@@ -150,13 +151,12 @@ class PlantNode(Node):
 
 
 def _fmpy(path: str) -> Any:
-    try:
-        import fmpy
-        import fmpy.fmi1
-        import fmpy.fmi2
-        import fmpy.fmi3
-    except ImportError:
-        raise InputError(f"--plant {path}: FMPy loads it and is not installed: pip install 'vaneloop[fmu]'") from None
+    needs(f"--plant {path}: an FMU", "fmpy")
+    import fmpy
+    import fmpy.fmi1
+    import fmpy.fmi2
+    import fmpy.fmi3
+
     return fmpy
 
 

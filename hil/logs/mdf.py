@@ -26,6 +26,7 @@ from hil.logs.bus_log import encode_channels, open_bus_log
 from hil.logs.frames import EXTENDED, Frames, in_order
 from hil.logs.names import meaning
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
+from vaneloop.base.extras import needs
 from vaneloop.base.signals import UNITS
 
 __all__ = ["Groups", "open_mdf", "read_mdf", "write_bus", "write_groups", "write_mdf"]
@@ -98,6 +99,7 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         raise LogError(
             f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else "")
         )
+    needs(f"{path}: MDF4", "asammdf")
     seconds = _TIME[0] + int(check_file(path) / _TIME[1])
     request = {"path": str(path.absolute()), "wanted": wanted, "guess": guess, "seconds": seconds}
     answer = _child(json.dumps(request).encode() + b"\n", _BUSY * seconds)
@@ -277,6 +279,7 @@ def _bus_columns(mdf: Any, g: int, names: list[str]) -> list[np.ndarray]:
 
 def write_mdf(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Channel groups, one per raster; bus logging where a DBC is given."""
+    needs(f"{path}: MDF4", "asammdf")
     if dbc is not None:
         write_bus(path, encode_channels(channels, dbc, path))
         return

@@ -27,6 +27,7 @@ from hil.logs.record_formats import FRAME, BlfRecord, CandumpRecord, MdfRecord, 
 from hil.logs.record_parquet import ParquetRecord, read_parquet
 from hil.logs.source import LogError, check_file
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
 
 __all__ = [
     "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message",
@@ -101,6 +102,8 @@ def check_name(path: str | Path) -> Path:
     if path.suffix.lower() not in SUFFIXES:
         known = "candump (.log), BLF (.blf), MDF4 (.mf4) or Parquet (.parquet)"
         raise InputError(f"{path}: suffix {path.suffix!r} is not one of a recording; allowed: {known}")
+    if path.suffix.lower() == ".mf4":
+        needs(f"{path}: MDF4", "asammdf")
     if path.is_dir() or not path.parent.is_dir():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -146,6 +149,8 @@ def read_record(path: str | Path) -> Record:
         if path.suffix.lower() == ".parquet":
             us, rows, sent = read_parquet(path)
         else:
+            if path.suffix.lower() == ".mf4":
+                needs(f"{path}: MDF4", "asammdf")
             import can
 
             with can.LogReader(path) as reader:

@@ -12,7 +12,7 @@ from typing import Any
 
 from vaneloop.cli import station
 
-__all__ = ["accepted", "add_service_options", "attend", "check_service_options", "isotp_is_there", "wanted"]
+__all__ = ["accepted", "add_service_options", "attend", "check_service_options", "wanted"]
 
 
 def add_service_options(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +35,7 @@ def wanted(args: argparse.Namespace) -> bool:
 def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     """Refuse options that do not go together. Raises InputError."""
     from vaneloop.base.errors import InputError
+    from vaneloop.base.extras import needs
 
     for option in ("xcp_save", "xcp_lock"):
         if getattr(args, option) and not args.xcp:
@@ -42,7 +43,7 @@ def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     if args.uds_memory and not args.uds:
         raise InputError("--uds-memory belongs to --uds")
     if args.uds:
-        isotp_is_there()
+        needs("--uds", "isotp")
     if lockstep and wanted(args) and not args.inputs:
         option = "--xcp" if args.xcp else "--uds"
         raise InputError(
@@ -64,16 +65,6 @@ def accepted(args: argparse.Namespace) -> list[dict[str, int]]:
 
         idents += [REQUEST, FUNCTIONAL]
     return [*station.ACCEPTED, *({"can_id": ident, "can_mask": 0x7FF} for ident in idents)]
-
-
-def isotp_is_there() -> None:
-    """Refuse UDS where its transport is not installed. Raises InputError."""
-    import importlib.util
-
-    from vaneloop.base.errors import InputError
-
-    if importlib.util.find_spec("isotp") is None:
-        raise InputError("--uds needs the package can-isotp: pip install 'vaneloop[diagnostics]'")
 
 
 def attend(args: argparse.Namespace, node: Any, *, recorded: bool = False) -> Any:

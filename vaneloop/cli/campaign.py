@@ -50,10 +50,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.fleet.rent import known, needs
+    from vaneloop.base.extras import needs
 
-    needs("psutil", "duckdb", "distributed")
+    needs("vaneloop campaign", "psutil", "duckdb", "distributed")
     from vaneloop.fleet import campaign
+    from vaneloop.fleet.rent import known
     from vaneloop.pages.campaign import campaign_page
 
     if not 1 <= args.workers <= 10_000:

@@ -14,7 +14,7 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp,
 and the limit cycles that play inside the loop would cause, predicted by describing function and held against the time
-simulation. Needs the extra `design`: pip install 'vaneloop[design]'.
+simulation.
 
 examples:
   vaneloop design --report design.html

@@ -87,9 +87,9 @@ def _add_patience(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.fleet.rent import needs
+    from vaneloop.base.extras import needs
 
-    needs("psutil", "duckdb")
+    needs("vaneloop fleet", "psutil", "duckdb", "ruptures")
     parts = {"run": _run, "work": _work, "status": _status, "report": _report, "demo": _demo}
     return parts[args.part](args)
 

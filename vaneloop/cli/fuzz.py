@@ -155,13 +155,13 @@ def _written(args: argparse.Namespace) -> Iterator[None]:
 def _tool(args: argparse.Namespace) -> int:
     """The campaign against what answers tools."""
     from hil.inject import fuzz_tools
-    from vaneloop.cli.attended import isotp_is_there
+    from vaneloop.base.extras import needs
 
     for option in ("replay", "model", "tables", "plant", "controller"):
         if getattr(args, option, None):
             raise InputError(f"--{option} is not for --tool")
     if args.tool == "uds":
-        isotp_is_there()
+        needs("--tool uds", "isotp")
     with terminal.progress_bar(args, "frames") as progress:
         c = fuzz_tools.fuzz_tools(
             args.tool, args.frames, args.seed, progress,

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
-from vaneloop.design.needs import needed
 
 __all__ = ["LimitCycle", "Play", "harmonic_balance", "limit_cycles", "play_describing_function"]
 
@@ -60,7 +59,7 @@ def play_describing_function(amplitude: ArrayLike, gap: float) -> Complex:
 
     From `control.friction_backlash_nonlinearity`, whose argument is the *total* gap. 0 for A <= gap/2.
     """
-    ct = needed("control")
+    import control as ct
 
     f = ct.friction_backlash_nonlinearity(gap)
     a = np.atleast_1d(np.asarray(amplitude, dtype=float))

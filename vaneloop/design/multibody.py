@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from plant import Geometry
 from plant.geometry import DEG, MM
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
 
 __all__ = ["multibody_angles"]
 
@@ -41,18 +42,16 @@ def multibody_angles(geometry: Geometry, stage: str, stroke: Array, offset: floa
 
     Raises InputError where Exudyn is not installed or where the system does not close.
     """
-    try:
-        import exudyn as exu
-        from exudyn.itemInterface import (
-            CoordinateConstraint,
-            MarkerBodyRigid,
-            MarkerNodeCoordinate,
-            NodePointGround,
-            SphericalJoint,
-        )
-        from exudyn.utilities import InertiaCuboid
-    except ImportError:
-        raise InputError("the multibody check needs the package exudyn: pip install 'vaneloop[multibody]'") from None
+    needs("the multibody check", "exudyn")
+    import exudyn as exu
+    from exudyn.itemInterface import (
+        CoordinateConstraint,
+        MarkerBodyRigid,
+        MarkerNodeCoordinate,
+        NodePointGround,
+        SphericalJoint,
+    )
+    from exudyn.utilities import InertiaCuboid
 
     s, c = getattr(geometry, stage), geometry.crank
     le, lb, lc, ld, ldp, lever = (q.value * MM for q in (c.le, s.lb, s.lc, s.ld, s.ld_prime, s.l))

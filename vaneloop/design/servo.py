@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
-from vaneloop.design.needs import needed
 
 if TYPE_CHECKING:
     import control
@@ -205,7 +204,7 @@ def default_gains() -> Gains:
 
 def _s_plant(plant: ServoPlant) -> control.TransferFunction:
     """From current (A) to measured stroke (m)."""
-    ct = needed("control")
+    import control as ct
 
     valve = ct.tf(*plant.dynamics())
     actuator = ct.tf([plant.speed_per_ampere], [1.0, 0.0])
@@ -217,7 +216,7 @@ def continuous_loop(gains: Gains, plant: ServoPlant, order: int = 4) -> control.
     """Loop transfer function L(s) with the delay of half a tick and of the computation as a Pade approximation of
     ``order``.
     """
-    ct = needed("control")
+    import control as ct
 
     pi = ct.tf([gains.kp, gains.ki], [1.0, 0.0]) if gains.ki else ct.tf([gains.kp], [1.0])
     delay = ct.tf(*ct.pade(plant.tick * (0.5 + plant.delay), order))
@@ -233,7 +232,7 @@ def continuous_response(gains: Gains, plant: ServoPlant, omega: ArrayLike) -> Co
 
 def _sampled_plant(plant: ServoPlant) -> control.StateSpace:
     """From current (A, held for a tick) to the LVDT's sample (m), computation delay included."""
-    ct = needed("control")
+    import control as ct
 
     p = ct.sample_system(ct.ss(_s_plant(plant)), plant.tick, method="zoh")
     if plant.delay:
@@ -243,7 +242,7 @@ def _sampled_plant(plant: ServoPlant) -> control.StateSpace:
 
 def _sampled_pi(gains: Gains, plant: ServoPlant) -> control.StateSpace:
     """kp + ki T z/(z - 1): the firmware adds a tick's error to the integral before it uses it."""
-    ct = needed("control")
+    import control as ct
 
     if not gains.ki:
         return ct.ss([], [], [], [[gains.kp]], plant.tick)
@@ -289,14 +288,14 @@ def frequency_grid(plant: ServoPlant, points: int = 2500) -> Array:
 
 def frequency_response(system: control.StateSpace, omega: Array) -> Complex:
     """Frequency response of a loop with one input and one output."""
-    ct = needed("control")
+    import control as ct
 
     return np.asarray(ct.frequency_response(system, np.atleast_1d(omega), squeeze=False).complex, dtype=complex)[0, 0]
 
 
 def margins(gains: Gains, plant: ServoPlant, omega: Array | None = None) -> Margins:
     """Margins of the sampled loop, from `control.stability_margins` and `control.disk_margins`."""
-    ct = needed("control")
+    import control as ct
 
     omega = frequency_grid(plant) if omega is None else omega
     loop = sampled_loop(gains, plant)
@@ -332,7 +331,7 @@ def margins(gains: Gains, plant: ServoPlant, omega: Array | None = None) -> Marg
 
 def noise_current(gains: Gains, plant: ServoPlant) -> float:
     """Current (A rms) that the LVDT's white noise makes: the 2-norm of -C/(1 + P C) times the noise's rms."""
-    ct = needed("control")
+    import control as ct
 
     transfer = ct.feedback(_sampled_pi(gains, plant), _sampled_plant(plant))
     omega = np.linspace(0.0, math.pi / plant.tick, 40001)[1:]

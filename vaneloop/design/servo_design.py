@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
 from vaneloop.design.limit_cycles import LimitCycle, Play, harmonic_balance, limit_cycles
-from vaneloop.design.needs import needed
 from vaneloop.design.servo import (
     Gains,
     Margins,
@@ -149,7 +148,7 @@ def _step_figures(gains: Gains, plant: ServoPlant, curves: dict[str, Any]) -> di
     """Linear step (no feed-forward, no limit), and 10 mm as a bare step and as the firmware would draw it (100
     mm/s).
     """
-    ct = needed("control")
+    import control as ct
 
     closed = ct.feedback(sampled_loop(gains, plant), 1)
     t = np.arange(0.0, 1.0, plant.tick)

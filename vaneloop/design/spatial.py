@@ -40,13 +40,12 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     offset  mm along the engine's axis between the crank's plane and the clevis' where the vane angle is 0
     Raises InputError, naming stage and stroke, where a stage does not close.
     """
-    import importlib.util
-
     import numpy as np
 
     from plant.geometry import vane_angles
     from plant.spatial import spatial_angles
     from vaneloop.base.errors import InputError
+    from vaneloop.base.extras import is_there
     from vaneloop.design.multibody import multibody_angles
 
     if not -100.0 <= offset <= 100.0:
@@ -57,7 +56,7 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     planar = dict(zip(geometry.vanes, np.rad2deg(vane_angles(stroke * 1e-3, geometry)).T, strict=True))
     newton = {s: spatial_angles(geometry, s, stroke, offset) for s in geometry.vanes}
     multibody, notes = {}, []
-    if importlib.util.find_spec("exudyn") is None:
+    if not is_there("exudyn"):
         notes.append(
             "exudyn is not installed (pip install 'vaneloop[multibody]'): constraint equations by Newton's method only"
         )

@@ -29,7 +29,6 @@ from controller.records import SCALAR_FIELDS, as_state, record
 from controller.trend import trend_step
 from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
-from vaneloop.design.needs import needed
 
 __all__ = [
     "TrendDesign",
@@ -75,11 +74,11 @@ class TrendModel:
 
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """F, H, Q, R; Q from `filterpy.common.Q_discrete_white_noise`."""
+        from filterpy.common import Q_discrete_white_noise
+
         f = np.array([[1.0, self.step], [0.0, 1.0]])
         h = np.array([[1.0, 0.0]])
-        q = np.asarray(
-            needed("filterpy.common").Q_discrete_white_noise(dim=2, dt=self.step, var=self.acceleration**2), dtype=float
-        )
+        q = np.asarray(Q_discrete_white_noise(dim=2, dt=self.step, var=self.acceleration**2), dtype=float)
         return f, h, q, np.array([[self.sigma**2]])
 
 
@@ -88,7 +87,9 @@ class TrendModel:
 
 def _filter(model: TrendModel, first: float) -> Any:
     """A filterpy KalmanFilter at rest on the demand ``first``."""
-    kf = needed("filterpy.kalman").KalmanFilter(dim_x=2, dim_z=1)
+    from filterpy.kalman import KalmanFilter
+
+    kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.F, kf.H, kf.Q, kf.R = model.matrices()
     kf.x = np.array([[first], [0.0]])
     kf.P = np.diag([model.sigma**2, 1.0])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import logging
 from collections.abc import Callable
 from concurrent.futures import CancelledError
@@ -11,23 +9,15 @@ from contextlib import suppress
 from typing import Any
 
 from vaneloop.base.errors import InputError, meant
+from vaneloop.base.extras import needed, needs
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import BEATS, Me
 
-__all__ = ["PLACES", "known", "needs", "rent"]
+__all__ = ["PLACES", "known", "rent"]
 
 PLACES = "local, slurm, tcp://HOST:PORT (a Dask scheduler)"
 SCHEDULERS = ("tcp://", "tls://", "ws://")
 ANSWERS = 30.0  # s within which a Dask scheduler answers
-_NEEDED = {"distributed": "dask", "duckdb": "duckdb", "psutil": "psutil"}
-
-
-def needs(*modules: str) -> None:
-    """Raise InputError, one line, where the extra ``fleet`` is not installed."""
-    for module in modules:
-        if importlib.util.find_spec(module) is None:
-            name = _NEEDED.get(module, module)
-            raise InputError(f"vaneloop fleet needs {name}, which is not installed: pip install 'vaneloop[fleet]'")
 
 
 def known(on: str) -> None:
@@ -47,7 +37,7 @@ def rent(
     told   function that takes chunks done and all, called every second
     Raises InputError where the place cannot be reached, or a worker cannot go on (a full disk).
     """
-    needs("distributed")
+    needs(f"--on {on}", "distributed")
     import dask
     from dask.distributed import Client, wait
 
@@ -104,9 +94,8 @@ def _cluster(on: str, workers: int, queue: dict[str, str]) -> Any:
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=logging.CRITICAL,
             dashboard_address="127.0.0.1:0",  # any port: without one Dask takes 8787, and warns where that is taken
         )  # fmt: skip
-    needs("dask_jobqueue")
     options = {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "08:00:00", **queue}
-    cluster = importlib.import_module("dask_jobqueue").SLURMCluster(**options)
+    cluster = needed(f"--on {on}", "dask_jobqueue").SLURMCluster(**options)
     cluster.scale(jobs=workers)
     return cluster
 

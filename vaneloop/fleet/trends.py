@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from vaneloop.base.extras import needed
+
 __all__ = ["Limit", "Trend", "limit_of", "odd", "trend"]
 
 Array = NDArray[np.float64]
@@ -252,8 +254,7 @@ def _by_ruptures(t: Array, y: Array, w: Array) -> bool:
 
     It takes none of the two shapes for granted: what only one bad log makes look like a change, it leaves alone.
     """
-    import ruptures
-
+    ruptures = needed("vaneloop fleet", "ruptures")
     z = (y - np.average(y, weights=w)) * np.sqrt(np.median(w))
     n, flat, line = len(z), float(np.sum((z := z - z.mean()) ** 2)), _straight(t, z)
     if line < flat - 2.0 * np.log(n) * line / (n - 2):

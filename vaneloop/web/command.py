@@ -60,6 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.base.errors import InputError
+    from vaneloop.base.extras import needs
 
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port (={args.port}) must be in [0, 65535]")
@@ -75,11 +76,7 @@ def command(args: argparse.Namespace) -> int:
             f"VANELOOP_WEB_TOKEN: {LEAST_TOKEN} or more letters, digits, - and _ are needed; it has {len(token)} "
             f"characters"
         )
-    try:
-        import nicegui  # noqa: F401
-        import tsdownsample  # noqa: F401
-    except ImportError as e:
-        raise InputError(f"the workbench needs the package {e.name}: pip install 'vaneloop[web]'") from None
+    needs("the workbench", "nicegui", "tsdownsample")
     sock = _listen(args.host, args.port)
     host, port = sock.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host

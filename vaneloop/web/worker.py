@@ -390,9 +390,9 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
 
 def fleet_state(progress: Progress, run: str) -> dict[str, Any]:
     """How far a fleet's run is, as ``vaneloop fleet status`` says it, and whether it is a campaign's."""
-    from vaneloop.fleet.rent import needs
+    from vaneloop.base.extras import needs
 
-    needs("psutil", "duckdb")
+    needs("a fleet's run", "psutil", "duckdb", "ruptures")
     from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.state import state_of
 
