@@ -2,6 +2,8 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
+# Targets share one environment, and what takes long uses the cores itself.
+.NOTPARALLEL:
 .PHONY: help demo test test-all test-short test-pythons test-can mutants bench pictures docs lint clean compiled
 
 # `make test PYTHON=python3.13`: another Python, in an environment of its own. Without it, the first that fits.
@@ -26,8 +28,11 @@ NOT_TESTED := out/not_tested.txt
 
 # An environment serves only the checkout that it was made in: a copied, moved or broken one is made anew.
 HOME_OF_VENV := $(VENV)/.made-in
+# What is installed in it: the core alone, or an extra of pyproject.toml beside it. A target adds what it runs.
+READY_CORE := $(VENV)/.ready-core
 READY := $(VENV)/.ready-test
 READY_ALL := $(VENV)/.ready-test-all
+READY_DOCS := $(VENV)/.ready-docs
 READY_BENCH := $(VENV)/.ready-bench
 ifneq ($(shell cat $(HOME_OF_VENV) 2>/dev/null && $(PY) -c '' 2>/dev/null && echo works),$(CURDIR) works)
   $(shell rm -f $(HOME_OF_VENV) $(VENV)/.ready-*)
@@ -59,21 +64,21 @@ test-short: $(READY)  ## imports and the quick tests of controller, plant, bus, 
 test-pythons: $(READY)  ## the same on every other Python that the package promises and this machine has
 	@$(PY) -m tests.pythons
 
-test-can: $(READY)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
+test-can: $(READY_ALL)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run
 
-mutants: $(READY)  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
+mutants: $(READY_ALL)  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
 	@$(PY) -m tests.mutants $(MUTANTS)
 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)
 	@$(PY) -m benchmarks
 
-pictures: $(READY)  ## take the pictures of the README anew (docs/pictures/web_*.png)
+pictures: $(READY_ALL)  ## take the pictures of the README anew (docs/pictures/web_*.png)
 	@$(need_chromium)
 	@$(PY) -m benchmarks.pictures
 
-docs: $(READY)  ## the documentation site, in out/site/index.html; every link and anchor is checked
+docs: $(READY_DOCS)  ## the documentation site, in out/site/index.html; every link and anchor is checked
 	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 	@$(SAY) 'open out/site/index.html'
 
@@ -82,7 +87,7 @@ lint: $(READY)  ## ruff and mypy
 	@$(SAY) 'mypy'
 	@$(PY) -m mypy
 
-compiled: $(READY)
+compiled: $(READY_CORE)
 	@$(PY) -m vaneloop.cli.ahead
 
 clean:  ## remove what the other targets made, the environment too
@@ -93,24 +98,18 @@ $(HOME_OF_VENV):
 	@$(make_venv)
 	@echo '$(CURDIR)' >$@
 
-$(READY): pyproject.toml constraints.txt | $(HOME_OF_VENV)
-	@$(call install,test)
-	@touch $@
+# Whatever is installed, the core is there, too; what is there already stays.
+$(VENV)/.ready-%: pyproject.toml constraints.txt | $(HOME_OF_VENV)
+	@$(call install,$*)
+	@touch $@ $(READY_CORE)
 
-$(READY_ALL): $(READY) pyproject.toml constraints.txt
-	@$(call install,test-all)
-	@touch $@
-
-$(READY_BENCH): $(READY) pyproject.toml constraints.txt
-	@$(call install,bench)
-	@touch $@
-
-# The editable install makes edits count at once. A slow or failing package index is asked again.
+# The editable install makes edits count at once. Python compiles a module when it is first imported; pip would compile
+# all of them, for 20 s. A slow or failing package index is asked again.
 define install
 $(SAY) 'installing the pinned packages for $(1) (a minute or two on first use; full log: $(VENV)/pip.log)'; \
 export PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_RETRIES=8 PIP_DEFAULT_TIMEOUT=$${PIP_DEFAULT_TIMEOUT:-60}; \
 for try in 1 2 3; do \
-  if $(PY) -m pip install -e '.[$(1)]' 2>&1 | tee $(VENV)/pip.log \
+  if $(PY) -m pip install --no-compile -e '.$(if $(filter-out core,$(1)),[$(1)])' 2>&1 | tee $(VENV)/pip.log \
     | { grep --line-buffered -E '^ +Downloading .*MB|^Installing|^ *(ERROR|error:)|[Rr]etrying' || true; } | cut -c1-110; \
   then exit 0; fi; \
   if [ $$try != 3 ]; then $(SAY) 'not installed; trying again'; sleep $$((try * 5)); fi; \

@@ -136,7 +136,7 @@ def test_the_wheel_writes_over_no_file_of_an_installed_package(wheel: Path) -> N
 
 @pytest.mark.slow
 def test_the_wheel_beside_pytables_leaves_both_in_order(wheel: Path, tmp_path: Path) -> None:
-    pytest.importorskip("tables", reason="PyTables is not installed (the test extra brings it)")
+    pytest.importorskip("tables", reason="PyTables is not installed (the extra test-all brings it)")
     beside = tmp_path / "beside"  # PyTables first, then ours over it, as pip would
     theirs = metadata.distribution("tables")
     for file in theirs.files or []:

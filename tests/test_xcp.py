@@ -685,7 +685,7 @@ def test_scapy_reads_every_published_request_and_answer() -> None:
     """scapy's XCP layer takes each frame apart by the standard's tables, knows the answer as one to its request, and
     puts the same bytes together again.
     """
-    pytest.importorskip("scapy", reason="scapy is not installed: pip install -e '.[test]'")
+    pytest.importorskip("scapy", reason="scapy is not installed: pip install -e '.[test-all]'")
     from scapy.contrib.automotive.xcp.xcp import CTORequest, CTOResponse
     from scapy.packet import Raw
 

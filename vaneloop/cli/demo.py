@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +15,15 @@ __all__ = ["main"]
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("demo")
+# what is made in OUT, and what it shows
+MADE = {
+    "engine_run.html": "a recorded run beside the same run through firmware and plant, signal by signal",
+    "real_engine.html": "how the controller moves the vanes where a car's engine gives the demand",
+    "engine_test.html": "the paper's engine test: errors of the vane angles under one mean curve and under dual curves",
+    "diagnosis.html": "the search on the log that does not fit: which effects were tried, and which explain it",
+    "extended.html": "the error before and after these effects are added",
+    "extended.toml": "the model with these effects: vaneloop compare LOG --model demo/extended.toml",
+}
 
 
 def _shared_data() -> Path | None:
@@ -33,10 +43,8 @@ def _step(text: str, *argv: str, allowed: tuple[int, ...] = (0,)) -> None:
         sys.exit(code)
 
 
-def main() -> int:
-    """Run the demonstration; pages go to ./demo."""
-    OUT.mkdir(exist_ok=True)
-    example = os.path.relpath(ROOT / "examples" / "engine_run.blf")
+def _simulate(example: str) -> None:
+    """Runs through firmware and plant."""
     _step(
         "A recorded engine run (CAN log, from an independent rig) through firmware and plant",
         "replay", example, "--report", str(OUT / "engine_run.html"),
@@ -53,7 +61,10 @@ def main() -> int:
         "The paper's engine test, 3,000 s under one mean curve and under dual curves",
         "engine-test", "--report", str(OUT / "engine_test.html"),
     )  # fmt: skip
-    hidden = os.path.relpath(ROOT / "examples" / "hidden_effect.parquet")
+
+
+def _search(hidden: str) -> None:
+    """From a log that does not fit to the model that does."""
     model = str(OUT / "extended.toml")
     _step("Another log does not fit: by how much, stage by stage?", "compare", hidden, allowed=(0, 1))
     _step("Where does it fail?", "locate", hidden, allowed=(0, 1))
@@ -67,11 +78,38 @@ def main() -> int:
             "extend", hidden, *effects, "--out", model, "--report", str(OUT / "extended.html"), allowed=(0, 1),
         )  # fmt: skip
         _step("The extended model against the log", "compare", hidden, "--model", model, allowed=(0, 1))
-    print("\npages to open in a browser:")
-    for written in sorted(OUT.glob("*.html")):
-        print(f"  {written}")
+
+
+def main(words: list[str]) -> int:
+    """Run the demonstration; what it makes goes to ./demo. The search runs beside the simulations, in a process of its
+    own (``words``: the log that it searches), and what it says is shown after theirs.
+    """
+    if words:
+        _search(*words)
+        return 0
+    OUT.mkdir(exist_ok=True)
+    for name in MADE:
+        (OUT / name).unlink(missing_ok=True)
+    example, hidden = (os.path.relpath(ROOT / "examples" / f) for f in ("engine_run.blf", "hidden_effect.parquet"))
+    search = subprocess.Popen(
+        [sys.executable, "-m", "vaneloop.cli.demo", hidden], stdout=subprocess.PIPE, text=True, encoding="utf-8"
+    )
+    try:
+        _simulate(example)
+        assert search.stdout is not None
+        for line in search.stdout:
+            print(line, end="", flush=True)
+        if code := search.wait():
+            return code
+    finally:
+        search.terminate()
+        search.wait()
+    print("\nmade, the pages to be opened in a browser:")
+    for name, shows in MADE.items():
+        if (OUT / name).exists():
+            print(f"  {OUT / name!s:<24}{shows}")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(terminal.run(main))
+    sys.exit(terminal.run(lambda: main(sys.argv[1:])))
