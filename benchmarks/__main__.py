@@ -16,12 +16,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bus, fleet, learn, long_log, measure, native, tools, web
+from benchmarks import bus, fleet, learn, long_log, measure, native, sizes, tools, web
 from benchmarks.measure import ROOT, Row, machine
 
 MEASUREMENTS = {
     **measure.MEASUREMENTS, **native.MEASUREMENTS, **bus.MEASUREMENTS, **tools.MEASUREMENTS, **web.MEASUREMENTS,
-    **fleet.MEASUREMENTS, **long_log.MEASUREMENTS, **learn.MEASUREMENTS,
+    **fleet.MEASUREMENTS, **long_log.MEASUREMENTS, **learn.MEASUREMENTS, **sizes.MEASUREMENTS,
 }  # fmt: skip
 
 
