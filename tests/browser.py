@@ -41,7 +41,7 @@ def violations(page: Any, run: str = AXE) -> dict[str, str]:
 
     run  `AXE`, or `COLOURS`: the rules of colours only, of a page of which nothing else has changed
     """
-    axe = pytest.importorskip("axe_playwright_python", reason="no axe-core: pip install -e '.[test-all]'")
+    axe = pytest.importorskip("axe_playwright_python", reason="no axe-core: pip install -e '.[test]'")
     if not page.evaluate("!!window.axe"):
         page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
     found = page.evaluate(f"{run}.then((r) => r.violations.map((v) => [v.id, v.nodes[0].html]))")

@@ -653,6 +653,7 @@ def test_parquet_is_read_without_importing_pandas(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.parquet")], check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:
     import datetime
 

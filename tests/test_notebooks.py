@@ -11,6 +11,7 @@ from tests.conftest import ROOT
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
+pytestmark = pytest.mark.slow
 
 FOLDER = ROOT / "docs" / "notebooks"
 
@@ -24,7 +25,6 @@ def test_there_are_three_notebooks() -> None:
     assert len(list(FOLDER.glob("*.ipynb"))) >= 3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("file", sorted(FOLDER.glob("*.ipynb")), ids=lambda f: f.stem)
 def test_a_notebook_runs_and_prints_what_it_shows(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))

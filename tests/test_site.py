@@ -25,6 +25,7 @@ from vaneloop.cli.main import COMMANDS
 from vaneloop.discrepancy.library import LAWS
 
 pytest.importorskip("mkdocs")
+pytestmark = pytest.mark.slow
 
 
 def build(root: Path, site: Path) -> subprocess.CompletedProcess[str]:
@@ -48,7 +49,6 @@ def words_of(page: Path) -> str:
     return html.unescape(re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8")))
 
 
-@pytest.mark.slow
 def test_every_page_is_on_the_site_and_in_its_navigation(site: Path) -> None:
     home = (site / "index.html").read_text(encoding="utf-8")
     pages = [p.relative_to(ROOT / "docs").with_suffix(".html") for p in (ROOT / "docs").rglob("*.md")]

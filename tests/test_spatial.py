@@ -47,6 +47,7 @@ def planar(stage: str, stroke: np.ndarray = STROKE) -> np.ndarray:
 # --- the mechanism in space -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "limit"), [("vigv", 0.041), ("vgv1", 0.012), ("vgv2", 0.0035)])
 def test_planar_model_is_the_multibody_mechanism_to_hundredths_of_a_degree(stage, limit):
     pytest.importorskip("exudyn")
@@ -54,6 +55,7 @@ def test_planar_model_is_the_multibody_mechanism_to_hundredths_of_a_degree(stage
     assert 0.5 * limit < np.max(np.abs(difference)) < limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("offset", [0.0, 15.0])
 def test_two_codes_close_the_same_loop_in_space(stage, offset):
@@ -95,6 +97,7 @@ def test_drawn_joints_have_the_lengths_of_the_table(stage):
         )
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_does_not_close_is_refused_with_its_stroke():
     with pytest.raises(InputError, match="vigv: the mechanism does not close in space at stroke 400 mm"):
         spatial_angles(GEOMETRY, "vigv", [24.0, 400.0])
@@ -210,6 +213,7 @@ def test_two_links_leave_a_free_ring_four_freedoms():
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_spatial_command_states_the_difference_and_draws_it(tmp_path, capsys):
     page = tmp_path / "p.html"
     assert main(["spatial", "--points", "9", "--json", "-", "--report", str(page)]) == 0

@@ -483,6 +483,7 @@ def test_random_commands_leave_the_limits_alone() -> None:
         assert bench.node.mode in MODES
 
 
+@pytest.mark.slow
 def test_two_tools_read_the_a2l_file(tmp_path: Path) -> None:
     parser = pytest.importorskip("pya2l.parser")
     pytest.importorskip("pyxcp")
@@ -685,7 +686,7 @@ def test_scapy_reads_every_published_request_and_answer() -> None:
     """scapy's XCP layer takes each frame apart by the standard's tables, knows the answer as one to its request, and
     puts the same bytes together again.
     """
-    pytest.importorskip("scapy", reason="scapy is not installed: pip install -e '.[test-all]'")
+    pytest.importorskip("scapy", reason="scapy is not installed: pip install -e '.[test]'")
     from scapy.contrib.automotive.xcp.xcp import CTORequest, CTOResponse
     from scapy.packet import Raw
 
