@@ -1,49 +1,64 @@
-"""The tests of a module against its mutants: which test runs which line, then each mutant against those tests, fastest
-first.
+"""The tests of a package against its mutants: which test runs which line, then each mutant against those tests,
+quickest first.
 
-The code runs uncompiled (NUMBA_DISABLE_JIT), where a mutant costs no compiling; that both ways give the same bits is
-tested elsewhere. Each mutant has a process of its own, forked where all tests are collected, in which only the changed
-function's code is exchanged. A process that uses much more processor time than the tests do unchanged hangs: killed.
+Each mutant has a process of its own, forked where all tests are collected, in which only the changed function's code,
+or number, is exchanged. What numba compiles is changed only where it runs uncompiled (NUMBA_DISABLE_JIT), where a
+mutant costs no compiling; that both ways give the same bits is tested elsewhere. A process that uses much more
+processor time than the tests do unchanged hangs: killed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import hashlib
 import json
 import os
 import random
 import resource
+import shutil
 import signal
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import CodeType, FunctionType, MemberDescriptorType, ModuleType
 from typing import Any
 
 import pytest
 
-from .mutate import Mutant, mutants_of, with_hits
+from .mutate import DEFAULT, FIELD, FUNCTION, MODULE, PRODUCT, Mutant, derived_from, mentions, mutants_of, with_hits
 
-__all__ = ["ROOT", "Outcome", "Target", "run_target"]
+__all__ = ["ROOT", "Outcome", "Target", "run_target", "sample"]
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-Costs = dict[str, tuple[float, set[tuple[str, int]]]]  # of each test: seconds of processor time, lines run
-OURS = ("controller", "plant", "hil", "vaneloop", "tests")
+Lines = set[tuple[str, int]]
+Costs = dict[str, tuple[float, Lines]]  # of each test: seconds of processor time, lines run
+OURS = (*PRODUCT, "tests")
 SURVIVED, KILLED, UNCHANGED_FAILED = 0, 10, 11
 MEMORY = 8 << 30  # bytes of address space of a mutant
 LEAST_SECONDS = 10.0  # of processor time that a mutant has, beside four times what its tests take unchanged
+# A test that takes longer, with what it shares with others, is not run: one mutant may need a hundred tests.
+LONGEST_TEST = 5.0  # s of processor time
+# The quickest tests that reach a mutant, up to this: a survivor costs all of it, and a sample has hundreds of them.
+MOST_SECONDS = 20.0  # of processor time
+WAITS = 6.0  # times the processor time that is allowed may pass on the clock: tests wait, and share the processor
 
 
 @dataclass(frozen=True)
 class Target:
     """Files, and the tests that belong to them.
 
-    tests     files of tests, relative to the root
-    without   words (of `pytest -k`) of the tests that take too long uncompiled, or need what is not there
+    files, but  patterns relative to the root, and the names of those files that another target has
+    tests       files of tests, relative to the root
+    without     words (of `pytest -k`) of the tests that do not run here: too long uncompiled, or all in other processes
     functions, constants, only    what of the files is changed, see `mutants_of`
+    compiled    the code runs compiled
+    enough      share of the mutants that the tests should kill
     """
 
     name: str
@@ -53,30 +68,77 @@ class Target:
     functions: bool = True
     constants: bool = True
     only: str | None = None
+    compiled: bool = False
+    enough: float = 0.9
+    but: tuple[str, ...] = ()
+
+    def paths(self) -> list[str]:
+        """Every file, relative to the root."""
+        found = [f for pattern in self.files for f in sorted(ROOT.glob(pattern)) if f.name not in self.but]
+        found = [f for f in found if f.name != "__init__.py" or "def " in f.read_text()]
+        if not found:
+            raise SystemExit(f"mutants: {', '.join(self.files)}: no such file")
+        return [str(f.relative_to(ROOT)) for f in found]
 
     def mutants(self) -> list[Mutant]:
         """Every mutant of the files."""
-        found = [f for pattern in self.files for f in sorted(ROOT.glob(pattern)) if f.name != "__init__.py"]
-        if not found:
-            raise SystemExit(f"mutants: {', '.join(self.files)}: no such file")
-        of = {"functions": self.functions, "constants": self.constants, "only": self.only}
-        return [m for f in found for m in mutants_of(ROOT, str(f.relative_to(ROOT)), **of)]  # type: ignore[arg-type]
+        return [
+            m
+            for f in self.paths()
+            for m in mutants_of(
+                ROOT, f, functions=self.functions, constants=self.constants, only=self.only, compiled=self.compiled
+            )
+        ]
+
+    def digest(self) -> str:
+        """Digest of all that decides which test runs which line."""
+        h = hashlib.sha256(repr(dataclasses.astuple(self)).encode() + sys.version.encode())
+        sources = [f for package in (*PRODUCT, "tables") for f in (ROOT / package).rglob("*") if f.suffix in SOURCES]
+        helpers = [f for f in (ROOT / "tests").rglob("*.py") if not f.name.startswith("test_")]
+        for f in sorted([*sources, *helpers, *(ROOT / t.split("::")[0] for t in self.tests)]):
+            h.update(str(f).encode() + f.read_bytes())
+        return h.hexdigest()
+
+
+SOURCES = {".py", ".toml", ".dbc", ".c", ".h", ".js", ".css"}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a mutant: ``by`` is the test that killed it, "" = it survived."""
+    """What became of a mutant: ``by`` is the test that killed it, "" = it survived; ``reached`` by some test."""
 
     mutant: Mutant
     by: str
+    reached: bool = True
 
 
 def sample(mutants: list[Mutant], n: int | None, seed: int) -> list[Mutant]:
-    """Return ``n`` of the mutants, the same for the same seed."""
-    if n is None or n >= len(mutants):
-        return mutants
-    chosen = set(random.Random(seed).sample(range(len(mutants)), n))
+    """Return ``n`` of the mutants, the same for the same seed: lines by chance, each with one of its mutants by chance,
+    so that a line of many numbers counts as one.
+    """
+    if n is None:
+        return [m for m in mutants if _compiles(m)]
+    chance = random.Random(seed)
+    order = chance.sample(range(len(mutants)), len(mutants))
+    lines: dict[tuple[str, int], list[int]] = {}
+    for i in order:
+        lines.setdefault((mutants[i].file, mutants[i].line), []).append(i)
+    each = [lines[line] for line in chance.sample(sorted(lines), len(lines))]
+    chosen: set[int] = set()
+    while len(chosen) < n and any(each):
+        for of_line in filter(None, each):
+            i = of_line.pop()
+            if len(chosen) < n and _compiles(mutants[i]):
+                chosen.add(i)
     return [m for i, m in enumerate(mutants) if i in chosen]
+
+
+def _compiles(m: Mutant) -> bool:
+    try:
+        m.code()
+    except SyntaxError:  # a name that is bound no more
+        return False
+    return True
 
 
 def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[Outcome], None]) -> list[Outcome]:
@@ -102,11 +164,17 @@ def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[O
     return campaign.outcomes
 
 
+class _TooLong(BaseException):
+    """A test runs longer than `LONGEST_TEST` allows."""
+
+
 class _Campaign:
     def __init__(self, target: Target, chosen: list[Mutant], jobs: int, say: Callable[[Outcome], None]):
         self.target, self.chosen, self.jobs, self.say = target, chosen, jobs, say
         self.outcomes: list[Outcome] = []
         self.failed, self.finished = "", False
+        self.hits: Lines = set()
+        self.shared: dict[Any, tuple[float, Lines]] = {}  # of fixtures that serve many tests
 
     def pytest_collection(self) -> None:
         from hypothesis import Phase, settings
@@ -116,115 +184,244 @@ class _Campaign:
             "mutants", max_examples=10, deadline=None, derandomize=True, database=None, phases=phases
         )
         settings.load_profile("mutants")
+        with contextlib.suppress(ImportError):
+            import tests.browser
+
+            tests.browser.CHROMIUM = None  # what a browser asks the product is not asked in this process
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
+        """What a fixture of many tests runs, each of them reaches."""
+        if fixturedef.scope == "function":
+            yield
+            return
+        before, begin = set(self.hits), _processor_time()
+        self.hits.clear()
+        yield
+        self.shared[fixturedef] = _processor_time() - begin, set(self.hits)
+        self.hits |= before
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        if not session.items:
-            self.failed = "no tests"
-            return True
-        modules = {m.file: _module(m.file) for m in self.chosen}
-        costs = self._unchanged(session, modules)
+        items = [i for i in session.items if not any(mark.name == "skip" for mark in i.iter_markers())]
+        modules = {file: _module(file) for file in self.target.paths()}
+        costs = self._costs(items, modules)
         if not self.failed:
-            self._mutants(session, modules, costs)
+            self._mutants([i for i in items if i.nodeid in costs], modules, costs)
         self.finished = True
         return True
 
-    def _unchanged(self, session: pytest.Session, modules: dict[str, ModuleType]) -> Costs:
-        """Run every test unchanged; return the processor time and the lines of each."""
-        at = Path(tempfile.mkstemp(suffix=".json")[1])
+    def _costs(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> Costs:
+        """Return the processor time of each test, and the lines that it runs: as kept from a run with the same sources
+        and tests, else measured.
+        """
+        at = ROOT / "out" / "mutants" / f"{self.target.name}.json"
+        digest = self.target.digest()
+        found = json.loads(at.read_text()) if at.exists() else {}
+        if found.get("digest") != digest:
+            found = {"digest": digest, "files": list(modules), **self._measured(items, modules)}
+            if found["costs"]:
+                at.parent.mkdir(parents=True, exist_ok=True)
+                new = at.with_suffix(f".{os.getpid()}")
+                new.write_text(json.dumps(found))
+                new.replace(at)
+        for test, why in found["without"].items():
+            print(f"{self.target.name}: without {test}: {why}", flush=True)
+        if not found["costs"]:
+            self.failed = "no test is left"
+        files = found["files"]
+        return {test: (cost, {(files[f], n) for f, n in lines}) for test, (cost, lines) in found["costs"].items()}
 
-        def work() -> str:
-            hits: set[tuple[str, int]] = set()
-            for file, module in modules.items():
-                vars(module)["__hit__"] = hits.add
-                for name, code in with_hits(ROOT, file):
+    def _measured(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> dict[str, Any]:
+        """Run the tests of each file unchanged, twice: to see which lines they run, and how long they take as they are.
+        Those that fail, take too long or reach no line are left out.
+        """
+        by_file: dict[str, list[pytest.Item]] = {}
+        for item in items:
+            by_file.setdefault(item.nodeid.split("::")[0], []).append(item)
+        lines: dict[str, Any] = {}
+        without: dict[str, str] = {}
+
+        def each(works: dict[str, Callable[[], str]]) -> Iterator[tuple[str, Any]]:
+            for file, said in _side_by_side([(f, work, None) for f, work in works.items()], self.jobs):
+                if said.startswith("{"):
+                    yield from json.loads(said).items()
+                else:
+                    without[file] = said or "its tests end the process"
+
+        for test, seen in each({f: lambda of=of: self._lines(of, modules) for f, of in by_file.items()}):
+            if isinstance(seen, str):
+                without[test] = seen
+            elif seen:
+                lines[test] = seen
+        left = {f: [i for i in of if i.nodeid in lines] for f, of in by_file.items()}
+        costs = {}
+        for test, cost in each({f: lambda of=of: self._times(of) for f, of in left.items() if of}):
+            if isinstance(cost, str):
+                without[test] = cost
+            elif cost <= LONGEST_TEST:
+                costs[test] = cost, lines[test]
+            else:
+                without[test] = f"takes {cost:.1f} s"
+        return {"costs": costs, "without": without}
+
+    def _lines(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> str:
+        """Of each test: the lines that it runs, or why it does not count. A line is a file, by its place, and a
+        number.
+        """
+        for file, module in modules.items():
+            vars(module)["__hit__"] = self.hits.add
+            for name, code in with_hits(ROOT, file, compiled=self.target.compiled):
+                with contextlib.suppress(LookupError, AttributeError, TypeError, ValueError):
                     _function(module, name).__code__ = code
-            out = {}
-            for item, following in zip(session.items, [*session.items[1:], None], strict=True):
-                hits.clear()
-                begin = time.process_time()
-                bad = _failure(item, following)
-                if bad:
-                    return bad
-                out[item.nodeid] = [time.process_time() - begin, sorted(hits)]
-            at.write_text(json.dumps(out))
-            return ""
+        at = {file: i for i, file in enumerate(modules)}
+        seen: dict[str, Any] = {}
+        for item, following in zip(items, [*items[1:], None], strict=True):
+            self.hits.clear()
+            bad = _within(item, following, 2.0 * LONGEST_TEST)
+            reached = self.hits.union(*(lines for _, lines in self._shared_by(item)))
+            seen[item.nodeid] = bad or sorted((at[f], n) for f, n in reached)
+        return json.dumps(seen)
 
-        child = _Child(work, None)
-        status = child.wait()
-        if status != SURVIVED:
-            self.failed = f"a test fails without any change: {child.said()}"
-            return {}
-        costs = {k: (v[0], {(f, n) for f, n in v[1]}) for k, v in json.loads(at.read_text()).items()}
-        at.unlink()
-        return costs
+    def _times(self, items: list[pytest.Item]) -> str:
+        out: dict[str, Any] = {}
+        for item, following in zip(items, [*items[1:], None], strict=True):
+            made = set(self.shared)
+            begin = _processor_time()
+            bad = _within(item, following, 2.0 * LONGEST_TEST)
+            spent = _processor_time() - begin - sum(s for f, (s, _) in self.shared.items() if f not in made)
+            out[item.nodeid] = bad or max(spent, 0.0) + sum(seconds for seconds, _ in self._shared_by(item))
+        return json.dumps(out)
 
-    def _mutants(self, session: pytest.Session, modules: dict[str, ModuleType], costs: Costs) -> None:
-        by_cost = sorted(session.items, key=lambda item: costs[item.nodeid][0])
-        running: dict[int, tuple[_Child, Mutant]] = {}
-        left = list(self.chosen)
-        while left or running:
-            while left and len(running) < self.jobs:
-                m = left.pop(0)
-                lines = {(m.file, n) for n in range(m.line, m.last + 1)}
-                items = [i for i in by_cost if not m.where or costs[i.nodeid][1] & lines]
-                limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in items)
-                child = _Child(lambda m=m, items=items: _try(m, modules[m.file], items), limit)
-                running[child.pid] = child, m
-            pid, status = os.wait()
-            if pid in running:
-                child, m = running.pop(pid)
-                by = child.verdict(status)
-                outcome = Outcome(m, by)
-                self.outcomes.append(outcome)
-                self.say(outcome)
+    def _shared_by(self, item: pytest.Item) -> Iterable[tuple[float, Lines]]:
+        found = getattr(item, "_fixtureinfo", None)
+        for definitions in found.name2fixturedefs.values() if found else ():
+            yield from (self.shared[d] for d in definitions if d in self.shared)
+
+    def _mutants(self, items: list[pytest.Item], modules: dict[str, ModuleType], costs: Costs) -> None:
+        by_cost = sorted(items, key=lambda item: costs[item.nodeid][0])
+        of_name = mentions(ROOT, modules)
+
+        def reaching(m: Mutant) -> list[pytest.Item]:
+            lines = {(m.file, n) for n in range(m.line, m.last + 1)}
+            if m.kind == DEFAULT:
+                lines = of_name[f"{m.file} {m.where}"]
+            elif m.kind in (MODULE, FIELD):
+                lines = set().union(*(of_name.get(name, ()) for name in m.names))
+            anywhere = m.kind in (MODULE, FIELD) and not lines  # only others read it
+            spent, out = 0.0, []
+            for item in by_cost:
+                cost, run = costs[item.nodeid]
+                if anywhere or run & lines:
+                    spent += cost
+                    if out and spent > MOST_SECONDS:
+                        break
+                    out.append(item)
+            return out
+
+        def decided(m: Mutant, by: str, reached: bool = True) -> None:
+            self.outcomes.append(Outcome(m, by, reached))
+            self.say(self.outcomes[-1])
+
+        works = []
+        for m in self.chosen:
+            found = reaching(m)
+            if found:
+                limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in found)
+                works.append((m, lambda m=m, found=found: _try(m, modules[m.file], found), limit))
+            else:
+                decided(m, "", reached=False)
+        for m, by in _side_by_side(works, self.jobs):
+            decided(m, by)
+
+
+def _processor_time() -> float:
+    of_children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + of_children.ru_utime + of_children.ru_stime
+
+
+def _within(item: pytest.Item, following: pytest.Item | None, seconds: float) -> str:
+    """Run a test; return why it failed, or that it took longer than these seconds of processor time."""
+
+    def late(*_: object) -> None:
+        raise _TooLong
+
+    for number in (signal.SIGPROF, signal.SIGALRM):
+        signal.signal(number, late)
+    begin = _processor_time()
+    signal.setitimer(signal.ITIMER_PROF, seconds, 1.0)
+    signal.setitimer(signal.ITIMER_REAL, WAITS * seconds, 1.0)
+    try:
+        bad = _failure(item, following)
+    except _TooLong:
+        bad = "takes too long"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    if bad and ("_TooLong" in bad or _processor_time() - begin > seconds):
+        return f"takes more than {seconds:.0f} s"
+    return bad and f"fails without any change: {bad}"
+
+
+def _side_by_side(
+    works: list[tuple[Any, Callable[[], str], float | None]], jobs: int
+) -> Iterator[tuple[Any, str]]:
+    """Run each work in a process of its own, as many at a time as there are jobs; yield whose it is and what it said."""
+    running: dict[int, tuple[_Child, Any]] = {}
+    left = works[::-1]
+    while left or running:
+        while left and len(running) < jobs:
+            whose, work, seconds = left.pop()
+            child = _Child(work, seconds)
+            running[child.pid] = child, whose
+        pid, status = os.wait()
+        if pid in running:
+            child, whose = running.pop(pid)
+            yield whose, child.verdict(status)
 
 
 class _Child:
-    """A forked process that runs ``work`` silently; what it returns is in `said`."""
+    """A forked process that runs ``work`` silently, in a folder and a group of its own; what it returns is in `said`."""
 
     def __init__(self, work: Callable[[], str], seconds: float | None):
-        handle, name = tempfile.mkstemp()
-        self.at = Path(name)
+        self.folder = Path(tempfile.mkdtemp(prefix="mutant-"))
+        self.at = self.folder / "said"
         sys.stdout.flush()
         self.pid = os.fork()
         if self.pid:
-            os.close(handle)
             return
-        status = UNCHANGED_FAILED
+        status, said = UNCHANGED_FAILED, ""
         try:
+            os.setpgid(0, 0)
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+            os.environ["TMPDIR"] = os.environ["PYTEST_DEBUG_TEMPROOT"] = tempfile.tempdir = str(self.folder)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             if seconds is not None:
                 resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 5))
                 resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-                resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, 1)
-            os.dup2(nowhere, 2)
+                signal.alarm(int(WAITS * seconds) + 1)
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            for stream in range(3):
+                os.dup2(nowhere, stream)
             said = work()
-            os.write(handle, said.encode())
             status = KILLED if said else SURVIVED
         except BaseException:  # what a test raises, pytest has caught: this is a defect here
-            os.write(handle, traceback.format_exc().encode()[-2000:])
+            said = traceback.format_exc()[-2000:]
         finally:
+            with contextlib.suppress(OSError):
+                self.at.write_text(said)
             os._exit(status)
 
-    def wait(self) -> int:
-        """Wait for its end; return its exit code, negative after a signal."""
-        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
-
     def verdict(self, status: int) -> str:
-        """Return what killed the mutant, "" if nothing did."""
-        code, said = os.waitstatus_to_exitcode(status), self.said()
+        """Return what killed the mutant, "" if nothing did; whatever it started ends with it."""
+        with contextlib.suppress(OSError):
+            os.killpg(self.pid, signal.SIGKILL)
+        code, said = os.waitstatus_to_exitcode(status), self.at.read_text() if self.at.exists() else ""
+        shutil.rmtree(self.folder, ignore_errors=True)
         if code in (SURVIVED, KILLED):
             return said
-        if code < 0:
-            return f"{signal.Signals(-code).name}: no end, or no memory"
-        raise SystemExit(f"mutants: {said}")
-
-    def said(self) -> str:
-        text = self.at.read_text(errors="replace")
-        self.at.unlink(missing_ok=True)
-        return text
+        if code == UNCHANGED_FAILED:
+            raise SystemExit(f"mutants: {said}")
+        return f"{signal.Signals(-code).name}: no end, or no memory" if code < 0 else f"exit {code}"
 
 
 def _failure(item: pytest.Item, following: pytest.Item | None) -> str:
@@ -237,14 +434,13 @@ def _failure(item: pytest.Item, following: pytest.Item | None) -> str:
 
 
 def _try(m: Mutant, module: ModuleType, items: list[pytest.Item]) -> str:
-    try:
-        code = m.code()
-        if m.where:
-            _function(module, m.where).__code__ = code
-        else:
-            _rebind(module, code)
-    except Exception as e:  # noqa: BLE001
-        return f"import: {type(e).__name__}: {e}"
+    if m.kind == FUNCTION:
+        _function(module, m.where).__code__ = m.code()
+    else:
+        try:
+            _put(module, m.kind, m.where, m.names, m.code())
+        except Exception as e:  # noqa: BLE001
+            return f"import: {type(e).__name__}: {e}"
     for i, item in enumerate(items):
         bad = _failure(item, items[i + 1] if i + 1 < len(items) else None)
         if bad:
@@ -255,46 +451,87 @@ def _try(m: Mutant, module: ModuleType, items: list[pytest.Item]) -> str:
 def _module(file: str) -> ModuleType:
     import importlib
 
-    return importlib.import_module(file.removesuffix(".py").replace("/", "."))
+    return importlib.import_module(file.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
+
+
+def _owner(module: ModuleType, name: str) -> Any:
+    place: Any = module
+    for owner in name.split("."):
+        place = getattr(place, owner)
+    return place
 
 
 def _function(module: ModuleType, name: str) -> FunctionType:
-    place: Any = module
-    *owners, last = name.split(".")
-    for owner in owners:
-        place = getattr(place, owner)
-    found = vars(place)[last]
+    owner, _, last = name.removesuffix(".setter").rpartition(".")
+    found = vars(_owner(module, owner) if owner else module)[last]
     if isinstance(found, property):
-        found = found.fget
+        found = found.fset if name.endswith(".setter") else found.fget
     elif isinstance(found, (staticmethod, classmethod)):
         found = found.__func__
+    elif isinstance(found, cached_property):
+        found = found.func
     while hasattr(found, "__wrapped__"):
         found = found.__wrapped__
+    if not isinstance(found, FunctionType):
+        raise TypeError(name)
     return found
 
 
-def _rebind(module: ModuleType, code: CodeType) -> None:
-    """Run the changed module aside, and give all that is loaded its new numbers, wherever the old ones are by the same
-    name.
+def _put(module: ModuleType, kind: str, where: str, names: tuple[str, ...], code: CodeType) -> None:
+    """Give the constants, the field or the argument the values that ``code`` gives their names; then the same for all
+    that is made of them, in every module that has them by these names.
     """
-    fresh: dict[str, Any] = {**{k: v for k, v in vars(module).items() if k.startswith("__")}}
-    exec(code, fresh)  # noqa: S102
-    changed = {}
-    for name, new in fresh.items():
-        old = vars(module).get(name)
-        if not name.startswith("__") and _differs(old, new):
-            changed[name] = old, new
-    loaded_modules = [m for n, m in list(sys.modules.items()) if n.split(".")[0] in OURS and isinstance(m, ModuleType)]
-    for loaded in [module, *(m for m in loaded_modules if m is not module)]:
-        for name, (old, new) in changed.items():
-            if name in vars(loaded) and not _differs(vars(loaded)[name], old):
-                vars(loaded)[name] = new
+    space = {**vars(module), **(vars(_owner(module, where)) if kind == FIELD else {})}
+    exec(code, space)  # noqa: S102
+    if kind == DEFAULT:
+        _set_default(_function(module, where), names[0], space[names[0]])
+        return
+    if kind == FIELD:
+        for name in names:
+            _set_field(_owner(module, where), name, space[name])
+        return
+    changed = {n: (vars(module)[n], space[n]) for n in names}
+    for loaded in [m for n, m in list(sys.modules.items()) if n.split(".")[0] in OURS or m is module]:
+        held = {n for n, (old, _) in changed.items() if n in vars(loaded) and _is_same(vars(loaded)[n], old)}
+        for name in held:
+            vars(loaded)[name] = changed[name][1]
+        file = Path(getattr(loaded, "__file__", None) or ROOT.parent)
+        if held and file.is_relative_to(ROOT):
+            for d in derived_from(ROOT, str(file.relative_to(ROOT))):
+                if d.reads & held and not set(d.names) & set(names):
+                    with contextlib.suppress(LookupError, AttributeError, TypeError):  # of compiled code
+                        _put(loaded, d.kind, d.where, d.names, d.code)
 
 
-def _differs(a: Any, b: Any) -> bool:
-    import numpy as np
+def _is_same(a: Any, b: Any) -> bool:
+    return a is b or (type(a) is type(b) and isinstance(a, (int, float, str)) and a == b)
 
-    if isinstance(a, np.ndarray):
-        return not np.array_equal(a, b)
-    plain = (int, float, str, tuple, dict, list)
-    return isinstance(a, plain) and isinstance(b, plain) and repr(a) != repr(b)
+
+def _set_default(function: Any, name: str, value: Any) -> None:
+    if name in (function.__kwdefaults__ or ()):
+        function.__kwdefaults__[name] = value
+        return
+    code = function.__code__
+    place = code.co_varnames[: code.co_argcount].index(name) - code.co_argcount
+    defaults = list(function.__defaults__)
+    defaults[place] = value
+    function.__defaults__ = tuple(defaults)
+
+
+def _set_field(owner: Any, name: str, value: Any) -> None:
+    """Give a field of a class another default, also in the classes that have it from there."""
+    for sub in owner.__subclasses__():
+        if name not in vars(sub).get("__annotations__", ()):
+            _set_field(sub, name, value)
+    if fields := getattr(owner, "model_fields", None):  # pydantic checks by what it made of the fields
+        fields[name].default = value
+        owner.model_rebuild(force=True)
+    elif name in getattr(owner, "_field_defaults", ()):
+        owner._field_defaults[name] = value
+        _set_default(owner.__new__, name, value)
+    else:
+        if name in getattr(owner, "__dataclass_fields__", ()):
+            owner.__dataclass_fields__[name].default = value
+            _set_default(owner.__init__, name, value)
+        if not isinstance(vars(owner).get(name), MemberDescriptorType):
+            setattr(owner, name, value)
