@@ -12,8 +12,11 @@ from tests.conftest import ROOT
 from tests.mutants.mutate import mutants_of
 
 TINY = '''
+from dataclasses import dataclass
+
 LIMIT = 4.0
 N = 2
+TWICE = 2 * LIMIT
 
 
 def over(x, low):
@@ -28,13 +31,48 @@ def over(x, low):
 
 def unused(x):
     return x + 1
+
+
+@dataclass
+class Range:
+    """Text."""
+
+    low: float = -1.0
+
+    def has(self, x, by=0.5, *, none=False):
+        """Text."""
+        try:
+            return x is not None and x not in (self.low, by, none) and x < TWICE
+        except TypeError:
+            return 7
+
+
+@dataclass
+class Wider(Range):
+    def __init__(self, low):
+        super().__init__(low)
+
+
+@compiled
+def fast(x):
+    return x + SIZE
+
+
+SIZE = 3
 '''
+# What stands beside the program's own decorators, for numba is not needed here.
+TINY = TINY.replace("LIMIT =", "compiled = lambda f: f\nLIMIT =", 1)
 TESTS = """
 import tiny
 
 def test_over():
     assert tiny.over(5.0, False) == -5.0 and tiny.over(5.0, True) == 5.0 and tiny.over(4.5, False) == -4.5
     assert tiny.over(3.9, False) == 3.9 and tiny.over(-9, False) == 2 and tiny.over(2.5, False) == 2.5
+
+def test_range():
+    r = tiny.Range()
+    assert r.low == -1.0 and r.has(1.0) and r.has(7.9) and r.has("x") == 7 and tiny.Wider(3.0).low == 3.0
+    assert not any(r.has(x) for x in (None, -1.0, 0.5, False, 8.0)) and tiny.over(4.1, False) < 0.0
 """
 
 
@@ -49,10 +87,30 @@ def test_every_operator_number_and_statement_is_changed_once(tmp_path: Path) -> 
                                                                      "and low`",
         "`return -x` -> `return x`", "`while n < N` -> `while n >= N`", "`n += 1` -> `n -= 1`", "`n += 1` -> `n += 2`",
         "`n += 1` -> `pass`",
-        "`return max(x, n)` -> `return min(x, n)`", "`return x + 1` -> `return x - 1`",
+        "`return max(x, n)` -> `return min(x, n)`", "`return x + 1` -> `return x - 1`", "`low: float = -1.0` -> `low: "
+                                                                                        "float = 1.0`",
+        "`by=0.5` -> `by=0.625`", "`none=False` -> `none=True`", "`return 7` -> `return 8`", "`SIZE = 3` -> `SIZE = 4`",
+        "`return x + SIZE` -> `return x - SIZE`", "`super().__init__(low)` -> `pass`",
     }  # fmt: skip
+    says = "return x is not None and x not in (self.low, by, none) and (x < TWICE)"
+    for was, becomes in (("is not", "is"), ("not in", "in"), ("x < ", "x <= ")):
+        assert f"`{says}` -> `{says.replace(was, becomes, 1)}`" in found
     for m in mutants_of(tmp_path, "tiny.py"):
         assert m.code() and m.line > 1  # each compiles
+
+
+def test_what_runs_compiled_stays_as_it_is_and_so_do_the_numbers_that_it_reads(tmp_path: Path) -> None:
+    for package in ("controller", "hil"):
+        (tmp_path / package).mkdir()
+    (tmp_path / "hil" / "tiny.py").write_text(TINY)
+    every, plain, kernels = (
+        {m.name for m in mutants_of(tmp_path, "hil/tiny.py", compiled=compiled, kernels=kernels)}
+        for compiled, kernels in ((False, False), (True, False), (False, True))
+    )
+    assert every == plain | kernels and not plain & kernels
+    assert {n.split(" ", 1)[1] for n in kernels} == {
+        "fast: `return x + SIZE` -> `return x - SIZE`", "module: `SIZE = 3` -> `SIZE = 4`",
+    }  # fmt: skip
 
 
 SCRIPT = """
@@ -62,8 +120,10 @@ import tests.mutants.campaign as c
 c.ROOT, c.LEAST_SECONDS = Path(sys.argv[1]), 1.0
 sys.path.insert(0, sys.argv[1])
 t = c.Target("tiny", ("tiny.py",), ("test_tiny.py",))
-for o in c.run_target(t, t.mutants(), 2, lambda o: None):
+for o in c.run_target(t, c.sample(t.mutants(), None, 1), 2, lambda o: None):
     print("#", bool(o.by), o.mutant.name)
+    if not o.reached:
+        print("@", o.mutant.name)
 """
 
 
@@ -83,10 +143,15 @@ def test_a_campaign_tells_the_killed_from_the_survivors_and_ends_endless_loops(t
         line.split(": ", 1)[1]: line.startswith("# True") for line in run.stdout.splitlines() if line.startswith("#")
     }
     assert killed["`n += 1` -> `pass`"] and killed["`n += 1` -> `n -= 1`"]  # these never end
+    never = {
+        "`return x + 1` -> `return x - 1`", "`return x + 1` -> `return x + 2`",
+        "`return x + SIZE` -> `return x - SIZE`", "`SIZE = 3` -> `SIZE = 4`",
+    }  # fmt: skip
+    assert {line.split(": ", 1)[1] for line in run.stdout.splitlines() if line.startswith("@")} == never
     survivors = {name for name, dead in killed.items() if not dead}
     assert survivors == {
         "`if x > LIMIT and (not low)` -> `if x >= LIMIT and (not low)`",  # nobody asks at the limit itself
-        "`return x + 1` -> `return x - 1`", "`return x + 1` -> `return x + 2`",  # nobody asks at all
+        *never,  # nobody asks at all
         "`n = 0` -> `n = 1`", "`n += 1` -> `n += 2`",  # no difference
     }  # fmt: skip
 

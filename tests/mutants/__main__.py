@@ -22,7 +22,7 @@ from .mutate import Mutant, mutants_of
 ENOUGH = 0.90  # of the mutants that are not equivalent
 STRICT = 0.95  # where a wrong answer is sent or believed: firmware, wire, calibration, diagnosis, search
 FIRMWARE = ("firmware", "modes", "monitors", "records", "schedule", "servo", "strategies", "trend")
-TARGETS = (
+TARGETS: tuple[Target, ...] = (
     Target(
         "firmware",
         tuple(f"controller/{part}.py" for part in FIRMWARE),
@@ -78,27 +78,86 @@ TARGETS = (
 )
 # Of each package the files of tests that are nearest to it, where its code runs as it does for a user: compiled.
 NEAREST = {
-    "hil.logs": (
-        "logs", "loggers", "reading", "readings", "guess", "held", "names", "tables", "record", "logs_fuzz", "long_logs"
+    "controller": "controller xcp tables c_reference node",
+    "plant": (
+        "plant effects effects_reference linkage electromechanical machines tables tolerances lanes "
+        "curve_lanes spatial fmu"
     ),
-    "hil.calibrate": ("xcp", "uds"),
-    "hil.uds": ("uds",),
-    "vaneloop.fleet": ("fleet_report", "fleet_run", "campaign"),
+    "plant.stages": "curve_lanes same_answer lanes effects machines electromechanical loggers",
+    "hil": "replay held figures page reading lockstep strategies schedule campaign",
+    "hil.bus": "bus frames wire loop moments realtime node uds",
+    "hil.logs": "logs loggers reading readings guess held names tables record logs_fuzz long_logs",
+    "hil.native": "native c_reference xcp",
+    "hil.loop": "loop lanes lockstep node realtime moments replay native machines frames strategies",
+    "hil.fmu": "fmu",
+    "hil.calibrate": "xcp uds",
+    "hil.uds": "uds",
+    "hil.inject": "inject fuzz campaign loop moments native",
+    "vaneloop.base": (
+        "tables kept parts held machines discrepancy learn learn_surfaces learn_periods learn_turns "
+        "learn_speed learn_stops exit_codes your_own_model verbs help curve_lanes"
+    ),
+    "vaneloop.discrepancy": (
+        "discrepancy trust latest laws names search_limits search_ahead promise directions rivals curves "
+        "readings held long_logs doubts learn learn_slopes same_answer"
+    ),
+    "vaneloop.discrepancy.models": (
+        "laws own_laws hidden_law learn learn_beside learn_confirmed learn_creep learn_differences "
+        "learn_faint learn_followers learn_lags learn_periods learn_screening learn_slopes learn_speed "
+        "learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes starts your_own_model "
+        "kept held"
+    ),
+    "vaneloop.discrepancy.models.vane_stages": (
+        "same_answer learn_vanes learn_lags learn_stops learn_followers learn_faint learn_screening held "
+        "loggers long_logs discrepancy curves directions electromechanical readings"
+    ),
+    "vaneloop.design": "design schedule spatial strategies tables tolerances",
+    "vaneloop.fleet": "fleet_report fleet_run campaign",
     "vaneloop.pages": (
-        "page", "design", "campaign", "fleet_report", "schedule", "strategies", "spatial", "verbs", "search_commands",
-        "learn_turns", "learn",
+        "page design campaign fleet_report schedule strategies spatial verbs search_commands learn_turns learn"
     ),
-}  # fmt: skip
-STRICTLY = ("hil.calibrate", "hil.uds")
+    "vaneloop.verbs": (
+        "verbs parts held long_logs guess starts spikes doubts machines learn learn_two learn_surfaces "
+        "own_laws your_own_model search_commands trust latest"
+    ),
+    "vaneloop.cli": (
+        "help exit_codes completion verbs search_commands campaign fuzz inject record design fleet_report fmu "
+        "guess hidden_effect hidden_law schedule strategies spatial same_law never_worse native xcp uds "
+        "reading learn learn_differences electromechanical"
+    ),
+    "vaneloop.web": "web moments",
+}
+STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", "vaneloop.discrepancy")
 TARGETS += tuple(
     Target(
         package,
         (f"{package.replace('.', '/')}/*.py",),
-        tuple(f"tests/test_{name}.py" for name in tests),
+        tuple(f"tests/test_{name}.py" for name in tests.split()),
         compiled=True,
         enough=STRICT if package in STRICTLY else ENOUGH,
     )
     for package, tests in NEAREST.items()
+)
+# What numba compiles of them, uncompiled: with those of these tests that are quick then.
+KERNELS = {
+    "plant": "plant effects_reference linkage electromechanical tables curve_lanes",
+    "plant.stages": "curve_lanes effects_reference same_answer electromechanical",
+    "hil.loop": "loop lanes lockstep node moments",
+    "vaneloop.base": "tables learn_surfaces learn_stops your_own_model",
+    "vaneloop.design": "design schedule",
+    "vaneloop.discrepancy": "laws discrepancy names search_limits promise trust",
+    "vaneloop.discrepancy.models": "laws learn hidden_law",
+    "vaneloop.discrepancy.models.vane_stages": "same_answer learn_vanes",
+}
+TARGETS += tuple(
+    Target(
+        f"{package}.kernels",
+        (f"{package.replace('.', '/')}/*.py",),
+        tuple(f"tests/test_{name}.py" for name in tests.split()),
+        kernels=True,
+        enough=STRICT if package in STRICTLY else ENOUGH,
+    )
+    for package, tests in KERNELS.items()
 )
 BY_NAME = {t.name: t for t in TARGETS}
 EQUIVALENT = Path(__file__).with_name("equivalent.toml")
@@ -153,7 +212,7 @@ def apart(target: Target, chosen: list[Mutant], jobs: int, reasons: dict[str, st
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     p = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
-    p.add_argument("targets", nargs="*", choices=[[], *BY_NAME], help=f"of {', '.join(BY_NAME)}; default: all")
+    p.add_argument("targets", nargs="*", choices=[[], *BY_NAME], help="default: all")
     p.add_argument("--all", action="store_true", help="every mutant, not a sample")
     p.add_argument("--sample", type=int, default=100, help="mutants of each target, by --seed (100)")
     p.add_argument("--seed", type=int, default=1)
@@ -177,9 +236,7 @@ def main(arguments: list[str] | None = None) -> int:
         wrong = [o for o in outcomes if o.by and o.mutant.name in reasons]
         for o in wrong:
             print(f"NOT EQUIVALENT, though {EQUIVALENT.name} says so: {o.mutant}, killed by {o.by}")
-        n = Counter(
-            "killed" if o.by else "equivalent" if o.mutant.name in reasons else "survived" for o in outcomes
-        )
+        n = Counter("killed" if o.by else "equivalent" if o.mutant.name in reasons else "survived" for o in outcomes)
         count = n["killed"] + n["survived"]
         share = n["killed"] / count if count else 1.0
         reached = sum(o.reached for o in outcomes)

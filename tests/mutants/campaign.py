@@ -24,7 +24,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import CodeType, FunctionType, MemberDescriptorType, ModuleType
 from typing import Any
@@ -57,7 +57,8 @@ class Target:
     tests       files of tests, relative to the root
     without     words (of `pytest -k`) of the tests that do not run here: too long uncompiled, or all in other processes
     functions, constants, only    what of the files is changed, see `mutants_of`
-    compiled    the code runs compiled
+    compiled    the code runs compiled, so what numba compiles stays as it is
+    kernels     it does not, and nothing else is changed
     enough      share of the mutants that the tests should kill
     """
 
@@ -69,6 +70,7 @@ class Target:
     constants: bool = True
     only: str | None = None
     compiled: bool = False
+    kernels: bool = False
     enough: float = 0.9
     but: tuple[str, ...] = ()
 
@@ -82,13 +84,8 @@ class Target:
 
     def mutants(self) -> list[Mutant]:
         """Every mutant of the files."""
-        return [
-            m
-            for f in self.paths()
-            for m in mutants_of(
-                ROOT, f, functions=self.functions, constants=self.constants, only=self.only, compiled=self.compiled
-            )
-        ]
+        of = {n: getattr(self, n) for n in ("functions", "constants", "only", "compiled", "kernels")}
+        return [m for f in self.paths() for m in mutants_of(ROOT, f, **of)]
 
     def digest(self) -> str:
         """Digest of all that decides which test runs which line."""
@@ -227,7 +224,7 @@ class _Campaign:
         for test, why in found["without"].items():
             print(f"{self.target.name}: without {test}: {why}", flush=True)
         if not found["costs"]:
-            self.failed = "no test is left"
+            self.failed = "; ".join(["no test is left", *(f"{test}: {why}" for test, why in found["without"].items())])
         files = found["files"]
         return {test: (cost, {(files[f], n) for f, n in lines}) for test, (cost, lines) in found["costs"].items()}
 
@@ -248,14 +245,14 @@ class _Campaign:
                 else:
                     without[file] = said or "its tests end the process"
 
-        for test, seen in each({f: lambda of=of: self._lines(of, modules) for f, of in by_file.items()}):
+        for test, seen in each({f: partial(self._lines, of, modules) for f, of in by_file.items()}):
             if isinstance(seen, str):
                 without[test] = seen
             elif seen:
                 lines[test] = seen
         left = {f: [i for i in of if i.nodeid in lines] for f, of in by_file.items()}
         costs = {}
-        for test, cost in each({f: lambda of=of: self._times(of) for f, of in left.items() if of}):
+        for test, cost in each({f: partial(self._times, of) for f, of in left.items() if of}):
             if isinstance(cost, str):
                 without[test] = cost
             elif cost <= LONGEST_TEST:
@@ -308,7 +305,8 @@ class _Campaign:
             elif m.kind in (MODULE, FIELD):
                 lines = set().union(*(of_name.get(name, ()) for name in m.names))
             anywhere = m.kind in (MODULE, FIELD) and not lines  # only others read it
-            spent, out = 0.0, []
+            spent = 0.0
+            out: list[pytest.Item] = []
             for item in by_cost:
                 cost, run = costs[item.nodeid]
                 if anywhere or run & lines:
@@ -322,12 +320,12 @@ class _Campaign:
             self.outcomes.append(Outcome(m, by, reached))
             self.say(self.outcomes[-1])
 
-        works = []
+        works: list[_Work] = []
         for m in self.chosen:
             found = reaching(m)
             if found:
                 limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in found)
-                works.append((m, lambda m=m, found=found: _try(m, modules[m.file], found), limit))
+                works.append((m, partial(_try, m, modules[m.file], found), limit))
             else:
                 decided(m, "", reached=False)
         for m, by in _side_by_side(works, self.jobs):
@@ -362,10 +360,11 @@ def _within(item: pytest.Item, following: pytest.Item | None, seconds: float) ->
     return bad and f"fails without any change: {bad}"
 
 
-def _side_by_side(
-    works: list[tuple[Any, Callable[[], str], float | None]], jobs: int
-) -> Iterator[tuple[Any, str]]:
-    """Run each work in a process of its own, as many at a time as there are jobs; yield whose it is and what it said."""
+_Work = tuple[Any, Callable[[], str], float | None]  # whose, what is done, within how much processor time
+
+
+def _side_by_side(works: list[_Work], jobs: int) -> Iterator[tuple[Any, str]]:
+    """Run each in a process of its own, as many at a time as there are jobs; yield whose it is and what it said."""
     running: dict[int, tuple[_Child, Any]] = {}
     left = works[::-1]
     while left or running:
@@ -380,7 +379,7 @@ def _side_by_side(
 
 
 class _Child:
-    """A forked process that runs ``work`` silently, in a folder and a group of its own; what it returns is in `said`."""
+    """A forked process that runs ``work`` silently, in a folder and a group of its own, and writes what it returns."""
 
     def __init__(self, work: Callable[[], str], seconds: float | None):
         self.folder = Path(tempfile.mkdtemp(prefix="mutant-"))

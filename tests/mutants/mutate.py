@@ -11,9 +11,10 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from types import CodeType
+from typing import cast
 
 __all__ = ["Derived", "Mutant", "derived_from", "mentions", "mutants_of", "with_hits"]
 
@@ -133,7 +134,7 @@ def _of_expression(owner: ast.AST, field: str, index: int | None, node: ast.AST)
         elif node.func.id == "abs":
             yield _Edit(owner, field, index, node.args[0])
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        for new in _number(node.value):
+        for new in _number(cast("float", node.value)):
             yield _Edit(owner, field, index, new)
     elif isinstance(node, ast.Constant) and type(node.value) is bool:
         yield _Edit(owner, field, index, ast.Constant(not node.value))
@@ -152,6 +153,8 @@ def _edits(owner: ast.AST) -> Iterator[_Edit]:
         for i, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
             if isinstance(node, ast.JoinedStr) or not isinstance(node, ast.AST):
                 continue
+            if isinstance(node, ast.keyword) and node.arg == "strict":
+                continue  # of a zip: it asserts
             yield from _of_expression(owner, field, i, node)
             yield from _edits(node)
 
@@ -195,9 +198,13 @@ def _text(s: ast.stmt) -> str:
     return ast.unparse(s)
 
 
-def _code_of(path: str, function: Function) -> CodeType:
-    """Compile the function named by ``path`` ("Class.function") as it stands in its class."""
+def _code_of(path: str, function: Function, knows_class: bool = False) -> CodeType:
+    """Compile the function named by ``path`` ("Class.function") as it stands in its class; ``knows_class``: as one that
+    asks for that, even if it does no more.
+    """
     decorators, function.decorator_list = function.decorator_list, []
+    if knows_class:
+        function.body.append(ast.copy_location(ast.Expr(ast.Name("__class__", ast.Load())), function.body[-1]))
     inside: ast.stmt = function
     path = path.removesuffix(".setter")
     for owner in reversed(path.split(".")[:-1]):
@@ -207,6 +214,8 @@ def _code_of(path: str, function: Function) -> CodeType:
         code = compile(ast.fix_missing_locations(ast.Module([inside], [])), "<mutant>", "exec")
     finally:
         function.decorator_list = decorators
+        if knows_class:
+            function.body.pop()
     for part in path.split("."):
         code = next(c for c in code.co_consts if isinstance(c, CodeType) and c.co_name == part)
     return code
@@ -218,9 +227,13 @@ def _code_of_statement(s: ast.stmt) -> CodeType:
     return compile(ast.fix_missing_locations(ast.Module([s], [])), "<mutant>", "exec")
 
 
-def _code_of_value(name: str, value: ast.expr) -> CodeType:
-    s = ast.Assign([ast.Name(name, ast.Store())], value)
-    return _code_of_statement(ast.copy_location(s, value))
+def _code_of_value(name: str, value: Callable[[], ast.expr]) -> CodeType:
+    s = ast.Assign([ast.Name(name, ast.Store())], value())
+    return _code_of_statement(ast.copy_location(s, value()))
+
+
+def _text_of_value(name: str, value: Callable[[], ast.expr]) -> str:
+    return f"{name}={ast.unparse(value())}"
 
 
 def _functions(tree: ast.Module, compiled: bool) -> Iterator[tuple[str, Function]]:
@@ -308,7 +321,12 @@ def _defaults(function: Function) -> Iterator[tuple[str, Callable[[], ast.expr],
     for argument, field, i in _arguments(function):
         value = getattr(function.args, field)[i]
         for edit in (*_of_expression(function.args, field, i, value), *_edits(value)):
-            yield argument, lambda field=field, i=i: getattr(function.args, field)[i], edit
+            yield argument, partial(_default, function, field, i), edit
+
+
+def _default(function: Function, field: str, i: int) -> ast.expr:
+    value: ast.expr = getattr(function.args, field)[i]
+    return value
 
 
 def _arguments(function: Function) -> Iterator[tuple[str, str, int]]:
@@ -353,9 +371,11 @@ def mutants_of(
     constants: bool = True,
     only: str | None = None,
     compiled: bool = False,
+    kernels: bool = False,
 ) -> list[Mutant]:
     """Return every mutant of ``file``: of its functions (``only`` that one), and of the module's and its classes'
     constants, in the order of the lines. ``compiled``: it runs compiled, so what numba compiles stays as it is.
+    ``kernels``: nothing else is changed.
     """
     tree = ast.parse((root / file).read_text(), file)
     seen: Counter[tuple[str, str, str]] = Counter()
@@ -389,23 +409,25 @@ def mutants_of(
         out.append(Mutant(file, where, s.lineno, last, was, becomes, seen[where, was, becomes], code, kind, names))
 
     if constants:
-        fixed = _compiled_in(root) if compiled else frozenset()
+        fixed = _compiled_in(root) if compiled or kernels else frozenset()
         for s, edit in _constants(tree.body):
-            if not fixed.intersection(_names_of(s)):
-                add("", s, edit, lambda s=s: _code_of_statement(s), MODULE, _names_of(s))
-        for path, _, s, edit in _fields(tree.body):
-            add(path, s, edit, lambda s=s: _code_of_statement(s), FIELD, _names_of(s))
+            is_fixed = bool(fixed.intersection(_names_of(s)))
+            if not (is_fixed and compiled) and not (kernels and not is_fixed):
+                add("", s, edit, partial(_code_of_statement, s), MODULE, _names_of(s))
+        for path, _, s, edit in () if kernels else _fields(tree.body):
+            add(path, s, edit, partial(_code_of_statement, s), FIELD, _names_of(s))
     if functions:
+        plain = {name for name, _ in _functions(tree, False)} if kernels else ()
         for name, f in _functions(tree, not compiled):
-            if only not in (None, name):
+            if only not in (None, name) or name in plain:
                 continue
+            knows = any(isinstance(n, ast.Name) and n.id in ("super", "__class__") for n in ast.walk(f))
             for owner, field, at, s in _statements(f.body, f, "body"):
                 for edit in _changes(s, owner, field, at):
-                    add(name, s, edit, lambda name=name, f=f: _code_of(name, f))
+                    add(name, s, edit, partial(_code_of, name, f, knows))
             for argument, value, edit in _defaults(f):
-                made = lambda n=argument, v=value: _code_of_value(n, v())
-                says = lambda n=argument, v=value: f"{n}={ast.unparse(v())}"
-                add(name, f, edit, made, DEFAULT, (argument,), says)
+                of = argument, value
+                add(name, f, edit, partial(_code_of_value, *of), DEFAULT, (argument,), partial(_text_of_value, *of))
     return sorted(out, key=lambda m: m.line)
 
 
@@ -423,13 +445,13 @@ class Derived:
 
 
 def derived_from(root: Path, file: str) -> list[Derived]:
-    """Every constant, default of a field and default of an argument that is made of names, in the order of the lines."""
+    """Every constant, default of a field and default of an argument that is made of names, by their lines."""
     tree = ast.parse((root / file).read_text(), file)
     out: list[tuple[int, Derived]] = []
 
     def add(kind: str, where: str, names: tuple[str, ...], s: ast.stmt | ast.expr) -> None:
         if names and (reads := _read(s)):
-            code = _code_of_statement(s) if isinstance(s, ast.stmt) else _code_of_value(names[0], s)
+            code = _code_of_statement(s) if isinstance(s, ast.stmt) else _code_of_value(names[0], lambda: s)
             out.append((s.lineno, Derived(kind, where, names, frozenset(reads), code)))
 
     for s in tree.body:
@@ -441,7 +463,7 @@ def derived_from(root: Path, file: str) -> list[Derived]:
                 add(FIELD, path, _names_of(s), s.value)
     for path, f in _functions(tree, True):
         for argument, field, i in _arguments(f):
-            add(DEFAULT, path, (argument,), getattr(f.args, field)[i])
+            add(DEFAULT, path, (argument,), _default(f, field, i))
     return [d for _, d in sorted(out, key=lambda d: d[0])]
 
 
@@ -495,6 +517,10 @@ def _mark(node: ast.AST, file: str) -> None:
         for s in body:
             if not (isinstance(s, FUNCTIONS) and _is_compiled(s)):
                 _mark(s, file)
-            hit = ast.Call(ast.Name("__hit__", ast.Load()), [ast.Constant((file, s.lineno))], [])
+            hit = ast.Call(
+                ast.Name("__hit__", ast.Load()),
+                [ast.Tuple([ast.Constant(file), ast.Constant(s.lineno)], ast.Load())],
+                [],
+            )
             marked += [ast.copy_location(ast.Expr(hit), s), s]
         setattr(node, field, marked)
