@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
-from tests.mutants.mutate import mutants_of
+from tests.mutants.__main__ import ENOUGH, STRICT, TARGETS
+from tests.mutants.mutate import PRODUCT, mutants_of
 
 TINY = '''
 from dataclasses import dataclass
@@ -111,6 +112,16 @@ def test_what_runs_compiled_stays_as_it_is_and_so_do_the_numbers_that_it_reads(t
     assert {n.split(" ", 1)[1] for n in kernels} == {
         "fast: `return x + SIZE` -> `return x - SIZE`", "module: `SIZE = 3` -> `SIZE = 4`",
     }  # fmt: skip
+
+
+def test_every_file_of_the_product_belongs_to_a_target_and_its_tests_are_there() -> None:
+    covered = {f for t in TARGETS for f in t.paths()}
+    files = {str(f.relative_to(ROOT)) for package in PRODUCT for f in (ROOT / package).rglob("*.py")}
+    of_users = {f for f in files if f.startswith("vaneloop/templates/")}
+    left = files - covered - of_users
+    assert not [f for f in left if not f.endswith(("__init__.py", "__main__.py")) or "def " in (ROOT / f).read_text()]
+    assert not [t for target in TARGETS for t in target.tests if not (ROOT / t.split("::")[0]).is_file()]
+    assert {t.enough for t in TARGETS} == {ENOUGH, STRICT}
 
 
 SCRIPT = """

@@ -12,10 +12,6 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-os.environ.setdefault("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
-os.environ["PYTHONHASHSEED"] = "0"
-os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"  # threads would not outlive a fork
-
 from .campaign import ROOT, Outcome, Target, run_target, sample
 from .mutate import Mutant, mutants_of
 
@@ -93,6 +89,7 @@ NEAREST = {
     "hil.calibrate": "xcp uds",
     "hil.uds": "uds",
     "hil.inject": "inject fuzz campaign loop moments native",
+    "vaneloop": "verbs",
     "vaneloop.base": (
         "tables kept parts held machines discrepancy learn learn_surfaces learn_periods learn_turns "
         "learn_speed learn_stops exit_codes your_own_model verbs help curve_lanes"
@@ -221,6 +218,9 @@ def main(arguments: list[str] | None = None) -> int:
     p.add_argument("--list", action="store_true", help="print the mutants and run nothing")
     p.add_argument("--verbose", action="store_true", help="print the killed ones too")
     a = p.parse_args(arguments)
+    os.environ.setdefault("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    os.environ["PYTHONHASHSEED"] = "0"
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"  # threads would not outlive a fork
     table = [f"{'':32}{'mutants':>8}{'sampled':>9}{'reached':>9}{'killed':>8}{'equal':>7}{'of the rest':>13}{'min':>6}"]
     short = []
     for t in [BY_NAME[n] for n in a.targets] or TARGETS:

@@ -77,7 +77,7 @@ class Target:
     def paths(self) -> list[str]:
         """Every file, relative to the root."""
         found = [f for pattern in self.files for f in sorted(ROOT.glob(pattern)) if f.name not in self.but]
-        found = [f for f in found if f.name != "__init__.py" or "def " in f.read_text()]
+        found = [f for f in found if f.name not in ("__init__.py", "__main__.py") or "def " in f.read_text()]
         if not found:
             raise SystemExit(f"mutants: {', '.join(self.files)}: no such file")
         return [str(f.relative_to(ROOT)) for f in found]
@@ -150,6 +150,7 @@ def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[O
         "no:cacheprovider",
         "-s",
         "--disable-warnings",
+        "--tb=native",  # looks for no source text
         "-m",
         "not slow",
     ]
@@ -229,41 +230,29 @@ class _Campaign:
         return {test: (cost, {(files[f], n) for f, n in lines}) for test, (cost, lines) in found["costs"].items()}
 
     def _measured(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> dict[str, Any]:
-        """Run the tests of each file unchanged, twice: to see which lines they run, and how long they take as they are.
-        Those that fail, take too long or reach no line are left out.
+        """Run the tests of each file unchanged: which lines they reach, and how long they take. Those that fail, take
+        too long or reach no line are left out.
         """
         by_file: dict[str, list[pytest.Item]] = {}
         for item in items:
             by_file.setdefault(item.nodeid.split("::")[0], []).append(item)
-        lines: dict[str, Any] = {}
+        costs: dict[str, tuple[float, list[tuple[int, int]]]] = {}
         without: dict[str, str] = {}
-
-        def each(works: dict[str, Callable[[], str]]) -> Iterator[tuple[str, Any]]:
-            for file, said in _side_by_side([(f, work, None) for f, work in works.items()], self.jobs):
-                if said.startswith("{"):
-                    yield from json.loads(said).items()
-                else:
-                    without[file] = said or "its tests end the process"
-
-        for test, seen in each({f: partial(self._lines, of, modules) for f, of in by_file.items()}):
-            if isinstance(seen, str):
-                without[test] = seen
-            elif seen:
-                lines[test] = seen
-        left = {f: [i for i in of if i.nodeid in lines] for f, of in by_file.items()}
-        costs = {}
-        for test, cost in each({f: partial(self._times, of) for f, of in left.items() if of}):
-            if isinstance(cost, str):
-                without[test] = cost
-            elif cost <= LONGEST_TEST:
-                costs[test] = cost, lines[test]
-            else:
-                without[test] = f"takes {cost:.1f} s"
+        works: list[_Work] = [(f, partial(self._reached, of, modules), None) for f, of in by_file.items()]
+        for file, said in _side_by_side(works, self.jobs):
+            if not said.startswith("{"):
+                without[file] = said or "its tests end the process"
+                continue
+            for test, (why, seconds, lines) in json.loads(said).items():
+                if why:
+                    without[test] = why
+                elif lines:
+                    costs[test] = seconds, lines
         return {"costs": costs, "without": without}
 
-    def _lines(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> str:
-        """Of each test: the lines that it runs, or why it does not count. A line is a file, by its place, and a
-        number.
+    def _reached(self, items: list[pytest.Item], modules: dict[str, ModuleType]) -> str:
+        """Of each test: why it does not count, its processor time, and the lines that it runs: the place of a file, and
+        a number.
         """
         for file, module in modules.items():
             vars(module)["__hit__"] = self.hits.add
@@ -271,23 +260,20 @@ class _Campaign:
                 with contextlib.suppress(LookupError, AttributeError, TypeError, ValueError):
                     _function(module, name).__code__ = code
         at = {file: i for i, file in enumerate(modules)}
-        seen: dict[str, Any] = {}
+        seen = {}
         for item, following in zip(items, [*items[1:], None], strict=True):
             self.hits.clear()
-            bad = _within(item, following, 2.0 * LONGEST_TEST)
-            reached = self.hits.union(*(lines for _, lines in self._shared_by(item)))
-            seen[item.nodeid] = bad or sorted((at[f], n) for f, n in reached)
+            made, begin = set(self.shared), _processor_time()
+            bad = _within(item, following)
+            seconds = _processor_time() - begin - sum(s for f, (s, _) in self.shared.items() if f not in made)
+            reached = set(self.hits)
+            for cost, lines in self._shared_by(item):
+                seconds += cost
+                reached |= lines
+            if not bad and seconds > LONGEST_TEST:
+                bad = f"takes more than {LONGEST_TEST:.0f} s"
+            seen[item.nodeid] = bad, seconds, sorted((at[f], n) for f, n in reached)
         return json.dumps(seen)
-
-    def _times(self, items: list[pytest.Item]) -> str:
-        out: dict[str, Any] = {}
-        for item, following in zip(items, [*items[1:], None], strict=True):
-            made = set(self.shared)
-            begin = _processor_time()
-            bad = _within(item, following, 2.0 * LONGEST_TEST)
-            spent = _processor_time() - begin - sum(s for f, (s, _) in self.shared.items() if f not in made)
-            out[item.nodeid] = bad or max(spent, 0.0) + sum(seconds for seconds, _ in self._shared_by(item))
-        return json.dumps(out)
 
     def _shared_by(self, item: pytest.Item) -> Iterable[tuple[float, Lines]]:
         found = getattr(item, "_fixtureinfo", None)
@@ -337,8 +323,8 @@ def _processor_time() -> float:
     return time.process_time() + of_children.ru_utime + of_children.ru_stime
 
 
-def _within(item: pytest.Item, following: pytest.Item | None, seconds: float) -> str:
-    """Run a test; return why it failed, or that it took longer than these seconds of processor time."""
+def _within(item: pytest.Item, following: pytest.Item | None) -> str:
+    """Run a test unchanged; return why it failed, or that it took too long."""
 
     def late(*_: object) -> None:
         raise _TooLong
@@ -346,17 +332,17 @@ def _within(item: pytest.Item, following: pytest.Item | None, seconds: float) ->
     for number in (signal.SIGPROF, signal.SIGALRM):
         signal.signal(number, late)
     begin = _processor_time()
-    signal.setitimer(signal.ITIMER_PROF, seconds, 1.0)
-    signal.setitimer(signal.ITIMER_REAL, WAITS * seconds, 1.0)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST_TEST, 1.0)
+    signal.setitimer(signal.ITIMER_REAL, WAITS * LONGEST_TEST, 1.0)
     try:
         bad = _failure(item, following)
     except _TooLong:
-        bad = "takes too long"
+        bad = "_TooLong"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-    if bad and ("_TooLong" in bad or _processor_time() - begin > seconds):
-        return f"takes more than {seconds:.0f} s"
+    if bad and ("_TooLong" in bad or _processor_time() - begin > LONGEST_TEST):
+        return f"takes more than {LONGEST_TEST:.0f} s"
     return bad and f"fails without any change: {bad}"
 
 
