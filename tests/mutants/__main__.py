@@ -91,12 +91,12 @@ NEAREST = {
     "hil.inject": "inject fuzz campaign loop moments native",
     "vaneloop": "verbs",
     "vaneloop.base": (
-        "tables kept parts held machines discrepancy learn learn_surfaces learn_periods learn_turns "
-        "learn_speed learn_stops exit_codes your_own_model verbs help curve_lanes"
+        "tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
+        "your_own_model verbs help curve_lanes"
     ),
     "vaneloop.discrepancy": (
         "discrepancy trust latest laws names search_limits search_ahead promise directions rivals curves "
-        "readings held long_logs doubts learn learn_slopes same_answer"
+        "readings held long_logs doubts learn_slopes same_answer"
     ),
     "vaneloop.discrepancy.models": (
         "laws own_laws hidden_law learn learn_beside learn_confirmed learn_creep learn_differences "
@@ -111,16 +111,16 @@ NEAREST = {
     "vaneloop.design": "design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_report fleet_run campaign",
     "vaneloop.pages": (
-        "page design campaign fleet_report schedule strategies spatial verbs search_commands learn_turns learn"
+        "page design campaign fleet_report schedule strategies spatial verbs search_commands learn_turns"
     ),
     "vaneloop.verbs": (
-        "verbs parts held long_logs guess starts spikes doubts machines learn learn_two learn_surfaces "
-        "own_laws your_own_model search_commands trust latest"
+        "verbs parts held long_logs guess starts spikes doubts machines learn_two own_laws your_own_model "
+        "search_commands trust latest"
     ),
     "vaneloop.cli": (
         "help exit_codes completion verbs search_commands campaign fuzz inject record design fleet_report fmu "
         "guess hidden_effect hidden_law schedule strategies spatial same_law never_worse native xcp uds "
-        "reading learn learn_differences electromechanical"
+        "reading electromechanical"
     ),
     "vaneloop.web": "web moments",
 }

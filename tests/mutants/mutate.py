@@ -121,7 +121,7 @@ def _of_expression(owner: ast.AST, field: str, index: int | None, node: ast.AST)
             for other in COMPARISONS.get(type(op), ()):
                 yield _Edit(node, "ops", i, other())
     elif isinstance(node, (ast.BinOp, ast.AugAssign)):
-        if type(node.op) in OPERATORS:
+        if type(node.op) in OPERATORS and not _has_text(node):  # else an error that tells nothing
             yield _Edit(node, "op", None, OPERATORS[type(node.op)]())
     elif isinstance(node, ast.BoolOp):
         yield _Edit(node, "op", None, ast.And() if isinstance(node.op, ast.Or) else ast.Or())
@@ -140,6 +140,13 @@ def _of_expression(owner: ast.AST, field: str, index: int | None, node: ast.AST)
         yield _Edit(owner, field, index, ast.Constant(not node.value))
     if field in ("test", "ifs") and not isinstance(node, (ast.Compare, ast.BoolOp, ast.UnaryOp, ast.Constant)):
         yield _Edit(owner, field, index, ast.UnaryOp(ast.Not(), node))  # type: ignore[arg-type]
+
+
+def _has_text(node: ast.BinOp | ast.AugAssign) -> bool:
+    return any(
+        isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
+        for n in ast.iter_child_nodes(node)
+    )
 
 
 _SKIPPED = {"annotation", "returns", "decorator_list", "args_defaults", "body", "orelse", "finalbody", "handlers"}
