@@ -46,7 +46,7 @@ LEAST_SECONDS = 10.0  # of processor time that a mutant has, beside four times w
 LONGEST_TEST = 5.0  # s of processor time
 # The quickest tests that reach a mutant, up to this: a survivor costs all of it, and a sample has hundreds of them.
 MOST_SECONDS = 20.0  # of processor time
-WAITS = 6.0  # times the processor time that is allowed may pass on the clock: tests wait, and share the processor
+WAITS = 6.0  # times the processor time of a test may pass on the clock: it waits, and shares the processor
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ class _Campaign:
             found = reaching(m)
             if found:
                 limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in found)
-                works.append((m, partial(_try, m, modules[m.file], found), limit))
+                works.append((m, partial(_try, m, modules[m.file], found, costs), limit))
             else:
                 decided(m, "", reached=False)
         for m, by in _side_by_side(works, self.jobs):
@@ -341,6 +341,9 @@ def _within(item: pytest.Item, following: pytest.Item | None) -> str:
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+    with contextlib.suppress(Exception):  # of what was stopped, something may still stand
+        if bad:
+            item.session._setupstate.teardown_exact(following)
     if bad and ("_TooLong" in bad or _processor_time() - begin > LONGEST_TEST):
         return f"takes more than {LONGEST_TEST:.0f} s"
     return bad and f"fails without any change: {bad}"
@@ -383,7 +386,6 @@ class _Child:
             if seconds is not None:
                 resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 5))
                 resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-                signal.alarm(int(WAITS * seconds) + 1)
             nowhere = os.open(os.devnull, os.O_RDWR)
             for stream in range(3):
                 os.dup2(nowhere, stream)
@@ -418,7 +420,7 @@ def _failure(item: pytest.Item, following: pytest.Item | None) -> str:
     return ""
 
 
-def _try(m: Mutant, module: ModuleType, items: list[pytest.Item]) -> str:
+def _try(m: Mutant, module: ModuleType, items: list[pytest.Item], costs: Costs) -> str:
     if m.kind == FUNCTION:
         _function(module, m.where).__code__ = m.code()
     else:
@@ -426,8 +428,9 @@ def _try(m: Mutant, module: ModuleType, items: list[pytest.Item]) -> str:
             _put(module, m.kind, m.where, m.names, m.code())
         except Exception as e:  # noqa: BLE001
             return f"import: {type(e).__name__}: {e}"
-    for i, item in enumerate(items):
-        bad = _failure(item, items[i + 1] if i + 1 < len(items) else None)
+    for item, following in zip(items, [*items[1:], None], strict=True):
+        signal.alarm(int(WAITS * (LEAST_SECONDS + costs[item.nodeid][0])))
+        bad = _failure(item, following)
         if bad:
             return bad
     return ""
