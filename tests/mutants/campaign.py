@@ -31,7 +31,19 @@ from typing import Any
 
 import pytest
 
-from .mutate import DEFAULT, FIELD, FUNCTION, MODULE, PRODUCT, Mutant, derived_from, mentions, mutants_of, with_hits
+from .mutate import (
+    DEFAULT,
+    FIELD,
+    FUNCTION,
+    MODULE,
+    PRODUCT,
+    Mutant,
+    derived_from,
+    mentions,
+    mutants_of,
+    own_names,
+    with_hits,
+)
 
 __all__ = ["ROOT", "Outcome", "Target", "run_target", "sample"]
 
@@ -481,11 +493,14 @@ def _put(module: ModuleType, kind: str, where: str, names: tuple[str, ...], code
     changed = {n: (vars(module)[n], space[n]) for n in names}
     for loaded in [m for n, m in list(sys.modules.items()) if n.split(".")[0] in OURS or m is module]:
         held = {n for n, (old, _) in changed.items() if n in vars(loaded) and _is_same(vars(loaded)[n], old)}
+        path = Path(getattr(loaded, "__file__", None) or ROOT.parent)
+        file = str(path.relative_to(ROOT)) if held and path.is_relative_to(ROOT) else ""
+        if file and loaded is not module:
+            held -= own_names(ROOT, file)  # another constant of the same name
         for name in held:
             vars(loaded)[name] = changed[name][1]
-        file = Path(getattr(loaded, "__file__", None) or ROOT.parent)
-        if held and file.is_relative_to(ROOT):
-            for d in derived_from(ROOT, str(file.relative_to(ROOT))):
+        if held and file:
+            for d in derived_from(ROOT, file):
                 if d.reads & held and not set(d.names) & set(names):
                     with contextlib.suppress(LookupError, AttributeError, TypeError):  # of compiled code
                         _put(loaded, d.kind, d.where, d.names, d.code)

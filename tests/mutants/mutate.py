@@ -16,7 +16,7 @@ from pathlib import Path
 from types import CodeType
 from typing import cast
 
-__all__ = ["Derived", "Mutant", "derived_from", "mentions", "mutants_of", "with_hits"]
+__all__ = ["Derived", "Mutant", "derived_from", "mentions", "mutants_of", "own_names", "with_hits"]
 
 COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
@@ -472,6 +472,11 @@ def derived_from(root: Path, file: str) -> list[Derived]:
         for argument, field, i in _arguments(f):
             add(DEFAULT, path, (argument,), _default(f, field, i))
     return [d for _, d in sorted(out, key=lambda d: d[0])]
+
+
+def own_names(root: Path, file: str) -> set[str]:
+    """The constants that stand in the file itself."""
+    return {name for s in ast.parse((root / file).read_text(), file).body for name in _names_of(s)}
 
 
 def mentions(root: Path, files: Iterable[str]) -> dict[str, set[tuple[str, int]]]:
