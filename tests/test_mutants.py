@@ -167,6 +167,22 @@ def test_a_campaign_tells_the_killed_from_the_survivors_and_ends_endless_loops(t
     }  # fmt: skip
 
 
+ALONE = """
+seen = []
+
+def test_first():
+    seen.append(1)
+
+def test_second():
+    assert seen and tiny.over(5.0, False) == -5.0
+"""
+
+
+def test_a_test_that_fails_alone_kills_nothing(tmp_path: Path) -> None:
+    run = campaign(tmp_path, "import tiny\n" + ALONE)
+    assert run.returncode == 0 and "# True" not in run.stdout and "alone it fails unchanged" in run.stdout
+
+
 def test_a_campaign_whose_tests_fail_unchanged_says_so(tmp_path: Path) -> None:
     run = campaign(tmp_path, "def test_wrong():\n    assert False\n")
     assert run.returncode != 0 and "fails without any change" in run.stderr and "test_wrong" in run.stderr

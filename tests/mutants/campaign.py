@@ -178,6 +178,10 @@ class _TooLong(BaseException):
     """A test runs longer than `LONGEST_TEST` allows."""
 
 
+class _NoImport(Exception):
+    """With this change the module cannot be imported."""
+
+
 class _Campaign:
     def __init__(self, target: Target, chosen: list[Mutant], jobs: int, say: Callable[[Outcome], None]):
         self.target, self.chosen, self.jobs, self.say = target, chosen, jobs, say
@@ -318,16 +322,35 @@ class _Campaign:
             self.outcomes.append(Outcome(m, by, reached))
             self.say(self.outcomes[-1])
 
-        works: list[_Work] = []
-        for m in self.chosen:
-            found = reaching(m)
-            if found:
-                limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in found)
-                works.append((m, partial(_try, m, modules[m.file], found, costs), limit))
-            else:
-                decided(m, "", reached=False)
-        for m, by in _side_by_side(works, self.jobs):
-            decided(m, by)
+        left = self.chosen
+        while left:
+            works: list[_Work] = []
+            for m in left:
+                found = reaching(m)
+                if found:
+                    limit = LEAST_SECONDS + 4.0 * sum(costs[i.nodeid][0] for i in found)
+                    works.append((m, partial(_try, m, modules[m.file], found, costs), limit))
+                else:
+                    decided(m, "", reached=False)
+            killed: dict[str, list[tuple[Mutant, str]]] = {}
+            for m, by in _side_by_side(works, self.jobs):
+                if test := next((i.nodeid for i in by_cost if by.startswith(f"{i.nodeid}: ")), ""):
+                    killed.setdefault(test, []).append((m, by))
+                else:
+                    decided(m, by)
+            # What fails alone and unchanged, too, tells nothing: its mutants are tried again without it.
+            alone: list[_Work] = [
+                (i, partial(_try, None, None, [i], costs), None) for i in by_cost if i.nodeid in killed
+            ]
+            left = []
+            for item, bad in _side_by_side(alone, self.jobs):
+                if bad:
+                    print(f"{self.target.name}: without {item.nodeid}: alone it fails unchanged", flush=True)
+                    by_cost.remove(item)
+                    left += [m for m, _ in killed[item.nodeid]]
+                else:
+                    for m, by in killed[item.nodeid]:
+                        decided(m, by)
 
 
 def _processor_time() -> float:
@@ -432,14 +455,17 @@ def _failure(item: pytest.Item, following: pytest.Item | None) -> str:
     return ""
 
 
-def _try(m: Mutant, module: ModuleType, items: list[pytest.Item], costs: Costs) -> str:
-    if m.kind == FUNCTION:
+def _try(m: Mutant | None, module: ModuleType | None, items: list[pytest.Item], costs: Costs) -> str:
+    """Run the tests with this change, or none; return which fails, and why."""
+    if m is None or module is None:
+        pass
+    elif m.kind == FUNCTION:
         _function(module, m.where).__code__ = m.code()
     else:
         try:
             _put(module, m.kind, m.where, m.names, m.code())
-        except Exception as e:  # noqa: BLE001
-            return f"import: {type(e).__name__}: {e}"
+        except _NoImport as e:
+            return f"import: {e}"
     for item, following in zip(items, [*items[1:], None], strict=True):
         signal.alarm(int(WAITS * (LEAST_SECONDS + costs[item.nodeid][0])))
         bad = _failure(item, following)
@@ -482,7 +508,10 @@ def _put(module: ModuleType, kind: str, where: str, names: tuple[str, ...], code
     that is made of them, in every module that has them by these names.
     """
     space = {**vars(module), **(vars(_owner(module, where)) if kind == FIELD else {})}
-    exec(code, space)  # noqa: S102
+    try:
+        exec(code, space)  # noqa: S102
+    except Exception as e:
+        raise _NoImport(f"{type(e).__name__}: {e}") from e
     if kind == DEFAULT:
         _set_default(_function(module, where), names[0], space[names[0]])
         return
@@ -502,7 +531,7 @@ def _put(module: ModuleType, kind: str, where: str, names: tuple[str, ...], code
         if held and file:
             for d in derived_from(ROOT, file):
                 if d.reads & held and not set(d.names) & set(names):
-                    with contextlib.suppress(LookupError, AttributeError, TypeError):  # of compiled code
+                    with contextlib.suppress(LookupError, AttributeError, TypeError, ValueError):  # of compiled code
                         _put(loaded, d.kind, d.where, d.names, d.code)
 
 
@@ -515,10 +544,11 @@ def _set_default(function: Any, name: str, value: Any) -> None:
         function.__kwdefaults__[name] = value
         return
     code = function.__code__
-    place = code.co_varnames[: code.co_argcount].index(name) - code.co_argcount
-    defaults = list(function.__defaults__)
-    defaults[place] = value
-    function.__defaults__ = tuple(defaults)
+    arguments = code.co_varnames[: code.co_argcount]
+    defaults = list(function.__defaults__ or ())
+    if name in arguments[len(arguments) - len(defaults) :]:  # else a subclass takes it otherwise
+        defaults[arguments.index(name) - len(arguments)] = value
+        function.__defaults__ = tuple(defaults)
 
 
 def _set_field(owner: Any, name: str, value: Any) -> None:
