@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -128,7 +129,7 @@ SCRIPT = """
 import sys
 from pathlib import Path
 import tests.mutants.campaign as c
-c.ROOT, c.LEAST_SECONDS = Path(sys.argv[1]), 1.0
+c.ROOT, c.LEAST_SECONDS, c.LONGEST_TEST = Path(sys.argv[1]), 1.0, 0.3
 sys.path.insert(0, sys.argv[1])
 t = c.Target("tiny", ("tiny.py",), ("test_tiny.py",))
 for o in c.run_target(t, c.sample(t.mutants(), None, 1), 2, lambda o: None):
@@ -181,6 +182,30 @@ def test_second():
 def test_a_test_that_fails_alone_kills_nothing(tmp_path: Path) -> None:
     run = campaign(tmp_path, "import tiny\n" + ALONE)
     assert run.returncode == 0 and "# True" not in run.stdout and "alone it fails unchanged" in run.stdout
+
+
+SLOW = """
+@pytest.fixture(scope="module")
+def slow():
+    begin = time.process_time()
+    while time.process_time() < begin + 0.4:
+        pass
+
+def test_first(slow):
+    assert tiny.over(5.0, False) == -5.0
+
+def test_second(slow):
+    assert tiny.over(5.0, False) == -5.0
+
+def test_third():
+    assert tiny.over(5.0, False) == -5.0
+"""
+
+
+def test_what_takes_too_long_is_left_out_with_all_that_needs_it(tmp_path: Path) -> None:
+    run = campaign(tmp_path, "import pytest, time, tiny\n" + SLOW)
+    assert run.returncode == 0 and "`return -x` -> `return x`" in run.stdout
+    assert re.findall(r"without test_tiny.py::(\w+): takes more", run.stdout) == ["test_first", "test_second"]
 
 
 def test_a_campaign_whose_tests_fail_unchanged_says_so(tmp_path: Path) -> None:

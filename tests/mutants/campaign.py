@@ -174,8 +174,11 @@ def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[O
     return campaign.outcomes
 
 
-class _TooLong(BaseException):
-    """A test runs longer than `LONGEST_TEST` allows."""
+TOO_LONG = f"takes more than {LONGEST_TEST:.0f} s"
+
+
+class _TooLong(pytest.fail.Exception):
+    """Ends a test that runs longer than `LONGEST_TEST`, and all that need the same fixture if that does."""
 
 
 class _NoImport(Exception):
@@ -287,7 +290,7 @@ class _Campaign:
                 seconds += cost
                 reached |= lines
             if not bad and seconds > LONGEST_TEST:
-                bad = f"takes more than {LONGEST_TEST:.0f} s"
+                bad = TOO_LONG
             seen[item.nodeid] = bad, seconds, sorted((at[f], n) for f, n in reached)
         return json.dumps(seen)
 
@@ -362,7 +365,7 @@ def _within(item: pytest.Item, following: pytest.Item | None) -> str:
     """Run a test unchanged; return why it failed, or that it took too long."""
 
     def late(*_: object) -> None:
-        raise _TooLong
+        raise _TooLong(TOO_LONG)
 
     for number in (signal.SIGPROF, signal.SIGALRM):
         signal.signal(number, late)
@@ -372,15 +375,15 @@ def _within(item: pytest.Item, following: pytest.Item | None) -> str:
     try:
         bad = _failure(item, following)
     except _TooLong:
-        bad = "_TooLong"
+        bad = TOO_LONG
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     with contextlib.suppress(Exception):  # of what was stopped, something may still stand
         if bad:
             item.session._setupstate.teardown_exact(following)
-    if bad and ("_TooLong" in bad or _processor_time() - begin > LONGEST_TEST):
-        return f"takes more than {LONGEST_TEST:.0f} s"
+    if bad and (TOO_LONG in bad or _processor_time() - begin > LONGEST_TEST):
+        return TOO_LONG
     return bad and f"fails without any change: {bad}"
 
 
