@@ -132,18 +132,19 @@ import tests.mutants.campaign as c
 c.ROOT, c.LEAST_SECONDS, c.LONGEST_TEST = Path(sys.argv[1]), 1.0, 0.3
 sys.path.insert(0, sys.argv[1])
 t = c.Target("tiny", ("tiny.py",), ("test_tiny.py",))
-for o in c.run_target(t, c.sample(t.mutants(), None, 1), 2, lambda o: None):
+chosen = [m for m in c.sample(t.mutants(), None, 1) if sys.argv[2] in m.name]
+for o in c.run_target(t, chosen, 2, lambda o: None):
     print("#", bool(o.by), o.mutant.name)
     if not o.reached:
         print("@", o.mutant.name)
 """
 
 
-def campaign(folder: Path, tests: str) -> subprocess.CompletedProcess[str]:
+def campaign(folder: Path, tests: str, only: str = "") -> subprocess.CompletedProcess[str]:
     (folder / "tiny.py").write_text(TINY)
     (folder / "test_tiny.py").write_text(tests)
     return subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", SCRIPT, str(folder), only], cwd=ROOT, capture_output=True, text=True, check=False
     )
 
 
@@ -180,8 +181,13 @@ def test_second():
 
 
 def test_a_test_that_fails_alone_kills_nothing(tmp_path: Path) -> None:
-    run = campaign(tmp_path, "import tiny\n" + ALONE)
-    assert run.returncode == 0 and "# True" not in run.stdout and "alone it fails unchanged" in run.stdout
+    run = campaign(tmp_path, "import tiny\n" + ALONE, "return -x")
+    assert (
+        run.returncode == 0
+        and "# False" in run.stdout
+        and "# True" not in run.stdout
+        and "alone it fails unchanged" in run.stdout
+    )
 
 
 SLOW = """
@@ -203,8 +209,8 @@ def test_third():
 
 
 def test_what_takes_too_long_is_left_out_with_all_that_needs_it(tmp_path: Path) -> None:
-    run = campaign(tmp_path, "import pytest, time, tiny\n" + SLOW)
-    assert run.returncode == 0 and "`return -x` -> `return x`" in run.stdout
+    run = campaign(tmp_path, "import pytest, time, tiny\n" + SLOW, "return -x")
+    assert run.returncode == 0 and "# True tiny.py over: `return -x` -> `return x`" in run.stdout
     assert re.findall(r"without test_tiny.py::(\w+): takes more", run.stdout) == ["test_first", "test_second"]
 
 
