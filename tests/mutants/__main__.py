@@ -82,13 +82,13 @@ NEAREST = {
     "plant.stages": "curve_lanes same_answer lanes effects machines electromechanical loggers",
     "hil": "replay held figures page reading lockstep strategies schedule campaign",
     "hil.bus": "bus frames wire loop moments realtime node uds",
-    "hil.logs": "logs loggers reading readings guess held names tables record logs_fuzz long_logs",
+    "hil.logs": "logs loggers reading readings guess held record logs_fuzz",
     "hil.native": "native c_reference xcp",
     "hil.loop": "loop lanes lockstep node realtime moments replay native machines frames strategies",
     "hil.fmu": "fmu",
     "hil.calibrate": "xcp uds",
     "hil.uds": "uds",
-    "hil.inject": "inject fuzz campaign loop moments native",
+    "hil.inject": "inject fuzz campaign loop moments",
     "vaneloop": "verbs",
     "vaneloop.base": (
         "tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
