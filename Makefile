@@ -67,7 +67,7 @@ test-pythons: $(READY)  ## the same on every other Python that the package promi
 test-can: $(READY_ALL)  ## only the tests on a real vcan0: this kernel's, that of user-mode Linux, or under QEMU (VANELOOP_CAN=host, uml, qemu)
 	@$(PY) -m tests.vcan.run
 
-mutants: compiled  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
+mutants: $(READY_ALL) compiled  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
 	@$(PY) -m tests.mutants $(MUTANTS)
 
 bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
