@@ -35,10 +35,10 @@ CHECKING = 120  # ticks that the check of a loaded file takes: longer than P2, s
 
 # negative responses
 (NO_SERVICE, NO_SUBFUNCTION, LENGTH, BUSY, CONDITIONS, SEQUENCE, RANGE, LOCKED, WRONG_KEY, ATTEMPTED, WAIT, REFUSED,
- SUSPENDED, FAILURE, WRONG_BLOCK, PENDING, NOT_IN_SESSION_SUB, NOT_IN_SESSION) = (
-    0x11, 0x12, 0x13, 0x21, 0x22, 0x24, 0x31, 0x33, 0x35, 0x36, 0x37, 0x70, 0x71, 0x72, 0x73, 0x78, 0x7E, 0x7F
+ SUSPENDED, FAILURE, WRONG_BLOCK, PENDING, NOT_IN_SESSION) = (
+    0x11, 0x12, 0x13, 0x21, 0x22, 0x24, 0x31, 0x33, 0x35, 0x36, 0x37, 0x70, 0x71, 0x72, 0x73, 0x78, 0x7F
 )  # fmt: skip
-_QUIET = (NO_SERVICE, NO_SUBFUNCTION, RANGE, NOT_IN_SESSION_SUB, NOT_IN_SESSION)  # not answered when asked of all
+_QUIET = (NO_SERVICE, NO_SUBFUNCTION, RANGE, NOT_IN_SESSION)  # not answered when asked of all
 
 # live signals: identifier -> name, unit; also what a freeze frame has, in this order
 SIGNALS = {
@@ -172,7 +172,7 @@ class Server:
             except Negative as e:
                 return [bytes([0x7F, 0x37, e.code])]
             return [bytes([0x77])]
-        if waited == P2 - 10 or waited % (P2_STAR - 100) == P2_STAR - 101:
+        if waited == P2 - 10:  # the desk gives up long before P2* is over
             return [bytes([0x7F, 0x37, PENDING])]
         return []
 
@@ -243,7 +243,7 @@ class Server:
         if self.memory.loop.foreign:
             raise Negative(CONDITIONS)
         self._reset = True
-        return data[1:2]
+        return data[1:]
 
     def _present(self, data: bytes) -> bytes:
         self._exactly(data, 2)
@@ -291,13 +291,13 @@ class Server:
         if data[1] not in (1, 2):
             raise Negative(NO_SUBFUNCTION)
         self.trouble.on = data[1] == 1
-        return data[1:2]
+        return data[1:]
 
     # ---- trouble codes -----------------------------------------------------------------------------------------------
 
     def _clear(self, data: bytes) -> bytes:
         self._exactly(data, 4)
-        if not self.trouble.clear(int.from_bytes(data[1:4], "big")):
+        if not self.trouble.clear(int.from_bytes(data[1:], "big")):
             raise Negative(RANGE)
         return b""
 
@@ -380,13 +380,13 @@ class Server:
 
     def _run_routine(self, data: bytes) -> bytes:
         self._exactly(data, 4)
-        what, routine = data[1], int.from_bytes(data[2:4], "big")
+        what, routine = data[1], int.from_bytes(data[2:], "big")
         if routine not in (routines.SWEEP, routines.LVDT, routines.CLEAR_LEARNED):
             raise Negative(RANGE)
         if what not in (1, 2, 3):
             raise Negative(NO_SUBFUNCTION)
         self._unlocked()
-        head = data[1:4]
+        head = data[1:]
         if what == 1:
             if self.sweep is not None:
                 raise Negative(SEQUENCE)

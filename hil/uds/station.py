@@ -36,9 +36,6 @@ class _Ticks(Timer):
             self.set_timeout(timeout)
         self.start_time = self._service.k
 
-    def elapsed(self) -> float:
-        return 0.0 if self.start_time is None else (self._service.k - self.start_time) * 1e-3
-
     def elapsed_ns(self) -> int:
         return 0 if self.start_time is None else (self._service.k - self.start_time) * 1_000_000
 
@@ -50,10 +47,6 @@ class _Transport(isotp.TransportLayerLogic):
         self._service = service
         super().__init__(**options)
         self.timer_tx_stmin = _Ticks(0, service)
-
-    def load_params(self) -> None:
-        super().load_params()
-        self.timer_rx_fc, self.timer_rx_cf = _Ticks(1.0, self._service), _Ticks(1.0, self._service)
 
     def _start_rx_fc_timer(self) -> None:
         self.timer_rx_fc = _Ticks(1.0, self._service)

@@ -170,13 +170,15 @@ class TroubleMemory:
         if not file.exists():
             return out
         try:
-            raw = file.read_bytes()[: MOST_BYTES + 1]
+            raw = file.read_bytes()
+            if len(raw) > MOST_BYTES:
+                raise ValueError(f"more than {MOST_BYTES} bytes")
             data = json.loads(raw)
             rows = {str(row["fault"]): row for row in data["codes"]}
             for i, name in enumerate(CODES):
                 row = rows[name]
                 numbers = [int(row[key]) for key in ("status", "failures", "trips", "age")]
-                if len(raw) > MOST_BYTES or not all(0 <= n <= 255 for n in numbers):
+                if not all(0 <= n <= 255 for n in numbers):
                     raise ValueError(f"{name} has a number beyond 255")
                 first, last = (base64.b64decode(row[key], validate=True) for key in ("first", "last"))
                 if max(len(first), len(last)) > 255:

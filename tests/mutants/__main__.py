@@ -86,8 +86,8 @@ NEAREST = {
     "hil.native": "native c_reference xcp",
     "hil.loop": "loop lanes lockstep node realtime moments replay native machines frames strategies",
     "hil.fmu": "fmu",
-    "hil.calibrate": "xcp uds",
-    "hil.uds": "uds",
+    "hil.calibrate": "xcp uds xcp_spec",
+    "hil.uds": "uds uds_spec",
     "hil.inject": "inject fuzz campaign loop moments",
     "vaneloop": "verbs",
     "vaneloop.base": (
