@@ -840,6 +840,7 @@ def test_the_demand_of_the_sweep_tick_by_tick() -> None:
     """45 % held for 1.5 s, up to 104 % at 12 %/s in 4917 ticks, held, down again, held: 14,334 ticks."""
     sweep = Sweep(SimpleNamespace(), 1000)  # type: ignore[arg-type]
     assert sweep.length == 14_334 and sweep.state == 1
+    assert sweep.low == sweep.high == (0.0, 0.0) and sweep.worst == 0.0, "nothing is measured"
     for at, wanted in (
         (0, 45.0), (1, 45.0), (1499, 45.0), (1500, 45.0), (1501, 45.012), (3000, 63.0), (6416, 45.0 + 12e-3 * 4916),
         (6417, 104.0), (7916, 104.0), (7917, 104.0), (7918, 103.988), (9417, 86.0), (12_833, 104.0 - 12e-3 * 4916),

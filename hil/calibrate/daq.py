@@ -86,8 +86,6 @@ class Daq:
     def allocate_tables(self, at: int, n: int) -> None:
         """Make room for ``n`` tables of a list."""
         self._in_order(2, 3)
-        if self.step == 3 and any(t for of in self.lists for t in of.tables):
-            raise Refusal(SEQUENCE, "tables come before entries")
         own = self._list(at)
         if sum(len(of.tables) for of in self.lists) + n > MOST_TABLES:
             raise Refusal(FULL, f"tables must be at most {MOST_TABLES}")
@@ -274,7 +272,7 @@ class Daq:
 
     def sample(self, k: int) -> np.ndarray:
         """Return the frames (int64[n, 2]) of tick ``k``, whose numbers are in memory now."""
-        out, n, fresh = self._out, 0, False
+        out, n = self._out, 0
         for own in self._running:
             period = EVENTS[own.event][1] * own.prescaler
             if k % period:
@@ -283,9 +281,8 @@ class Daq:
             if n + m > MOST_FRAMES:
                 self.overloads += 1
                 continue
-            if not fresh:
+            if n == 0:
                 self.memory.refresh(self._used)
-                fresh = True
             out[n : n + m] = own.heads
             out[n, 1] |= (k & 0xFFFF) << 8
             gather(self.memory.raw, own.plan, out, n)

@@ -160,7 +160,7 @@ class Memory:
         with np.errstate(over="ignore", invalid="ignore"):
             image = row.astype(kind).tobytes()
         at = address - base
-        if size < 0 or at + size > len(image):
+        if at + size > len(image):
             raise Refusal(RANGE, f"no memory from {address:#x} to {address + size:#x}")
         return image[at : at + size]
 

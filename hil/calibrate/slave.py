@@ -83,14 +83,17 @@ class Slave:
         self.k = 0  # the next tick
         self.why = ""  # of the last refusal
         self._a2l = a2l
-        self._locked = self._lockable = sum(RESOURCES[name] for name in set(locked))
+        self._lockable = sum(RESOURCES[name] for name in set(locked))
+        self._locked: int
         self._generator = random.Random(seed)
-        self._seed: tuple[int, bytes] | None = None
+        self._seed: tuple[int, bytes] | None
         self._freeze = False
-        self._mta: tuple[bytes | None, int, int] = (None, EXACT, 0)  # a text of ours or memory: extension, address
+        self._mta: tuple[bytes | None, int, int]  # a text of ours or memory: extension, address
         self.waiting = False  # for the result of a check
         self._late: list[bytes] = []
-        self._told, self._told_at = 0, -AGAIN
+        self._told: int
+        self._told_at = -AGAIN
+        self._reset()
         self._commands: dict[int, tuple[Callable[[bytes], list[bytes] | None], int, str]] = {
             0xFE: (self._disconnect, 1, ""),
             0xFD: (self._status, 1, ""),
