@@ -321,6 +321,7 @@ def test_what_is_no_seed_and_no_key(request_: str, answer: str) -> None:
 def test_a_seed_is_good_for_one_key_and_the_latest_counts() -> None:
     s = server()
     asked(s, "10 03")
+    assert asked(s, "27 01") == "67 01 CD 07 2C D8 BE 6F 9F 62", "the first one, as published"
     first, second = seed_of(s), seed_of(s)
     assert first != second
     assert asked(s, b"\x27\x02" + key_of(first)) == "7F 27 35"
@@ -840,7 +841,6 @@ def test_the_demand_of_the_sweep_tick_by_tick() -> None:
     """45 % held for 1.5 s, up to 104 % at 12 %/s in 4917 ticks, held, down again, held: 14,334 ticks."""
     sweep = Sweep(SimpleNamespace(), 1000)  # type: ignore[arg-type]
     assert sweep.length == 14_334 and sweep.state == 1
-    assert sweep.low == sweep.high == (0.0, 0.0) and sweep.worst == 0.0, "nothing is measured"
     for at, wanted in (
         (0, 45.0), (1, 45.0), (1499, 45.0), (1500, 45.0), (1501, 45.012), (3000, 63.0), (6416, 45.0 + 12e-3 * 4916),
         (6417, 104.0), (7916, 104.0), (7917, 104.0), (7918, 103.988), (9417, 86.0), (12_833, 104.0 - 12e-3 * 4916),
@@ -921,6 +921,9 @@ def test_a_fault_aborts_the_sweep() -> None:
 
 
 def test_what_the_routines_tell_of_two_ends() -> None:
+    sweep = Sweep(SimpleNamespace(), 0)  # type: ignore[arg-type]
+    assert sweep.low == sweep.high == (0.0, 0.0) and sweep.worst == 0.0, "nothing is measured"
+    assert sweep.result(0x0201) == b"\1" + bytes(12) and sweep.result(0x0202) == b"\1" + bytes(8)
     sweep = Sweep(SimpleNamespace(), 0, 0, (0.004, 0.005), (0.044, 0.037), 0.0015)  # type: ignore[arg-type]
     assert sweep.result(0x0201) == b"\0" + struct.pack(">3f", 4.0, 44.0, 1.5)
     assert sweep.result(0x0202)[:1] == b"\0"
@@ -1022,9 +1025,8 @@ def test_a_file_is_answered_after_40_and_120_ticks_and_its_session_lasts_5000_mo
         assert asked(s, request, 1000) == answer
     assert answers_until(s, 1001, 1300) == {1040: "7F 37 78", 1120: "77"}
     assert s.memory.loop.calibration.scalars.kp == 12.0
-    assert asked(s, "37", 1120) == "7F 37 24", "the file is used up"
     s.before(6119)
-    assert s.session == 2
+    assert s.session == 2 and s.before(6119) == [], "answered once"
     s.before(6120)
     assert s.session == 1
 
@@ -1035,6 +1037,13 @@ def test_a_session_does_not_end_while_its_file_is_checked() -> None:
     s.before(5000)
     assert s.session == 2
     assert answers_until(s, 5001, 5003) == {5001: "7F 37 72"}
+
+
+def test_a_check_that_does_not_end_is_answered_after_1500_ticks() -> None:
+    s = unlocked(session=2)
+    s.memory.desk.runner = SimpleNamespace(begin=lambda *of: None, done=lambda: (0, None))  # type: ignore[assignment]
+    given_file(s, calibration())
+    assert answers_until(s, 1, 3000) == {40: "7F 37 78", 1500: "7F 37 72"}
 
 
 def test_the_answer_waits_for_a_check_of_another_tool() -> None:

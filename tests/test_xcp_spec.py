@@ -615,6 +615,16 @@ def test_a_page_with_another_monitor_is_switched_to_with_an_open_loop_only(mode:
     assert s.memory.pages[0][SCALARS.index("tracking_limit")] == (0.004 if closed else 0.002)
 
 
+def test_what_is_protected_is_refused_at_once_and_not_checked_first() -> None:
+    s = slave(STANDBY)
+    write(s, scalar("tracking_limit"), 0.004)
+    s.memory.loop.given.mode = float(RUN)
+    s.memory.desk = Desk(held := Held())  # type: ignore[arg-type]
+    assert asked(s, "EB 01 00 01") == "FE 23" and asked(s, "E4 00 01 00 00") == "FE 23"
+    assert write(s, scalar("tracking_limit"), 0.003) == "FE 23" and held.begun == [] and not s.waiting
+    assert write(s, scalar("kp"), 12.0) == "" and held.begun == [(1, "judge")] and s.waiting
+
+
 def test_a_page_that_does_not_fit_together_is_not_switched_to_and_not_saved(tmp_path: Path) -> None:
     s = slave(save=tmp_path / "tuned")
     was = s.memory.live()
@@ -1360,6 +1370,7 @@ def test_where_the_process_is_gone_nothing_comes_back(monkeypatch: pytest.Monkey
 
 
 def test_every_number_has_its_place_and_bounds() -> None:
+    elements._bounds.cache_clear()
     memory = Memory(Node(*shipped()))
     e = memory.elements
     assert len(e) == NUMBERS and [x.name for x in e[:68]] == list(SCALARS) and len({x.name for x in e}) == NUMBERS
@@ -1442,6 +1453,30 @@ def test_scalars_of_a_controller_of_your_own_stand_last(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_scalars_of_your_own_are_read_written_and_measured_in_their_own_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = {"gain": np.array([2.5]), "b": np.array([0.5])}
+    own = {name: {**of, "value": values[name]} for name, of in OWN.items()}
+    monkeypatch.setattr("hil.calibrate.memory.own_scalars", lambda foreign: own)
+    s = slave(STANDBY)
+    memory = s.memory
+    first = CAL + 8 * NUMBERS
+    assert memory.live()[NUMBERS:].tolist() == [2.5, 0.5] and memory.by_name()["own_b"] == NUMBERS + 1
+    assert memory.place(0, first, 16) == (6, 0) and memory.place(1, CAL + 4 * NUMBERS + 4, 4) == (13, 4)
+    assert memory.place(0, first + 16, 1) is None and asked(s, "E8 00 00 01 00") == "FF 00 00 00 90 10 00 00"
+    assert memory.raw[6].tobytes() == struct.pack("<2d", 2.5, 0.5), "there from the start"
+    assert write(s, first + 8, 0.25) == "FF" and values["b"].tolist() == [0.25] and values["gain"].tolist() == [2.5]
+    assert write(s, first, 9.5) == "FE 22" and write(s, first, 9.0) == "FF" and values["gain"].tolist() == [9.0]
+    assert memory.raw[6].tobytes() == struct.pack("<2d", 2.5, 0.5), "a copy, of the last tick that was measured"
+    memory.refresh({13})
+    assert memory.raw[6].tobytes() == struct.pack("<2d", 9.0, 0.25)
+    assert memory.raw[13].tobytes() == struct.pack("<2f", 9.0, 0.25)
+    assert memory.read(0, first, 16) == struct.pack("<2d", 9.0, 0.25)
+    memory.loop.given.mode = float(RUN)
+    assert write(s, first, 8.0) == "FE 23", "what it limits nobody knows"
+    memory.loop.given.mode = float(STANDBY)
+    assert asked(s, "EB 03 00 01") == "FF" and values["gain"].tolist() == [2.5] and values["b"].tolist() == [0.5]
+
+
 def test_what_is_written_is_the_whole_calibration_and_is_read_back_as_the_same_bits(tmp_path: Path) -> None:
     memory = Memory(Node(*shipped()))
     rng = np.random.default_rng(5)
@@ -1470,7 +1505,7 @@ def test_what_is_written_is_the_whole_calibration_and_is_read_back_as_the_same_b
 
 @pytest.mark.parametrize(
     ("value", "factor", "shown"),
-    [(0.04, 1e-3, 40.0), (0.0030263, 1e-3, 3.0263), (16.0, 1.0, 16.0), (0.1234567, 1.0, 0.1234567), (0.0, 1e-3, 0.0)],
+    [(0.04, 1e-3, 40.0), (0.001956, 1e-3, 1.956), (16.0, 1.0, 16.0), (0.1234567, 1.0, 0.1234567), (0.0, 1e-3, 0.0)],
 )
 def test_a_number_is_written_as_short_as_its_bits_allow(value: float, factor: float, shown: float) -> None:
     assert elements.border(value, factor) == shown and shown * factor == value
@@ -1571,7 +1606,6 @@ def block(text: str, kind: str, name: str) -> list[str]:
     return [line.strip() for line in found[0].splitlines()]
 
 
-@cache
 def a2l() -> tuple[str, Memory]:
     """The A2L file of the shipped machine."""
     memory = Memory(Node(*shipped()))

@@ -231,7 +231,7 @@ class Daq:
                 plan += [(row, 8 * (at + i), where[0], where[1] + i) for i in range(size)]
                 at += size
             heads.append((self.ident | at << 32, pid + row))
-        own.plan, own.heads = np.array(plan, np.int64).reshape(-1, 4), np.array(heads, np.int64)
+        own.plan, own.heads = np.array(plan, np.int64).reshape(len(plan), 4), np.array(heads, np.int64)
 
     def _start(self, own: DaqList) -> None:
         own.running = True

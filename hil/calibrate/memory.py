@@ -86,7 +86,7 @@ class Memory:
         spans = [(INPUTS, loop.inputs), (OUTPUTS, loop.outputs), (STATE, loop.z)]
         first = 0
         for key in ("k", "table", "angles"):
-            built, flashed = (getattr(of, key).reshape(-1) for of in (loop.built, loop.calibration))
+            built, flashed = (getattr(of, key).ravel() for of in (loop.built, loop.calibration))
             self._places.append((first, built, flashed))
             spans.append((CALIBRATION + 8 * first, flashed))
             first += len(built)
@@ -118,7 +118,7 @@ class Memory:
     def live(self) -> np.ndarray:
         """The calibration that the next tick uses, one row."""
         cal = self.loop.calibration
-        return np.concatenate([cal.k, cal.table.reshape(-1), cal.angles.reshape(-1), *self._own])
+        return np.concatenate([cal.k, cal.table.ravel(), cal.angles.ravel(), *self._own])
 
     def refresh(self, used: Collection[int] | None = None) -> None:
         """Bring copies up to date: single precision, and the scalars of a controller's own.

@@ -203,8 +203,6 @@ class Slave:
     def _connect(self, data: bytes) -> list[bytes]:
         if len(data) < 2 or data[1] not in (0, 1):
             return [self._refuse(SYNTAX, "mode must be 0 or 1")] if self.connected else []
-        if not self.connected:
-            self._reset()
         self.connected = True
         resource = 0x01 | 0x04 | 0x08  # calibration, measurement, STIM
         # Intel byte order, addresses of bytes, blocks from the slave, GET_COMM_MODE_INFO

@@ -110,7 +110,7 @@ class XcpService:
         if not self._out and not len(measured):
             return None
         answers = [row_of(slave.ident, self._out.popleft()) for _ in range(min(MOST_ANSWERS, len(self._out)))]
-        return np.concatenate([np.array(answers, np.int64).reshape(-1, 2), measured])
+        return np.concatenate([np.array(answers, np.int64).reshape(len(answers), 2), measured])
 
 
 class Attended:

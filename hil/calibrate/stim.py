@@ -75,4 +75,4 @@ class Stimulus:
     def _given_for(self, *own: float) -> tuple[float, float, int]:
         """The demand that the ECU's ``own`` becomes: n_dem, n_r, mode_request."""
         n_dem, n_r, request = (self.given.get(i, float(v)) for i, v in zip(_ECU, own, strict=True))
-        return n_dem, n_r, int(min(max(request, 0.0), 3.0))
+        return n_dem, n_r, min(max(int(request), 0), 3)

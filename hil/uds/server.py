@@ -55,7 +55,6 @@ class Negative(Exception):
     """A negative response."""
 
     def __init__(self, code: int):
-        super().__init__(f"{code:#04x}")
         self.code = code
 
 
@@ -84,23 +83,23 @@ class Server:
     ):
         self.memory, self.trouble = memory, trouble or TroubleMemory()
         self.node = memory.node
-        self.session = DEFAULT
-        self.silent = False
         self.sweep: routines.Sweep | None = None
         self._routine = 0
         self._results: dict[int, bytes] = {}
         self._store = store
         self._generator = random.Random(seed)
-        self._last = self._k = 0
-        self._seed: bytes | None = None
-        self._open = False
+        self._last: int  # tick of the last request
+        self._k: int  # tick of the request
+        self._seed: bytes | None
         self._wrong = 0
         self._no_seed_until = 0
-        self._file: bytearray | None = None
-        self._size = self._block = 0
+        self._file: bytearray | None
+        self._size: int
+        self._block: int
         self._since: int | None = None  # tick at which a file was given; None: none is being checked
         self._found: list[np.ndarray | None] | None = None  # its scalars, once read; None: it is no calibration
         self._reset = False
+        self._end_session()
         all_sessions, not_default = (DEFAULT, PROGRAMMING, EXTENDED), (PROGRAMMING, EXTENDED)
         # service -> what does it, least length, sessions, whether it has a subfunction
         self._services: dict[int, tuple[Callable[[bytes], bytes | None], int, tuple[int, ...], bool]] = {
@@ -129,7 +128,6 @@ class Server:
             return []
         service = data[0]
         known = self._services.get(service)
-        quiet = False
         try:
             if self._since is not None and service != 0x3E:
                 raise Negative(BUSY)
@@ -152,7 +150,6 @@ class Server:
 
     def before(self, k: int) -> list[bytes]:
         """Work before tick ``k``: a reset, the end of a session, answers that took their time."""
-        self._k = k
         if self._reset:
             self._reset = False
             self.memory.loop.z[:] = new_state()
