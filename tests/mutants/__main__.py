@@ -109,7 +109,7 @@ NEAREST = {
         "loggers long_logs discrepancy curves directions electromechanical readings"
     ),
     "vaneloop.design": "design schedule spatial strategies tables tolerances",
-    "vaneloop.fleet": "fleet_report fleet_run campaign",
+    "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
     "vaneloop.pages": (
         "page design campaign fleet_report schedule strategies spatial verbs search_commands learn_turns"
     ),

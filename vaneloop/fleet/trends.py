@@ -95,7 +95,7 @@ def trend(t: Array, y: Array, s: Array, sure: float = SURE, told: NDArray[np.boo
     if n < LEAST or t[-1] <= t[0]:
         return Trend("too few", n)
     b = _scatter(t[told], y[told], s[told])
-    w = 1.0 / np.maximum(s**2 + np.where(told, b, 0.0) ** 2, 1e-300)
+    w = 1.0 / np.maximum(s**2 + np.where(told, b, 0.0) ** 2, 1e-100)
     level = float(np.average(y, weights=w))
     rest = float(np.sum(w * (y - level) ** 2))
     fits = {kind: _fitted(kind, t, y, w, _candidates(t, kind)) for kind in ("growth", "step")}
@@ -104,7 +104,7 @@ def trend(t: Array, y: Array, s: Array, sure: float = SURE, told: NDArray[np.boo
     # three numbers against one; two shapes, and T chosen among many, make chance fits six times as probable (simulated)
     gain = (rest - left) / 3.0 / max(left / (n - 3), 1e-300)
     p = min(1.0, 6.0 * float(stats.f.sf(gain, 3, n - 3)))
-    if p >= sure or not _by_ruptures(t, y, w):
+    if p >= sure or not _by_ruptures(t, y):
         half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * np.sqrt(rest / (n - 1) / w.sum()))
         return Trend("none", n, level, level, level - half, level + half, p=p, scatter=b)
     return _changed(kind, p, b, t, y, w, fits[kind], told)
@@ -249,14 +249,14 @@ def _scatter(t: Array, y: Array, s: Array) -> float:
     return float(np.sqrt(max(variance - float(np.median(s**2)), 0.0)))
 
 
-def _by_ruptures(t: Array, y: Array, w: Array) -> bool:
+def _by_ruptures(t: Array, y: Array) -> bool:
     """Whether a search for change points (ruptures, exact, of level and slope) finds one too.
 
     It takes none of the two shapes for granted: what only one bad log makes look like a change, it leaves alone.
     """
     ruptures = needed("vaneloop fleet", "ruptures")
-    z = (y - np.average(y, weights=w)) * np.sqrt(np.median(w))
-    n, flat, line = len(z), float(np.sum((z := z - z.mean()) ** 2)), _straight(t, z)
+    z, n = y - y.mean(), len(y)
+    flat, line = float(np.sum(z**2)), _straight(t, z)
     if line < flat - 2.0 * np.log(n) * line / (n - 2):
         return True  # it has changed all along
     signal = np.column_stack([z, np.ones(n), (t - t[0]) / (t[-1] - t[0])])
