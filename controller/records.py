@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
-from numba.extending import overload
+from numba.extending import lower_builtin, type_callable
+from numba.np.arrayobj import make_array
+from numba.np.numpy_support import from_dtype
 
 from vaneloop.base.vanes import VANES, own_rows
 
@@ -260,16 +262,31 @@ def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
     def view(row: Any) -> Record:
         return row if isinstance(row, np.void) else row.view(layout)[0]
 
-    def numbers(row: Any) -> Any:
-        return row.view(layout)[0]
+    shown: Any = from_dtype(layout)
+    count = len(flat_names(fields))
 
-    def named(row: Any) -> Any:
-        return row
+    def type_of(context: Any) -> Any:
+        def of(row: Any) -> Any:
+            if isinstance(row, types.Record):
+                return row
+            plain = isinstance(row, types.Array) and (row.dtype, row.ndim, row.layout) == (types.float64, 1, "C")
+            return shown if plain else None
 
-    @overload(view)
-    def _compiled(row: Any) -> Any:
-        return numbers if isinstance(row, types.Array) else named
+        return of
 
+    def code_of_numbers(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        row: Any = make_array(signature.args[0])(context, builder, values[0])
+        with builder.if_then(builder.icmp_signed("<", row.nitems, row.nitems.type(count)), likely=False):
+            context.call_conv.return_user_exc(builder, ValueError, (f"a row must have at least {count} numbers",))
+        return builder.bitcast(row.data, context.get_value_type(shown))
+
+    def code_of_record(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return values[0]
+
+    # numba's own view and item would be functions to compile, for each record and each set of options
+    type_callable(view)(type_of)
+    lower_builtin(view, types.Array)(code_of_numbers)
+    lower_builtin(view, types.Record)(code_of_record)
     return view
 
 

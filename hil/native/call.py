@@ -187,7 +187,9 @@ def firmware(inputs: np.ndarray, outputs: np.ndarray, z: np.ndarray, calibration
         give(z, outputs)
 
 
-_AS_INLINED: Any = {"_nrt": False, "forceinline": True, "error_model": "numpy"}  # `vaneloop.base.compiled.inlined`
+_AS_INLINED: Any = {  # `vaneloop.base.compiled.inlined`, and without what Python would call
+    "_nrt": False, "forceinline": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True
+}  # fmt: skip
 
 
 @overload(firmware, jit_options=_AS_INLINED)

@@ -18,6 +18,7 @@ import numba
 from numba import njit
 
 from vaneloop.base.kept import is_kept, keep, sources_digest
+from vaneloop.base.lean import called_by_code
 
 __all__ = [
     "cache_folder",
@@ -72,10 +73,11 @@ class Compiler(Protocol):
 
 
 def _compiler(**options: Any) -> Compiler:
-    compile_: Any = njit(error_model="numpy", **options)
+    # nobody enters it as a function of C
+    compile_: Any = njit(error_model="numpy", no_cfunc_wrapper=True, **options)
 
     def of(function: F, /) -> F:
-        return cast("F", keep(compile_(function)))
+        return cast("F", called_by_code(keep(compile_(function))))
 
     return of
 

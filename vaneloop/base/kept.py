@@ -38,6 +38,7 @@ _ROOT = Path(__file__).parents[2]
 _PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
 # What was compiled when the program was set up (`vaneloop.cli.ahead`), for each Python; here it is only read.
 AHEAD = Path(os.environ.get("VANELOOP_AHEAD") or Path(__file__).parent / "ahead" / str(sys.implementation.cache_tag))
+ENTERED, INNER = ".nbc", ".nbi"  # files of code that Python can call, and of code that only compiled code can
 OWN = 1_000  # files of users' functions that are kept
 _unknown = itertools.count()
 _Result: Any = compiler.CompileResult  # what has no types
@@ -98,6 +99,7 @@ class _Files(FunctionCache):
     """What numba asks for compiled code of one function, and gives it to."""
 
     _index_key: Any  # of a signature and a processor, as numba makes it
+    inner = False  # whether compiled code calls: it may be code without an entry for Python (`vaneloop.base.lean`)
 
     def __init__(self, function: Any, stamp: Callable[[], str], folder: str):
         self._py_func, self._stamp, self._folder = function, stamp, folder
@@ -117,22 +119,23 @@ class _Files(FunctionCache):
         says = f"{what} {numba.__version__} {sys.version} {sources_digest()} {self._stamp()}"
         return f"{self._title}-{hashlib.sha256(says.encode()).hexdigest()[:24]}"
 
-    def _file(self, key: Any) -> str:
-        return f"{self._begins()}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+    def _file(self, key: Any, suffix: str) -> str:
+        return f"{self._begins()}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}{suffix}"
 
     def has_any(self) -> bool:
-        """Whether there is code for any signature."""
-        return any(any(folder.glob(f"{self._begins()}-*.nbc")) for folder in self._folders())
+        """Whether there is code for any signature that Python calls."""
+        return any(any(folder.glob(f"{self._begins()}-*{ENTERED}")) for folder in self._folders())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for a signature, or None. A file that cannot be read counts as none."""
         target_context.refresh()
         key = self._index_key(sig, target_context.codegen())
-        for folder in self._folders():
-            with contextlib.suppress(Exception):
-                kept, data = pickle.loads((folder / self._file(key)).read_bytes())
-                if kept == key:
-                    return _Result._rebuild(target_context, *data)
+        for suffix in (INNER, ENTERED) if self.inner else (ENTERED,):
+            for folder in self._folders():
+                with contextlib.suppress(Exception):
+                    kept, data = pickle.loads((folder / self._file(key, suffix)).read_bytes())
+                    if kept == key:
+                        return _Result._rebuild(target_context, *data)
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -143,7 +146,7 @@ class _Files(FunctionCache):
             return
         key = self._index_key(sig, data.codegen)
         folder = self._folders()[0]
-        file = folder / self._file(key)
+        file = folder / self._file(key, INNER if self.inner else ENTERED)
         writing = file.with_suffix(f".{uuid.uuid4().hex}")
         try:
             if pickle.loads(_dumps(key)) != key:
@@ -167,13 +170,14 @@ class _Files(FunctionCache):
 
     def flush(self) -> None:
         """Forget what is kept of this function."""
-        for file in self._folders()[0].glob(f"{self._begins()}-*.nbc"):
-            file.unlink(missing_ok=True)
+        for suffix in (INNER, ENTERED):
+            for file in self._folders()[0].glob(f"{self._begins()}-*{suffix}"):
+                file.unlink(missing_ok=True)
 
 
 def _prune(folder: Path) -> None:
     with contextlib.suppress(OSError):
-        files = sorted(folder.glob("*.nbc"), key=lambda f: f.stat().st_mtime)
+        files = sorted(folder.glob(f"*{ENTERED}"), key=lambda f: f.stat().st_mtime)
         for old in files[: max(len(files) - OWN, 0)]:
             old.unlink(missing_ok=True)
 
