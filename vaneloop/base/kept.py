@@ -128,13 +128,13 @@ class _Files(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for a signature, or None. A file that cannot be read counts as none."""
-        target_context.refresh()
         key = self._index_key(sig, target_context.codegen())
         for suffix in (INNER, ENTERED) if self.inner else (ENTERED,):
             for folder in self._folders():
                 with contextlib.suppress(Exception):
                     kept, data = pickle.loads((folder / self._file(key, suffix)).read_bytes())
                     if kept == key:
+                        target_context.refresh()
                         return _Result._rebuild(target_context, *data)
         return None
 

@@ -10,12 +10,13 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba.core import codegen, errors, event, sigutils, targetconfig, types
+from numba.core import codegen, compiler, errors, event, sigutils, types
 from numba.core.compiler_lock import global_compiler_lock
 
 __all__ = ["KNOWN", "called_by_code", "is_known"]
 
 KNOWN = ("0.68.",)
+_DEFAULTS = {name: option.default for name, option in compiler.Flags.options.items()}
 
 
 def is_known() -> bool:
@@ -91,19 +92,19 @@ def called_by_code(dispatcher: Any) -> Any:
 
 
 def _given(flags: Any) -> dict[str, Any]:
-    return {k: v for k, v in flags._values.items() if v != flags.options[k].default}
+    return {name: v for name, v in flags._values.items() if v != _DEFAULTS[name]}
 
 
 def _same_flags(self: Any, other: Any) -> Any:
     """Whether two sets of options say the same. numba compares all sixty, at each look-up of what is compiled."""
-    if not isinstance(other, targetconfig.TargetConfig):
+    if type(other) is not compiler.Flags:
         return NotImplemented
-    return self._values == other._values or (self.options == other.options and _given(self) == _given(other))
+    return self._values == other._values or _given(self) == _given(other)
 
 
 def _hash_of_flags(self: Any) -> int:
-    """One for all: few sets of options are in use."""
-    return hash(targetconfig.TargetConfig)
+    """Of those options in which functions of this program differ."""
+    return hash((self.nrt, self.forceinline, self.release_gil, self.no_cpython_wrapper))
 
 
 def _optimise_functions(self: Any, module: Any) -> None:
@@ -164,7 +165,7 @@ class _NoCollection(event.Listener):
 
 
 def _change_numba() -> None:
-    flags: Any = targetconfig.TargetConfig
+    flags: Any = compiler.Flags
     flags.__eq__, flags.__hash__ = _same_flags, _hash_of_flags
     library: Any = codegen.CPUCodeLibrary
     library._optimize_functions = _optimise_functions

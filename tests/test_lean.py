@@ -1,0 +1,113 @@
+"""What is changed inside numba (`vaneloop.base.lean`) changes how long it compiles, and nothing that it makes."""
+
+import gc
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba.core import compiler, event
+
+from vaneloop.base import lean
+from vaneloop.base.compiled import compiled, in_place, inlined
+
+ROOT = Path(__file__).parents[1]
+known = pytest.mark.skipif(not lean.is_known(), reason="another numba: nothing is changed")
+
+SYSTEM = """
+import sys
+import numba
+if sys.argv[1] == "as it comes":
+    numba.__version__ = "0.0"
+import numpy as np
+from vaneloop.base import lean
+from vaneloop.base.compiled import compiled, in_place, inlined
+
+@compiled
+def lag(x, u):
+    return x + 0.1 * (min(max(u, -1.0), 1.0) - x)
+
+@inlined
+def put(s, row, x):
+    s[row, 0] = max(x, 0.5 * s[row, 0])
+
+@in_place
+def step(s, u):
+    put(s, 0, lag(s[0, 0], u))
+    put(s, 1, s[0, 0] / s[2, 0])
+
+s = np.arange(6.0).reshape(3, 2)
+step(s, 0.3)
+assert lean.is_known() == (sys.argv[1] != "as it comes")
+print(s.tobytes().hex())
+print(step.inspect_asm(step.signatures[0]))
+"""
+
+
+@known
+def test_the_machine_code_is_that_of_numba_as_it_comes(tmp_path):
+    made = []
+    for how in ("as it comes", "changed"):
+        (tmp_path / "system.py").write_text(SYSTEM, encoding="utf-8")
+        said = subprocess.run(
+            [sys.executable, str(tmp_path / "system.py"), how],
+            env={"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / how[:2]), "HOME": str(tmp_path)},
+            capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+        named = re.sub(r"[.\w$]*(_ZN|numba)[^\s,(]*", "NAME", said)
+        made.append([line for line in named.splitlines() if not re.match(r"\s*\.(comm|type)\s", line)])
+    assert any("div" in line for line in made[0])
+    assert made[0] == made[1]
+
+
+@known
+def test_options_are_equal_where_numba_says_so():
+    plain, explicit, other, marked = (compiler.Flags() for _ in range(4))
+    explicit.nrt = plain.nrt  # its default, given
+    other.nrt = not plain.nrt
+    marked.dbg_directives_only = True
+    every = (plain, explicit, other, marked)
+    assert [[a == b for b in every] for a in every] == [[a.values() == b.values() for b in every] for a in every]
+    assert hash(plain) == hash(explicit)
+
+
+@known
+def test_what_compiled_code_called_first_python_can_call_too():
+    @inlined
+    def double(s: np.ndarray, row: int) -> float:
+        return 2.0 * s[row]
+
+    @in_place
+    def both(s: np.ndarray) -> float:
+        return double(s, 0) + double(s, 1)
+
+    s = np.array([1.5, 4.0])
+    assert both(s) == 11.0
+    assert len(double.overloads) == 1  # constants 0 and 1 are no functions of their own
+    assert double(s, 1) == 8.0 and double(s, row=0) == 3.0
+    assert len(double.overloads) == 1
+
+
+@known
+def test_garbage_is_collected_again_after_compiling():
+    seen = []
+
+    class During(event.Listener):
+        def on_start(self, event):
+            seen.append(gc.isenabled())
+
+        def on_end(self, event):
+            pass
+
+    during = During()
+    event.register("numba:compile", during)
+    try:
+        assert compiled(lambda x: x + 1.0)(2.0) == 3.0
+        with pytest.raises(Exception, match="no_such_name"):
+            compiled(lambda x: x.no_such_name)(2.0)
+    finally:
+        event.unregister("numba:compile", during)
+    assert seen == [False, False]
+    assert gc.isenabled()
