@@ -27,6 +27,9 @@ __all__ = [
     "as_scalars", "as_state", "flat", "flat_names", "kind", "record", "state_rows",
 ]  # fmt: skip
 
+_array: Any = make_array  # what has no types
+_type_of: Any = type_callable
+_code_of: Any = lower_builtin
 Record = Any  # a numpy.record: its fields are attributes, which the types of numpy do not know
 TICK = 1e-3  # s, servo rate 1 kHz
 SLOW = 10  # ticks: demand, trend and schedule run every 10 ms
@@ -275,7 +278,7 @@ def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
         return of
 
     def code_of_numbers(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        row: Any = make_array(signature.args[0])(context, builder, values[0])
+        row: Any = _array(signature.args[0])(context, builder, values[0])
         with builder.if_then(builder.icmp_signed("<", row.nitems, row.nitems.type(count)), likely=False):
             context.call_conv.return_user_exc(builder, ValueError, (f"a row must have at least {count} numbers",))
         return builder.bitcast(row.data, context.get_value_type(shown))
@@ -284,9 +287,9 @@ def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
         return values[0]
 
     # numba's own view and item would be functions to compile, for each record and each set of options
-    type_callable(view)(type_of)
-    lower_builtin(view, types.Array)(code_of_numbers)
-    lower_builtin(view, types.Record)(code_of_record)
+    _type_of(view)(type_of)
+    _code_of(view, types.Array)(code_of_numbers)
+    _code_of(view, types.Record)(code_of_record)
     return view
 
 

@@ -1,10 +1,12 @@
 """What is changed inside numba (`vaneloop.base.lean`) changes how long it compiles, and nothing that it makes."""
 
 import gc
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,13 +49,13 @@ print(step.inspect_asm(step.signatures[0]))
 
 
 @known
-def test_the_machine_code_is_that_of_numba_as_it_comes(tmp_path):
+def test_the_machine_code_is_that_of_numba_as_it_comes(tmp_path: Path) -> None:
     made = []
     for how in ("as it comes", "changed"):
         (tmp_path / "system.py").write_text(SYSTEM, encoding="utf-8")
         said = subprocess.run(
             [sys.executable, str(tmp_path / "system.py"), how],
-            env={"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / how[:2]), "HOME": str(tmp_path)},
+            env={**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / how[:2])},
             capture_output=True, text=True, check=True,
         ).stdout  # fmt: skip
         named = re.sub(r"[.\w$]*(_ZN|numba)[^\s,(]*", "NAME", said)
@@ -63,8 +65,9 @@ def test_the_machine_code_is_that_of_numba_as_it_comes(tmp_path):
 
 
 @known
-def test_options_are_equal_where_numba_says_so():
-    plain, explicit, other, marked = (compiler.Flags() for _ in range(4))
+def test_options_are_equal_where_numba_says_so() -> None:
+    options: Any = compiler.Flags
+    plain, explicit, other, marked = (options() for _ in range(4))
     explicit.nrt = plain.nrt  # its default, given
     other.nrt = not plain.nrt
     marked.dbg_directives_only = True
@@ -74,7 +77,7 @@ def test_options_are_equal_where_numba_says_so():
 
 
 @known
-def test_what_compiled_code_called_first_python_can_call_too():
+def test_what_compiled_code_called_first_python_can_call_too() -> None:
     @inlined
     def double(s: np.ndarray, row: int) -> float:
         return 2.0 * s[row]
@@ -83,31 +86,33 @@ def test_what_compiled_code_called_first_python_can_call_too():
     def both(s: np.ndarray) -> float:
         return double(s, 0) + double(s, 1)
 
+    made: Any = double
     s = np.array([1.5, 4.0])
     assert both(s) == 11.0
-    assert len(double.overloads) == 1  # constants 0 and 1 are no functions of their own
+    assert len(made.overloads) == 1  # constants 0 and 1 are no functions of their own
     assert double(s, 1) == 8.0 and double(s, row=0) == 3.0
-    assert len(double.overloads) == 1
+    assert len(made.overloads) == 1
 
 
 @known
-def test_garbage_is_collected_again_after_compiling():
-    seen = []
+def test_garbage_is_collected_again_after_compiling() -> None:
+    seen: list[bool] = []
+    events: Any = event
 
     class During(event.Listener):
-        def on_start(self, event):
+        def on_start(self, event: Any) -> None:
             seen.append(gc.isenabled())
 
-        def on_end(self, event):
+        def on_end(self, event: Any) -> None:
             pass
 
     during = During()
-    event.register("numba:compile", during)
+    events.register("numba:compile", during)
     try:
         assert compiled(lambda x: x + 1.0)(2.0) == 3.0
         with pytest.raises(Exception, match="no_such_name"):
             compiled(lambda x: x.no_such_name)(2.0)
     finally:
-        event.unregister("numba:compile", during)
+        events.unregister("numba:compile", during)
     assert seen == [False, False]
     assert gc.isenabled()

@@ -73,8 +73,8 @@ class Compiler(Protocol):
 
 
 def _compiler(**options: Any) -> Compiler:
-    # nobody enters it as a function of C
-    compile_: Any = njit(error_model="numpy", no_cfunc_wrapper=True, **options)
+    options |= {"error_model": "numpy", "no_cfunc_wrapper": True}  # nobody enters it as a function of C
+    compile_: Any = njit(**options)
 
     def of(function: F, /) -> F:
         return cast("F", called_by_code(keep(compile_(function))))

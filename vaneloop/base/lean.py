@@ -17,6 +17,8 @@ __all__ = ["KNOWN", "called_by_code", "is_known"]
 
 KNOWN = ("0.68.",)
 _DEFAULTS = {name: option.default for name, option in compiler.Flags.options.items()}
+_unliteral: Any = types.unliteral  # what has no types
+_signature: Any = sigutils.normalize_signature
 
 
 def is_known() -> bool:
@@ -48,8 +50,8 @@ class _Calls:
         it: LLVM knows the constant there.
         """
         if self.of.targetoptions.get("forceinline"):
-            args = tuple(types.unliteral(a) for a in args)
-            kws = {name: types.unliteral(a) for name, a in kws.items()}
+            args = tuple(_unliteral(a) for a in args)
+            kws = {name: _unliteral(a) for name, a in kws.items()}
         before, self.within = self.within, True
         try:
             return self.template(args, kws)
@@ -59,7 +61,7 @@ class _Calls:
     def compile_as_called(self, sig: Any) -> Any:
         """Compile a signature, with an entry for Python where Python calls."""
         with global_compiler_lock:
-            args = tuple(sigutils.normalize_signature(sig)[0])
+            args = tuple(_signature(sig)[0])
             there = self.of.overloads.get(args)
             if there is not None and not self.within and not _has_entry(there):
                 del self.of.overloads[args]
@@ -179,7 +181,7 @@ def _change_numba() -> None:
         lock.unregister(*pair)
 
 
-register: Any = event.register
-register("numba:compile", _NoCollection())
+_register: Any = event.register
+_register("numba:compile", _NoCollection())
 if is_known():
     _change_numba()
