@@ -367,7 +367,7 @@ def test_warming_up_compiles_the_loop_and_runs_a_moment(monkeypatch: pytest.Monk
     seen: list[Any] = []
     monkeypatch.setattr(hil.loop.lockstep, "warm_up", lambda told: seen.append(told("x")))
     monkeypatch.setattr(trial, "run", lambda scenario: seen.append(scenario.duration))
-    trial.run_trial.warm_up({}, "")  # type: ignore[attr-defined]
+    trial.run_trial.warm_up({}, "")
     assert seen == [None, 0.1]
 
 
@@ -643,6 +643,17 @@ def test_a_search_begins_with_the_worst_samples(tmp_path: Path, monkeypatch: pyt
     assert said["known"] == [[x, share] for share, x in known[:3]]
     assert (said["search"], said["among"], said["name"]) == (7, ["m"], "search")
     assert list(run.chunks())[-1] == "000001-000000"
+
+
+def test_of_equally_bad_samples_the_order_is_that_of_their_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, quantities, run = begun(tmp_path, monkeypatch, "samples = 8")
+    campaign.take_samples(plan, quantities, run)
+    answered(run, lambda u: 0.5)
+    campaign.take_searches(plan, run)
+    said = json.loads((run.path / "trials" / "still.shipped.shipped" / "search.json").read_text())
+    assert said["known"] == [[x, 0.1] for x in sorted(draw(plan, 2)[0].tolist())]
 
 
 @pytest.mark.parametrize(("lost", "search"), [(3, 1), (4, 0)])

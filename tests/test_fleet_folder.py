@@ -11,6 +11,7 @@ import os
 import signal
 import stat
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -445,6 +446,37 @@ def test_a_file_that_cannot_be_read_is_named_before_a_run_begins(
         folder._digest_of_all({"model": str(tmp_path / "m.toml")})
 
 
+def test_a_version_is_that_of_every_source_by_name_and_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    from vaneloop.base import tables as shipped
+
+    assert all(list((folder._ROOT / p).glob("*.py")) for p in folder._SOURCES), "each has sources of this VaneLoop"
+    monkeypatch.setattr(folder, "_ROOT", tmp_path)
+    monkeypatch.setattr(shipped, "path", lambda name: tmp_path / "tables" / name)
+    of = folder.sources_version.__wrapped__
+    (tmp_path / "plant" / "deep" / "__pycache__").mkdir(parents=True)
+    a, b = tmp_path / "plant" / "deep" / "a.py", tmp_path / "plant" / "b.toml"
+    a.write_text("1")
+    b.write_text("2")
+    expected = version("numba") + f"b.toml:{sha('2')}\ndeep/a.py:{sha('1')}\n"
+    assert of() == f"{version('vaneloop')}+{sha(expected)[:16]}"
+    before = of()
+    for name in ("deep/__pycache__/a.py", "notes.md", "deep/a.pyc"):
+        (tmp_path / "plant" / name).write_text("3")
+        assert of() == before, name
+    a.rename(tmp_path / "plant" / "a.py")
+    assert of() != before
+
+    def unknown(name: str) -> str:
+        if name == "vaneloop":
+            raise PackageNotFoundError
+        return "1"
+
+    monkeypatch.setattr("importlib.metadata.version", unknown)
+    assert of().startswith("0+")
+
+
 # ---- the logs of a run -----------------------------------------------------------------------------------------------
 
 
@@ -469,6 +501,8 @@ def test_chunks_are_as_large_as_asked_or_a_two_hundredth_of_the_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int, asked: int | None, size: int
 ) -> None:
     monkeypatch.setattr(folder, "_look", lambda s, known, again: Entry(s.path, s.path, 1, 1, "", "e", None))
+    pool = SimpleNamespace(map=map)
+    monkeypatch.setattr(folder, "ThreadPoolExecutor", lambda n: nullcontext(pool))
     run = begun(tmp_path)
     assert run.add([Source(f"/nowhere/{k}") for k in range(n)], asked) == n
     sizes = [len(es) for es in run.chunks().values()]
@@ -567,6 +601,11 @@ def test_a_chunk_is_closed_when_all_its_results_are_there(tmp_path: Path) -> Non
     run.clear(chunk)
 
 
+def test_two_answers_that_say_the_same_are_the_same_text() -> None:
+    assert folder._json({"b": 1, "a": {"d": 2, "c": 3}}) == folder._json({"a": {"c": 3, "d": 2}, "b": 1})
+    assert folder._json(None) is None
+
+
 def test_a_part_is_passed_before_its_chunk_is_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, logs = begun(tmp_path), written(tmp_path, {"a.csv": "1"})
     run.add(logs)
@@ -644,6 +683,21 @@ def test_names_of_workers_that_are_gone_are_struck_off(tmp_path: Path) -> None:
     state.tidy(run)
     assert sorted(p.name for p in (run.path / "workers").iterdir()) == ["far.beat", "far.json", "me.beat", "me.json"]
     assert not list((run.path / "parts").iterdir())
+
+
+def test_a_worker_that_leaves_while_somebody_looks_is_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = begun(tmp_path)
+    for name in ("a", "b", "c"):
+        worker(run.path, name)
+    read = state.read_json
+
+    def late(file: Path) -> Any:
+        if file.stem == "b":
+            file.unlink()
+        return read(file)
+
+    monkeypatch.setattr(state, "read_json", late)
+    assert [file.stem for file, _ in state._workers(run)] == ["a", "c"]
 
 
 # ---- the tables ------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -263,6 +264,7 @@ def test_eight_logs_and_two_moments_are_needed() -> None:
     few = trend(t[:7], y[:7], np.full(7, 0.01))
     assert (few.kind, few.logs, few.p, few.scatter) == ("too few", 7, 1.0, 0.0) and np.isnan([few.now, few.rate]).all()
     assert trend(np.ones(8), y, np.full(8, 0.01)).kind == "too few"
+    assert trend(np.r_[np.ones(7), 2.0], np.resize([0.0, 0.1], 8), np.full(8, 0.1)).kind == "none"
 
 
 def test_logs_without_any_deviation_are_followed_all_the_same() -> None:
@@ -469,7 +471,7 @@ def test_the_curve_of_a_trend_bends_or_jumps_at_its_onset() -> None:
     assert at.tolist() == [t[0], t[1]] and y.tolist() == [4.0, 4.0]
 
 
-def test_an_outlier_is_held_against_its_sisters_in_its_own_quantity() -> None:
+def test_an_outlier_is_held_against_its_sisters_in_its_own_quantity(monkeypatch: pytest.MonkeyPatch) -> None:
     level = np.random.default_rng(5).normal(1.0, 0.01, 8).tolist()
     level[6] = 1.6
 
@@ -483,6 +485,9 @@ def test_an_outlier_is_held_against_its_sisters_in_its_own_quantity() -> None:
     assert row["p"] == pytest.approx(odd(level, own, 1)[6]) and row["p"] < 0.01
     assert (row["engine"], row["quantity"], row["unit"], row["value"]) == ("e6", "q", "deg", 1.6)
     assert row["sisters"] == pytest.approx(np.median(level[:6] + level[7:]))
+    with monkeypatch.context() as m:
+        m.setattr(report, "ODD", row["p"])
+        assert report._outliers(group) == [], "what one healthy engine in a hundred is, is not odd"
     both = report._outliers([*group, *(told(k, v, "r") for k, v in enumerate(level))])
     assert [(r["engine"], r["quantity"]) for r in both] == [("e6", "q"), ("e6", "r")]
     assert both[0]["p"] == pytest.approx(2.0 * row["p"]), "over two quantities chance has twice the tries"
@@ -496,7 +501,7 @@ OF = ("path", "engine", "time", "key")
 def database(**tables: list[dict[str, Any]]) -> Any:
     """A database as `roll_up` gives it, of these rows; a table without any has one of nobody."""
     import duckdb
-    import polars as pl
+    import pyarrow as pa
 
     idle: dict[str, dict[str, Any]] = {
         "effects": {"effect": "", "stage": "", "parameter": "", "unit": "", "value": 0.0, "low": 0.0, "high": 0.0,
@@ -509,7 +514,9 @@ def database(**tables: list[dict[str, Any]]) -> Any:
     nobody = {"path": "", "engine": "", "time": None, "key": ""}
     for name in ("logs", *idle):
         rows = tables.get(name) or [nobody | idle[name]]
-        db.register("rows", pl.DataFrame(rows, schema_overrides={"time": pl.Float64}).to_arrow())
+        table = pa.Table.from_pylist(rows)
+        times = pa.array([row["time"] for row in rows], pa.float64())
+        db.register("rows", table.set_column(table.column_names.index("time"), "time", times))
         db.execute(f"CREATE TABLE {name} AS SELECT * FROM rows")
     return db
 
@@ -536,7 +543,7 @@ def named(log: dict[str, Any], value: float, half: float = 0.1, **more: Any) -> 
 @pytest.mark.parametrize(
     ("n", "names", "blind", "lacks"),
     [(2, 2, 0, False), (8, 3, 0, False), (8, 4, 0, True), (40, 3, 34, False), (40, 4, 34, True), (40, 5, 38, True),
-     (3, 3, 0, True)],
+     (3, 3, 0, True), (10, 4, 0, False), (42, 8, 0, True)],
 )  # fmt: skip
 def test_an_engine_lacks_an_effect_that_false_names_do_not_explain(n: int, names: int, blind: int, lacks: bool) -> None:
     """A twentieth of the logs names some effect falsely; the chance of so many of those that could show it."""
@@ -684,6 +691,19 @@ def test_limits_are_read_from_two_columns_and_perhaps_others(tmp_path: Path) -> 
     file.write_text("quantity,note\na,b\n")
     with pytest.raises(InputError, match="needs the columns quantity, limit; has quantity, note"):
         report.limits_of(str(file))
+
+
+def test_each_log_that_the_page_leads_to_has_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import vaneloop.pages.fleet
+
+    def page(key: str, answer: dict[str, Any]) -> Any:
+        return SimpleNamespace(write=lambda file: file.write_text(f"{key} {answer}"))
+
+    monkeypatch.setattr(vaneloop.pages.fleet, "log_page", page)
+    for _ in range(2):
+        report.write_pages(tmp_path / "deep" / "logs", {"a": {"n": 1}, "b": {}})
+    said = {f.name: f.read_text() for f in (tmp_path / "deep" / "logs").iterdir()}
+    assert said == {"a.html": "a {'n': 1}", "b.html": "b {}"}
 
 
 def test_half_an_interval_is_a_normal_s_at_ninety_percent() -> None:

@@ -4,10 +4,10 @@ stand-ins for readers, Dask and Slurm.
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -132,12 +132,12 @@ def test_without_a_limit_a_log_has_an_hour(tmp_path: Path, readings: Readings) -
 def test_workers_begin_at_different_chunks(tmp_path: Path, readings: Readings) -> None:
     begun = set()
     run = fleet(tmp_path, "abcdef")
-    for _ in range(40):
+    for k in range(40):
         taken: list[list[str]] = []
-        me = SimpleNamespace(name=os.urandom(8).hex(), stopped=threading.Event(), every=1.0)
+        me = SimpleNamespace(name=f"worker-{k}", stopped=threading.Event(), every=1.0)
         leases = Leases(run.path)
-        leases.take = lambda order, name, taken=taken: taken.append(list(order))  # type: ignore[assignment, return-value, func-returns-value]
-        worker._Worker(run, me, leases).run(wait=False)  # type: ignore[arg-type]
+        leases.take = lambda order, name, taken=taken: taken.append(list(order))
+        worker._Worker(run, me, leases).run(wait=False)
         assert sorted(taken[0]) == sorted(run.chunks()), "each comes to all of them"
         begun.add(taken[0][0])
         at = sorted(run.chunks()).index(taken[0][0])
@@ -175,7 +175,7 @@ def test_a_worker_that_waits_stops_when_it_is_told_to(tmp_path: Path, readings: 
     stopped = SimpleNamespace(is_set=lambda: False, wait=lambda timeout: waited.append(timeout) or True)
     me: Any = SimpleNamespace(name="me", stopped=stopped, every=1.0)
     w = worker._Worker(run, me, Leases(run.path))
-    w.leases.take = lambda chunks, name: None  # type: ignore[method-assign]
+    w.leases.take = lambda chunks, name: None
     assert w.run(True) == {} and waited == [1.0]
     with pytest.raises(OSError):
         os.fstat(w.journal.file)  # its journal is closed
@@ -221,7 +221,7 @@ def test_a_chunk_that_was_finished_between_look_and_lease_is_cleared(tmp_path: P
     assert Leases(run.path).take([chunk], "me") == (chunk, 0)
     me = SimpleNamespace(name="me", stopped=threading.Event(), every=1.0)
     before = journal(run)
-    worker._Worker(run, me, Leases(run.path))._chunk(chunk, 0, entries)  # type: ignore[arg-type]
+    worker._Worker(run, me, Leases(run.path))._chunk(chunk, 0, entries)
     assert not run.results(chunk).exists() and not list((run.path / "leases").iterdir()) and journal(run) == before
     assert readings.asked == ["a.csv"]
 
@@ -244,7 +244,7 @@ def test_a_file_that_is_gone_is_a_fault_only_where_nobody_else_has_cleared_up(
         raise FileNotFoundError(2, "gone")
 
     me = SimpleNamespace(name="me", stopped=threading.Event(), every=1.0)
-    w = worker._Worker(run, me, Leases(run.path))  # type: ignore[arg-type]
+    w = worker._Worker(run, me, Leases(run.path))
     w.leases.take([chunk], "me")
     monkeypatch.setattr(w, "_log", vanishes)
     if fails:
@@ -448,14 +448,14 @@ def reads(*processes: Process, errors: bytes = b"") -> tuple[Reader, list[Any]]:
         more["stderr"].write(errors)
         return processes[len(begun) - 1]
 
-    r.popen = popen  # type: ignore[attr-defined]
+    r.popen = popen
     return r, begun
 
 
 @pytest.fixture
 def popen(monkeypatch: pytest.MonkeyPatch) -> Callable[[Reader], None]:
     def put(r: Reader) -> None:
-        monkeypatch.setattr(reader.subprocess, "Popen", r.popen)  # type: ignore[attr-defined]
+        monkeypatch.setattr(reader.subprocess, "Popen", r.popen)
 
     return put
 
@@ -591,21 +591,28 @@ class Served:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, asked: list[dict[str, Any]]):
         """Serve these lines."""
         self.done: list[Any] = []
+        self.text = ""
         read, write = os.pipe()
+
+        def lines() -> Iterator[str]:
+            """Whoever asks waits for the answer before it asks again."""
+            for line in asked:
+                yield json.dumps(line) + "\n"
+                if select.select([read], [], [], 0.0)[0]:
+                    self.text += os.read(read, 1 << 16).decode()
+
         mine = SimpleNamespace(
             dup=lambda n: self.done.append(("dup", n)) or write,
             dup2=lambda a, b: self.done.append(("dup2", a, b)),
             fdopen=os.fdopen, getppid=lambda: 4711,
         )  # fmt: skip
         monkeypatch.setattr(reader, "os", mine)
-        monkeypatch.setattr(reader, "sys", SimpleNamespace(
-            argv=["-c", f"{__name__}:stand_in", "/run"], stdin=io.StringIO("".join(json.dumps(a) + "\n" for a in asked))
-        ))  # fmt: skip
+        argv = ["-c", f"{__name__}:stand_in", "/run"]
+        monkeypatch.setattr(reader, "sys", SimpleNamespace(argv=argv, stdin=lines()))
         monkeypatch.setattr("faulthandler.enable", lambda: self.done.append("faults"))
         monkeypatch.setattr(reader, "threading", SimpleNamespace(Thread=self.thread))
         monkeypatch.setattr(reader, "_warm_up", lambda *of: self.done.append(("warm", *of)))
         reader.serve()
-        self.text = os.read(read, 1 << 16).decode()
         os.close(read)
 
     def thread(self, target: Any, args: Any, daemon: bool) -> Any:
@@ -721,12 +728,12 @@ class Dask:
         self.did: list[Any] = []
         self.results, self.refuses, self.looks = results, refuses, 0
         dask, distributed, queue = ModuleType("dask"), ModuleType("dask.distributed"), ModuleType("dask_jobqueue")
-        dask.config = SimpleNamespace(set=lambda what: self.did.append(("set", what)))  # type: ignore[attr-defined]
-        dask.distributed = distributed  # type: ignore[attr-defined]
-        distributed.Client = self.client  # type: ignore[attr-defined]
-        distributed.wait = self.wait  # type: ignore[attr-defined]
-        distributed.LocalCluster = lambda **o: self.cluster("local", o)  # type: ignore[attr-defined]
-        queue.SLURMCluster = lambda **o: self.cluster("slurm", o)  # type: ignore[attr-defined]
+        dask.config = SimpleNamespace(set=lambda what: self.did.append(("set", what)))
+        dask.distributed = distributed
+        distributed.Client = self.client
+        distributed.wait = self.wait
+        distributed.LocalCluster = lambda **o: self.cluster("local", o)
+        queue.SLURMCluster = lambda **o: self.cluster("slurm", o)
         for name, module in (("dask", dask), ("dask.distributed", distributed), ("dask_jobqueue", queue)):
             monkeypatch.setitem(sys.modules, name, module)
         monkeypatch.setattr(rent, "needs", lambda *modules: self.did.append(("needs", *modules)))
@@ -957,14 +964,14 @@ def test_warming_up_diagnoses_a_short_run_of_the_machine(monkeypatch: pytest.Mon
     monkeypatch.setattr(hil.loop.lockstep, "lockstep", lockstep)
     monkeypatch.setattr(hil.loop.lockstep, "Stimulus", SimpleNamespace(of=lambda n_dem: n_dem.tolist()))
     monkeypatch.setattr(vaneloop.verbs.search, "diagnose", lambda log, m, workers: seen.append((log, m, workers)))
-    diagnosis.diagnose_log.warm_up({"files": {"model": "machine/m.toml"}}, "/run")  # type: ignore[attr-defined]
+    diagnosis.diagnose_log.warm_up({"files": {"model": "machine/m.toml"}}, "/run")
     files, more, (log, of, workers) = seen
     assert files == {"model": "/run/machine/m.toml"} and of is machine and workers == 1
     steps = [60.0] * 1000 + [90.0] * 1000 + [70.0] * 1000 + [95.0] * 1000
     assert more == {"calibration": "K", "plant": "P", "seed": 1, "every": 10, "of": steps}
     assert list(log.channels) == ["n"] and log.channels["n"].t.tolist() == [0.0, 1.0, 2.0]
     seen.clear()
-    diagnosis.diagnose_log.warm_up({"files": {"system": "s.py"}}, "/run")  # type: ignore[attr-defined]
+    diagnosis.diagnose_log.warm_up({"files": {"system": "s.py"}}, "/run")
     assert seen == [], "a system of one's own compiles with its first log"
 
 

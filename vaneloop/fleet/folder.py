@@ -22,6 +22,7 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -245,11 +246,9 @@ class Folder:
     def tidy(self) -> None:
         """Clear up after processes that were killed between a part and its clearing, or while they wrote a file."""
         for file in self.path.rglob(".*.part"):
-            try:
+            with suppress(FileNotFoundError):  # it has become whole meanwhile
                 if time.time() - file.stat().st_mtime > LEFT_BEHIND:
                     file.unlink()
-            except FileNotFoundError:  # it has become whole meanwhile
-                continue
         done = self.finished()
         for folder in (self.path / "results").glob("*"):
             if folder.name in done:

@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,5 @@ def lines(run: Path) -> Iterator[dict[str, Any]]:
     for file in sorted((run / "journal").glob("*.jsonl")):
         with open(file, encoding="utf-8", errors="replace") as f:
             for text in f:
-                try:
+                with suppress(ValueError):
                     yield {**json.loads(text), "worker": file.stem}
-                except ValueError:
-                    continue
