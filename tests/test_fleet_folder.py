@@ -384,6 +384,7 @@ def test_a_run_keeps_its_job_and_copies_of_its_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        ({"options": {"b": 1, "a": 2}}, 'not {"a": 2, "b": 1}; give another'),
         ({"function": "m:g"}, "was begun with function m:f, not m:g; give another --out"),
         ({"options": {"a": "x" * 80}}, 'was begun with options {}, not {"a": "' + "x" * 50 + "...; give another"),
         ({"options": {"a": "x" * 51}}, 'not {"a": "' + "x" * 51 + '"}; give another'),

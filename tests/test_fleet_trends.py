@@ -54,7 +54,7 @@ def everywhere(kind: str, t: Array, y: Array, w: Array) -> tuple[Array, Array]:
     if kind == "step":
         places = np.array([(t[i] + t[i + 1]) / 2 for i in range(2, len(t) - 3)])
     else:
-        places = np.linspace(t[0], t[-3], 1201)
+        places = np.linspace(t[0], t[-3], 801)
     return places, np.array([line(kind, t, y, w, at)[2] for at in places])
 
 

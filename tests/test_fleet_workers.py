@@ -397,11 +397,12 @@ def test_sigterm_stops_a_worker_and_afterwards_means_what_it_meant(tmp_path: Pat
     def elsewhere() -> None:
         with worker._terminable(me):
             ran.append(True)
+        ran.append(True)
 
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
-    assert ran == [True], "a thread cannot hear it, and works all the same"
+    assert ran == [True, True], "a thread cannot hear it, and works all the same"
 
 
 # ---- the reader's process, as its worker sees it ---------------------------------------------------------------------
