@@ -343,11 +343,13 @@ def test_a_full_disk_stops_no_heart(tmp_path: Path) -> None:
     assert me.beats == 2
 
 
-def test_a_worker_stops_with_the_process_that_rents_it(tmp_path: Path) -> None:
+def test_a_worker_stops_with_the_process_that_rents_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     worker(tmp_path, "starter")
+    me = Me(tmp_path, 3600.0, "starter")
+    assert me._watch is not None and me._watch.patience == BEATS * 3600.0 == 12 * 3600.0
+    me.leave()
+    monkeypatch.setattr(leases, "BEATS", 3.6e6)
     me = Me(tmp_path, 1e-3, "starter")
-    assert me._watch is not None and me._watch.patience == BEATS * 1e-3 == 0.012
-    me._watch.patience = 3600.0
     assert not me.stopped.wait(0.05)
     (tmp_path / "workers" / "starter.json").unlink()
     assert me.stopped.wait(30.0)

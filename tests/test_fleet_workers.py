@@ -461,11 +461,21 @@ def popen(monkeypatch: pytest.MonkeyPatch) -> Callable[[Reader], None]:
     return put
 
 
-def test_a_reader_has_its_process_compile_first_and_asks_it_log_by_log(popen: Any) -> None:
+def test_a_reader_has_its_process_compile_first_and_asks_it_log_by_log(
+    popen: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     p = Process([b"{}\n", b'{"status": ', b'{"b": 2}\n'])
     r, begun = reads(p)
     popen(r)
-    threading.Timer(0.02, lambda: os.write(p.into, b'"done"}\n')).start()
+    rest = [b'"done"}\n']
+
+    def wait(into: Any, *more: Any) -> Any:
+        """The rest of an answer comes when its beginning has been read."""
+        if rest and not select.select(into, [], [], 0.0)[0]:
+            os.write(p.into, rest.pop())
+        return select.select(into, *more)
+
+    monkeypatch.setattr(reader, "select", SimpleNamespace(select=wait))
     assert r.ask("/a", {"x": 1}, 60.0) == {"status": "done"} and r.ask("/b", {"x": 1}, 60.0) == {"b": 2}
     assert p.got == [{"options": {"x": 1}}, {"path": "/a", "options": {"x": 1}}, {"path": "/b", "options": {"x": 1}}]
     ((words, more),) = begun
