@@ -958,6 +958,8 @@ def test_two_inputs_of_one_table_stand_side_by_side() -> None:
     s = stim("n_dem", "x_lvdt")
     s.daq.lists[1].tables[1] += [(4, 1, INPUT + 4)]
     s.command(frame(0, 81.0))
+    s.command(frame(1, 0.25))
+    assert given(s) == {}, "half of the table is missing"
     s.command(frame(1, 0.25, 79.0))
     assert given(s) == {"n_dem": 81.0, "x_lvdt": 0.25, "n_r": 79.0}
 
@@ -1343,6 +1345,8 @@ def test_the_process_beside_the_loop_does_one_work_after_the_other_and_ends_with
     outside = Outside(memory.elements)
     assert niced == [5] and outside.done() == (0, None)
     (words, of), *_ = begun
+    with pytest.raises(OSError):
+        os.fstat(of["pass_fds"][0])  # that end is the process's alone
     assert words[:3] == [sys.executable, "-P", "-c"] and f"serve({of['pass_fds'][0]})" in words[3]
     assert of["start_new_session"] is True and of["stdin"] == prepare.subprocess.DEVNULL
     falls = memory.live()
