@@ -48,6 +48,7 @@ print(step.inspect_asm(step.signatures[0]))
 """
 
 
+@pytest.mark.slow
 @known
 def test_the_machine_code_is_that_of_numba_as_it_comes(tmp_path: Path) -> None:
     made = []

@@ -208,12 +208,14 @@ def test_third():
 """
 
 
+@pytest.mark.slow
 def test_what_takes_too_long_is_left_out_with_all_that_needs_it(tmp_path: Path) -> None:
     run = campaign(tmp_path, "import pytest, time, tiny\n" + SLOW, "return -x")
     assert run.returncode == 0 and "# True tiny.py over: `return -x` -> `return x`" in run.stdout
     assert re.findall(r"without test_tiny.py::(\w+): takes more", run.stdout) == ["test_first", "test_second"]
 
 
+@pytest.mark.slow
 def test_a_campaign_whose_tests_fail_unchanged_says_so(tmp_path: Path) -> None:
     run = campaign(tmp_path, "def test_wrong():\n    assert False\n")
     assert run.returncode != 0 and "fails without any change" in run.stderr and "test_wrong" in run.stderr
