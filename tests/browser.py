@@ -76,13 +76,19 @@ def look_at(browser: Any, file: Path, name: str, *, every: bool = False) -> None
     assert not complaints, complaints
 
 
+def driver() -> Any:
+    """What starts browsers. Skips where it is not installed."""
+    reason = "no driver of browsers: pip install -e '.[test-all]'"
+    return pytest.importorskip("playwright.sync_api", reason=reason).sync_playwright()
+
+
 def open_to_all(file: Path, name: str) -> None:
-    """`look_at` in a browser of its own. Skips, saying so, where there is no Chromium: stands last in its test."""
+    """`look_at` in a browser of its own. Skips, saying so, where there is no Chromium or no driver: stands last in its
+    test.
+    """
     if CHROMIUM is None:
         pytest.skip(WHY_NOT)
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as p:
+    with driver() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         look_at(browser, file, name)
         browser.close()

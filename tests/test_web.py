@@ -27,7 +27,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hil.logs.survey import survey
-from tests.browser import AXE, CHROMIUM, COLOURS, LONG, WHY_NOT, look_at, shot, violations
+from tests.browser import AXE, CHROMIUM, COLOURS, LONG, WHY_NOT, driver, look_at, shot, violations
 from tests.conftest import ROOT, examples
 from tests.test_realtime import ON_TIME_US
 
@@ -146,9 +146,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("no Chromium")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as p:
+    with driver() as p:
         b = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield b
         b.close()
