@@ -30,6 +30,7 @@ from types import CodeType, FunctionType, MemberDescriptorType, ModuleType
 from typing import Any
 
 import pytest
+from _pytest.outcomes import Failed
 
 from .mutate import (
     DEFAULT,
@@ -177,7 +178,7 @@ def run_target(target: Target, chosen: list[Mutant], jobs: int, say: Callable[[O
 TOO_LONG = f"takes more than {LONGEST_TEST:.0f} s"
 
 
-class _TooLong(pytest.fail.Exception):
+class _TooLong(Failed):
     """Ends a test that runs longer than `LONGEST_TEST`, and all that need the same fixture if that does."""
 
 

@@ -121,7 +121,7 @@ def _of_expression(owner: ast.AST, field: str, index: int | None, node: ast.AST)
             for other in COMPARISONS.get(type(op), ()):
                 yield _Edit(node, "ops", i, other())
     elif isinstance(node, (ast.BinOp, ast.AugAssign)):
-        if type(node.op) in OPERATORS and not _has_text(node):  # else an error that tells nothing
+        if type(node.op) in OPERATORS and not _is_of_text(node):  # else an error that tells nothing
             yield _Edit(node, "op", None, OPERATORS[type(node.op)]())
     elif isinstance(node, ast.BoolOp):
         yield _Edit(node, "op", None, ast.And() if isinstance(node.op, ast.Or) else ast.Or())
@@ -142,9 +142,10 @@ def _of_expression(owner: ast.AST, field: str, index: int | None, node: ast.AST)
         yield _Edit(owner, field, index, ast.UnaryOp(ast.Not(), node))  # type: ignore[arg-type]
 
 
-def _has_text(node: ast.BinOp | ast.AugAssign) -> bool:
+def _is_of_text(node: ast.BinOp | ast.AugAssign) -> bool:
+    """Text, or a type: "or None"."""
     return any(
-        isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
+        isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes, type(None))))
         for n in ast.iter_child_nodes(node)
     )
 
