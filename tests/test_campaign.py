@@ -157,6 +157,7 @@ def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path:
     assert theirs.same and "--controller" in theirs.command and "abort" in theirs.seen[0]
 
 
+@pytest.mark.slow
 def test_calibrations_and_firmwares_of_one_s_own_and_a_kill_within_a_trial(tmp_path: Path) -> None:
     """A second calibration acts, a controller that works passes, and what a kill leaves is gone on with."""
     if shutil.which("gcc") is None or shutil.which("make") is None:

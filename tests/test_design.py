@@ -99,6 +99,7 @@ def test_disk_margin_of_the_published_example() -> None:
     assert 10 ** (gain / 20) == pytest.approx(1.59, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_gain_raised_by_the_gain_margin_is_at_the_edge(result: DesignResult) -> None:
     edge = GAINS.kp * 10 ** (result.nominal.gain_margin_db / 20)
     ratio = GAINS.ki / GAINS.kp

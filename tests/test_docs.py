@@ -103,6 +103,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop replay rig.mf4": "a file with several groups of one channel name; tests/test_logs.py writes one",
     "vaneloop extend warm_play.parquet --effect play_temperature": "after the page's change to the library",
     "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
+    "python -m tests.costs": "reads what the runs of the whole left; tests/test_costs.py",
     "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
     "python -m benchmarks": "measures for minutes; no test judges time",
     "python -m benchmarks.fleet": "holds a run of hundreds of logs against its truth",
@@ -123,8 +124,9 @@ NAMES: dict[str, str] = {
 
 # pages whose steps, together, take a processor longer than 5 s
 DEAR = [
-    f"docs/{name}.md"
-    for name in ("bus", "engine_test", "fmu", "machines", "own_controller", "python", "your_own_model")
+    "README.md",
+    *(f"docs/{name}.md" for name in ("bus", "engine_test", "fmu", "machines", "own_controller", "python", "rig")),
+    "docs/your_own_model.md",
 ]
 # the beginning of a step that takes long -> the quick test that covers what it does
 LONG: dict[str, str] = {

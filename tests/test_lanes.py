@@ -56,6 +56,7 @@ def assert_same(runs: list[Run], alone: list[Run]) -> None:
             np.testing.assert_allclose(run.columns[name], values, rtol=0.0, atol=most, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [0, 1, 4, 8])
 def test_machines_drawn_at_random_are_the_loops_that_run_alone(effects: int) -> None:
     generator, stimulus = np.random.default_rng(20 + effects), Stimulus.of(profile(12.0))

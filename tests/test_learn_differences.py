@@ -88,6 +88,7 @@ def differences(bound) -> dict[str, object]:
     return {q.name: q for q in quantities(bound, bound.stage.neutral()[:own]) if q.less}
 
 
+@pytest.mark.slow
 def test_a_difference_is_of_one_unit_and_in_the_order_of_the_model(bound) -> None:
     assert list(differences(bound)) == ["motor_minus_drum", "motor_minus_belt", "drum_minus_belt"]
     r = bound.data.records[0]
@@ -161,6 +162,7 @@ def test_a_name_is_taken_apart_where_both_sides_are_known(names: list[str]) -> N
 # ---- what it does ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "at", "of"),
     [

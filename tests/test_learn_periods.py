@@ -42,6 +42,7 @@ Array = np.ndarray
 # ---- names and curves
 
 
+@pytest.mark.slow
 @given(st.floats(1e-8, 1e5), st.integers(3, 8))
 def test_the_name_of_a_period_says_how_long(period: float, digits: int) -> None:
     name = f"place.curve_of_time_every_{in_name(period, digits)}"
@@ -227,6 +228,7 @@ def test_a_hum_is_learned_with_its_period_and_size(humming) -> None:
     assert before > 0.15 and after < 0.06
 
 
+@pytest.mark.slow
 def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
     humming.write(tmp_path / "law.toml")
     model = read(tmp_path / "law.toml", Model)

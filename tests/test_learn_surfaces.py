@@ -162,6 +162,7 @@ def test_a_surface_is_read_as_it_was_written_and_the_vane_chain_says_that_it_tak
     assert "\n" not in str(e.value)
 
 
+@pytest.mark.slow
 def test_a_product_of_formulas_is_a_surface(bound) -> None:
     """Their numbers: those of the first, and of the second all but what multiplies it."""
     second = Second(of="oil", low=20.0, high=60.0, form="exponential")
@@ -304,6 +305,7 @@ def learned(truth: str) -> Any:
     return learn(runs[:2], METER, test=runs[2:])
 
 
+@pytest.mark.slow
 def test_a_leak_that_grows_with_pressure_and_with_warmth_is_a_surface_and_a_product(tmp_path: Path) -> None:
     answer = learned("leak")
     (one,) = answer.laws

@@ -152,6 +152,7 @@ def test_an_encoder_out_of_centre_is_learned_with_its_turn_and_size(eccentric) -
     assert before > 0.01 and after < 0.0015
 
 
+@pytest.mark.slow
 def test_its_file_says_the_same_to_another_log_and_in_python(eccentric, tmp_path) -> None:
     eccentric.write(tmp_path / "law.toml")
     model = read(tmp_path / "law.toml", Model)
@@ -173,6 +174,7 @@ def test_its_file_says_the_same_to_another_log_and_in_python(eccentric, tmp_path
     assert curve(1.0) == pytest.approx(curve(1.0 + 5.0 * turn[1]), abs=1e-9)  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_its_figure_goes_on_as_it_began(eccentric) -> None:
     (law,) = eccentric.laws
     parts = [line for line in curve_figure(law)["data"] if line["name"] == "the same again"]
@@ -199,6 +201,7 @@ def cogging():
     return learn([turned(1, "one", cogs=4.0)], MOTOR)
 
 
+@pytest.mark.slow
 def test_a_motor_that_cogs_is_told_its_slots(cogging) -> None:
     """What is simulated shifts its own phase: the law is a function of the angle that the model has with it."""
     assert cogging.verdict == "learned"

@@ -27,6 +27,7 @@ def record(seed: int) -> Record:
     return Record(f"run {seed}", t, {"gap": gap, "heat": heat, "y": y})
 
 
+@pytest.mark.slow
 def test_each_of_two_laws_is_told_by_its_formula() -> None:
     """Splines follow no tanh as steep as this, so that the second law is hidden in what they leave."""
     answer = learn([record(1)], SENSOR, test=[record(2)])

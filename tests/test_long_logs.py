@@ -52,6 +52,7 @@ def test_rows_of_an_excerpt_are_those_of_the_log() -> None:
     assert set(np.flatnonzero(~part[2])) == {5_999, 6_000}  # the pieces' border is a gap
 
 
+@pytest.mark.slow
 def test_errors_of_an_excerpt_are_those_that_the_log_has_there() -> None:
     """Also of the demand, whose frames are late by whole rows of the log, and of play, which remembers its turns."""
     log = logs()[0]

@@ -110,6 +110,7 @@ def test_coulomb_friction_and_offset_of_the_axis_are_found_at_their_published_si
     assert value(emps, "force.force_offset", "force") == pytest.approx(-3.165, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_axis_is_left_with_the_published_force_error(emps: dict[str, Any]) -> None:
     assert error(emps, "DATA_EMPS.mat", 0)["relative"] > 0.17
     assert error(emps, "DATA_EMPS.mat")["relative"] <= 0.041
@@ -122,11 +123,13 @@ def test_the_gap_of_the_damper_is_found(damper: dict[str, Any]) -> None:
     assert value(damper, "force.backlash_gap", "gap") == pytest.approx(5.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_damper_is_predicted_where_it_was_not_fitted(damper: dict[str, Any]) -> None:
     assert error(damper, "1Hz")["rms"] <= 2.14
     assert error(damper, "Kocaeli")["rms"] <= 1.825  # 1.82 in the digits of the plain fit that it is held against
 
 
+@pytest.mark.slow
 def test_the_damper_s_report_says_where_the_gap_hardly_helps_and_what_the_start_changes(damper: dict[str, Any]) -> None:
     notes = " ".join(damper["notes"])
     assert "force.backlash_gap hardly helps on" in notes and "2Hz36lbtension" in notes
@@ -136,6 +139,7 @@ def test_the_damper_s_report_says_where_the_gap_hardly_helps_and_what_the_start_
     assert 'start_force="measured"' in notes
 
 
+@pytest.mark.slow
 def test_the_turbine_lacks_a_rate_limit_and_no_dead_time(turbine: dict[str, Any]) -> None:
     named = [e["effect"] for e in turbine["effects"]]
     assert named == ["el_power.rate_limit"]
@@ -146,12 +150,14 @@ def test_the_turbine_lacks_a_rate_limit_and_no_dead_time(turbine: dict[str, Any]
     assert test[-1] <= 151.0
 
 
+@pytest.mark.slow
 def test_the_hardening_spring_of_the_oscillator_is_found(silverbox: dict[str, Any]) -> None:
     assert silverbox["effects"][0]["effect"] == "speed.cubic_spring"
     own = {p["parameter"]: p["value"] for p in silverbox["parameters"]}
     assert (own["spring"] ** 0.5) / (2.0 * 3.14159) == pytest.approx(68.3, rel=0.02)  # Hz, its resonance
 
 
+@pytest.mark.slow
 def test_the_oscillator_s_free_run_is_as_good_as_published_ones(silverbox: dict[str, Any]) -> None:
     assert error(silverbox, "94.95", 0)["rms"] > 6.6e-3
     assert error(silverbox, "94.95")["rms"] <= 0.45e-3  # V; published: 0.26 to 0.36 mV

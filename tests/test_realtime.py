@@ -532,6 +532,7 @@ def test_a_stalled_controller_times_the_ecu_out_in_one_line(recorded: Path) -> N
     assert err.count("\n") == 1 and "vaneloop ecu: timed out: no good VGV_STATUS for 3.0" in err
 
 
+@pytest.mark.slow
 def test_a_stall_is_reported_and_the_limit_makes_exit_code_1(recorded: Path) -> None:
     code, out, _ = json.loads((recorded / "ended.json").read_text())["run"]
     said = json.loads((recorded / "run.json").read_text())

@@ -268,6 +268,7 @@ def test_stick_slip_converges_in_its_statistics():
 # ---- agreement with the design's nominal equations -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_clean_log_is_clean_at_the_noise_floor(seed):
     run = closed_loop(seed=seed)
@@ -332,6 +333,7 @@ def test_a_gross_effect_shows_in_its_own_stage(name):
 
 
 # the demand stage has no noise: a whole frame's delay or a turned table always shows
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in HYDRAULIC if CATALOGUE[name].site != "demand"])
 def test_the_smallest_size_is_lost_in_noise(name):
     effect = CATALOGUE[name]

@@ -53,12 +53,9 @@ CASES: list[tuple[str, dict[str, float], str, int]] = [
 ]
 
 
-SLOW = (954, 955)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("effect", "size", "stage", "seed"),
-    [pytest.param(*c, id=f"{c[0] or 'clean'} {c[3]}", marks=[pytest.mark.slow] if c[3] in SLOW else []) for c in CASES],
+    ("effect", "size", "stage", "seed"), [pytest.param(*c, id=f"{c[0] or 'clean'} {c[3]}") for c in CASES]
 )
 def test_every_verb_starts_from_the_same_number(effect: str, size: dict[str, float], stage: str, seed: int) -> None:
     s = rig([Hidden(effect, size)] if effect else [], seed).stage(stage)
@@ -113,6 +110,7 @@ def test_the_example_s_actuator_starts_at_132_floors_whoever_is_asked(said: dict
         assert ratios(verb, said[verb])["x_lvdt"] == pytest.approx(132.0, rel=0.02), verb
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["locate", "diagnose", "extend", "web"])
 def test_every_signal_of_the_example_has_one_figure(said: dict[str, Any], verb: str) -> None:
     compared = ratios("compare", said["compare"])

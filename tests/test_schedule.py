@@ -212,6 +212,7 @@ def engine(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_log_to_tables_to_engine_test_shows_small_errors(engine, capsys):
     out = engine / "out"
     report = engine / "schedule.html"

@@ -57,6 +57,7 @@ def test_a_log_that_begins_in_motion_may_start_at_a_fitted_velocity() -> None:
     assert "start={'v': 'fitted'} fits it" in note and not any("at the start" in n for n in free.by_log.notes)
 
 
+@pytest.mark.slow
 def test_a_measured_state_may_start_beside_its_noisy_first_sample() -> None:
     log = swing("a", 5, 0.5, 0.0, noise=0.0)
     log.columns["x"][0] = 0.8  # an outlier

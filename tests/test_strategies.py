@@ -71,6 +71,7 @@ def failed(failure: str, during: str, stages: tuple[str, ...] = VANES[:3]) -> tu
     return st.failing(failure, during, healthy, dual, row, profile(), CALIBRATIONS["adaptive"], stages=stages)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failure", st.FAILURES)
 def test_potentiometers_that_fail_make_no_step(failure: str) -> None:
     """At rest; in motion the command's own test has them. Only a drift as slow as a casing's growth leaves more error

@@ -63,6 +63,7 @@ def test_diagnose_says_in_a_notebook_what_the_command_says(diagnosed: Diagnosed,
     assert without_times(diagnosed.to_dict()) == without_times(command(tmp_path, "diagnose", str(LOG)))
 
 
+@pytest.mark.slow
 def test_a_diagnosis_page_has_the_numbers_of_its_json(diagnosed: Diagnosed, tmp_path: Path) -> None:
     from vaneloop.pages.style import number
 

@@ -155,6 +155,7 @@ def test_friction_and_offset_are_found_from_measured_force() -> None:
     assert float(str(value["value"])) * (1.0 if last == "force.force_offset" else 5.0) == pytest.approx(-2.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_springs_may_start_with_the_measured_force() -> None:
     x = 3.0 * np.sin(1.2 * T + 1.0)
     s = np.empty(len(T))  # where the slider stands
