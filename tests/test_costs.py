@@ -33,7 +33,7 @@ def test_dear_files_come_first_and_cheap_ones_are_one_row(tmp_path: Path) -> Non
 
 
 def test_a_run_reports_what_its_tests_and_their_children_took(tmp_path: Path) -> None:
-    burn = "import time\\nwhile time.process_time() < 0.4: pass"
+    burn = "import time\\nwhile time.process_time() < 1.0: pass"
     (tmp_path / "conftest.py").write_text(
         "from tests.conftest import pytest_runtest_protocol, pytest_runtest_teardown\n"
     )
@@ -45,7 +45,7 @@ def test_a_run_reports_what_its_tests_and_their_children_took(tmp_path: Path) ->
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", tmp_path, "--junitxml"]
     subprocess.run([*words, tmp_path / "out.xml", tmp_path], cwd=ROOT, check=True, capture_output=True)
     idle, child = (seconds for _, seconds in costs.costs(tmp_path / "out.xml"))
-    assert idle < 0.4 <= child
+    assert idle < 0.5 < child  # the clock of processes ticks in hundredths of a second
 
 
 def test_the_page_has_a_place_for_the_table() -> None:
