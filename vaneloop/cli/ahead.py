@@ -1,6 +1,6 @@
 """``python -m vaneloop.cli.ahead``: compile what the first commands need, when the program is set up.
 
-`make` runs it. Without it the first replay and the first diagnosis compile for some 15 s of processor time each. The
+`make` runs it. Without it the first replay and the first diagnosis compile for some 20 s of processor time each. The
 code is for this processor, this Python and these sources. Where one of them is another, the first command compiles as
 if there were none.
 """
@@ -94,7 +94,7 @@ def main(words: list[str]) -> int:
     except OSError as e:
         print(f"[vaneloop] nothing is compiled ahead: {AHEAD}: {e.strerror}; the first command will compile")
         return 0
-    print("[vaneloop] compiling for this machine (once, about 15 s on two cores)", flush=True)
+    print("[vaneloop] compiling for this machine (once, about 30 s on two cores)", flush=True)
     started = time.perf_counter()
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(AHEAD)}
     with tempfile.TemporaryDirectory() as folder:

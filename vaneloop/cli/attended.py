@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from vaneloop.base.extras import needs
 from vaneloop.cli import station
 
 __all__ = ["accepted", "add_service_options", "attend", "check_service_options", "wanted"]
@@ -35,7 +36,6 @@ def wanted(args: argparse.Namespace) -> bool:
 def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     """Refuse options that do not go together. Raises InputError."""
     from vaneloop.base.errors import InputError
-    from vaneloop.base.extras import needs
 
     for option in ("xcp_save", "xcp_lock"):
         if getattr(args, option) and not args.xcp:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
 
 if TYPE_CHECKING:
     from vaneloop.pages.campaign import CampaignView
@@ -50,8 +51,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.base.extras import needs
-
     needs("vaneloop campaign", "psutil", "duckdb", "distributed")
     from vaneloop.fleet import campaign
     from vaneloop.fleet.rent import known

@@ -9,6 +9,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
 from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -87,8 +88,6 @@ def _add_patience(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.base.extras import needs
-
     needs("vaneloop fleet", "psutil", "duckdb", "ruptures")
     parts = {"run": _run, "work": _work, "status": _status, "report": _report, "demo": _demo}
     return parts[args.part](args)

@@ -25,6 +25,7 @@ from hil.inject.fuzz import (
 from vaneloop.base import terminal
 from vaneloop.base.compiled import is_cached
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
 from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -155,7 +156,6 @@ def _written(args: argparse.Namespace) -> Iterator[None]:
 def _tool(args: argparse.Namespace) -> int:
     """The campaign against what answers tools."""
     from hil.inject import fuzz_tools
-    from vaneloop.base.extras import needs
 
     for option in ("replay", "model", "tables", "plant", "controller"):
         if getattr(args, option, None):

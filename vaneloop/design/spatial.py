@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vaneloop.base.extras import is_there
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -45,7 +47,6 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     from plant.geometry import vane_angles
     from plant.spatial import spatial_angles
     from vaneloop.base.errors import InputError
-    from vaneloop.base.extras import is_there
     from vaneloop.design.multibody import multibody_angles
 
     if not -100.0 <= offset <= 100.0:

@@ -9,6 +9,7 @@ import socket
 import sys
 from pathlib import Path
 
+from vaneloop.base.extras import needs
 from vaneloop.cli.options import add_controller_options, add_tables_option, machine_of
 from vaneloop.web.guard import is_loopback
 
@@ -60,7 +61,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from vaneloop.base.errors import InputError
-    from vaneloop.base.extras import needs
 
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port (={args.port}) must be in [0, 65535]")

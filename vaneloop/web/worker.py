@@ -22,6 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NoReturn
 
+from vaneloop.base.extras import needs
 from vaneloop.cli import options
 from vaneloop.web.jobs import LOADING
 
@@ -390,8 +391,6 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
 
 def fleet_state(progress: Progress, run: str) -> dict[str, Any]:
     """How far a fleet's run is, as ``vaneloop fleet status`` says it, and whether it is a campaign's."""
-    from vaneloop.base.extras import needs
-
     needs("a fleet's run", "psutil", "duckdb", "ruptures")
     from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.state import state_of
