@@ -118,6 +118,10 @@ def test_no_damage_takes_the_reader_of_bus_mdf_down(tmp_path: Path, quick_mdf: N
     campaign(tmp_path, ".mf4", range(1000, 1000 + QUICK[".mf4"]), DBC)
 
 
+def test_damaged_statistics_of_a_parquet_do_not_end_the_process(tmp_path: Path) -> None:
+    campaign(tmp_path, ".parquet", range(14_396, 14_397))  # a histogram too long: pyarrow 26 calls std::terminate
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs.FORMATS))
 def test_long_campaign(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
