@@ -48,10 +48,7 @@ REPLACED: dict[str, dict[str, tuple[str, str]]] = {
         "NEW": ("warm.csv", "the page's own example"),
         "my_model.py": ("tank.py", "the page's own example"),
     },
-    "docs/diagnosis.md": {
-        "LOG": (EXAMPLE, "any log"),
-        "--logs 200": ("--logs 1 --duration 60", "200 logs of 300 s take an hour"),
-    },
+    "docs/diagnosis.md": {"LOG": (EXAMPLE, "any log")},
     "docs/own_controller.md": {
         "LOG": ("examples/engine_run.blf", "any log"),
         "./my_controller.so": ("my_controller/my_controller.so", "the page's session is in that folder"),
@@ -108,6 +105,8 @@ NOT_RUN: dict[str, str] = {
     "python -m benchmarks": "measures for minutes; no test judges time",
     "python -m benchmarks.fleet": "holds a run of hundreds of logs against its truth",
     "vaneloop fleet": "needs the logs of many engines; tests/test_fleet_run.py, tests/test_fleet_report.py",
+    "vaneloop hidden-effect": "draws and diagnoses logs for an hour; tests/test_hidden_effect.py",
+    "vaneloop hidden-law": "draws and diagnoses systems for an hour; tests/test_hidden_law.py",
     "vaneloop campaign": "runs for minutes, on workers; tests/test_campaign.py",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
     "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",
@@ -119,6 +118,7 @@ NAMES: dict[str, str] = {
     "python -m hil.replay": "docs/architecture.md",
     "python -m hil.inject": "tests/test_exit_codes.py",
     "vaneloop engine-test --profile": "tests/test_machines.py",
+    "vaneloop learn LOG": "tests/test_learn_vanes.py",
     "vaneloop ecu --model": "an option, which the command must have",
 }
 
@@ -138,10 +138,9 @@ LONG: dict[str, str] = {
     "vaneloop inject --all": "tests/test_inject.py",
     "vaneloop spatial --report": "tests/test_spatial.py",
     "vaneloop clearance --report": "tests/test_linkage.py",
-    "vaneloop hidden-effect": "tests/test_rig.py",
-    "vaneloop hidden-law": "tests/test_hidden_law.py",
     "vaneloop experiment": "tests/test_search_commands.py",
     "vaneloop diagnose warm_play.parquet": "tests/test_search_commands.py",
+    "vaneloop extend warm_play.parquet --effect linkage_backlash": "tests/test_search_commands.py",
     "vaneloop compare tank.csv": "tests/test_your_own_model.py",  # each command compiles the model anew
     "vaneloop locate tank.csv": "tests/test_your_own_model.py",
     "vaneloop diagnose tank.csv --test": "tests/test_your_own_model.py",
@@ -160,7 +159,10 @@ LONG: dict[str, str] = {
 OURS = ("vaneloop", "python", "make", "candump")
 # page -> the beginning of the output of a block that quotes no output of the step above it -> what it is
 NO_OUTPUT: dict[str, dict[str, str]] = {
-    "docs/diagnosis.md": {"  what  ": "of 200 logs, which take an hour; `vaneloop hidden-effect` is run with one"},
+    "docs/diagnosis.md": {"note: actuator fails from ": "of a log of six hours; tests/test_long_logs.py"},
+    "docs/learn.md": {
+        "A function of angle within each ": "of a log with an error once a turn; tests/test_learn_turns.py"
+    },
     "docs/tables.md": {"my.toml: servo: kp (": "complaints of files with one mistake each; tests/test_tables.py"},
 }
 
