@@ -78,11 +78,11 @@ def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generat
     """The steps of a `vaneloop.discrepancy.fit.Judge.fitting` in these columns."""
     low, high = judge.bounds()
     theta, linear, weights = judge.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
-    nominal, prior, scale = judge.stage.neutral(), judge._prior[free], judge.scale[free]
+    expected, prior, scale = judge.stage.expected(), judge._prior[free], judge.scale[free]
     block_weights = np.ones(judge.n_blocks) if weights is None else weights
 
     def total(cost: Array, thetas: Array) -> Array:
-        return cost @ block_weights + np.sum(prior * (thetas[:, free] - nominal[free]) ** 2, axis=1)
+        return cost @ block_weights + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
 
     may_carry = weights is None and carries(judge, free)
     carried = Carried(*begin.slopes) if begin.slopes is not None and may_carry else None
@@ -115,7 +115,7 @@ def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generat
         if judge.roughly:
             little *= 1.0 + max(here - judge.n, 0.0) / EVIDENCE
         least = max(little, STILL * (here - judge.n)) if judge.sparing else little
-        a, g = a + np.diag(prior * scale**2), g - prior * scale * (theta[free] - nominal[free])
+        a, g = a + np.diag(prior * scale**2), g - prior * scale * (theta[free] - expected[free])
         limits = [(b[free] - theta[free]) / scale for b in (low, high)]
         if (judge.roughly and not first) or (fresh and not ahead):
             step = bounded_step(a + 1e-9 * np.diag(np.maximum(np.diag(a), 1e-9)), g, *limits)

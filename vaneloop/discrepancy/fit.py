@@ -21,7 +21,7 @@ import numpy as np
 from vaneloop.discrepancy.carried import NOT_KNOWN, Known, LatestSlopes
 from vaneloop.discrepancy.descent import EVIDENCE, STILL, Begin, End, carries, descent
 from vaneloop.discrepancy.latest import Latest
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.discrepancy.stage import Array, Stage, StageError
 from vaneloop.discrepancy.whiten import whiten
 
 __all__ = ["Fit", "Judge", "Task", "finished", "recalibrate"]
@@ -185,12 +185,8 @@ class Judge:
 
     def _limits(self) -> tuple[Array, Array]:
         s = self.stage
-        low = [max(p.low, p.value - p.tolerance) for p in s.parameters] + [
-            p.low for e in s.effects for p in e.parameters
-        ]
-        high = [min(p.high, p.value + p.tolerance) for p in s.parameters] + [
-            p.high for e in s.effects for p in e.parameters
-        ]
+        limits = [p.limits() for p in s.parameters] + [(p.low, p.high) for e in s.effects for p in e.parameters]
+        low, high = np.array(limits, dtype=float).reshape(-1, 2).T
         endless = np.array([p.period > 0.0 for p in s.all_parameters()], dtype=bool)
         return np.where(endless, -np.inf, low), np.where(endless, np.inf, high)
 
@@ -210,11 +206,11 @@ class Judge:
         """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior,
         float64[sets].
         """
-        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.neutral()) ** 2 @ self._prior)
+        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.expected()) ** 2 @ self._prior)
 
     def total_of(self, fit: Fit) -> float:
         """What the fit has minimised."""
-        return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.neutral())[fit.free] ** 2))
+        return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.expected())[fit.free] ** 2))
 
     def fit(
         self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None,
@@ -273,7 +269,7 @@ class Judge:
             linear = self._blocks(error, rows)
             if carries(self, free):
                 self._near.put(end.theta, free, error, rows)
-        fit = self._finish(effects, end.theta, free, end.prior, scale, s.neutral(), low, high, *linear)
+        fit = self._finish(effects, end.theta, free, end.prior, scale, s.expected(), low, high, *linear)
         return replace(fit, stalled=end.stalled, near=self._near)
 
     def leading(self, effects: tuple[str, ...], start: Array, iterations: int, slopes: Known = NOT_KNOWN) -> Task[Led]:
@@ -387,7 +383,7 @@ class Judge:
         return self._shared[key]
 
     def _finish(
-        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, nominal: Array,
+        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, expected: Array,
         low: Array, high: Array,
         cost: Array, gradients: Array, normals: Array,
     ) -> Fit:  # fmt: skip
@@ -401,7 +397,7 @@ class Judge:
         if move.any():
             nm, gm, pm = normals[:, move][:, :, move], gradients[:, move], scaled_prior[move]
             # at the solution the blocks' pulls and the prior's cancel; what is left of the pull is rounding and bounds
-            pull = gm.sum(axis=0) - pm * ((theta[free] - nominal[free]) / scale)[move]
+            pull = gm.sum(axis=0) - pm * ((theta[free] - expected[free]) / scale)[move]
             total = nm.sum(axis=0) + np.diag(pm)
             a = total - nm + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
             without = np.linalg.solve(a, (pull - gm)[:, :, None])[:, :, 0]
@@ -482,7 +478,17 @@ def finished(judge: Judge, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
 def recalibrate(judge: Judge) -> Fit:
     """The stage with nothing added, its nominal parameters refitted within their tolerances, from wherever the stage
     says that a fit may begin: what every verb starts from.
+
+    Raises StageError where the model, as it was given, says nothing of a measured sample.
     """
+    stage = judge.stage
+    silent = judge.valid & ~np.isfinite(stage.run(stage.neutral()[None])[0])
+    if silent.any():
+        o, i = (int(k[0]) for k in np.nonzero(silent))
+        raise StageError(
+            f"stage {stage.name!r}: the model's {stage.outputs[o]} is no number at {stage.t[i]:g} s and in "
+            f"{int(silent.sum()):,} samples; allowed: finite values"
+        )
     begins = [judge.stage.neutral(), *(judge.stage.begins if judge.stage.begins is not None else ())]
     fits = judge.together([finished(judge, judge.fitting((), b), len(begins) > 1) for b in begins])
     return min(fits, key=judge.total_of)

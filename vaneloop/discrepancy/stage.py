@@ -38,6 +38,7 @@ class Parameter:
     low, high  physical bounds
     tolerance  half-width of the plausible interval around a nominal value; 0: exactly known, never refitted. Of an
                effect's parameter: how well it is known beforehand; 0: not at all
+    middle     of that interval, where it is not ``value``: a recalibrated model begins elsewhere in it
     output     the only output that it moves, if there is one: parameters of different outputs are then varied in one
                simulation
     log        the only log that it moves, as the stage's condition "log" counts them, if there is one; likewise
@@ -58,6 +59,19 @@ class Parameter:
     shape: bool = False
     period: float = 0.0
     log: int | None = None
+    middle: float | None = None
+
+    @property
+    def expected(self) -> float:
+        """What is expected beforehand: the middle of the tolerance."""
+        return self.value if self.middle is None else self.middle
+
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value of a fit: within the tolerance, where there is one, or at ``value`` beyond it."""
+        if self.tolerance == 0.0:
+            return self.value, self.value
+        low, high = self.expected - self.tolerance, self.expected + self.tolerance
+        return max(self.low, min(self.value, low)), min(self.high, max(self.value, high))
 
     def wrapped(self, value: float) -> float:
         """Return the same value within the turn that begins at ``low``; of a parameter without period, the value."""
@@ -188,6 +202,10 @@ class Stage:
     def neutral(self) -> Array:
         """Nominal parameters, every effect absent: float64[parameters]."""
         return np.array([p.value for p in self.all_parameters()], dtype=float)
+
+    def expected(self) -> Array:
+        """What is expected of every parameter beforehand, the middle of its prior: float64[parameters]."""
+        return np.array([p.expected for p in self.all_parameters()], dtype=float)
 
     def effect(self, name: str) -> Effect:
         """Return the effect of that name."""

@@ -157,7 +157,7 @@ def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
             p = stage.parameters[c]
             low, high, value = float(fit.low[k]), float(fit.high[k]), float(fit.theta[c])
             if not low <= p.value <= high:
-                limit = abs(value - p.value) >= 0.999 * p.tolerance  # the data pull on beyond what it allows
+                limit = abs(value - p.expected) >= 0.999 * p.tolerance  # the data pull on beyond what it allows
                 moved: dict[str, object] = {"parameter": p.name, "value": value, "low": low, "high": high}
                 out.append(moved | {"unit": p.unit, "at_limit": bool(limit)})
     return out

@@ -32,7 +32,7 @@ def doubts(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
     fit = d.final
     for k, p in enumerate(bound.stage.parameters):
         value = float(fit.theta[k])
-        low, high = max(p.low, p.value - p.tolerance), min(p.high, p.value + p.tolerance)
+        low, high = p.limits()
         near = 1e-6 * max(abs(value), p.scale, 1e-300)
         side = -1.0 if value <= low + near else 1.0 if value >= high - near else 0.0
         if side == 0.0 or p.tolerance == 0.0 or k in judge.spared or (value == 0.0 != d.base.theta[k]):

@@ -4,6 +4,7 @@ plant's parameters behind them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,7 @@ from plant import chain
 from plant.curve import PLACES, Place, at_curve, quantity_of
 from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
+from plant.model import allowed_of
 from plant.stages import run_bends
 from vaneloop.base.vanes import VANES, vane_in
 from vaneloop.discrepancy.models.curve import Curve
@@ -62,15 +64,17 @@ def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[E
         if name not in known:
             continue
         n = known[name]
-        value = float(machine.p[n.row, 0]) / n.si
-        if name.endswith("_play"):
-            # the play is known at the vane and used at the ring
-            factor = machine.p[n.row, 0] / (n.value * n.si)
-            parameters.append(Parameter(name, n.value, n.unit, 0.0, np.inf, n.tolerance, vane_in(name)))
-            si.append(n.si * factor)
-        else:
-            parameters.append(Parameter(name, value, n.unit, -np.inf, np.inf, n.tolerance, vane_in(name)))
-            si.append(n.si)
+        ring = 1.0
+        if name.endswith("_play"):  # known at the vane, used at the ring; a model's lever does not change what it says
+            vane = VANES.index(str(vane_in(name)))
+            lever = known[f"linkage.{VANES[vane]}_l"]
+            ring = lever.value * lever.si / machine.lever(vane)[0]
+        value = float(machine.p[n.row, 0]) / (n.si * ring)
+        value = n.value if math.isclose(value, n.value, rel_tol=1e-12) else value  # through SI and back
+        parameters.append(
+            Parameter(name, value, n.unit, *allowed_of(machine, n), n.tolerance, vane_in(name), middle=n.value)
+        )
+        si.append(n.si * ring)
         rows.append(n.row)
     effects = []
     for e in EFFECTS.values():

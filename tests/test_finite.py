@@ -1,0 +1,155 @@
+"""A model that says nothing is never a model that fits: what is no number is far off, or refused where it arises."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hil.logs import Channel, Log, read_log
+from plant.effects import EFFECTS
+from plant.machine import build_plant
+from plant.model import Model, allowed_of
+from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
+from vaneloop.discrepancy.fit import Judge, recalibrate
+from vaneloop.discrepancy.models.vane_stages.declared import FREE
+from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.discrepancy.stage import Parameter, Stage, StageError
+from vaneloop.discrepancy.whiten import FAR, whiten
+
+TABLES = ("plant.toml", "plant_electromechanical.toml")
+
+
+@cache
+def log() -> Log:
+    """20 s of the example."""
+    whole = read_log(ROOT / "examples" / "hidden_effect.parquet")
+    return Log("short", {k: Channel(c.t[c.t < 20.0], c.values[c.t < 20.0]) for k, c in whole.channels.items()})
+
+
+def chain(table: str, model: Model | None = None) -> Chain:
+    return build_chain(log(), build_plant(table, model=model))
+
+
+def free_of(table: str) -> list[tuple[str, str]]:
+    known = {n.name for n in build_plant(table).nominal}
+    return [(stage, name) for stage, names in FREE.items() for name in names if name in known]
+
+
+def fake(model: float) -> Stage:
+    """A stage of one output that was measured as 0, but for its first sample, and is simulated as ``model``."""
+    t = np.arange(400) * 0.01
+    measured = np.zeros((1, len(t)))
+    measured[0, 0] = np.nan
+
+    def run(thetas: np.ndarray) -> np.ndarray:
+        out = np.broadcast_to(thetas[:, 0, None, None], (len(thetas), 1, len(t))).copy()
+        out[:, 0, 7] = model
+        return out
+
+    return Stage("servo", ("i_cmd",), ("mA",), (Parameter("gain", 0.1, "-", tolerance=1.0),), (), run, t, measured)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_a_model_does_not_say_is_far_off_and_what_was_not_measured_counts_nothing(value: float) -> None:
+    model = np.array([[[0.5, value, value]]])
+    out = np.empty_like(model)
+    whiten(model, np.zeros((1, 3)), np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.empty(0, np.int64), out)
+    assert out.tolist() == [[[-5.0, FAR, 0.0]]]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_stage_that_gives_no_number_as_it_was_given_is_refused_in_one_line(value: float) -> None:
+    with pytest.raises(StageError, match=r"^stage 'servo': the model's i_cmd is no number at 0.07 s and in 1 samples"):
+        recalibrate(Judge(fake(value), np.array([0.1])))
+
+
+def test_a_sample_that_was_not_measured_asks_nothing_of_the_model() -> None:
+    stage = fake(0.0)
+    stage.measured[0, 7] = np.nan
+    recalibrate(Judge(stage, np.array([0.1])))
+
+
+@pytest.mark.parametrize(
+    ("value", "middle", "limits"),
+    [(0.8, None, (0.6, 0.9)), (0.8, 0.8, (0.6, 0.9)), (0.75, 0.8, (0.6, 0.9)), (0.55, 0.8, (0.55, 0.9)),
+     (0.9, 0.7, (0.5, 0.9))],
+)  # fmt: skip
+def test_a_tolerance_is_about_its_middle_within_the_bounds(
+    value: float, middle: float | None, limits: tuple[float, float]
+) -> None:
+    p = Parameter("damping", value, "-", 0.4, 0.9, 0.2, middle=middle)
+    assert p.limits() == pytest.approx(limits) and p.expected == (value if middle is None else middle)
+
+
+def test_a_parameter_without_tolerance_stays() -> None:
+    assert Parameter("damping", 0.8, "-", 0.4, 0.9).limits() == (0.8, 0.8)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_recalibrated_model_may_go_where_the_table_allows_and_no_farther(table: str) -> None:
+    """However often a model is recalibrated and continued: its tolerances do not wander with it."""
+    machine = build_plant(table)
+    known = {n.name: n for n in machine.nominal}
+    names = [name for _, name in free_of(table)]
+    moved = {name: known[name].value + 0.9 * known[name].tolerance for name in names}
+    for name, value in moved.items():
+        low, high = allowed_of(machine, known[name])
+        moved[name] = float(np.clip(value, low, high))
+    plain, model = chain(table), chain(table, Model(parameters=moved))
+    for one, other in zip(plain.stages, model.stages, strict=True):
+        for p, q in zip(one.parameters, other.parameters, strict=True):
+            n = known[p.name]
+            assert p.expected == q.expected == n.value and p.value == n.value
+            assert q.value == pytest.approx(moved[p.name], rel=1e-9)
+            assert q.limits() == pytest.approx(p.limits(), rel=1e-12)
+            assert allowed_of(machine, n)[0] <= q.limits()[0] < q.limits()[1] <= allowed_of(machine, n)[1]
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_stage_gives_numbers_to_the_ends_of_every_tolerance_and_of_every_effect(table: str) -> None:
+    for stage in chain(table).stages:
+        low, high = Judge(stage, np.ones(len(stage.outputs))).bounds()
+        low, high = np.maximum(low, -1e9), np.minimum(high, 1e9)
+        own, index = len(stage.parameters), stage.index()
+        thetas = [stage.neutral() for _ in range(2 * own)]
+        for k in range(own):
+            thetas[2 * k][k], thetas[2 * k + 1][k] = low[k], high[k]
+        for e in stage.effects:
+            for end in (low, high):
+                thetas.append(stage.neutral())
+                thetas[-1][index[e.name]] = end[index[e.name]]
+        for theta in thetas:
+            out = stage.run(theta[None])[0]
+            names = [p.name for p, a, b in zip(stage.all_parameters(), theta, stage.neutral(), strict=True) if a != b]
+            assert np.isfinite(out).all(), (stage.name, names)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_parameter_of_a_model_gives_numbers_at_its_ends_and_is_refused_beyond(table: str) -> None:
+    machine = build_plant(table)
+    for n in machine.nominal:
+        low, high = allowed_of(machine, n)
+        for end, beyond in ((low, low - 1e-6 * max(abs(low), 1.0)), (high, high + 1e-6 * max(abs(high), 1.0))):
+            p = build_plant(table, model=Model(parameters={n.name: end})).p
+            assert np.isfinite(p).all(), (n.name, end)
+            for wrong in (beyond, np.nan, np.inf):
+                with pytest.raises((InputError, ValueError), match=r"must be in|finite"):
+                    Model(parameters={n.name: wrong}).check(machine)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_effect_of_a_model_gives_numbers_at_its_ends_and_is_refused_beyond(table: str) -> None:
+    machine = build_plant(table)
+    for e in EFFECTS.values():
+        if machine.kind not in e.kinds:
+            continue
+        for p in machine.parameters_of(e.name).values():
+            for end in (p.low, p.high):
+                made = build_plant(table, model=Model(effects={e.name: {p.name: end}}))
+                assert np.isfinite(made.p).all(), (e.name, p.name, end)
+            for wrong in (p.low - 1.0, p.high + 1.0, np.nan, np.inf):
+                with pytest.raises((InputError, ValueError), match=r"must be in|finite"):
+                    Model(effects={e.name: {p.name: wrong}}).check(machine)
