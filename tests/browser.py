@@ -54,6 +54,7 @@ def look_at(browser: Any, file: Path, name: str, *, every: bool = False) -> None
     every  both schemes on both. One page is enough for that: a width sets no colour (`test_a_width_sets_no_colour`)
     """
     context = browser.new_context()
+    context.set_default_timeout(LONG)
     page = context.new_page()
     complaints: list[str] = []
     page.on("pageerror", lambda e: complaints.append(str(e)))

@@ -46,8 +46,8 @@ def test_three_hundred_thousand_frames_do_no_harm() -> None:
 
 
 @pytest.mark.slow
-def test_ten_million_frames_do_no_harm() -> None:
-    held(fuzz.fuzz(10_000_000, seed=12), 10_000_000)
+def test_two_million_frames_do_no_harm() -> None:
+    held(fuzz.fuzz(2_000_000, seed=12), 2_000_000)
 
 
 def test_the_same_seed_gives_the_same_campaign_and_another_another() -> None:
@@ -236,8 +236,8 @@ def test_ten_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tool", ["xcp", "uds"])
-def test_a_million_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
-    hostile(tool, 1_000_000)
+def test_two_hundred_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
+    hostile(tool, 200_000)
 
 
 FREE = np.array([np.inf, np.inf])

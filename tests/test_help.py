@@ -106,7 +106,8 @@ NOT_RUN = {
     "fuzz --tool": "a minute each: tests/test_fuzz.py",
 }
 SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60",
-           "--logs 60": "--logs 1 --duration 60"}  # fmt: skip
+           "--logs 60": "--logs 1 --duration 60",
+           "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
 LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables"}

@@ -125,7 +125,8 @@ def test_damaged_statistics_of_a_parquet_do_not_end_the_process(tmp_path: Path) 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(logs.FORMATS))
 def test_long_campaign(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
-    campaign(tmp_path, suffix, range(10_000, 10_000 + (2000 if suffix == ".mf4" else 8000)))
+    many = {".mf4": 2000, ".log": 2500, ".asc": 2500, ".trc": 2500}.get(suffix, 8000)
+    campaign(tmp_path, suffix, range(10_000, 10_000 + many))
 
 
 @pytest.mark.slow

@@ -614,6 +614,7 @@ def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path:
         look_at(browser, file, name, every=name == "replay")
         if name == "extend":  # the way from a cell to its moment, by keyboard
             page = browser.new_page()
+            page.set_default_timeout(LONG)
             page.goto(file.as_uri())
             page.wait_for_function("document.querySelectorAll('.show').length > 0", timeout=LONG)
             tab_to(page, ".show")
@@ -1166,6 +1167,7 @@ def test_a_browser_opens_the_link_and_reloads_without_it(server: Server, page: A
     with http.server.HTTPServer(("127.0.0.1", 0), Other) as other:
         threading.Thread(target=other.serve_forever, daemon=True).start()
         there = page.context.new_page()
+        there.set_default_timeout(LONG)
         there.goto(f"http://127.0.0.1:{other.server_port}/")
         ours = f"http://127.0.0.1:{server.port}"
         opened = there.evaluate(f"new Promise((r) => {{ const w = new "
