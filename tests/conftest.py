@@ -84,11 +84,10 @@ def spent() -> tuple[float, float]:
     return sum(os.times()[:4]), time.monotonic()
 
 
-@pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Note when a test began."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Note when a test began, also where no session runs it but `make mutants`."""
     item.stash[BEGAN] = spent()
-    return (yield)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
