@@ -142,12 +142,21 @@ class Disturber:
         for first, end, place in self.off:
             node = self.wire.node[place]
             if k == first:
-                node[w.TEC], node[w.MODE], node[w.TO_RECOVER] = 256, w.BUS_OFF, w.RECOVER
+                node[w.TEC], node[w.MODE], node[w.TO_RECOVER] = 256, w.BUS_OFF, self._from_now(w.RECOVER)
                 node[w.REFUSED] += node[w.TX_N]
                 node[w.TX_N] = 0
                 node[w.BUS_OFFS] += 1
             if end < np.inf and first <= k <= end and node[w.MODE] == w.BUS_OFF:
-                node[w.TO_RECOVER] = w.RECOVER if k == end else 1 << 40
+                node[w.TO_RECOVER] = self._from_now(w.RECOVER) if k == end else 1 << 40
+
+    def _from_now(self, times: int) -> int:
+        """Return what ``times`` occurrences of 11 recessive bits from now on are for the wire, which counts from where
+        it became free.
+        """
+        from hil.bus import wire as w
+
+        idle = max(int(self.wire.clock[w.NOW] - self.wire.clock[w.FREE]), 0)
+        return times + -(-idle // w.RECESSIVE)
 
 
 def sender_of(action: Action) -> str:
