@@ -301,7 +301,7 @@ class Replay(Outsider):
     def _source(self) -> Replay:
         if (self.log is None) == (self.begin is None):
             raise ValueError("replay takes either log (a file) or begin (s, of this run), and not both")
-        if self.begin is not None and self.begin + self.length > self.start:
+        if self.begin is not None and self.begin + self.length > self.start + 1e-9:  # 0.1 + 0.2 is more than 0.3
             raise ValueError(
                 f"begin + length (={self.begin + self.length:g} s) must not be after start (={self.start:g} s)"
             )

@@ -398,7 +398,7 @@ def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float],
     notes = [f"{port.refused} frames were not taken by the bus"] if port.refused else []
     notes += [f"{port.lost} frames came faster than they could be read"] if port.lost else []
     trace = witness.trace(begin)
-    if not len(trace.t):
+    if not trace.t[-1] > 0.0:
         raise InputError(f"{bus}: the controller was not heard again after {begin:.1f} s")
     wall = time.perf_counter() - started
     return outcome_of(

@@ -84,7 +84,10 @@ class Trace:
         if claim.late is not None:
             return "late at times" if self.late[claim.late][at].any() else "not late"
         values = (self.signals[claim.signal] if claim.signal is not None else self.counts[str(claim.count)])[at]
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        values = values[~np.isnan(values)]
+        if not len(values):
+            return f"{claim.signal} nan"
+        low, high = float(np.min(values)), float(np.max(values))
         return f"{claim.signal or claim.count} {low:.6g}" + (f" to {high:.6g}" if high > low else "")
 
 
