@@ -101,6 +101,12 @@ def test_every_operator_number_and_statement_is_changed_once(tmp_path: Path) -> 
         assert m.code() and m.line > 1  # each compiles
 
 
+def test_a_type_is_no_number(tmp_path: Path) -> None:
+    """Pydantic's classes keep what was made of it: another one in its place would change nothing."""
+    (tmp_path / "typed.py").write_text("Share = Annotated[float, Field(gt=0.0, le=1.0)]\nSIZE = 3\n")
+    assert [m.becomes for m in mutants_of(tmp_path, "typed.py")] == ["SIZE = 4"]
+
+
 def test_what_runs_compiled_stays_as_it_is_and_so_do_the_numbers_that_it_reads(tmp_path: Path) -> None:
     for package in ("controller", "hil"):
         (tmp_path / package).mkdir()

@@ -292,6 +292,8 @@ def _constants(body: list[ast.stmt]) -> Iterator[tuple[ast.stmt, _Edit]]:
             continue
         if isinstance(s.value, ast.Call) and ast.unparse(s.value.func) == "njit":
             continue  # how it is compiled
+        if isinstance(s.value, ast.Subscript) and ast.unparse(s.value.value) == "Annotated":
+            continue  # a type: classes keep what was made of it
         for edit in _edits(s):
             yield from ((s, e) for e in _both_ways(edit))
 
