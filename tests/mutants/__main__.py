@@ -88,7 +88,7 @@ NEAREST = {
     "hil.fmu": "fmu",
     "hil.calibrate": "xcp uds xcp_spec",
     "hil.uds": "uds uds_spec",
-    "hil.inject": "inject fuzz campaign loop moments",
+    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",
     "vaneloop": "verbs",
     "vaneloop.base": (
         "tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
