@@ -1,0 +1,925 @@
+"""Tables and what is made of them: cells, times, dates, units, names, limits, and what is said of what was left out."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pint
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from hil.logs import Channel, Log, LogError, csv_format, offered, read_log, source, write_log
+from hil.logs import log as logs
+from hil.logs.mapping import Bench, read_mapping, write_mapping
+from hil.logs.opening import open_log
+from hil.logs.source import ABSENT, check_file, close_names, is_absent, names_held, numbers, read_bytes
+from hil.logs.survey import MOST_LISTED, Row, Survey, sparkline, survey
+from hil.logs.table import NoTime, split_unit
+from hil.logs.times import from_dates, guess_column, guess_unit
+from hil.logs.units import USUAL_UNITS, Units, factor_of
+from vaneloop.base.signals import UNITS
+
+
+def csv(path: Path, text: str | bytes, name: str = "a.csv") -> Path:
+    file = path / name
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return file
+
+
+def read(file: Path, **options: Any) -> Log:
+    return read_log(file, **{"require": ()} | options)
+
+
+def values(file: Path, signal: str = "n_dem", **options: Any) -> list[float]:
+    return read(file, **options).channels[signal].values.tolist()
+
+
+def refused(file: Path, **options: Any) -> str:
+    with pytest.raises(LogError) as caught:
+        read(file, **options)
+    return str(caught.value).replace(str(file), "LOG")
+
+
+ROWS = "0,50\n1,51\n2,52\n"
+
+
+# ---- CSV -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,n_dem\n0,50\n1,51\n2,52\n",
+        "t;n_dem\n0;50\n1;51\n2;52",
+        "t\tn_dem\r\n0\t50\r\n1\t51\r\n2\t52\r\n",
+        "t;n_dem\n0,0;50,0\n1,0;51,0\n2,0;52,0\n",
+        "\n# a remark\n\nt,n_dem\n0,50\n1,51\n2,52\n",
+        "sep=;\nt;n_dem\n0;50\n1;51\n2;52\n",
+        '"sep=,"\nt,n_dem\n0,50\n1,51\n2,52\n',
+        "t [s],n_dem [%]\n0,50\n1,51\n2,52\n",
+        "t,n_dem\ns,%\n0,50\n1,51\n2,52\n",
+        "t,n_dem\n[s],(%)\n0,50\n1,51\n2,52\n",
+        "t,n_dem,foo\n-,%,\n0,50,1\n1,51,1\n2,52,1\n",
+        " t , n_dem \n0, 50\n1,51 \n2,52\n",
+        "t,n_dem,word\n0,50,a\n1,51,b\n2,52,c\n",
+        't,n_dem,word\n0,50,"a,b"\n1,51,"c\nd"\n2,52,e\n',
+        "t,n_dem\n0,50,9,9\n1,51\n2,52\n",
+        b"\xef\xbb\xbft,n_dem\n0,50\n1,51\n2,52\n",
+        "t,n_dem\n0,50\n1,51\n2,52\n".encode("utf-16"),
+        "t,n_dem,\u00d6l\n0,50,1\n1,51,1\n2,52,1\n".encode("cp1252"),
+        "t,n_dem,,\n0,50,1,\n1,51,1,\n2,52,1,\n",
+    ],
+)
+def test_the_same_table_is_read_however_it_is_written(tmp_path: Path, text: str | bytes) -> None:
+    log = read(csv(tmp_path, text))
+    assert log.channels["n_dem"].values.tolist() == [50, 51, 52] and log.channels["n_dem"].t.tolist() == [0, 1, 2]
+    assert set(log.channels) == {"n_dem"} and not log.channels["n_dem"].framed
+
+
+@pytest.mark.parametrize("none", ["", "NA", "N/A", "null", "None", "-", " NA ", "nan"])
+def test_a_cell_without_a_sample_leaves_its_row_out(tmp_path: Path, none: str) -> None:
+    for last in ("52", " 52"):  # plain numbers, and one by one
+        log = read(csv(tmp_path, f"t,n_dem\n0,50\n1,{none}\n2,{last}\n"))
+        assert log.channels["n_dem"].t.tolist() == [0, 2]
+        assert log.notes == (["n_dem (n_dem): 1 of 3 samples are NaN or infinite: left out"] if none == "nan" else [])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("t,n_dem\n0,50\n1,x y\n", "LOG: column 'n_dem', row 3: 'x y' is not a number"),
+        ("# r\n\nt,n_dem\ns,%\n0,50\n1,1_000\n", "LOG: column 'n_dem', row 6: '1_000' is not a number"),
+        ("sep=,\nt,n_dem\n0,50\n1,x\n", "LOG: column 'n_dem', row 4: 'x' is not a number"),
+        ("t,n_dem\n0,50\nx,51\n", "LOG: column 't', row 3: 'x' is not a number"),
+        ("t,n_dem\n0,50\n1," + "x" * 41 + "\n", f"row 3: '{'x' * 40}' is not a number"),
+        ("t,n_dem,n_dem\n0,1,2\n", "LOG: column 'n_dem' is there more than once"),
+        (b"t,\0\n", "LOG: is not a CSV (binary bytes in it)"),
+        (
+            "a,b\n0,1\n",
+            "LOG: no time column; looked for t, time, timestamp, timestamps, time_s, zeit (--map NAME=t names another)",
+        ),
+        ("t,b\n0,1\n", "LOG: none"),
+    ],
+)
+def test_what_is_no_table_is_refused_by_row_and_column(tmp_path: Path, text: str | bytes, said: str) -> None:
+    file = csv(tmp_path, text)
+    if said == "LOG: none":
+        assert read(file).channels == {}
+    else:
+        assert said in refused(file)
+
+
+def test_a_table_has_ten_thousand_columns_at_most(tmp_path: Path) -> None:
+    for n, fine in ((10_000, True), (10_001, False)):
+        head = "t,n_dem" + "," * (n - 2)
+        file = csv(tmp_path, f"{head}\n0,50\n1,51\n")
+        if fine:
+            assert list(csv_format.open_csv(file, source.Options(None, {})).names) == ["n_dem"]
+        else:
+            assert refused(file) == "LOG: 10001 columns; allowed: 10000"
+
+
+def test_rows_of_other_lengths_keep_their_place(tmp_path: Path) -> None:
+    for quote in ("", '"'):
+        text = f"t,n_dem,x_dem\n0,50,{quote}1{quote}\n1,51\n2,52,3,4,5\n3\n4,54,5\n"
+        log = read(csv(tmp_path, text))
+        assert log.channels["n_dem"].t.tolist() == [0, 1, 2, 4] and log.channels["x_dem"].values.tolist() == [1, 3, 5]
+    longer = read(csv(tmp_path, "t,n_dem\r\n0,50,1\r\n1,51\r\n"))
+    assert longer.channels["n_dem"].values.tolist() == [50, 51]
+
+
+@pytest.mark.parametrize(
+    ("under", "unit"),
+    [
+        ("s,rpm", "rpm"),
+        ("s,", ""),
+        (",rpm", "rpm"),
+        ("0,rpm", None),
+        ("s,quux", None),
+        ("nan,rpm", None),
+        ("-,none", None),
+    ],
+)
+def test_a_row_of_units_has_units_and_nothing_else(tmp_path: Path, under: str, unit: str | None) -> None:
+    file = csv(tmp_path, f"t,n_dem\n{under}\n0,500\n1,510\n")
+    if unit is None:
+        assert "row 2" in refused(file, units={"n_dem": "rpm"}, design_rpm=1000.0) or under == "-,none"
+    else:
+        found = values(file, design_rpm=1000.0, units={} if unit else {"n_dem": "rpm"})
+        assert found == pytest.approx([50.0, 51.0])
+
+
+def test_what_is_written_as_a_table_is_plain_text(tmp_path: Path) -> None:
+    write_log(
+        tmp_path / "b.csv",
+        {
+            "n_dem": Channel(np.array([0.0, 2.0]), np.array([50.0, 51.5])),
+            "x_dem": Channel(np.array([1.0]), np.array([9.0])),
+        },
+    )
+    assert (tmp_path / "b.csv").read_text() == "t,n_dem,x_dem\n0,50,\n1,,9\n2,51.5,\n"
+
+
+# ---- Parquet ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor"),
+    [
+        (pa.timestamp("s"), 1.0),
+        (pa.timestamp("ms"), 1e-3),
+        (pa.timestamp("us"), 1e-6),
+        (pa.timestamp("ns", "UTC"), 1e-9),
+        (pa.duration("ms"), 1e-3),
+        (pa.int32(), 1.0),
+        (pa.uint8(), 1.0),
+        (pa.float32(), 1.0),
+        (pa.decimal128(21, 2), 1.0),
+    ],
+)
+def test_times_of_any_arrow_type_are_seconds(tmp_path: Path, kind: Any, factor: float) -> None:
+    whole = pa.array([1, 2, 4], pa.int64()).cast(kind)
+    pq.write_table(pa.table({"t": whole, "n_dem": [50.0, 51.0, 52.0]}), tmp_path / "a.parquet")
+    np.testing.assert_allclose(
+        read(tmp_path / "a.parquet").channels["n_dem"].t, factor * np.array([1, 2, 4]), rtol=1e-12
+    )
+
+
+def test_cells_of_any_number_and_dates_in_words_are_read_and_words_are_not(tmp_path: Path) -> None:
+    dates = ["2024-01-02 10:00:00", None, "2024-01-02 10:00:02"]
+    table = pa.table({
+        "t": dates, "n_dem": pa.array([50, 51, None]), "state": [True, False, True], "x_dem": ["a", "b", "c"],
+        "n_r": pa.array([50.0, 51.0, 52.0]).dictionary_encode(),
+    })  # fmt: skip
+    pq.write_table(table, tmp_path / "a.parquet")
+    assert refused(tmp_path / "a.parquet") == "LOG: column 'x_dem' holds string, not numbers"
+    pq.write_table(table.drop_columns("x_dem"), tmp_path / "a.parquet")
+    log = read(tmp_path / "a.parquet")
+    assert log.channels["n_r"].t.tolist() == [0.0, 2.0] and log.channels["state"].values.tolist() == [1, 1]
+    assert log.channels["n_dem"].values.tolist() == [50.0]
+    assert log.notes[0] == "time: dates; 2024-01-02 10:00:00 taken for the start of the log"
+    pq.write_table(pa.table({"t": ["x", "y"], "n_dem": [1.0, 2.0]}), tmp_path / "a.parquet")
+    assert refused(tmp_path / "a.parquet") == "LOG: column 't' holds words that are no dates, not numbers"
+    (tmp_path / "b.parquet").write_bytes(b"PAR1" * 9)
+    assert "is not a Parquet file" in refused(tmp_path / "b.parquet")
+    twice = pa.Table.from_arrays([pa.array([1.0])] * 3, names=["t", "a", "a"])
+    pq.write_table(twice, tmp_path / "a.parquet")
+    assert refused(tmp_path / "a.parquet") == "LOG: column 'a' is there more than once"
+
+
+class Claims:
+    """What a Parquet file says of itself, without being it."""
+
+    def __init__(self, rows: int, bytes_: int, columns: int):
+        self.schema_arrow = pa.schema([("t", pa.float64()), *((f"c{k}", pa.float64()) for k in range(columns - 1))])
+        self.metadata, self.num_rows, self.num_row_groups, self.total_byte_size = self, rows, 2, bytes_
+
+    def row_group(self, k: int) -> Claims:
+        return Claims(0, self.total_byte_size // 2 + (self.total_byte_size % 2) * k, 1)
+
+
+@pytest.mark.parametrize(("more", "fine"), [(0, True), (1, False)])
+def test_a_parquet_file_has_four_million_rows_and_two_a_byte_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int, fine: bool
+) -> None:
+    file = csv(tmp_path, b"x" * 1000, "a.parquet")
+    rows = 4_000_000 + 2 * 1000 + more
+    monkeypatch.setattr(pq, "ParquetFile", lambda _: Claims(rows, 0, 3))
+    if fine:
+        assert offered(file) == ["t", "c0", "c1"]
+    else:
+        assert refused(file) == f"LOG: 1,000 bytes say that they hold {rows:,} rows; allowed: up to {rows - 1:,}"
+    unpacked = 40 * 3 * (500 + 100_000) + 100 * 1000 + more
+    monkeypatch.setattr(pq, "ParquetFile", lambda _: Claims(500, unpacked, 3))
+    if fine:
+        assert offered(file) == ["t", "c0", "c1"]
+    else:
+        assert (
+            refused(file) == f"LOG: 1,000 bytes say that they unpack to {unpacked:,}; allowed: up to {unpacked - 1:,}"
+        )
+
+
+def test_a_table_with_a_row_a_frame_holds_from_that_frame_on(tmp_path: Path) -> None:
+    columns: dict[str, Any] = {"t": [0.0, 1.0], "n_dem": [1.0, 2.0]}
+    columns |= {n: ["a", "b"] for n in ("id", "extended", "kind", "tx", "length", "bytes", "time")}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    assert read(tmp_path / "a.parquet").channels["n_dem"].framed
+    del columns["bytes"]
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    assert not read(tmp_path / "a.parquet").channels["n_dem"].framed
+
+
+# ---- the time --------------------------------------------------------------------------------------------------------
+
+
+def dates(*cells: str | None) -> Any:
+    found = from_dates(pa.array(list(cells), pa.string()))
+    return None if found is None else found[0].tolist()
+
+
+NINE = dt.datetime(2024, 3, 7, 9, 8, 7, 654321)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y-%m-%d %H:%M:%S.%f",
+        "%Y/%m/%d %H:%M:%S.%f",
+        "%d.%m.%Y %H:%M:%S.%f",
+        "%d.%m.%y %H:%M:%S.%f",
+        "%d/%m/%Y %H:%M:%S.%f",
+        "%m/%d/%y %H:%M:%S.%f",
+        "%y/%m/%d %H:%M:%S.%f",
+        "%Y%m%d %H:%M:%S.%f",
+        "%Y-%m-%dT%H:%M:%S,%fZ",
+        "%Y-%m-%d  %H:%M:%S.%f+02:00",
+        "%Y-%m-%d %H:%M:%S.%f -0330",
+        "%H:%M:%S.%f",
+        "%d.%m.%Y %H:%M:%S,%f",
+    ],
+)
+@pytest.mark.parametrize("later", [1e-6, 0.25, 59.5, 3599.000001, 40_000.0])
+def test_dates_of_every_form_are_the_seconds_between_them(form: str, later: float) -> None:
+    other = NINE + dt.timedelta(seconds=later)
+    assert dates(NINE.strftime(form), None, other.strftime(form))[::2] == pytest.approx([0.0, later], abs=1e-9)
+
+
+def test_days_months_leap_years_and_centuries_count_as_in_the_calendar() -> None:
+    days = [
+        "1999-12-31 00:00",
+        "2000-02-28 23:59",
+        "2000-03-01 00:00",
+        "2023-02-28 12:00",
+        "2023-03-01 12:00",
+        "2024-12-31 23:59:60",
+    ]
+    real = [dt.datetime.fromisoformat(d.replace(":60", ":59")) for d in days]
+    want = [(r - real[0]).total_seconds() + d.endswith(":60") for r, d in zip(real, days, strict=True)]
+    assert dates(*days) == pytest.approx(want)
+    assert dates("01.01.68 00:00", "01.01.69 00:00") == pytest.approx(
+        [0.0, (dt.datetime(1969, 1, 1) - dt.datetime(2068, 1, 1)).total_seconds()]
+    )
+    for wrong in ("2023-02-29 12:00", "2023-13-01 12:00", "2023-00-01 12:00", "2023-04-31 12:00", "2023-04-01 24:00",
+                  "2023-04-01 12:60", "2023-04-01 12:00:61", "2023-04-00 12:00", "2023-04-01", "12", "x"):  # fmt: skip
+        assert dates(wrong) is None, wrong
+    assert dates("2023-04-01 23:59:60") == [0.0] and dates(None) is None
+    assert dates("2023-04-01 12:00", "x") is None
+
+
+def test_zones_are_all_there_or_none_and_their_sign_is_that_of_hours_and_minutes() -> None:
+    assert dates("2024-01-01 12:00:00+05:30", "2024-01-01 12:00:00Z", "2024-01-01 12:00:00-00:30") == pytest.approx(
+        [0.0, 19_800.0, 21_600.0]
+    )
+    assert dates("2024-01-01 12:00:00-03:30", "2024-01-01 12:00:00+00:00") == pytest.approx([0.0, -12_600.0])
+    assert dates("2024-01-01 12:00:00", "2024-01-01 12:00:00Z") is None
+
+
+def test_a_time_of_day_that_falls_by_more_than_half_a_day_has_passed_midnight() -> None:
+    assert dates("23:59:59", "00:00:01", "12:00:01") == pytest.approx([0.0, 2.0, 43_202.0])
+    assert dates("13:00:00", "01:00:00") == pytest.approx([0.0, -43_200.0])
+    assert dates("13:00:00.000001", "01:00:00") == pytest.approx([0.0, 43_199.999999])
+    assert dates("23:00", "01:00", "23:00", "01:00")[-1] == pytest.approx(26 * 3600.0)
+
+
+def test_a_day_and_a_month_that_cannot_be_told_apart_do_not_matter_within_a_day() -> None:
+    assert dates("03/04/2024 10:00", "03/04/2024 11:00") == [0.0, 3600.0]
+    assert dates("03/04/2024 10:00", "04/04/2024 10:00") is None
+    assert dates("13/04/2024 10:00", "14/04/2024 10:00") == [0.0, 86_400.0]
+    assert dates("04/13/2024 10:00", "04/14/2024 10:00") == [0.0, 86_400.0]
+    # the first fifty rows tell them apart, or none do
+    assert dates(*["03/04/2024 10:00"] * 49, "13/04/2024 10:00")[-1] == pytest.approx(10 * 86_400.0)
+    assert dates(*["03/04/2024 10:00"] * 50, "13/04/2024 10:00") is None
+
+
+@pytest.mark.parametrize(
+    ("start", "step", "unit"),
+    [
+        (45_000.0, 1e-6, "day"),
+        (45_000.0, 4.9e-5, "day"),
+        (45_000.0, 5.1e-5, ""),
+        (25_001.0, 1e-6, "day"),
+        (24_999.0, 1e-6, ""),
+        (74_999.0, 1e-6, "day"),
+        (75_001.0, 1e-6, ""),
+        (1.7e9, 0.01, ""),
+        (4.09e9, 1.0, ""),
+        (4.11e9, 1.0, ""),
+        (1.7e12, 10.0, "ms"),
+        (3.11e11, 10.0, "ms"),
+        (3.09e11, 10.0, ""),
+        (4.09e12, 10.0, "ms"),
+        (1.7e15, 1e4, "us"),
+        (3.11e14, 1e4, "us"),
+        (3.09e14, 1e4, ""),
+        (4.09e15, 1e4, "us"),
+        (1.7e18, 1e7, "ns"),
+        (3.11e17, 1e7, "ns"),
+        (3.09e17, 1e7, ""),
+        (4.09e18, 1e7, "ns"),
+        (4.11e18, 1e7, ""),
+    ],
+)
+def test_a_time_that_says_a_date_between_1980_and_2100_has_its_unit(start: float, step: float, unit: str) -> None:
+    t = start + step * (np.arange(20) - 10)
+    said, why = guess_unit(t)
+    assert said == unit
+    if unit == "day":
+        assert why == f"{np.median(t):.6g} counts days since 1900 as Excel does"
+    elif unit:
+        assert why == f"{np.median(t):.6g} counts {unit} since 1970"
+    assert guess_unit(t[:1]) == ("", "") and guess_unit(t[:2])[0] in (unit, "")
+
+
+def test_of_several_times_a_unit_and_a_clock_decide() -> None:
+    found, sure = guess_column(["Date", "Uhrzeit", "speed"])
+    assert found == ["Uhrzeit"] and sure == pytest.approx(0.98)
+    assert guess_column(["Uhrzeit", "Messzeit_s"])[0] == ["Messzeit_s"]
+    assert guess_column(["Uhrzeit", "Laufzeit"])[0] == ["Uhrzeit", "Laufzeit"]
+    assert guess_column(["time 2", "Datum"])[0] == ["Datum"] and guess_column(["speed"]) == ([], 0.0)
+    assert guess_column(["Datetime", "Date"])[0] == ["Datetime"]
+
+
+def test_a_time_of_another_name_is_guessed_and_told(tmp_path: Path) -> None:
+    file = csv(tmp_path, "Messzeit_ms,n_dem\n0,50\n1000,51\n2000,52\n")
+    log = read(file)
+    assert log.channels["n_dem"].t.tolist() == [0, 1, 2]
+    assert log.notes[0] == (
+        "t: guessed to be 'Messzeit_ms', 98 % sure (its name says time in ms); "
+        "--map NAME=t takes another, --no-guess none"
+    )
+    with pytest.raises(NoTime) as caught:
+        read(file, guess=False)
+    assert caught.value.headers == ["Messzeit_ms", "n_dem"] and offered(file) == ["Messzeit_ms", "n_dem"]
+    assert "no column 'Zeit' to map to t; the file has 2 columns" in refused(file, mapping={"Zeit": "t"})
+    two = csv(tmp_path, "Uhrzeit,Laufzeit,n_dem\n0,0,50\n1,1,51\n")
+    assert refused(two) == "LOG: the time may be 'Uhrzeit' or 'Laufzeit': --map NAME=t takes one"
+    assert values(two, mapping={"Laufzeit": "t"}) == [50, 51]
+    assert offered(csv(tmp_path, "t,n_dem,,b\n0,1,2,3\n")) == ["t", "n_dem", "b"]
+
+
+@pytest.mark.parametrize(
+    ("header", "split"),
+    [
+        ("a [mm]", ("a", "mm")),
+        (" a(mm) ", ("a", "mm")),
+        ("a", ("a", "")),
+        ("a [b] [c]", ("a [b] [c]", "")),
+        ("a []", ("a", "")),
+        ("[mm]", ("[mm]", "")),
+    ],
+)
+def test_a_bracket_behind_a_header_is_its_unit(header: str, split: tuple[str, str]) -> None:
+    assert split_unit(header) == split
+
+
+# ---- units -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "into", "a", "b"),
+    [
+        ("%", "%", 1.0, 0.0),
+        ("ratio", "%", 100.0, 0.0),
+        ("rpm", "rpm", 1.0, 0.0),
+        ("1/min", "rpm", 1.0, 0.0),
+        ("Hz", "rpm", 60.0, 0.0),
+        ("kHz", "rpm", 60_000.0, 0.0),
+        ("rps", "rpm", 60.0, 0.0),
+        ("rad/s", "rpm", 30.0 / np.pi, 0.0),
+        ("m", "mm", 1e3, 0.0),
+        ("inch", "mm", 25.4, 0.0),
+        ("\u00b5m", "mm", 1e-3, 0.0),
+        ("A", "mA", 1e3, 0.0),
+        ("bar", "MPa", 0.1, 0.0),
+        ("psi", "MPa", 6.894757293e-3, 0.0),
+        ("K", "degC", 1.0, -273.15),
+        ("\u00b0F", "degC", 5 / 9, -160 / 9),
+        ("C", "degC", 1.0, 0.0),
+        ("rad", "deg", 180 / np.pi, 0.0),
+        ("\u00b0", "deg", 1.0, 0.0),
+        ("min", "s", 60.0, 0.0),
+        ("day", "s", 86_400.0, 0.0),
+        ("ns", "s", 1e-9, 0.0),
+        (" MM ", "mm", None, 0.0),
+    ],
+)
+def test_units_convert_as_the_books_say(unit: str, into: str, a: float | None, b: float) -> None:
+    found = factor_of(unit, into)
+    if a is None:
+        assert not isinstance(found, tuple) or found[0] != 1.0  # a unit's letters count: MM is no mm
+        return
+    assert found == pytest.approx((a, b), rel=1e-9, abs=1e-9)
+
+
+def test_what_is_no_unit_is_none_and_what_does_not_convert_is_named() -> None:
+    assert factor_of("quux", "mm") is None and factor_of("9**9**9", "mm") is None and factor_of("m^10", "mm") is None
+    assert (
+        factor_of("m\n", "mm") == (1000.0, 0.0)
+        and factor_of("x" * 33, "mm") is None
+        and factor_of("1000", "mm") is None
+    )
+    assert factor_of("bar", "mm") == "bar" and factor_of("m^9", "mm") == "m^9" and factor_of("$", "mm") is None
+    assert isinstance(pint.UnitRegistry(), pint.UnitRegistry) and all(factor_of(u, u) is not None for u in USUAL_UNITS)
+    long = "m" + "*m/m" * 7
+    assert len(long) == 29 and isinstance(factor_of(long, "mm"), tuple)
+    assert isinstance(factor_of(long + "*mm/mm"[:0] + " " * 9, "mm"), tuple)
+    assert factor_of("m*m/m*m/m*m/m*m/m*m/m*m/m*m/m*1 ".replace("*1 ", "") + "*m/m", "mm") is None
+
+
+def convert(signal: str, unit: str, stated: str = "", rpm: float | None = None) -> tuple[Any, list[str]]:
+    notes: list[str] = []
+    units = Units(Path("LOG"), {signal: stated} if stated else {}, rpm, notes)
+    given = np.array([1.0, 2.0])
+    return units.convert(signal, "key", given, unit).tolist(), notes
+
+
+def test_a_channel_is_brought_to_its_own_unit_with_its_sign() -> None:
+    assert convert("x_dem", "m") == ([1000.0, 2000.0], []) and convert("x_dem", "m", "-cm") == ([-10.0, -20.0], [])
+    assert convert("x_dem", "", "-mm") == ([-1.0, -2.0], []) and convert("x_dem", "-mm")[0] == [1.0, 2.0]
+    assert convert("t_oil", "K", "-K")[0] == pytest.approx([-274.15, -275.15])
+    for none in ("", "-", "none", "n/a", "null", "NULL", "1", "mm"):
+        assert convert("x_dem", none) == ([1.0, 2.0], [])
+    assert convert("x_dem", "quux") == ([1.0, 2.0], ["x_dem (key): unit 'quux' is not known, mm assumed"])
+    assert convert("n_r", "rpm", rpm=200.0)[0] == [0.5, 1.0] and convert("n_r", "", "-Hz", 200.0)[0] == [-30.0, -60.0]
+    assert convert("state", "quux") == ([1.0, 2.0], []) and convert("t", "ms")[0] == pytest.approx([0.001, 0.002])
+    for arguments, said in (
+        (
+            ("x_dem", "bar"),
+            "LOG: x_dem (key) in 'bar': unit does not convert; allowed: mm or what converts to it (--unit x_dem=...)",
+        ),
+        (("x_dem", "", "quux"), "LOG: x_dem (key) in 'quux': unit is not known; allowed: mm or what converts to it"),
+        (("n_r", "mm"), "unit does not convert; allowed: %, or rpm, Hz, rad/s with the design speed (--unit n_r=...)"),
+        (
+            ("n_r", "rpm"),
+            "LOG: n_r (key) is in rpm and needs the design speed to become %; --design-rpm R gives the design speed",
+        ),
+        (("x_dem", "mm", "1"), "unit does not convert"),
+    ):
+        with pytest.raises(LogError) as caught:
+            convert(*arguments)
+        assert said in str(caught.value)
+
+
+def test_a_unit_that_the_user_states_is_checked_before_the_log_is_opened(tmp_path: Path) -> None:
+    file = csv(tmp_path, f"t,n_dem\n{ROWS}")
+    assert (
+        refused(file, units={"n_dem": "mm"})
+        == "LOG: --unit n_dem=mm: unit does not convert; allowed: %, rpm, Hz or rad/s"
+    )
+    assert (
+        refused(file, units={"x_dem": "bar"})
+        == "LOG: --unit x_dem=bar: unit does not convert; allowed: mm or what converts to it"
+    )
+    assert "unit is not known (did you mean rpm?)" in refused(file, units={"n_r": "rpmm"})
+    for fine in ("%", "", "-", "rpm"):
+        assert values(file, units={"n_dem": fine}, design_rpm=100.0)
+    assert "is not a signal; close: n_dem, x_dem; allowed: n_dem, n_r" in refused(file, units={"n_den": "%"})
+    assert "required 'foo': is not a signal" in refused(file, require=("foo",))
+    for rpm in (0.0, -1.0, np.inf):
+        assert f"design speed (={rpm:g} rpm) must be finite and above 0" in refused(file, design_rpm=rpm)
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------------
+
+
+def test_names_may_be_mapped_both_ways_and_not_twice(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t,N1,N2\n0,50,60\n1,51,61\n")
+    assert values(file, mapping={"N1": "n_dem", "n_r": "N2"}) == [50, 51]
+    assert "map a=b: 'b' is not a signal" in refused(file, mapping={"a": "b"})
+    assert "both 'N1' and 'N2' are mapped to n_dem" in refused(file, mapping={"N1": "n_dem", "N2": "n_dem"})
+    assert values(file, mapping={"n1": "n_dem"}) == [50, 51]
+    assert (
+        refused(file, mapping={"N3": "n_dem"})
+        == "LOG: no column 'N3' to map to n_dem; the file has 3 columns: t, N1, N2"
+    )
+    assert "no n_dem: looked for column 'n_dem'; --map NAME=n_dem names another" in refused(
+        file, require=("n_dem",), guess=False
+    )
+    one = csv(tmp_path, "t,n_dem\n0,50\n")
+    assert "only one sample of n_dem" in refused(one, require=("n_dem",)) and values(one) == [50]
+
+
+def test_wild_samples_are_left_out_and_the_furthest_is_named(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{v}\n" for k, v in enumerate([50.0] * 19 + [-300.0, 200.0]))
+    log = read(csv(tmp_path, "t,n_dem\n" + rows))
+    assert log.channels["n_dem"].t.tolist() == list(range(19))
+    assert log.notes == ["n_dem (n_dem): 2 of 21 samples are outside -10 to 150 % (furthest -300): left out"]
+    both = csv(tmp_path, "t,n_dem,n_r,x_dem\n0,9000,9000,1\n1,9000,9000,2\n")
+    assert refused(both) == (
+        "LOG: n_dem (n_dem): all values are outside -10 to 150 % (median of these 9,000); "
+        "--unit n_dem=rpm --design-rpm R, if it is in rpm; the same for n_r"
+    )
+    mode = csv(tmp_path, "t,state\n" + "".join(f"{k},{9 if k == 3 else 2}\n" for k in range(20)))
+    assert read(mode).notes == ["state (state): 1 of 20 samples are outside 0 to 4 (furthest 9): left out"]
+    with pytest.raises(LogError, match="LOG: x_dem"):
+        Log("LOG", {"x_dem": Channel(np.arange(2.0), np.array([900.0, 900.0]))})
+    with pytest.raises(LogError, match="spans 30,000 s with 2 rows; .* --unit t=ms, if time counts in ms"):
+        Log("LOG", {"x_dem": Channel(np.array([0.0, 3e4]), np.ones(2))})
+    Log("LOG", {"x_dem": Channel(np.arange(2.0), np.array([900.0, 900.0]))}, signals={"x_dem": "N"})
+
+
+def test_rows_with_a_wrong_stamp_are_left_out_and_the_first_is_named(tmp_path: Path) -> None:
+    t = [*range(30)]
+    t[20] = 3
+    file = csv(tmp_path, "t,n_dem,x_dem\n" + "".join(f"{s},50,{k}\n" for k, s in enumerate(t)))
+    log = read(file)
+    assert log.channels["x_dem"].values.tolist() == [k for k in range(30) if k != 20]
+    assert log.notes == ["time: 1 of 30 rows have a wrong time stamp (first row 22: 3 s): left out"]
+    back = csv(tmp_path, "t,n_dem\n" + "".join(f"{s},50\n" for s in [*range(30), *range(10, 40)]))
+    assert refused(back) == "LOG: n_dem (n_dem): time runs backwards at row 32, from 29 s to 10 s"
+    # a channel with a block of rows of its own
+    text = "t,n_dem,x_dem\n" + "".join(f"{k},50,\n" for k in range(20)) + "".join(f"{k},,9\n" for k in range(5))
+    log = read(csv(tmp_path, text))
+    assert log.channels["n_dem"].t.size == 20 and log.channels["x_dem"].t.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_of_samples_at_one_time_the_last_counts_and_half_of_them_may_differ(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t,n_dem\n0,50\n1,51\n1,52\n2,53\n")
+    log = read(file)
+    assert log.channels["n_dem"].values.tolist() == [50, 52, 53]
+    assert log.notes[0].startswith("n_dem (n_dem): 1 of 4 samples have the time of the next: ")
+    half = csv(tmp_path, "t,n_dem\n" + "".join(f"{k // 2},{50 + k}\n" for k in range(20)))
+    assert read(half).channels["n_dem"].t.size == 10
+    three = csv(tmp_path, "t,n_dem\n" + "".join(f"{k // 3},{50 + k}\n" for k in range(21)))
+    assert "LOG: n_dem (n_dem): 14 of 21 samples have the time of the next: the times need more digits" in refused(
+        three
+    )
+    same = csv(tmp_path, "t,n_dem\n" + "".join(f"{k // 3},50\n" for k in range(21)))
+    assert read(same).channels["n_dem"].t.size == 7
+
+
+def test_a_time_far_from_zero_is_counted_from_the_start(tmp_path: Path) -> None:
+    for start, note in (
+        (10_000.0, None),
+        (10_000.5, "time does not count from the start: 10000.500000 s taken for the start of the log"),
+        (1.0e8, "time does not count from the start: 100000000.000000 s taken"),
+        (1.7e9, "time counts from 1970: 1700000000.000000 s taken for the start of the log"),
+    ):
+        log = read(csv(tmp_path, f"t,n_dem,x_dem\n{start},,1\n{start + 1},50,2\n"))
+        assert log.channels["n_dem"].t.tolist() == ([start + 1] if note is None else [1.0])
+        assert log.notes == [] if note is None else log.notes[0].startswith(note)
+    excel = csv(tmp_path, "t,n_dem\n45000.0,50\n45000.00001157407,51\n")
+    log = read(excel)
+    assert any(n.startswith("time counts from 1900: ") for n in log.notes)
+    assert "time (=1.05e+11 s) must be below 1e+10 s; --unit t=ms, if it is in ms" in refused(
+        csv(tmp_path, "t,n_dem\n1e11,1\n1.1e11,2\n"), guess=False
+    )
+    jump = (
+        "t,n_dem,x_dem\n" + "".join(f"{k},50,\n" for k in range(12)) + "".join(f"{1e6 + k},51,5\n" for k in range(30))
+    )
+    log = read(csv(tmp_path, jump))
+    assert log.channels["n_dem"].t.size == 30 and "only the longer part is kept, 30 of 42" in log.notes[0]
+    lost = (
+        "t,n_dem,x_dem\n" + "".join(f"{k},50,5\n" for k in range(12)) + "".join(f"{1e6 + k},51,\n" for k in range(30))
+    )
+    assert "no x_dem in the part of the log that is kept (time jumps" in refused(
+        csv(tmp_path, lost), require=("x_dem",)
+    )
+    assert "x_dem" not in read(csv(tmp_path, lost)).channels
+    assert "time jumps 2 times" in refused(
+        csv(tmp_path, "t,n_dem\n" + "".join(f"{1e6 * j + k},50\n" for j in range(3) for k in range(12)))
+    )
+
+
+def test_a_channel_far_too_small_is_refused_or_told(tmp_path: Path) -> None:
+    ramp = "".join(f"{0.01 * k},{0.0005 * k},{0.3 * k},{0.001}\n" for k in range(100))
+    line = refused(csv(tmp_path, "t,x_dem,n_r,vgv1\n" + ramp))
+    assert (
+        line.startswith("LOG: x_dem (x_dem): all values are within 0 to 0.0495 mm, which is too little")
+        and "the same" not in line
+    )
+    told = read(csv(tmp_path, "t,x_dem,n_r,vgv1\n" + ramp), units={"x_dem": "mm"})
+    assert any(
+        n.startswith("vgv1 (vgv1): all values are within 0.001 to 0.001 deg; if they are in rad") for n in told.notes
+    )
+    two = csv(tmp_path, "t,x_dem,x_lvdt\n" + "".join(f"{0.01 * k},{0.0005 * k},{0.0004 * k}\n" for k in range(100)))
+    assert refused(two).endswith("; the same for x_lvdt")
+
+
+@pytest.mark.parametrize(
+    ("channels", "said"),
+    [
+        ({}, "no channel to write"), ({"n_den": (np.zeros(1), np.zeros(1))}, "'n_den' is not a signal; close: n_dem"),
+        ({"n_dem": (np.zeros(2), np.zeros(3))}, "n_dem: t (2,) and values (3,) must be lists of one length, not empty"),
+        ({"n_dem": (np.zeros(0), np.zeros(0))}, "must be lists of one length, not empty"),
+        ({"n_dem": (np.zeros((1, 1)), np.zeros((1, 1)))}, "must be lists of one length"),
+        ({"n_dem": (np.zeros(2), np.zeros(2))}, "samples must be finite and their times increasing"),
+        ({"n_dem": (np.array([0.0, np.nan]), np.zeros(2))}, "samples must be finite"),
+        ({"n_dem": (np.arange(2.0), np.array([0.0, np.inf]))}, "samples must be finite"),
+    ],
+)  # fmt: skip
+def test_what_is_no_channel_is_not_written(tmp_path: Path, channels: dict[str, Any], said: str) -> None:
+    with pytest.raises(LogError) as caught:
+        write_log(tmp_path / "a.csv", {n: Channel(*c) for n, c in channels.items()})
+    assert said in str(caught.value)
+
+
+def test_a_suffix_that_is_no_log_s_is_refused(tmp_path: Path) -> None:
+    for act in (read, lambda p: write_log(p, {"n_dem": Channel(np.zeros(1), np.zeros(1))}), offered):
+        with pytest.raises(
+            LogError, match=r"suffix '.txt' is not a log's; allowed: .log, .asc, .blf, .trc, .mf4, .csv, .parquet"
+        ):
+            act(tmp_path / "a.txt")
+    assert values(csv(tmp_path, f"t,n_dem\n{ROWS}", "A.CSV")) == [50, 51, 52]
+    with pytest.raises(LogError, match="cannot be written"):
+        write_log(tmp_path / "no" / "a.csv", {"n_dem": Channel(np.zeros(1), np.zeros(1))})
+
+
+# ---- files and names -------------------------------------------------------------------------------------------------
+
+
+def test_a_file_has_four_gigabytes_at_most(tmp_path: Path) -> None:
+    file = tmp_path / "a.log"
+    with file.open("wb") as f:
+        f.truncate(4 << 30)
+    assert check_file(file) == 4294967296
+    with file.open("wb") as f:
+        f.truncate((4 << 30) + 1)
+    for path, said in (
+        (file, "4294967297 bytes; allowed: up to 4294967296"),
+        (tmp_path, "is a folder, not a log"),
+        (tmp_path / "none", "cannot be read (No such file or directory)"),
+        (Path("/dev/null"), "is not a file, not a log"),
+    ):
+        with pytest.raises(LogError) as caught:
+            check_file(path)
+        assert said in str(caught.value)
+    file.write_bytes(b"")
+    with pytest.raises(LogError, match="is empty"):
+        check_file(file)
+    file.write_bytes(b"abcdef")
+    assert (read_bytes(file), read_bytes(file, 4)) == (b"abcdef", b"abcd")
+
+
+def test_a_refusal_is_one_printable_line_of_a_thousand_letters() -> None:
+    assert str(LogError("a\n\tb\x00  c")) == "a b c"
+    assert len(str(LogError("x" * 1001))) == 1000 and len(str(LogError("x" * 1000))) == 1000
+
+
+def test_names_on_offer_are_shortened_to_twelve_of_sixty_letters() -> None:
+    assert (
+        names_held("column", []) == "; the file has no column"
+        and names_held("column", ["a"]) == "; the file has 1 column: a"
+    )
+    assert names_held("signal", "abcdefghijkl") == "; the file has 12 signals: a, b, c, d, e, f, g, h, i, j, k, l"
+    assert names_held("signal", "abcdefghijklmn").endswith("k, l and 2 more") and "x" * 61 not in names_held(
+        "c", ["x" * 61]
+    )
+    assert (
+        close_names("n_den", ["n_dem", "n_r", "x_dem"]).startswith("; close: n_dem")
+        and close_names("qqq", ["n_dem"]) == ""
+    )
+    assert close_names("aaaa", [f"aaaa{k}" for k in range(9)]).count("aaaa") == 4
+    assert (
+        close_names("abcde", ["abcxx"]) == "; close: abcxx" and close_names("abcde", ["abxxx"]) == ""
+    )  # 0.6 alike, and 0.4
+
+
+def test_numbers_of_arrow_are_scaled_and_what_is_absent_is_told_from_nan() -> None:
+    column = pa.array([1.0, None, float("nan"), 4.0] * 5).slice(1, 17)
+    found = numbers(column, 2.0)
+    want = [None, np.nan, 8.0, 2.0] * 4 + [None]
+    assert is_absent(found).tolist() == [w is None for w in want]
+    np.testing.assert_array_equal(found, [np.nan if w is None else w for w in want])
+    assert numbers(pa.array([1.0, 2.0])).tolist() == [1.0, 2.0] and np.isnan(ABSENT)
+    assert numbers(pa.nulls(3, pa.float64())).size == 3
+
+
+# ---- mapping files ---------------------------------------------------------------------------------------------------
+
+
+def test_a_mapping_file_is_written_with_remarks_and_read_again(tmp_path: Path) -> None:
+    bench = Bench({"n_dem": 'a "b" \u00e4\x7f'}, {"n_dem": "rpm"}, 9000.0, tmp_path / "x.dbc")
+    write_mapping(tmp_path / "m.toml", bench, {"n_dem": "why\n so"}, "head\nof two lines")
+    text = (tmp_path / "m.toml").read_text()
+    assert text.startswith("# head\n# of two lines\ndesign_rpm = 9000.0  # rotor speed that is 100 %\ndbc = ")
+    assert "\n\n[names]  # signal = name in the log\nn_dem = " in text and "  # why so\n" in text
+    assert text.endswith('\n\n[units]  # signal = unit in the log\nn_dem = "rpm"\n')
+    assert read_mapping(tmp_path / "m.toml") == bench
+    (tmp_path / "r.toml").write_text('dbc = "y.dbc"\n')
+    assert read_mapping(tmp_path / "r.toml").dbc == tmp_path / "y.dbc"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name = 1", "'name' is unknown; close: names; allowed: names, units, design_rpm, dbc"),
+        ("names = 1", "names (=1) must be a table"),
+        ("[names]\nn_den = 'a'", "names.n_den: is not a signal; close: n_dem"),
+        ("[units]\nn_dem = 1", "units.n_dem (=1) must be a word"),
+        ("[names]\nn_dem = ' '", "must be a word in quotation marks"),
+        ("design_rpm = 0", "design_rpm (=0 rpm) must be above 0 and below 10,000,000"),
+        ("design_rpm = 1e7", "must be above 0"),
+        ("design_rpm = true", "design_rpm (=True rpm)"),
+        ("design_rpm = 'a'", "design_rpm (='a' rpm)"),
+        ("dbc = 1", "dbc (=1) must be a file name"),
+    ],
+)
+def test_a_wrong_line_of_a_mapping_file_is_named(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(LogError) as caught:
+        read_mapping(tmp_path / "m.toml")
+    assert said in str(caught.value)
+    (tmp_path / "m.toml").write_text("design_rpm = 9999999.0\n[names]\nt = 'a'")
+    assert read_mapping(tmp_path / "m.toml").design_rpm == 9999999.0
+
+
+def test_a_mapping_file_says_it_all_and_what_the_log_lacks_is_told(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t,N1,speed_act\n0,500,500\n1,510,510\n")
+    (tmp_path / "m.toml").write_text("design_rpm = 1000\n[names]\nn_dem = 'N1'\nx_dem = 'X'\n[units]\nn_dem = 'rpm'\n")
+    log = read(file, mapping_file=tmp_path / "m.toml")
+    assert set(log.channels) == {"n_dem"} and log.channels["n_dem"].values.tolist() == pytest.approx([50, 51])
+    assert log.notes == [f"x_dem: {tmp_path / 'm.toml'} calls it 'X', which the log does not have"]
+    beside = read(file, mapping_file=tmp_path / "m.toml", design_rpm=60_000.0, units={"n_dem": "Hz"})
+    assert beside.channels["n_dem"].values.tolist() == pytest.approx([50, 51])  # what is given beside it goes before
+
+
+def test_the_unit_that_a_mapped_name_says_is_taken_and_told(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t_ms,N1_rpm,stroke_cmd_m\n0,500,0.01\n1000,510,0.02\n")
+    options: dict[str, Any] = {
+        "mapping": {"t_ms": "t", "N1_rpm": "n_dem", "stroke_cmd_m": "x_dem"},
+        "design_rpm": 1000.0,
+    }
+    log = read(file, **options)
+    assert log.channels["n_dem"].t.tolist() == [0, 1] and log.channels["x_dem"].values.tolist() == pytest.approx(
+        [0.01, 0.02]
+    )
+    assert log.channels["n_dem"].values.tolist() == pytest.approx([50.0, 51.0])
+    assert "n_dem (N1_rpm): taken in rpm, as its name says; --unit n_dem=% states another" in log.notes
+    assert "t (t_ms): taken in ms, as its name says; --unit t=s states another" in log.notes
+    plain = read(file, guess=False, units={"n_dem": "rpm"}, **options)
+    assert "t (t_ms): taken in s, though its name says ms; --unit t=ms takes that" in plain.notes
+
+
+def test_systems_of_a_user_s_own_take_a_name_in_other_letters(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t,LOAD_m,LOAD_mm,other\n0,1,1,2\n1,2,2,3\n")
+    log = read(file, signals={"load": "m"})
+    assert log.channels["load"].values.tolist() == [0.001, 0.002] and log.guesses[0].why == "its name in other letters"
+    assert read(file, signals={"load": "bar"}).channels == {}
+    assert open_log(file, None, None, None, None, {"other": "mm"}, True, None, {}).guesses.made == {}
+
+
+# ---- surveys ---------------------------------------------------------------------------------------------------------
+
+
+def of(**other: str) -> Survey:
+    return Survey("a", [], {}, other, [], "", None, None, None, False)
+
+
+def test_unused_names_are_listed_by_reason_twenty_at_a_time() -> None:
+    assert MOST_LISTED == 20
+    assert of(**{f"a{k}": "why" for k in range(20)}).unused() == [", ".join(f"a{k}" for k in range(20)) + ": why"]
+    assert of(**{f"a{k}": "why" for k in range(22)}).unused() == [
+        ", ".join(f"a{k}" for k in range(20)) + " and 2 more: why"
+    ]
+    assert of(a="x", b="", c="x").unused() == ["a, c: x", "b"]
+
+
+def test_a_survey_shows_every_signal_how_it_was_found_and_what_is_left(tmp_path: Path) -> None:
+    t = np.arange(200) * 0.01
+    rows = "".join(f"{a:g},{50 + 20 * a:g},{500 + 200 * a:g},{200 + 5 * a:g},{200},x\n" for a in t)
+    file = csv(tmp_path, "t,n_dem,Nist,supply_pressure,foo,word\n" + rows)
+    found = survey(file, mapping={"Nist": "n_r"}, units={"n_r": "rpm"}, design_rpm=1000.0)
+    assert [(r.signal, r.name, r.unit, r.how) for r in found.rows] == [
+        ("t", "t", "s", "named"), ("n_dem", "n_dem", "%", "named"), ("n_r", "Nist", "rpm", "stated"),
+        ("p_s", "supply_pressure", "bar", "guessed"),
+    ]  # fmt: skip
+    assert found.guessed and found.complaint == "" and set(found.other) == {"foo", "word"} and not found.damaged
+    speed = found.rows[2]
+    assert (speed.low, speed.curve.size, speed.confidence) == (500.0, 60, 1.0) and speed.high == pytest.approx(898.0)
+    assert (speed.curve[0], speed.curve[-1]) == (500.0, pytest.approx(898.0))
+    assert found.rows[3].confidence == 0.88 and "its name says pressure" in found.rows[3].why
+    bench = found.bench()
+    assert (
+        bench.names == {"t": "t", "n_dem": "n_dem", "n_r": "Nist", "p_s": "supply_pressure"}
+        and bench.design_rpm == 1000.0
+    )
+    as_json = found.to_dict()
+    assert (
+        as_json["other"] == ["foo", "word"]
+        and "curve" not in as_json["signals"][0]
+        and as_json["why_not"] == found.other
+    )
+    stated = survey(file, mapping={"t": "t"}, guess=False)
+    assert stated.rows[0].how == "stated" and not stated.guessed
+    few = csv(tmp_path, "t,n_dem\n0,50\n1,51\n")
+    assert survey(few).rows[1].curve.tolist() == [50, 51]
+
+
+def test_a_survey_complains_where_reading_would(tmp_path: Path) -> None:
+    none = survey(csv(tmp_path, "t,foo\n0,1\n1,2\n"))
+    assert none.complaint.replace(str(tmp_path / "a.csv"), "LOG").startswith(
+        "LOG: none of its names is a signal of ours (n_dem, n_r"
+    )
+    empty = survey(csv(tmp_path, "t,n_dem\n"))
+    assert empty.complaint.endswith("a.csv: has no sample") and np.isnan(empty.rows[1].low)
+    words = survey(csv(tmp_path, "t,n_dem,x_dem\n0,a,1\n1,b,2\n"))
+    assert words.damaged and "row 2: 'a' is not a number" in words.complaint
+    wrong = survey(csv(tmp_path, "t,n_dem\n0,9000\n1,9100\n"))
+    assert "outside -10 to 150" in wrong.complaint and not wrong.damaged and wrong.rows[1].high == 9100.0
+    turns = survey(csv(tmp_path, "t,speed_act_rpm\n" + "".join(f"{k},{9000 + 2 * k}\n" for k in range(30))))
+    assert turns.suggested_rpm == 9100.0 and "needs the design speed" in turns.open["n_r"]
+    late = survey(csv(tmp_path, "Messzeit_ms,n_dem\n0,50\n1000,51\n"))
+    assert (late.rows[0].how, late.rows[0].unit, late.rows[0].confidence) == ("guessed", "ms", 0.98)
+
+
+def test_a_sparkline_has_eight_steps_and_its_width_at_most() -> None:
+    assert (
+        sparkline(np.arange(8.0)) == "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588" and sparkline(np.empty(0)) == ""
+    )
+    assert (
+        sparkline(np.arange(100.0)) == sparkline(np.linspace(0, 99, 16).astype(int).astype(float))
+        and len(sparkline(np.arange(100.0))) == 16
+    )
+    assert sparkline(np.full(3, 5.0)) == "\u2581" * 3 and sparkline(np.arange(100.0), 4) == "\u2581\u2583\u2586\u2588"
+    assert Row("a", "b", "mm", "named", 1.0, "", 0.0, 1.0, np.empty(0)).signal == "a" and "state" in UNITS
+
+
+def test_short_rows_with_separators_in_quotes_are_squared_as_cells(tmp_path: Path) -> None:
+    log = read(csv(tmp_path, 't,word,n_dem\n0,"a,b",50\n1\n2,"c,d",52,9\n3,"e",53\n'))
+    assert log.channels["n_dem"].t.tolist() == [0, 2, 3] and log.channels["n_dem"].values.tolist() == [50, 52, 53]
+
+
+class Repeats:
+    """A source that offers one name under several keys, as a database does that repeats a signal."""
+
+    kind, sorted = "signal", True
+
+    def __init__(self, **series: list[float]):
+        self.notes: list[str] = []
+        self.of, self.names = series, {f"{k}.a": (f"{k}.a", "a") for k in series}
+
+    def series(self, key: str) -> source.Series:
+        values = np.array(self.of[key.split(".")[0]], float)
+        return source.Series(np.arange(values.size, dtype=float), values)
+
+    def has(self) -> str:
+        return ""
+
+    def absent(self, name: str) -> str:
+        return ""
+
+
+def take(of: Repeats, mapped: bool, needed: bool) -> tuple[str | None, list[str]]:
+    notes: list[str] = []
+    found = logs._take(Path("LOG"), of, "n_dem", "a", mapped, needed, notes)
+    return (found[0] if found else None), notes
+
+
+def test_of_a_name_in_several_messages_the_only_one_that_moves_is_meant() -> None:
+    one = Repeats(M=[5.0, 5.0], N=[5.0, 5.5], O=[])
+    assert take(one, True, False) == ("N.a", ["n_dem: took N.a; M.a, O.a never changes"])
+    two = Repeats(**{k: [0.0, float(i + 1)] for i, k in enumerate("MNOPQRS")})
+    assert take(two, False, False) == (
+        None, ["n_dem: may be M.a or N.a or O.a or P.a or Q.a or R.a: left out (--map M.a=n_dem takes one)"]
+    )  # fmt: skip
+    for mapped, needed in ((True, False), (False, True)):
+        with pytest.raises(
+            LogError, match=r"n_dem may be M.a or N.a or O.a or P.a or Q.a or R.a; name one: --map M.a="
+        ):
+            take(two, mapped, needed)
+    assert take(Repeats(), False, False) == (None, [])
