@@ -64,6 +64,7 @@ TARGETS: tuple[Target, ...] = (
         ),
         (
             "tests/test_search_limits.py",
+            "tests/test_descent.py",
             "tests/test_names.py::test_nine_tenths_are_neither_less_nor_more",
             "tests/test_names.py::test_half_of_the_excess_is_the_limit",
             "tests/test_names.py::test_two_stages_may_differ_by_half_of_a_size",
