@@ -150,6 +150,7 @@ ALL = tuple(UNITS)
         ("time", "", None),
         ("foo", "", None),
         ("state", "", None),
+        ("vgvx 2", "", None),
     ],
 )
 def test_a_name_says_the_signal_the_unit_and_how_surely(
@@ -198,6 +199,7 @@ def test_a_meaning_says_why(name: str, why: str) -> None:
         ("vane current pressure", "", "it does not say what is measured; a unit would"),
         ("valve current act", "", "the model has no such signal: valve, current, actual"),
         ("valve", "mA", "the model has no such signal: valve"),
+        ("speed_foos", "", "no signal of the model has such a name: 'foos' is not known"),
     ],
 )
 def test_what_a_name_lacks_is_said_in_a_few_words(name: str, unit: str, why: str) -> None:
@@ -210,7 +212,8 @@ def test_what_a_name_lacks_is_said_in_a_few_words(name: str, unit: str, why: str
         ("PosMm", ("pos",), "mm", "stroke"), ("speed_rpm", ("speed",), "rpm", "speed"),
         ("speed 1/min", ("speed",), "rpm", "speed"), ("speed_u_min", ("speed",), "rpm", "speed"),
         ("pressure_k", ("pressure", "k"), "", "pressure"), ("oiltemp_k", ("oil", "temp"), "K", "temperature"),
-        ("oiltempk", ("oiltempk",), "", ""), ("speed_%", ("speed",), "%", "speed"),
+        ("oiltempk", ("oiltempk",), "", ""), ("oil_temp2c", ("oil", "temp", "2", "c"), "", "temperature"),
+        ("speed_%", ("speed",), "%", "speed"),
         ("pressure_mpa", ("pressure",), "MPa", "pressure"), ("mpa", ("mpa",), "", ""),
         ("oil_temp_deg_c", ("oil", "temp"), "degC", "temperature"), ("vigv_grad", ("vigv",), "deg", "vigv"),
         ("vgv_2_mrad", ("vgv", "2"), "mrad", "vgv"), ("hub [mm]", ("hub",), "", "stroke"),

@@ -897,3 +897,71 @@ def test_an_mdf_of_frames_is_seen_through_a_database_unless_its_channels_are_ask
     assert kind(table_path("vgv.dbc"), {"speed": "n_dem"}) == "signal"
     mdf.write_groups(tmp_path / "a.mf4", [(n, {"x": (n, "")})])
     assert kind(table_path("vgv.dbc"), {}) == "channel"
+
+
+def test_a_channel_whose_values_have_words_is_read_as_its_numbers(tmp_path: Path, here: list[Any]) -> None:
+    words = {"val_0": 0, "text_0": "off", "val_1": 1, "text_1": "on", "default_addr": "?"}
+    with asammdf.MDF(version="4.10") as made:
+        made.append([asammdf.Signal(np.array([0, 1, 1], np.uint8), np.arange(3.0), name="state", conversion=words)])
+        made.append(
+            [asammdf.Signal(np.array([1, 2], np.uint8), np.arange(2.0), name="n_dem", conversion={"a": 2.0, "b": 5.0})]
+        )
+        made.save(tmp_path / "a.mf4")
+    series = mdf.read_mdf(tmp_path / "a.mf4", ["state", "n_dem"])[0]["series"]
+    assert series["state"][1].tolist() == [0, 1, 1] and series["n_dem"][1].tolist() == [7, 9]
+
+
+def test_the_extra_that_reads_mdf_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: list[Any]
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(mdf, "needs", lambda *what: asked.append(what))
+    mdf.write_mdf(tmp_path / "a.mf4", {"n_dem": Channel(np.arange(2.0), np.arange(2.0))}, None)
+    mdf.read_mdf(tmp_path / "a.mf4", [])
+    assert asked == [(f"{tmp_path / 'a.mf4'}: MDF4", "asammdf")] * 2
+
+
+@pytest.mark.parametrize(
+    ("last", "frames_", "error"),
+    [("frames 3", 3, ""), ("error no room", 0, "no room"), ("", 0, "the recorder was killed")],
+)
+def test_a_recorder_in_another_process_tells_how_it_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: str, frames_: int, error: str
+) -> None:
+    import fcntl
+
+    reads, writes = os.pipe()
+    waited: list[int] = []
+    process = SimpleNamespace(
+        stdin=os.fdopen(writes, "wb"),
+        stdout=io.BytesIO(f"ready old.log\n{last}\n".encode()),
+        wait=lambda: waited.append(1),
+    )
+
+    def start(command: list[str], **options: Any) -> Any:
+        assert command == [sys.executable, "-m", "hil.logs.recorder", str(tmp_path / "a.log"), "can3"]
+        assert options["start_new_session"] is True
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    to = recorder.RecorderProcess(tmp_path / "a.log", "can3")
+    assert (to.kept, to.frames, to.lost, to.error) == ("old.log", 0, 0, "")
+    assert not os.get_blocking(writes) and fcntl.fcntl(writes, fcntl.F_GETPIPE_SZ) == 1 << 20
+    to.put(b"x" * 160)
+    assert os.read(reads, 1000) == b"x" * 160
+    to.close()
+    assert (to.frames, to.error, waited, process.stdin.closed) == (frames_, error, [1], True)
+    os.close(reads)
+
+
+def test_a_recorder_that_does_not_start_is_refused_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for said, why in ((b"error it cannot\n", "it cannot"), (b"", "a.log: the recorder did not start")):
+        reads, writes = os.pipe()
+        process = SimpleNamespace(stdin=os.fdopen(writes, "wb"), stdout=io.BytesIO(said))
+        monkeypatch.setattr(subprocess, "Popen", lambda *_, process=process, **__: process)
+        with pytest.raises(InputError, match=why):
+            recorder.RecorderProcess(tmp_path / "a.log")
+        os.close(reads)
+        process.stdin.close()

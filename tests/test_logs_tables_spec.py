@@ -923,3 +923,18 @@ def test_of_a_name_in_several_messages_the_only_one_that_moves_is_meant() -> Non
         ):
             take(two, mapped, needed)
     assert take(Repeats(), False, False) == (None, [])
+
+
+def test_a_channel_loses_wrong_rows_unless_they_are_more_than_half_of_it(tmp_path: Path) -> None:
+    wrong, few = range(50, 56), {10, 20, 30, 40, 60, 70, 50, 51, 52, 53}
+    rows = [f"{3 if k in wrong else k},50,{k if k in few else ''}\n" for k in range(100)]
+    log = read(csv(tmp_path, "t,n_dem,x_dem\n" + "".join(rows)))
+    assert log.channels["x_dem"].values.tolist() == [10, 20, 30, 40, 60, 70] and log.channels["n_dem"].t.size == 94
+
+
+def test_a_refused_channel_is_named_as_the_log_names_it(tmp_path: Path) -> None:
+    file = csv(tmp_path, "t,N1\n0,9000\n1,9000\n")
+    assert refused(file, mapping={"N1": "n_dem"}).startswith("LOG: n_dem (N1): all values are outside -10 to 150 %")
+    good = csv(tmp_path, f"t,n_dem\n{ROWS}")
+    assert values(good, design_rpm=0.5) == [50, 51, 52]
+    assert values(good, units={"x_dem": "none", "state": "quux", "n_dem": "null"}) == [50, 51, 52]
