@@ -132,7 +132,7 @@ def day(seconds: float | None) -> str:
         return "–"
     try:
         return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
-    except (OverflowError, ValueError):
+    except (OverflowError, OSError, ValueError):  # which of them depends on how far it is
         return "later than any date"
 
 
