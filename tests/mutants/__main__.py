@@ -115,7 +115,8 @@ NEAREST = {
     "vaneloop.design": "design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
     "vaneloop.pages": (
-        "page design campaign fleet_report schedule strategies spatial verbs search_commands learn_turns"
+        "page_parts page_outlines page design campaign fleet_report schedule strategies spatial verbs search_commands "
+        "learn_turns"
     ),
     "vaneloop.verbs": (
         "verbs parts held long_logs guess starts spikes doubts machines learn_two own_laws your_own_model "
