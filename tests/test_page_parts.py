@@ -117,6 +117,8 @@ def test_numbers_at_the_ends_of_their_ranges() -> None:
         "1.0e+06",
         "1.2345e-04",
     )
+    rounded_up = ((9.979, 2), (99.96, 3), (0.9996, 3), (0.09999, 2), (-999.7, 3), (999.7, 4), (1000.0, 3), (0.001, 2))
+    assert [number(*v) for v in rounded_up] == ["10", "100", "1.00", "0.10", "-1,000", "999.7", "1,000", "0.001"]
     assert number(0.3 + 1e-9, 3) == "0.300"  # measured, not as published: zeros tell what is known
 
 

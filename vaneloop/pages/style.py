@@ -110,7 +110,8 @@ def number(value: object, digits: int = 3) -> str:
             return "0"
         if not 1e-3 <= abs(v) < 1e5:
             return f"{v:.{digits - 1}e}"
-        decimals = max(0, digits - 1 - math.floor(math.log10(abs(v))))
+        shown = float(f"{abs(v):.{digits - 1}e}")  # 9.98 to two digits is 10, not 10.0
+        decimals = max(0, digits - 1 - math.floor(math.log10(shown)))
         while decimals > 0 and math.isclose(round(v, decimals - 1), v, rel_tol=1e-12):  # 0.55 as published, not 0.550
             decimals -= 1
         return f"{v:,.{decimals}f}"
