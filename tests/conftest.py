@@ -37,9 +37,10 @@ def examples(thorough: int) -> int:
 # The modules with the longest tests, longest first. Each worker of xdist begins with some of them, so that none is left
 # for the end, when the others have nothing more to do.
 LONG = (
-    "web", "docs", "real_data", "learn_periods", "realtime", "vcan", "fleet_run", "your_own_model", "own_laws", "learn",
-    "hidden_effect", "design", "reading", "machines", "doubts", "record", "search_commands", "hidden_law", "xcp", "rig",
-    "notebooks", "verbs", "strategies", "native", "fmu", "loggers", "lockstep", "effects", "readings", "starts",
+    "real_data", "docs", "web", "help", "logs_fuzz", "fuzz", "hidden_law", "fleet_report", "learn", "native", "fmu",
+    "reading", "fleet_run", "kept", "rig", "record", "learn_periods", "your_own_model", "learn_stops", "realtime",
+    "strategies", "same_answer", "design", "learn_surfaces", "own_laws", "electromechanical", "effects",
+    "search_commands", "held", "learn_turns",
 )  # fmt: skip
 
 
