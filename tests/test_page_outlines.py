@@ -21,7 +21,7 @@ from hil.figures import SignalError, error_figures
 from plant import load_geometry
 from plant.geometry import vane_angles
 from plant.spatial import Clearances
-from tests.page_outline import approve, outline, written
+from tests.page_outline import approve, outline, unpacked, written
 from vaneloop.design.clearance import WORDS, ClearanceStudy
 from vaneloop.design.links import LinkChange, geometry_with
 from vaneloop.design.measured_loop import MeasuredLoop
@@ -468,6 +468,8 @@ def test_what_several_logs_say_beyond_one() -> None:
     lines = outline(page).splitlines()
     starts = [i for i, line in enumerate(lines) if line.startswith("plot")]
     approve("by_log_curves", "\n".join([*lines[: starts[2]], *lines[starts[4] : starts[6]]]) + "\n")
+    for figure in page.figures[::2]:  # each log begins at 0 s
+        assert {tuple(unpacked(d["x"])[[0, -1]].round(3)) for d in figure["data"]} == {(0.0, 4.9)}
     assert sum("(fitted)." in line for line in lines) == 2 and sum("(test)." in line for line in lines) == 6
 
 

@@ -33,7 +33,7 @@ from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.fleet import _digits
 from vaneloop.pages.page import Page, Plot, _finite, _json, _version, write_atomically
-from vaneloop.pages.replay import _error_lines, _replay_verdict
+from vaneloop.pages.replay import _error_lines, _ratio, _replay_verdict
 from vaneloop.pages.run import _middle_curve, axis_title, loops, rotor_speed, signal_name, speed_lines
 from vaneloop.pages.series import break_at_holes, decimate, distribution, packed, thin_path
 from vaneloop.pages.story import (
@@ -223,6 +223,14 @@ def test_a_path_that_is_short_stays_and_one_that_is_long_is_covered() -> None:
     gap[8_000:12_000] = np.nan
     u, v = thin_path(t, gap)
     assert np.isnan(u).sum() == np.isnan(v).sum() == 1 and not ((u > 0.401) & (u < 0.599)).any()
+    (k,) = np.flatnonzero(np.isnan(u))
+    assert (u[k - 1], u[k + 1]) == pytest.approx((0.4, 0.6), abs=0.003)
+    gap = t.copy()
+    gap[[5_000, 15_000]] = np.nan  # of one sample each
+    assert np.isnan(thin_path(t, gap)[0]).sum() == 2
+    swing = np.cos(np.linspace(0.0, 300.0, 40_000)) * np.linspace(0.2, 1.0, 40_000)
+    whole = len(thin_path(t[::-1].repeat(2), swing, 39_000)[0])
+    assert all(len(thin_path(t[::-1].repeat(2), swing, whole - k)[0]) <= whole - k for k in range(1, 5))
     still = np.zeros(5000)
     assert [len(a) for a in thin_path(still, still)] == [1, 1]
     assert len(thin_path(np.full(5000, np.nan), still)[0]) == 5000
@@ -438,6 +446,13 @@ def test_a_plotly_figure_is_taken_as_its_json() -> None:
     assert page.figures == [{"data": [], "layout": {"height": 111}}] and 'style="height:111px"' in page.html()
 
 
+def test_a_figure_that_names_no_height_is_400_pixels_high() -> None:
+    page = Page("t", "v")
+    for figure in ({"data": []}, {"data": [], "layout": {}}):
+        page.plot(figure)
+    assert page.html().count('style="height:400px"') == 2
+
+
 def test_scripts_stand_behind_the_page_and_know_its_figures() -> None:
     page = Page("t", "v")
     page.plot(loop([Line("a", [0.0, 1.0], [2.0, 3.0])], "x", "y"))
@@ -533,6 +548,20 @@ def test_a_way_without_a_loop_has_a_straight_middle_and_a_stroke_at_rest_none() 
     assert _middle_curve(np.full(100, 3.0), np.arange(100.0)) is None
     rest = 3.0 + 0.001 * np.modf(np.arange(1.0, 400.0) ** 2 * 0.754877)[0]
     assert _middle_curve(rest, rest) is None
+
+
+def test_the_middle_at_two_places_is_between_their_sides_however_often_each_was_visited() -> None:
+    x = np.repeat([0.0, 48.0], 100) + 0.01 * np.modf(np.arange(1.0, 201.0) ** 2 * 0.754877)[0]
+    y = np.tile(np.where(np.arange(100) % 10 == 0, 1.0, -1.0), 2)
+    y[100:] *= -1.0  # mostly below at one end, mostly above at the other
+    assert_allclose(_middle_curve(x, y)([0.0, 48.0]), [0.0, 0.0], atol=0.02)
+
+
+def test_an_error_in_noise_floors_of_a_sensor_without_noise() -> None:
+    def ratio(rms: float, floor: float) -> float:
+        return _ratio(SignalError("p_s", "supply", "MPa", "measured", rms, 0.5, 0.9, None, floor, 100))
+
+    assert [ratio(*v) for v in ((0.5, 0.25), (0.5, 0.0), (0.0, 0.0), (0.0, 1.0))] == [2.0, math.inf, 0.0, 0.0]
 
 
 def test_a_loop_of_few_samples_is_not_drawn() -> None:
