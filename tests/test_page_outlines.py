@@ -102,9 +102,11 @@ def all_figures() -> Page:
     page.plot(ranking([*names, "more"], [0.0, *values], "left", ["top"], log=True))
     page.plot(ranking([], [], "nothing"))
     page.section("Maps")
-    page.plot(heat([[1.0, None, 0.5], [4.0, 0.0, 2.0]], ["a", "b", "c"], ["<r>", "s"], "mm", "x", "y"))
+    cells: Any = [[1.0, None, 0.5], [4.0, 0.0, 2.0]]
+    page.plot(heat(cells, ["a", "b", "c"], ["<r>", "s"], "mm", "x", "y"))
     places = [["1 … 2", "2 … 3"], ["", "<4>"]]
-    page.plot(heat([[1.0, 2.0], [None, 0.1]], ["a", "b"], ["r", "s"], "deg", places=places, moments=[[3.0, np.nan],
+    few: Any = [[1.0, 2.0], [None, 0.1]]
+    page.plot(heat(few, ["a", "b"], ["r", "s"], "deg", places=places, moments=[[3.0, np.nan],
               [None, 7.5]]))  # fmt: skip
     page.plot(heat([[None, None]] * 5, ["a", "b"], list("rstuv"), "deg"))
     page.table(["word", "n", "", "mixed"], [["short", 1, Link("here", "a.html?x&y"), 1.23456],
@@ -812,10 +814,10 @@ def scheduled(stages: int = 2, loops: bool = True) -> ScheduleResult:
     strokes = np.array([speed, 0.7 * (speed - 40.0) + 1.0, 0.7 * (speed - 40.0) - 1.0, 0.7 * (speed - 40.0)])
     angles = np.rad2deg(vane_angles(np.linspace(-2.0, 50.0, 53) * 1e-3, built))
     found = {"vigv": loop_of("vigv", angles[:, 0] + 0.25)} if loops else {}
-    unread: Any = [None, None]  # schedules and options
+    unread: Any = None  # schedules and options
     return ScheduleResult(
         speed, target, strokes, [link(k, n) for k, n in enumerate(names)], found, adjusted, built,
-        *unread, "run.csv", "here", ["The first.", "The second."] if loops else [],
+        unread, unread, "run.csv", "here", ["The first.", "The second."] if loops else [],
     )  # fmt: skip
 
 
@@ -834,7 +836,7 @@ def test_a_schedule_of_one_stage_without_a_log(monkeypatch: pytest.MonkeyPatch) 
 def strategies() -> tuple[tuple[Scenario, ...], dict[tuple[str, str], Outcome]]:
     """Two machines, each under all strategies for 60 s."""
     rows = (Scenario("nominal"), Scenario("all together", 2.4, 0.5, 3.0, 0.15))
-    t = np.arange(600) * 0.1
+    t: Any = np.arange(600) * 0.1
     outcomes = {}
     for i, row in enumerate(rows):
         for k, name in enumerate(STRATEGIES):
@@ -869,9 +871,9 @@ def test_strategies_beside_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
                 (failed("other", "at rest", 0.01), run)]  # fmt: skip
     assert strategies_report(
         "s.html", rows, plant, outcomes, failures, goals, "adaptive", "vaneloop strategies"
-    ) == Path("s.html")  # type: ignore[arg-type]
+    ) == Path("s.html")
     approve("strategies", outline(pages[0]))
-    strategies_report("s.html", rows[:1], plant, outcomes, [], goals[:1], "dual")  # type: ignore[arg-type]
+    strategies_report("s.html", rows[:1], plant, outcomes, [], goals[:1], "dual")
     text = outline(pages[1])
     assert "All 1 goals are held." in pages[1].verdict and pages[1].tone == "good"
     assert "fail" not in text and "with 1.00 of the travel" in pages[1].verdict

@@ -448,8 +448,8 @@ def test_a_plotly_figure_is_taken_as_its_json() -> None:
 
 def test_a_figure_that_names_no_height_is_400_pixels_high() -> None:
     page = Page("t", "v")
-    for figure in ({"data": []}, {"data": [], "layout": {}}):
-        page.plot(figure)
+    page.plot({"data": []})
+    page.plot({"data": [], "layout": {}})
     assert page.html().count('style="height:400px"') == 2
 
 
@@ -583,13 +583,13 @@ def test_a_loop_of_few_samples_is_not_drawn() -> None:
 
 def test_an_error_has_a_mean_over_a_second_where_its_raster_allows_it() -> None:
     def names(dt: float, n: int) -> list[str]:
-        t = np.arange(n) * dt
+        t: Any = np.arange(n) * dt
         return [line.name for line in _error_lines(t, np.sin(t))]
 
     one, both = ["simulated − measured"], ["simulated − measured", "its mean over 1 s"]
     assert names(0.2, 50) == both and names(0.2, 49) == one and names(0.25, 500) == one and names(0.1, 1) == one
     assert [line.name for line in _error_lines(np.zeros(500), np.zeros(500))] == one
-    t = np.arange(105) * 0.1
+    t: Any = np.arange(105) * 0.1
     e = np.arange(105.0)
     e[25] = np.nan
     mean = _error_lines(t, e)[1]
