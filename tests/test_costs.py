@@ -34,9 +34,7 @@ def test_dear_files_come_first_and_cheap_ones_are_one_row(tmp_path: Path) -> Non
 
 def test_a_run_reports_what_its_tests_and_their_children_took(tmp_path: Path) -> None:
     burn = "import time\\nwhile time.process_time() < 1.0: pass"
-    (tmp_path / "conftest.py").write_text(
-        "from tests.conftest import pytest_runtest_setup, pytest_runtest_teardown\n"
-    )
+    (tmp_path / "conftest.py").write_text("from tests.conftest import pytest_runtest_setup, pytest_runtest_teardown\n")
     (tmp_path / "test_it.py").write_text(
         "import subprocess, sys\n"
         "def test_idle(): pass\n"
