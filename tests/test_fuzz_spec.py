@@ -446,6 +446,7 @@ def test_shrinking_ends_after_so_many_runs_with_what_it_has() -> None:
 
 
 def test_a_campaign_begins_with_nothing_seen() -> None:
+    assert fuzz.fuzz(5).seed == 0
     c = Campaign(3)
     assert (c.seed, c.frames, c.ticks, c.episodes, c.verdicts, c.longest_recovery_s, c.elapsed_s, c.failure) == (
         3, 0, 0, 0, {}, 0.0, 0.0, None,
@@ -727,6 +728,21 @@ def test_a_target_takes_the_ecu_s_frames_and_the_tool_s_and_gives_the_tool_its_a
     assert not target.busy and not target.given
 
 
+def test_a_target_of_uds_answers_requests_of_iso_tp() -> None:
+    pytest.importorskip("isotp")
+    target = fuzz_tools._Target("uds", 1, 1, FREE)
+    answers = target.tick([(0x7E0, b"\x02\x10\x03")])
+    for _ in range(20):
+        answers += target.tick([])
+    assert [a[:3] for a in answers] == [b"\x06\x50\x03"] and not target.busy and not target.given
+    still(target)
+    target.service._in.extend([b""] * 1024)
+    target.tick([])
+    target.service._transport.tx_queue.put(b"")
+    with pytest.raises(AssertionError, match="^1025 frames are kept$"):
+        target.tick([])
+
+
 BROKEN: list[tuple[str, float, str]] = [
     ("i_cmd", 0.0401, "current (=0.0401 A) beyond its limit (=0.04 A)"),
     ("i_cmd", -0.0401, "current (=-0.0401 A) beyond its limit (=0.04 A)"),
@@ -811,6 +827,7 @@ def test_flashing_puts_the_calibration_of_the_beginning_back(target: Any) -> Non
     still(target)
     before = target.memory.live().copy()
     target.node.loop.calibration.scalars.current_limit *= 0.5
+    target.tick([])
     target.flash()
     assert np.array_equal(target.memory.live(), before) and np.array_equal(target.before, before)
 
@@ -874,6 +891,7 @@ def test_an_episode_is_5000_frames_then_what_waits_then_the_flash_and_run_again(
     c = fuzz_tools.fuzz_tools("uds", 12_000, 3, told.append, limits=FREE)
     assert c.failure == "" and c.sent == [] and (c.protocol, c.seed, c.episodes) == ("uds", 3, 3)
     assert [(t.protocol, t.seed, t.request) for t in fake.made] == [("uds", 0, 0), ("uds", 1, 1), ("uds", 2, 0)]
+    assert [t.waiting for t in fake.made] == [-1] * 3, "nothing waits any more"
     assert all(t.limits is FREE and t.calls == ["flash", "70.0 1"] and t.after == 3 for t in fake.made)
     sums = [sum(t.frames) for t in fake.made]
     assert c.frames == sum(sums) and all(0 <= over < 8 for over in (sums[0] - 5000, sums[1] - 5000, sum(sums) - 12_000))
