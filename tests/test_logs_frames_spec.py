@@ -951,3 +951,11 @@ def test_units_in_a_database_are_of_windows_or_of_unicode_with_its_mark(tmp_path
 
 def test_fifty_milliseconds_late_are_not_too_late() -> None:
     assert ordered(np.array([0.0, 0.05, 0.0]))[0] == [0.0, 0.0, 0.05]
+
+
+def test_the_first_frame_of_a_current_that_begins_later_is_the_mean_of_all_before_it() -> None:
+    t = 0.002 * np.arange(1, 16)
+    channels = {"n_dem": Channel(0.01 * np.arange(4), np.full(4, 50.0)), "i_cmd": Channel(t, np.arange(1.0, 16.0))}
+    at, values = sent(channels, "VGV_SERVO", "i_cmd")
+    np.testing.assert_allclose(at, [0.01, 0.02, 0.03], atol=1e-9)
+    np.testing.assert_allclose(values, [3.0, 8.0, 13.0], atol=0.001)

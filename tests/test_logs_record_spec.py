@@ -965,3 +965,13 @@ def test_a_recorder_that_does_not_start_is_refused_with_its_reason(
             recorder.RecorderProcess(tmp_path / "a.log")
         os.close(reads)
         process.stdin.close()
+
+
+@pytest.mark.parametrize("kind", [CandumpRecord, MdfRecord])
+def test_a_recording_that_is_closed_holds_no_file_open(tmp_path: Path, kind: Any) -> None:
+    made = kind(tmp_path / {CandumpRecord: "a.log", MdfRecord: "a.mf4"}[kind], "vcan0")
+    fd = made.fd
+    os.fstat(fd)
+    made.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)

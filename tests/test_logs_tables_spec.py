@@ -938,3 +938,16 @@ def test_a_refused_channel_is_named_as_the_log_names_it(tmp_path: Path) -> None:
     good = csv(tmp_path, f"t,n_dem\n{ROWS}")
     assert values(good, design_rpm=0.5) == [50, 51, 52]
     assert values(good, units={"x_dem": "none", "state": "quux", "n_dem": "null"}) == [50, 51, 52]
+
+
+@pytest.mark.parametrize(("samples", "kept"), [(1, False), (2, True)])
+def test_two_samples_of_what_is_required_are_enough_in_the_part_that_is_kept(
+    tmp_path: Path, samples: int, kept: bool
+) -> None:
+    rows = "".join(f"{k},50,5\n" for k in range(12))
+    rows += "".join(f"{1e6 + k},51,{5 if k < samples else ''}\n" for k in range(30))
+    file = csv(tmp_path, "t,n_dem,x_dem\n" + rows)
+    if kept:
+        assert read(file, require=("x_dem",)).channels["x_dem"].t.tolist() == [0.0, 1.0]
+    else:
+        assert "no x_dem in the part of the log that is kept" in refused(file, require=("x_dem",))
