@@ -959,3 +959,9 @@ def test_the_first_frame_of_a_current_that_begins_later_is_the_mean_of_all_befor
     at, values = sent(channels, "VGV_SERVO", "i_cmd")
     np.testing.assert_allclose(at, [0.01, 0.02, 0.03], atol=1e-9)
     np.testing.assert_allclose(values, [3.0, 8.0, 13.0], atol=0.001)
+
+
+def test_integers_of_fifty_two_bits_are_written_and_longer_ones_are_not() -> None:
+    assert encode(message(' SG_ a : 0|52@1+ (1,0) [0|0] "" A'), {"a": np.array([2.0**52 - 1])}, 1).any()
+    with pytest.raises(LogError, match="a: its 53 bits in M cannot be written"):
+        encode(message(' SG_ a : 0|53@1+ (1,0) [0|0] "" A'), {"a": np.array([1.0])}, 1)
