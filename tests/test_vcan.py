@@ -344,7 +344,8 @@ def test_no_kernel_outlives_a_run_that_is_interrupted(tmp_path: Path, number: si
     )
     kernel.chmod(0o755)
     code = (
-        "import runpy, sys\nfrom tests.vcan import run\n"
+        "import signal\nfrom tests.vcan import run\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's job in the background ignores it
         "run.install = lambda wanted: None\nrun.warm_up = lambda *a, **k: None\n"
         f"run.find = lambda program: {str(kernel)!r} if program == 'linux.uml' else "
         f"__import__('shutil').which(program)\n"
