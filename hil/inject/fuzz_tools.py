@@ -8,10 +8,12 @@ the process does not grow.
 
 from __future__ import annotations
 
+import contextlib
 import resource
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -184,7 +186,13 @@ def _in_frames(ident: int, request: bytes) -> list[tuple[int, bytes]]:
 
 
 def _resident() -> float:
-    """The most memory that this process has had, MB."""
+    """The most memory that this process has had, MB.
+
+    ``ru_maxrss`` counts what it was started from, too: a small program's growth would not show.
+    """
+    with contextlib.suppress(OSError, ValueError, StopIteration):  # not on macOS
+        told = Path("/proc/self/status").read_text()
+        return int(next(line for line in told.splitlines() if line.startswith("VmHWM:")).split()[1]) / 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
