@@ -120,12 +120,12 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
 
     def leave(member: _Member) -> None:
         nonlocal alone_since
-        if members.pop(member.connection, None) is not None:
-            selector.unregister(member.connection)
-            member.connection.close()
-            alone_since = time.monotonic()
-            if member.priority:
-                schedule(m.priority for m in members.values())
+        del members[member.connection]
+        selector.unregister(member.connection)
+        member.connection.close()
+        alone_since = time.monotonic()
+        if member.priority:
+            schedule(m.priority for m in members.values())
 
     def read(member: _Member) -> None:
         nonlocal number
@@ -134,6 +134,8 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
                 raw = member.connection.recv(256)
             except BlockingIOError:
                 return
+            except ConnectionResetError:  # it left with packets unread: what it has sent is there all the same
+                continue
             if not raw:
                 return leave(member)
             if not member.greeted:
@@ -151,14 +153,12 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
             for other in list(members.values()):
                 if not other.greeted or (other is member and not other.own):
                     continue
-                try:
+                with contextlib.suppress(OSError):  # it is gone; what it has sent before is still to be read
                     other.give(
                         packet if other is not member else packet[:MARK_AT] + bytes([MINE]) + packet[MARK_AT + 1 :]
                     )
                     if other.waiting:
                         selector.modify(other.connection, selectors.EVENT_READ | selectors.EVENT_WRITE)
-                except OSError:
-                    leave(other)
 
     while members or time.monotonic() - alone_since < linger:
         for key, events in selector.select(None if members else linger):
@@ -173,12 +173,11 @@ def serve(listener: socket.socket, linger: float = LINGER) -> None:
                     members[connection] = _Member(connection)
                     selector.register(connection, selectors.EVENT_READ)
                 continue
-            member = members.get(key.fileobj)  # type: ignore[call-overload]
-            if member is None:
-                continue
+            member = members[key.fileobj]  # type: ignore[index]
             try:
                 if events & selectors.EVENT_WRITE:
-                    member.catch_up()
+                    with contextlib.suppress(OSError):
+                        member.catch_up()
                     if not member.waiting:
                         selector.modify(member.connection, selectors.EVENT_READ)
                 if events & selectors.EVENT_READ:
