@@ -108,7 +108,7 @@ class Channel:
         return (
             not any(t.active for t in self.tasks)
             and not (node[there, w.TX_N] > 0).any()
-            and not (node[there, w.MODE] == w.BUS_OFF).any()
+            and not (self.wire.clock[w.RESTART] and (node[there, w.MODE] == w.BUS_OFF).any())
         )
 
     def destroy(self, frames: int, *, node: int = -1, ident: int = -1) -> None:
