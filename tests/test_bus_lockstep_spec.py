@@ -7,13 +7,14 @@ numbers stand here again: 500 kbit/s, 64 frames to send, 4,096 received, 16 part
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import can
 import numpy as np
 import pytest
 
-from hil.bus import lockstep_bus
+from hil.bus import frames, lockstep_bus
 from hil.bus import wire as w
 from hil.bus.lockstep_bus import Channel, LockstepBus, channel_of, run_lockstep
 from hil.loop.node import Ecu, Node
@@ -653,13 +654,15 @@ def test_shutdown_ends_ones_own_tasks_only() -> None:
 # ---- the whole loop --------------------------------------------------------------------------------------------------
 
 
-def test_a_run_has_a_row_of_demand_every_10_ms_and_keeps_each_frame_at_its_end() -> None:
+def test_a_run_has_a_row_of_demand_every_10_ms_and_keeps_each_frame_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[float] = []
+    clock = iter([100.0, 107.5])
+    monkeypatch.setattr(lockstep_bus, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     n_dem = np.full(10, 80.0)
     channel = Channel()
     run = run_lockstep(n_dem, seed=1, channel=channel, progress=told.append)
     assert run.simulated_s == pytest.approx(0.1, rel=1e-12) and run.vgv.k == run.ecu.k == 100
-    assert channel.now == 0.1 and run.wall_s >= 0.0 and run.wall_s < 1e4 and told[-1] == 1.0
+    assert channel.now == 0.1 and run.wall_s == 7.5 and told[-1] == 1.0
     assert run.state_hash == "" and run.error_frames == 0 and run.load == channel.load
     # every 10 ms a demand and three frames of the controller, and once its health
     assert run.frames == 41 == len(run.rows) == len(run.t) and run.rows.shape == (41, 2) and run.t.shape == (41,)
@@ -712,7 +715,7 @@ def test_a_run_of_no_time_has_no_frames() -> None:
     assert run.simulated_s == 0.0 and run.vgv.k == 0
 
 
-def demands(run: Any) -> list[tuple[float, float, int]]:
+def demands(run: Any) -> list[Any]:
     """n_dem and n_r (%), and mode_request of the ECU's frames, by the DBC."""
     out = []
     for head, data in run.rows.tolist():
@@ -782,3 +785,14 @@ def test_a_long_run_tells_how_far_it_is_and_goes_on_where_it_was() -> None:
     assert parts == [pytest.approx(k / 250) for k in (60, 100, 160, 200, 250)] and told[-1] == 1.0
     assert pieces.state_hash == run.state_hash and np.array_equal(pieces.rows, run.rows)
     assert np.array_equal(pieces.t, run.t)
+
+
+def test_a_demand_that_is_changed_in_a_record_keeps_its_counter_and_what_is_no_good_demand_stays() -> None:
+    good, other = frames.encode_demand(70.0, 60.0, 1, 11), frames.encode_status(1.0, 2.0, 2, 3)
+    demand, status = frames.word0(0x0A0), frames.word0(0x0B0)
+    rows = np.array([[demand, good], [demand, good ^ 1], [status, other]], np.int64)
+    asked: list[Any] = []
+    changed = frames.with_demand(rows, lambda *d: asked.append(d) or (71.0, 61.0, 0))  # type: ignore[func-returns-value]
+    assert asked == [(pytest.approx(70.0), pytest.approx(60.0), 1)] and rows[0, 1] == good
+    assert changed.tolist() == [[demand, frames.encode_demand(71.0, 61.0, 0, 11)], *rows[1:].tolist()]
+    assert np.array_equal(frames.with_demand(rows, lambda *_: None), rows)

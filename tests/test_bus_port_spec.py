@@ -224,7 +224,7 @@ class Spied:
         return self.real.recvmsg_into(*which)
 
     def send(self, *which: Any) -> int:
-        return self.real.send(*which)  # type: ignore[no-any-return]
+        return self.real.send(*which)
 
 
 @pytest.fixture

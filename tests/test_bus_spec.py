@@ -20,6 +20,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -231,7 +232,7 @@ class Over(Exception):
 class Turns(selectors.EpollSelector):
     """The selector of a broker that does the next step of the test where it would wait."""
 
-    def __init__(self, steps: Iterator[object]):
+    def __init__(self, steps: Iterator[Any]):
         super().__init__()
         self.steps = steps
         self.waits: list[float | None] = []
@@ -300,7 +301,7 @@ class Stand:
         )
         self.monkeypatch = monkeypatch
 
-    def run(self, steps: Callable[[], Iterator[object]]) -> None:
+    def run(self, steps: Callable[[], Iterator[Any]]) -> None:
         """Serve until the steps are over or the broker ends."""
 
         def made() -> Turns:
@@ -310,7 +311,7 @@ class Stand:
         self.monkeypatch.setattr(broker, "selectors", SimpleNamespace(**{**vars(selectors), "DefaultSelector": made}))
         broker.serve(self.listener)
 
-    def all(self, steps: Callable[[], Iterator[object]]) -> None:
+    def all(self, steps: Callable[[], Iterator[Any]]) -> None:
         """Serve until the steps are over, all of them."""
         with pytest.raises(Over):
             self.run(steps)
@@ -359,7 +360,7 @@ def packet(number: int, ns: int, raw: bytes, mark: int = 0) -> bytes:
 
 
 def test_a_greeting_is_answered_and_a_frame_goes_to_every_other_participant(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b, c = stand.join(), stand.join(), stand.join()
         yield
         assert [heard(x) for x in (a, b, c)] == [[GREETING]] * 3
@@ -376,7 +377,7 @@ def test_a_greeting_is_answered_and_a_frame_goes_to_every_other_participant(stan
 
 
 def test_who_wants_its_own_frames_gets_them_marked_and_the_others_unmarked(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(1), stand.join()
         yield
         assert heard(a) == heard(b) == [GREETING]
@@ -392,7 +393,7 @@ def test_who_wants_its_own_frames_gets_them_marked_and_the_others_unmarked(stand
 
 
 def test_the_two_spare_bytes_of_a_frame_are_the_brokers(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(), stand.join()
         yield
         heard(b)
@@ -407,7 +408,7 @@ def test_the_two_spare_bytes_of_a_frame_are_the_brokers(stand: Stand) -> None:
 
 
 def test_who_has_not_greeted_hears_nothing(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, silent = stand.join(), stand.connect()
         yield
         a.send(classic(1))
@@ -426,7 +427,7 @@ def test_who_has_not_greeted_hears_nothing(stand: Stand) -> None:
     "greeting", [GREETING, b"vaneloop bus 2\0", GREETING + b"\0\0", GREETING[:-1] + b"\0", b"v", bytes(16), b"\0" * 300]
 )
 def test_who_greets_otherwise_is_sent_away(stand: Stand, greeting: bytes) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, other = stand.join(), stand.connect()
         yield
         other.send(greeting)
@@ -441,7 +442,7 @@ def test_who_greets_otherwise_is_sent_away(stand: Stand, greeting: bytes) -> Non
 
 @pytest.mark.parametrize("size", [1, 8, 15, 17, 71, 73, 88, 256, 257])
 def test_what_is_neither_16_nor_72_bytes_ends_the_connection_and_reaches_nobody(stand: Stand, size: int) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(), stand.join()
         yield
         a.send(classic(1))
@@ -457,7 +458,7 @@ def test_what_is_neither_16_nor_72_bytes_ends_the_connection_and_reaches_nobody(
 
 
 def test_a_second_greeting_is_no_frame(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(), stand.join()
         yield
         a.send(GREETING + b"\0")
@@ -468,7 +469,7 @@ def test_a_second_greeting_is_no_frame(stand: Stand) -> None:
 
 
 def test_64_frames_of_one_participant_then_it_is_the_next_ones_turn(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b, c = stand.join(), stand.join(), stand.join()
         yield
         assert heard(c) == [GREETING]
@@ -483,7 +484,7 @@ def test_64_frames_of_one_participant_then_it_is_the_next_ones_turn(stand: Stand
 
 
 def test_another_users_process_is_sent_away(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         monkeypatch.setattr(broker, "same_user", lambda _: False)
         other = stand.join()
         yield
@@ -501,7 +502,7 @@ def test_another_users_process_is_sent_away(stand: Stand, monkeypatch: pytest.Mo
 
 
 def test_a_connection_that_the_system_refuses_ends_nothing(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.listener.fails = 1
         a = stand.join()
         yield
@@ -511,7 +512,7 @@ def test_a_connection_that_the_system_refuses_ends_nothing(stand: Stand) -> None
 
 
 def test_a_connection_does_not_block_and_may_keep_a_mebibyte(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.connect()
         yield
         (connection,) = stand.listener.connections  # type: ignore[attr-defined]
@@ -524,7 +525,7 @@ def test_a_connection_does_not_block_and_may_keep_a_mebibyte(stand: Stand) -> No
 def test_the_scheduler_follows_who_comes_and_goes(stand: Stand) -> None:
     fifo, other = os.SCHED_FIFO, os.SCHED_OTHER
 
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a = stand.join()
         yield
         assert stand.scheduled == [(other, 0)]
@@ -547,7 +548,7 @@ def test_the_scheduler_follows_who_comes_and_goes(stand: Stand) -> None:
 
 
 def test_own_frames_are_asked_for_by_bit_0_alone(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(98 << 1), stand.join(2 << 1 | 1)
         yield
         a.send(classic(1))
@@ -560,7 +561,7 @@ def test_own_frames_are_asked_for_by_bit_0_alone(stand: Stand) -> None:
 
 
 def test_who_leaves_is_forgotten_and_another_may_come(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(), stand.join()
         yield
         b.close()
@@ -580,7 +581,7 @@ def test_who_leaves_is_forgotten_and_another_may_come(stand: Stand) -> None:
 @pytest.mark.parametrize("own", [0, 1])
 @pytest.mark.parametrize("unread", [False, True])
 def test_what_a_participant_sent_before_it_left_reaches_the_others(stand: Stand, own: int, unread: bool) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b, c = stand.join(), stand.join(own), stand.join()
         yield
         if not unread:
@@ -597,7 +598,7 @@ def test_what_a_participant_sent_before_it_left_reaches_the_others(stand: Stand,
 
 
 def test_what_a_slow_reader_sent_before_it_left_reaches_the_others(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, slow, c = stand.join(), stand.join(), stand.join()
         yield
         yield from fill(stand, a, slow, lambda: heard(c))
@@ -610,7 +611,7 @@ def test_what_a_slow_reader_sent_before_it_left_reaches_the_others(stand: Stand)
 
 
 def test_who_is_gone_when_a_frame_comes_for_it_leaves_the_others_undisturbed(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b, c = stand.join(), stand.join(), stand.join()
         yield
         a.send(classic(1))  # the broker gives it to b before it hears that b is gone
@@ -625,7 +626,7 @@ def test_who_is_gone_when_a_frame_comes_for_it_leaves_the_others_undisturbed(sta
 
 
 def test_who_is_gone_with_packets_unread_leaves_the_others_undisturbed(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b, c = stand.join(), stand.join(), stand.join()
         yield
         a.send(classic(1))
@@ -641,7 +642,7 @@ def test_who_is_gone_with_packets_unread_leaves_the_others_undisturbed(stand: St
 
 
 def test_who_cannot_be_read_is_sent_away(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, b = stand.join(), stand.join()
         yield
         stand.listener.connections[1].broken = True  # type: ignore[attr-defined]
@@ -653,7 +654,7 @@ def test_who_cannot_be_read_is_sent_away(stand: Stand) -> None:
 
 
 def test_who_leaves_before_its_answer_comes_is_forgotten(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.join().close()
         yield
         assert len(stand.selector.get_map()) == 1
@@ -666,7 +667,7 @@ def test_who_leaves_before_its_answer_comes_is_forgotten(stand: Stand) -> None:
 
 def fill(
     stand: Stand, sender: socket.socket, reader: socket.socket, read: Callable[[], object] = lambda: None
-) -> Iterator[object]:
+) -> Iterator[Any]:
     """Send frames until the broker keeps one for the reader; the others ``read`` all but the last."""
     held = waiting_of(stand, reader)
     for _ in range(100_000):
@@ -695,7 +696,7 @@ def test_a_reader_that_does_not_read_is_told_what_is_gone_and_holds_up_nobody(
     monkeypatch.setattr(broker, "BACKLOG", 5)
     quick: list[bytes] = []
 
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, slow, fast = stand.join(), stand.join(), stand.join()
         yield
         assert heard(slow) == heard(fast) == [GREETING]
@@ -733,7 +734,7 @@ def test_a_reader_that_does_not_read_is_told_what_is_gone_and_holds_up_nobody(
 
 
 def test_who_leaves_with_packets_still_waiting_is_forgotten(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         a, slow = stand.join(), stand.join()
         yield
         yield from fill(stand, a, slow)
@@ -747,7 +748,7 @@ def test_who_leaves_with_packets_still_waiting_is_forgotten(stand: Stand) -> Non
 def test_the_broker_ends_a_second_after_the_last_has_left_and_waits_no_longer_than_that(stand: Stand) -> None:
     done = []
 
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.clock = 500.999
         yield IDLE
         a = stand.join()
@@ -771,7 +772,7 @@ def test_the_broker_ends_a_second_after_the_last_has_left_and_waits_no_longer_th
 
 
 def test_without_any_participant_the_broker_ends_after_a_second(stand: Stand) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.clock = 501.0
         yield IDLE
         raise AssertionError("it stays")
@@ -781,7 +782,7 @@ def test_without_any_participant_the_broker_ends_after_a_second(stand: Stand) ->
 
 
 def test_a_broker_may_be_told_how_long_it_lingers(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
-    def steps() -> Iterator[object]:
+    def steps() -> Iterator[Any]:
         stand.clock += 2.5
         yield IDLE
         stand.clock += 0.5
@@ -866,7 +867,7 @@ def of_64() -> bytes:
     listener.bind(f"\0{new_name()}")
     listener.listen(64)
     _open.append(listener)
-    return listener.getsockname()  # type: ignore[no-any-return]
+    return listener.getsockname()
 
 
 _open: list[socket.socket] = []
@@ -955,7 +956,7 @@ class Line:
     def recv(self, size: int) -> bytes:
         if isinstance(self.answer, tuple):
             raise self.answer[0]
-        return self.answer[:size]  # type: ignore[no-any-return]
+        return self.answer[:size]
 
     def close(self) -> None:
         self.closed = True
@@ -1448,7 +1449,7 @@ def test_a_reader_whose_broker_ended_joins_the_next_and_is_told(
     fd, files = bus.fileno(), len(os.listdir("/proc/self/fd"))
     other.close()
     got: list[Any] = []
-    monkeypatch.setattr(local_bus.time, "time_ns", lambda: 5_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: 5_000_000_000)
     with caplog.at_level(logging.WARNING), warnings.catch_warnings(record=True) as unclosed:
         warnings.simplefilter("always", ResourceWarning)
         again = desk.meet(lambda: got.append(bus.receive_packet()))
