@@ -161,6 +161,7 @@ def test_side_by_side_as_lane_by_lane(stage: str, kind: str, data: st.DataObject
     assert np.allclose(together, alone, rtol=0.0, atol=1e-9 * scale)
 
 
+@pytest.mark.slow
 def test_lanes_with_other_curves_run_alone() -> None:
     """Curves of another range, or none, are not those of their neighbours."""
     rng = np.random.default_rng(3)

@@ -66,6 +66,7 @@ def test_machines_drawn_at_random_are_the_loops_that_run_alone(effects: int) -> 
     assert len({float(r.columns["x_lvdt"][-1]) for r in alone}) > 1
 
 
+@pytest.mark.slow
 def test_lanes_in_different_modes_and_with_different_faults_do_not_mix() -> None:
     generator, trouble = np.random.default_rng(7), troubled(110.0)
     calm = Stimulus.of(profile(110.0))

@@ -149,6 +149,7 @@ def test_its_file_is_taken_and_another_log_confirms_its_scale(tmp_path) -> None:
     assert part.run(theta)[:, :, late] == pytest.approx(stage.run(theta)[:, :, rows][:, :, late], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_stops_are_tried_where_something_slips_and_of_what_drives_the_stage() -> None:
     _, whole = chain()
     found = set()

@@ -233,7 +233,7 @@ def answer(*words: str) -> Any:
     return json.loads(out.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("n", [1, 8])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 8])
 def test_a_run_is_recorded_repeated_and_replayed(made: Any, tmp_path: Path, n: int) -> None:
     folder, out = str(made.folder(n)), str(tmp_path / "out.json")
     record, page = str(tmp_path / "run.parquet"), tmp_path / "replay.html"

@@ -279,6 +279,7 @@ def test_a_clean_log_is_clean_at_the_noise_floor(seed):
     assert np.std(reference.engine_residual(run)) < 1.02 * 0.02  # %
 
 
+@pytest.mark.slow
 def test_without_noise_only_model_form_is_left():
     run = simulate(manoeuvre(1, 60.0), controller(), seed=1, rate=1000, noise=False)
     actuator = reference.actuator_residual(run, window=1.0)

@@ -114,6 +114,7 @@ def test_replay_says_in_a_notebook_what_the_command_says(tmp_path: Path) -> None
         assert {number(s.rms), number(s.noise_floor)} <= there
 
 
+@pytest.mark.slow
 def test_an_experiment_of_a_log_without_rivals(diagnosed: Diagnosed, tmp_path: Path) -> None:
     answer = vaneloop.experiment(LOG, diagnosed)
     assert isinstance(answer, Experiment) and answer.recommended is None
