@@ -75,7 +75,7 @@ TARGETS: tuple[Target, ...] = (
 )
 # Of each package the files of tests that are nearest to it, where its code runs as it does for a user: compiled.
 NEAREST = {
-    "controller": "controller xcp tables c_reference node",
+    "controller": "records_spec controller xcp tables c_reference node",
     "plant": (
         "plant effects effects_reference linkage electromechanical machines tables tolerances lanes "
         "curve_lanes spatial fmu"
