@@ -24,6 +24,7 @@ from hil.inject import fuzz, fuzz_tools
 from hil.inject.fuzz import KINDS, Attack, Bench, Campaign, good_frames, make_attack, read_attack, run_attack
 from hil.inject.fuzz_tools import ToolCampaign
 from hil.loop.node import MOST_SENT, Node, node_tick
+from hil.uds.server import key_of as uds_key
 from tests.conftest import ROOT
 from tests.test_inject_spec import DEMAND, demand, protected, row, seen
 from vaneloop.base.errors import InputError
@@ -681,8 +682,6 @@ def test_hostile_requests_of_uds_are_known_services_sessions_pieces_and_long_one
 
 
 def test_a_server_s_seed_is_answered_with_its_key_now_and_then() -> None:
-    from hil.uds.server import key_of as uds_key
-
     key = fuzz_tools._in_frames(0x7E0, b"\x27\x02" + uds_key(b"12345678"))
     answered = [of for of in drawn(fuzz_tools._uds, uds_target(b"12345678"), 1000) if of == key]
     assert 60 < len(answered) < 140

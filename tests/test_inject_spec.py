@@ -18,7 +18,7 @@ import pytest
 from pydantic import ValidationError
 
 from controller import FAULTS, MODES, load_calibration
-from hil import inject
+from hil import inject, native
 from hil.bus import port, wire
 from hil.bus.frames import EXTENDED, REMOTE
 from hil.bus.lockstep_bus import run_lockstep
@@ -1273,8 +1273,6 @@ def test_the_fixture_has_two_options_and_gives_them_on() -> None:
 def test_a_controller_of_the_user_s_own_is_judged_by_the_table_of_reactions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hil import native
-
     assert sil.Sil(tmp_path)._of_own_controller() == {}
     monkeypatch.setattr(native, "Program", lambda path: f"program of {path}")
     given = sil.Sil(tmp_path, "mine.so")._of_own_controller()

@@ -6,6 +6,7 @@ e2e library and closed forms.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -346,8 +347,6 @@ def test_lines_of_one_length_and_many_layouts_are_all_read(tmp_path: Path) -> No
 
 
 def test_a_line_of_six_hundred_bytes_is_read_and_a_longer_one_is_none() -> None:
-    import re
-
     layout = re.compile(rb"\((?P<s> *\d{1,10})\)(?P<tail>.*)\Z", re.S)
     raw = b"\n".join(
         [b"(" + b"7" * 3 + b")" + b"x" * n for n in (595, 596)] + [b"(12)\r", b"", b"other", b"(1x)", b"(9)"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil.logs import plausible
-from hil.logs.guess import Guess, contradictions, design_speed, guess
+from hil.logs.guess import Guess, _mean_stroke, contradictions, design_speed, guess
 from hil.logs.names import CERTAIN, bracketed, is_time, lacks, meaning, spool, unit_behind, unit_in_name, unit_kind
 from hil.logs.plausible import RANGES, judge, latest, longest_part, out_of_order, proposed, span_complaint, too_small
 from hil.logs.source import LogError, Series
@@ -577,8 +577,6 @@ def test_a_current_that_drives_the_stroke_backwards_is_turned() -> None:
 
 def mean_stroke(speed: np.ndarray) -> np.ndarray:
     """The shipped controller's mean curve: mm."""
-    from hil.logs.guess import _mean_stroke
-
     return np.interp(speed, *_mean_stroke({}))
 
 

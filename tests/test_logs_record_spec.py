@@ -47,6 +47,7 @@ from hil.logs.record_formats import (
 from hil.logs.record_parquet import ParquetRecord, _thrift_read, _thrift_write, read_parquet
 from hil.logs.recorder import FLUSH, Recorder, check_name, free_name, read_record
 from hil.logs.signals import encode
+from hil.logs.source import Options
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path as table_path
 
@@ -874,8 +875,6 @@ def test_mdf_is_written_as_groups_of_one_raster_and_as_frames_where_a_database_i
 def test_an_mdf_of_frames_is_seen_through_a_database_unless_its_channels_are_asked_for(
     tmp_path: Path, here: list[Any]
 ) -> None:
-    from hil.logs.source import Options
-
     n = np.arange(4.0)
     with asammdf.MDF(version="4.10") as made:
         bus_group(

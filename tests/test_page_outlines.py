@@ -22,6 +22,7 @@ from plant import load_geometry
 from plant.geometry import vane_angles
 from plant.spatial import Clearances
 from tests.page_outline import approve, outline, unpacked, written
+from tests.test_page import play
 from vaneloop.design.clearance import WORDS, ClearanceStudy
 from vaneloop.design.links import LinkChange, geometry_with
 from vaneloop.design.measured_loop import MeasuredLoop
@@ -171,15 +172,6 @@ class Run:
     target: dict[str, Array]
     measured: dict[str, Samples]
     signals: list[SignalError] = field(default_factory=list)
-
-
-def play(x: Array, gap: float) -> Array:
-    """Lost motion of total width ``gap``."""
-    y, s = np.empty_like(x), x[0]
-    for i, v in enumerate(x):
-        s = min(max(s, v - gap / 2), v + gap / 2)
-        y[i] = s
-    return y
 
 
 def run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 import os
@@ -416,8 +417,6 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_page_says_which_version_wrote_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    import importlib.metadata
-
     assert _version().startswith("vaneloop ") and Page("t", "v").facts["version"] == _version()
     assert Page("t", "v", version="mine 1").facts["version"] == "mine 1"
 
