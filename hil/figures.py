@@ -35,7 +35,7 @@ class SignalError:
     reference          ``measured`` (the log's own channel) or ``schedule`` (target at the measured speed)
     mean_abs_99_100    mean of |error| over 99 % < n_r < 100 %, None where the log has no such sample
     noise_floor        RMS of the reference's measurement noise: an RMS error at this level is a perfect model
-    samples            samples in which model and reference are both finite
+    samples            samples in which the reference is finite
     """
 
     signal: str
@@ -67,20 +67,23 @@ def error_figures(
     noise_floor  in ``unit``; None: estimated by `noise_floor`, from ``reference_values`` or from the error, which holds
                  less motion where the model moves as the machine does: each is an upper bound
 
-    Samples with a NaN or an infinity on either side do not count. Raises InputError when none is left,
-    or when the arrays differ in length.
+    Samples with a NaN or an infinity in the reference do not count. Raises InputError when none is left, where the
+    model is no number at one that counts, or when the arrays differ in length.
     """
     times, model, ref = (np.asarray(a, dtype=float) for a in (t, model_values, reference_values))
     speed = None if n_r is None else np.asarray(n_r, dtype=float)
     for name, a in (("model", model), ("reference", ref), ("n_r", speed)):
         if a is not None and a.shape != times.shape:
             raise InputError(f"signal {signal!r}: {name} has {a.size} samples, must have {times.size} as its time has")
-    good = np.isfinite(model) & np.isfinite(ref)
+    good = np.isfinite(ref)
     samples = int(good.sum())
     if samples == 0:
+        raise InputError(f"signal {signal!r}: no sample in which the {reference} value is finite; at least 1 is needed")
+    silent = good & ~np.isfinite(model)
+    if silent.any():
         raise InputError(
-            f"signal {signal!r}: no sample in which the model and the {reference} value are both finite; at least 1 "
-            f"is needed"
+            f"signal {signal!r}: the model (={model[silent][0]}) at t = {times[silent][0]:g} s and in "
+            f"{int(silent.sum())} of {samples} samples must be finite"
         )
     error = np.abs(model[good] - ref[good])
     at_design = None

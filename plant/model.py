@@ -321,11 +321,14 @@ class Model(Table):
                 p[row] *= lever / ldp
         for effect, values in self.effects.items():
             if effect in self.curves:
-                put_curve(p, self.curves[effect], values)
+                with np.errstate(over="ignore", invalid="ignore"):  # refused below
+                    put_curve(p, self.curves[effect], values)
                 continue
             for row, parameter in machine.parameters_of(effect).items():
                 p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
         derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+        if not np.isfinite(p).all():
+            raise InputError("model: a number that follows from its parameters, effects or curves is not finite")
         return replace(machine, p=p)
 
 

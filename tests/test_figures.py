@@ -59,9 +59,15 @@ def test_fields_are_the_ones_of_the_architecture_page():
         figures([1.0], [2.0], noise_floor=0.0).rms = 3.0
 
 
-def test_nan_and_infinity_do_not_count():
-    f = figures([1.0, np.nan, 3.0, 9.0], [2.0, 1.0, np.inf, 8.0], noise_floor=0.0)
+def test_what_was_not_measured_does_not_count():
+    f = figures([1.0, np.nan, 3.0, 9.0], [2.0, np.nan, np.inf, 8.0], noise_floor=0.0)
     assert (f.samples, f.max_abs, f.rms) == (2, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_model_that_is_no_number_where_it_was_measured_is_refused(value):
+    with pytest.raises(InputError, match=r"'vigv': the model \(=(nan|-?inf)\) at t = [0-9.]+ s and in 1 of 3 samples"):
+        figures([1.0, value, 3.0], [2.0, 1.0, 8.0], noise_floor=0.0)
 
 
 def test_design_point_is_the_open_interval_99_to_100():
@@ -73,7 +79,7 @@ def test_design_point_is_the_open_interval_99_to_100():
 
 def test_no_common_sample_is_refused_in_one_line():
     with pytest.raises(InputError, match="'vigv'.*no sample"):
-        figures([np.nan, 1.0], [1.0, np.nan])
+        figures([2.0, 1.0], [np.inf, np.nan])
     with pytest.raises(InputError, match="reference has 3 samples, must have 2"):
         figures([1.0, 2.0], [1.0, 2.0, 3.0])
 

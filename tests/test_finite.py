@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from hil.fmu.plant_fmu import PlantFmu
+from hil.fmu.plant_fmu import _Joined as Joined
 from hil.logs import Channel, Log, read_log
+from hil.loop.lanes import lockstep_lanes
+from hil.loop.lockstep import Stimulus, lockstep
+from hil.replay import replay
 from plant.effects import EFFECTS
 from plant.machine import build_plant
-from plant.model import Model, allowed_of
+from plant.model import Learned, Model, allowed_of
+from plant.parameters import LVDT_FACTOR
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
+from vaneloop.base.forms import FORMS
 from vaneloop.discrepancy.fit import Judge, recalibrate
 from vaneloop.discrepancy.models.vane_stages.declared import FREE
 from vaneloop.discrepancy.models.vanes import Chain, build_chain
@@ -153,3 +161,64 @@ def test_every_effect_of_a_model_gives_numbers_at_its_ends_and_is_refused_beyond
             for wrong in (p.low - 1.0, p.high + 1.0, np.nan, np.inf):
                 with pytest.raises((InputError, ValueError), match=r"must be in|finite"):
                     Model(effects={e.name: {p.name: wrong}}).check(machine)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_loop_gives_numbers_at_any_ends_of_all_parameters_and_effects_at_once(table: str) -> None:
+    machine, rng = build_plant(table), np.random.default_rng(38)
+    effects = [e for e in EFFECTS.values() if machine.kind in e.kinds]
+    plants = []
+    for _ in range(16 if table == TABLES[0] else 2):
+        parameters = {n.name: float(rng.choice(allowed_of(machine, n))) for n in machine.nominal}
+        some = [e for e in effects if rng.random() < 0.4]
+        at = {
+            e.name: {p.name: float(rng.choice([p.low, p.high])) for p in machine.parameters_of(e.name).values()}
+            for e in some
+        }
+        plants.append(Model(parameters=parameters, effects=at).plant(machine))
+    demand = np.concatenate([np.full(30, 70.0), np.linspace(70.0, 100.0, 60), np.linspace(100.0, 60.0, 30)])
+    for run in lockstep_lanes(Stimulus.of(demand), plants):
+        assert all(np.isfinite(v).all() for v in run.columns.values())
+
+
+def test_a_run_that_is_no_number_is_refused_where_it_arises() -> None:
+    machine, stimulus = build_plant(), Stimulus.of(np.full(20, 70.0))
+    p = machine.p.copy()
+    p[LVDT_FACTOR] = np.nan
+    plant = replace(machine, p=p)
+    for run in (
+        lambda: lockstep(stimulus, plant=plant),
+        lambda: lockstep_lanes(stimulus, [plant]),
+        lambda: replay(log(), plant=plant),
+    ):
+        with pytest.raises(InputError, match=r"^simulation: x_lvdt \(=nan\) at t = 0.000 s must be finite"):
+            run()
+
+
+def test_a_model_whose_curve_overflows_is_refused() -> None:
+    x, many = np.linspace(0.0, 100.0, 5), 0
+    for form in FORMS:
+        values = [1e308] * len(form.numbers)
+        with np.errstate(all="ignore"):
+            if np.isfinite(form.value(x, np.array(values))).all():
+                continue
+        curve = Learned(how="times", at="sensors.lvdt", of="n_r", low=0.0, high=100.0, values=values, form=form.name)
+        with pytest.raises(InputError, match="is not finite$"):
+            Model(curves={"push": curve}, effects={"push": {}}).plant()
+        many += 1
+    assert many > 2
+
+
+class Fmu(PlantFmu):
+    """A running FMU that shows ``value`` as its stroke."""
+
+    def __init__(self, value: float):
+        self.path, self._outputs, self._out_refs, self._k = "own.fmu", [Joined("x_lvdt", 1, 1.0, 0.0)], [1], 7
+        self._read = lambda refs: [value]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_plant_of_others_that_shows_no_number_is_refused(value: float) -> None:
+    assert Fmu(0.02).outputs() == {"x_lvdt": 0.02}
+    with pytest.raises(InputError, match=r"^--plant own.fmu: x_lvdt \(=(nan|inf)\) at t = 0.007 s must be finite$"):
+        Fmu(value).outputs()

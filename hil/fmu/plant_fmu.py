@@ -6,6 +6,7 @@ tick of 1 ms. FMPy loads the FMU.
 
 from __future__ import annotations
 
+import math
 import platform
 import shutil
 import tempfile
@@ -106,9 +107,15 @@ class PlantFmu:
         self._write(self._in_refs, values)
 
     def outputs(self) -> dict[str, float]:
-        """What it gives now, SI."""
+        """What it gives now, SI. InputError where that is no number."""
         values = self._read(self._out_refs)
-        return {v.signal: x * v.factor + v.offset for v, x in zip(self._outputs, values, strict=True)}
+        out = {v.signal: x * v.factor + v.offset for v, x in zip(self._outputs, values, strict=True)}
+        for signal, value in out.items():
+            if not math.isfinite(value):
+                raise InputError(
+                    f"--plant {self.path}: {signal} (={value}) at t = {self._k * chain.TICK:.3f} s must be finite"
+                )
+        return out
 
     def step(self, signals: Mapping[str, float]) -> dict[str, float]:
         """Move on by 1 ms under these inputs (SI); return the outputs. InputError where it fails."""

@@ -26,6 +26,7 @@ from controller.records import SLOW, as_inputs, as_outputs
 from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free
+from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = ["FRAME", "Run", "Stimulus", "columns_of", "lockstep", "snapshot_names", "to_border", "warm_up"]
@@ -80,6 +81,8 @@ class Stimulus:
 class Run:
     """One simulated run: ``columns`` of border-unit arrays on the raster ``t`` (s), and the digest of every tick's
     state.
+
+    Raises InputError where a signal is no number: the machine that was given has no such run.
     """
 
     columns: dict[str, np.ndarray]
@@ -87,6 +90,15 @@ class Run:
     wall_s: float
     state_hash: str
     faults: int
+
+    def __post_init__(self) -> None:
+        for name, values in self.columns.items():
+            silent = ~np.isfinite(values)
+            if silent.any():
+                raise InputError(
+                    f"simulation: {name} (={values[silent][0]}) at t = {self.t[silent][0]:.3f} s must be finite; this "
+                    f"machine runs away"
+                )
 
     @property
     def t(self) -> np.ndarray:
