@@ -13,7 +13,7 @@ import pytest
 from numba import njit
 from numba.core import compiler, event
 
-from vaneloop.base import lean
+from vaneloop.base import compiled, lean
 from vaneloop.base.compiled import in_place, inlined
 
 ROOT = Path(__file__).parents[1]
@@ -118,3 +118,19 @@ def test_garbage_is_collected_again_after_compiling() -> None:
         events.unregister("numba:compile", during)
     assert seen == [False, False]
     assert gc.isenabled()
+
+
+def test_where_nothing_can_be_kept_compiled_code_lies_where_nobody_else_may_write(monkeypatch: Any) -> None:
+    """Code is loaded from there: a name in the folder for temporary files that others know could be theirs."""
+    monkeypatch.setattr(os, "access", lambda place, mode: False)
+    folders = []
+    for _ in range(2):
+        compiled.cache_folder.cache_clear()
+        folders.append(compiled.cache_folder())
+    monkeypatch.undo()
+    compiled.cache_folder.cache_clear()
+    assert folders[0].parent != folders[1].parent
+    for folder in folders:
+        about = folder.parent.lstat()
+        assert about.st_uid == os.getuid() and about.st_mode & 0o77 == 0
+        folder.parent.rmdir()

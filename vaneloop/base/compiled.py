@@ -7,10 +7,12 @@ served from stale code; the folder carries that digest in its name, too, so that
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -36,21 +38,24 @@ __all__ = [
 KEPT = 6
 
 
+@cache
 def cache_folder() -> Path:
-    """Return the folder for compiled code: in the package where that can be written, else in the user's cache."""
-    places = [
-        Path(__file__).parent / "__pycache__",
-        Path.home() / ".cache" / "vaneloop",
-        Path(tempfile.gettempdir()) / f"vaneloop-{os.getuid()}",
-    ]
-    for place in places:
+    """Return the folder for compiled code: in the package where that can be written, else in the user's cache, else
+    one of this process's own, which goes with it.
+
+    What lies there is loaded as code. A folder with a name that others know, in a place where they may write, could be
+    theirs.
+    """
+    for place in (Path(__file__).parent / "__pycache__", Path.home() / ".cache" / "vaneloop"):
         try:
             place.mkdir(parents=True, exist_ok=True)
         except OSError:
             continue
         if os.access(place, os.W_OK):
             return place / f"compiled-{sources_digest()}"
-    return places[-1]
+    own = tempfile.mkdtemp(prefix="vaneloop-")
+    atexit.register(shutil.rmtree, own, ignore_errors=True)
+    return Path(own) / f"compiled-{sources_digest()}"
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
