@@ -6,13 +6,15 @@ import json
 import random
 import subprocess
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hil.logs.mdf
-from hil.logs import LogError, dbc, read_log, write_log
+from hil.logs import Channel, LogError, dbc, read_log, write_log
 from hil.logs import log as logs
 from tests.test_logs import check, run
 from vaneloop.base import tables
@@ -146,6 +148,24 @@ def test_a_damaged_mdf_ends_the_child_and_not_the_reader(tmp_path: Path) -> None
         except LogError as e:
             assert "\n" not in str(e)
     check(read_log(tmp_path / "a.mf4"))
+
+
+def test_a_recording_that_was_not_ended_leaves_no_copy_of_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What its logger never finished is finished in a copy; that goes with the process that reads it."""
+    file, place = tmp_path / "cut_off.mf4", tmp_path / "temporary"
+    place.mkdir()
+    t = np.arange(0.0, 2.0, 0.01)
+    write_log(file, {"n_dem": Channel(t, 60.0 + t)})
+    data = bytearray(file.read_bytes())
+    data[:8], data[60] = b"UnFinMF ", 1  # its counters of samples were never written
+    file.write_bytes(data[:400])
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setenv("TMPDIR", str(place))
+    with pytest.raises(LogError):
+        read_log(file)
+    assert list(place.iterdir()) == []
 
 
 def test_a_child_that_never_answers_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

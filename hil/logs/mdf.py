@@ -17,6 +17,7 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -139,18 +140,22 @@ def _merge(parts: list[Any]) -> Frames | None:
 
 
 def _child(request: bytes, seconds: float) -> bytes:
-    """Answer of a fresh interpreter that runs `serve`; empty where it was ended by a fault or a limit."""
+    """Answer of a fresh interpreter that runs `serve`; empty where it was ended by a fault or a limit.
+
+    Temporary files lie in a folder that goes with it: of a file that was not finalised the library leaves a copy there.
+    """
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from hil.logs.mdf import serve; serve()"
     )
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code], input=request, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            timeout=seconds, env=environment, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return b""
+    with tempfile.TemporaryDirectory(prefix="vaneloop-mdf-") as own:
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "TMPDIR": own}
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", code], input=request, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                timeout=seconds, env=environment, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return b""
     return done.stdout if done.returncode == 0 else b""
 
 
