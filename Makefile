@@ -98,15 +98,22 @@ $(HOME_OF_VENV):
 	@$(make_venv)
 	@echo '$(CURDIR)' >$@
 
-# Whatever is installed, the core is there, too; what is there already stays.
-$(VENV)/.ready-%: pyproject.toml constraints.txt | $(HOME_OF_VENV)
-	@$(call install,$*)
-	@touch $@ $(READY_CORE)
+$(READY_CORE): pyproject.toml constraints.txt | $(HOME_OF_VENV)
+	@$(call install,core)
+	@touch $@
+
+# The core comes first; what is there already stays. What pip leaves of two processors compiles meanwhile.
+$(VENV)/.ready-%: pyproject.toml constraints.txt | $(READY_CORE)
+	@$(PY) -m vaneloop.cli.ahead >/dev/null 2>&1 & ahead=$$!; code=0; \
+	{ $(call install,$*); } || code=$$?; \
+	wait $$ahead || true; \
+	exit $$code
+	@touch $@
 
 # The editable install makes edits count at once. Python compiles a module when it is first imported; pip would compile
 # all of them, for 20 s. A slow or failing package index is asked again.
 define install
-$(SAY) 'installing the pinned packages for $(1) (a minute or two on first use; full log: $(VENV)/pip.log)'; \
+($(SAY) 'installing the pinned packages for $(1) (a minute or two on first use; full log: $(VENV)/pip.log)'; \
 export PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_RETRIES=8 PIP_DEFAULT_TIMEOUT=$${PIP_DEFAULT_TIMEOUT:-60}; \
 for try in 1 2 3; do \
   if $(PY) -m pip install --no-compile -e '.$(if $(filter-out core,$(1)),[$(1)])' 2>&1 | tee $(VENV)/pip.log \
@@ -114,7 +121,7 @@ for try in 1 2 3; do \
   then exit 0; fi; \
   if [ $$try != 3 ]; then $(SAY) 'not installed; trying again'; sleep $$((try * 5)); fi; \
 done; \
-$(SAY) 'the packages could not be installed; the lines above and $(VENV)/pip.log say why'; exit 1
+$(SAY) 'the packages could not be installed; the lines above and $(VENV)/pip.log say why'; exit 1)
 endef
 
 # The first Python from 3.11 on that can make an environment; Debian and Ubuntu keep that part in a package of its own.
