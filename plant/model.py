@@ -46,6 +46,7 @@ from plant.parameters import Nominal, derive
 from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import write
 from vaneloop.base.forms import FORMS, product
 from vaneloop.base.hull import nearest_within, within
 from vaneloop.base.hysteresis import stops_of
@@ -370,10 +371,7 @@ def write_model(path: str | Path, model: Model) -> None:
         for key, axis in ((_key(name), of), (f"{_key(name)}.second", of.pop("second", {}))):
             rows = [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in axis.items()]
             lines += [f"[curves.{key}]", *rows, ""] if rows else []
-    try:
-        Path(path).write_text("\n".join(lines), encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror})") from None
+    write(path, "\n".join(lines))
 
 
 def _key(name: str) -> str:

@@ -81,19 +81,19 @@ def test_of_several_that_make_a_file_the_first_has_it(tmp_path: Path) -> None:
     assert files.create(at, lambda f: f.write_text("second")) is False
     assert at.read_text() == "first" and [p.name for p in at.parent.iterdir()] == ["c.0"]
     with pytest.raises(FileNotFoundError):
-        files.create(at, lambda f: None)  # nothing was written
+        files.create(tmp_path / "c.1", lambda f: f.unlink())  # nothing was written
 
 
 def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
 
     def sync(number: int) -> None:
-        seen.append("sync" if not (tmp_path / "a").exists() else "too late")
+        seen.append("its name" if (tmp_path / "a").exists() else "sync")
 
     monkeypatch.setattr(files.os, "fsync", sync)
     monkeypatch.setattr(files, "passed", seen.append)
     files.whole(tmp_path / "a", lambda f: f.write_text("x"))
-    assert seen == ["sync", "written"]
+    assert seen == ["written", "sync", "its name"]
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

@@ -277,4 +277,4 @@ def test_a_campaign_against_tools_heeds_its_options(
     assert idents == {MASTER}
     nowhere = tmp_path / "no" / "folder.log"
     assert main(["fuzz", "--tool", "xcp", *options, "--out", str(nowhere)]) == 2
-    assert f"--out {nowhere}: cannot be written" in capsys.readouterr().err
+    assert f"cannot write {nowhere}: No such file or directory" in capsys.readouterr().err

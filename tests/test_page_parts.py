@@ -33,7 +33,7 @@ from vaneloop.pages.engine_test import _rise_and_fall
 from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
 from vaneloop.pages.fleet import _digits
-from vaneloop.pages.page import Page, Plot, _finite, _json, _version, write_atomically
+from vaneloop.pages.page import Page, Plot, _finite, _json, _version
 from vaneloop.pages.replay import _error_lines, _ratio, _replay_verdict
 from vaneloop.pages.run import _middle_curve, axis_title, loops, rotor_speed, signal_name, speed_lines
 from vaneloop.pages.series import break_at_holes, decimate, distribution, packed, thin_path
@@ -372,48 +372,9 @@ def test_digits_follow_the_width_of_an_interval() -> None:
 # ---------------------------------------------------------------- the file
 
 
-def test_a_file_is_written_whole_with_the_mode_of_others(tmp_path: Path) -> None:
-    file = tmp_path / "a.html"
-    mask = os.umask(0o027)
-    try:
-        assert write_atomically(str(file), "ä\n\udc80 b\n") == file
-        assert stat.S_IMODE(file.stat().st_mode) == 0o640
-        now = os.umask(0o027)
-        assert now == 0o027
-    finally:
-        os.umask(mask)
-    assert file.read_bytes() == "ä\n\\udc80 b\n".encode()
-    assert [f.name for f in tmp_path.iterdir()] == ["a.html"]
-
-
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    end = r"; the folder must exist and be writable$"
-    with pytest.raises(InputError, match=r"report cannot be written \(it is a folder; a file name is needed\)" + end):
-        write_atomically(tmp_path, "x")
-    with pytest.raises(InputError, match=r"no/a.html: report cannot be written \(No such file or directory\)" + end):
-        write_atomically(tmp_path / "no" / "a.html", "x")
-    with pytest.raises(InputError, match=r"report cannot be written \(embedded null byte\)" + end) as refused:
-        write_atomically(str(tmp_path / "a\0b"), "x")
-    assert refused.value.__cause__ is None and refused.value.__suppress_context__
-    replaced = os.replace
-
-    def gone(source: str, target: str) -> None:
-        if not source.endswith(".part") or "/.a.html." not in source:
-            return replaced(source, target)
-        os.unlink(source)  # as one who cleans up would
-        raise OSError(5, "Input/output error")
-
-    monkeypatch.setattr(os, "replace", gone)
-    with pytest.raises(InputError, match="Input/output error"):
-        write_atomically(tmp_path / "a.html", "x")
-
-    def refuse(*_: Any) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(InputError, match="Permission denied"):
-        write_atomically(tmp_path / "a.html", "x")
-    assert list(tmp_path.iterdir()) == []
+def test_a_page_keeps_what_is_no_text(tmp_path: Path) -> None:
+    assert Page("t", "\udc80").write(str(tmp_path / "a.html")) == tmp_path / "a.html"
+    assert b"\\udc80" in (tmp_path / "a.html").read_bytes()
 
 
 def test_a_page_says_which_version_wrote_it(monkeypatch: pytest.MonkeyPatch) -> None:

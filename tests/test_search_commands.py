@@ -232,9 +232,9 @@ BAD: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("extend", "{log}", "--effect", "aero_load"), ("--out",)),
     (
         ("extend", "{log}", "--effect", "aero_load", "--out", "no_such_folder/m.toml"),
-        ("no_such_folder/m.toml", "cannot be written"),
+        ("no_such_folder/m.toml", "cannot write"),
     ),
-    (("extend", "{log}", "--effect", "aero_load", "--out", "a_folder"), ("a_folder", "cannot be written")),
+    (("extend", "{log}", "--effect", "aero_load", "--out", "a_folder"), ("a_folder", "cannot write")),
     (("extend", "vanes_only.csv", "--effect", "aero_load", "--out", "m.toml"), ("vanes_only.csv",)),
     *(((c, "no_such.csv"), ("no_such.csv",)) for c in (*SEARCH, "compare")),
     *(((c, "vanes_only.csv"), ("vanes_only.csv", "no stage can be judged")) for c in SEARCH),
@@ -245,7 +245,7 @@ BAD: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("diagnose", "{log}", "--workers", "two"), ("--workers",)),
     (("diagnose", "{log}", "--model", "wrong.toml"), ("wrong.toml", "valve_dead_bnad")),
     (("locate", "{log}", "--model", "no_such.toml"), ("no_such.toml",)),
-    (("locate", "{log}", "--json", "no_such_folder/out.json"), ("no_such_folder/out.json", "cannot be written")),
+    (("locate", "{log}", "--json", "no_such_folder/out.json"), ("no_such_folder/out.json", "cannot write")),
 ]
 
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from controller import STRATEGIES, Calibration
 from controller.calibration import SI, AngleTable, CalibrationTable, StrokeTable
 from controller.records import SCALAR_FIELDS, SCALARS
+from vaneloop.base.files import write_all
 from vaneloop.base.tables import Bound
 from vaneloop.base.vanes import vane_in
 
@@ -219,17 +220,14 @@ def write_tables(folder: Path, elements: tuple[Element, ...], row: np.ndarray) -
     """Write a calibration as tables that ``--tables`` takes; return the files. They are read back as the same bits."""
     folder.mkdir(parents=True, exist_ok=True)
     names = (*MODELS, *(["own_calibration"] if any(e.table == "own_calibration" for e in elements) else []))
-    out = []
+    out = {}
     for name, content in documents(elements, row, names).items():
         lines = [f"{key} = {_toml(v)}" for key, v in content.items() if not _is_section(v)]
         for section, of in content.items():
             if _is_section(of):
                 lines += ["", f"[{section}]", *(f"{key} = {_toml(v)}" for key, v in of.items())]
-        file, beside = folder / f"{name}.toml", folder / f".{name}.toml.new"
-        beside.write_text("\n".join(lines).lstrip() + "\n", encoding="utf-8")
-        beside.replace(file)
-        out.append(file)
-    return out
+        out[folder / f"{name}.toml"] = "\n".join(lines).lstrip() + "\n"
+    return write_all(out)
 
 
 def _is_section(value: Any) -> bool:

@@ -24,6 +24,7 @@ from hil.calibrate import elements
 from hil.calibrate.elements import Element
 from hil.calibrate.errors import BUSY, DENIED, VERIFY, Refusal
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import cannot_write
 
 __all__ = ["WORK", "AtOnce", "Desk", "Outside", "Task"]
 
@@ -54,7 +55,9 @@ def save(of: Elements, row: np.ndarray, folder: Path) -> tuple[int, str]:
     try:
         elements.write_tables(folder, of, row)
     except OSError as e:
-        return DENIED, f"{folder}: {e.strerror}"
+        return DENIED, cannot_write(folder, e)
+    except InputError as e:
+        return DENIED, str(e)
     return 0, ""
 
 

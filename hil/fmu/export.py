@@ -19,6 +19,7 @@ from hil.fmu.source import SHELL, build, kept_source, model_source, part_object,
 from hil.fmu.variables import PARTS, Variable, variables_of
 from plant import Model, Plant
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 
 __all__ = ["VERSIONS", "Written", "is_made", "write_fmu"]
 
@@ -84,16 +85,13 @@ def write_fmu(
     described = model_description(version, f"VaneLoop {part}", identifier, token, variables, release_of("vaneloop"))
     binary = _built(files, SOURCES[version], part_object(part, shape))
     where = f"{platform.machine()}-linux" if version == "3.0" else "linux64"
-    try:
-        with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-            _put(archive, "modelDescription.xml", described)
-            _put(archive, f"binaries/{where}/{identifier}.so", binary)
-            for name, text in files.items():
-                _put(archive, f"sources/{name}", text.encode())
-            if version == "3.0":
-                _put(archive, "sources/buildDescription.xml", build_description(identifier))
-    except OSError as e:
-        raise InputError(f"{out}: cannot be written ({e.strerror})") from None
+    with whole(out) as made, zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+        _put(archive, "modelDescription.xml", described)
+        _put(archive, f"binaries/{where}/{identifier}.so", binary)
+        for name, text in files.items():
+            _put(archive, f"sources/{name}", text.encode())
+        if version == "3.0":
+            _put(archive, "sources/buildDescription.xml", build_description(identifier))
     return Written(str(out), version, part, token, variables)
 
 

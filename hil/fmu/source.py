@@ -12,7 +12,6 @@ import gc
 import hashlib
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -29,6 +28,7 @@ from hil.fmu.memory import Shape, places_of
 from hil.fmu.variables import Variable
 from hil.loop.lockstep import WARM_UP
 from vaneloop.base.compiled import cache_folder
+from vaneloop.base.files import write
 
 __all__ = ["SHELL", "build", "kept_source", "model_source", "part_object", "part_source"]
 
@@ -86,9 +86,7 @@ def _make_source(kept: Path, part: str, shape: Shape) -> None:
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"the source of the FMU could not be made: {done.stderr[-2000:]}")
-    writing = kept.with_suffix(f".{os.getpid()}")
-    writing.write_text(done.stdout, encoding="ascii")
-    writing.replace(kept)
+    write(kept, done.stdout)
 
 
 def part_object(part: str, shape: Shape) -> Path:
@@ -100,9 +98,7 @@ def part_object(part: str, shape: Shape) -> Path:
             (Path(folder) / "part.c").write_text(text, encoding="ascii")
             build(["-c", "part.c"], "part.o", Path(folder))
             kept.parent.mkdir(parents=True, exist_ok=True)
-            writing = kept.with_suffix(f".{os.getpid()}")
-            shutil.copyfile(Path(folder) / "part.o", writing)
-            writing.replace(kept)
+            write(kept, (Path(folder) / "part.o").read_bytes())
     return kept
 
 

@@ -48,6 +48,7 @@ from hil.loop.node import MOST_SENT, Node, NodeArrays, node_tick
 from hil.native.program import restore, save
 from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 
 if TYPE_CHECKING:
     from controller import Calibration
@@ -458,10 +459,10 @@ def write_attack(path: str | Path, attack: Attack) -> None:
 
 
 def write_frames(path: str | Path, frames: Iterable[tuple[int, Sequence[int]]]) -> None:
-    """Write frames (tick, its two words) as a candump log, one ms a tick. Raises OSError."""
+    """Write frames (tick, its two words) as a candump log, one ms a tick. Raises InputError."""
     import can
 
-    with can.CanutilsLogWriter(path) as log:
+    with whole(path) as part, can.CanutilsLogWriter(part) as log:
         count: dict[int, int] = {}
         for tick, (head, data) in frames:
             order = count[tick] = count.get(tick, -1) + 1

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs.frames import EXTENDED, Frames
-from hil.logs.source import read_bytes
+from hil.logs.source import LogError, read_bytes
 from hil.logs.text_lines import Part, join_parts, match_lines
+from vaneloop.base.files import whole
 
 __all__ = ["read_candump", "write_candump"]
 
@@ -74,4 +75,5 @@ def write_candump(path: Path, frames: Frames) -> None:
         f"{i & 0x1FFFFFFF:0{8 if i >> 31 else 3}X}#{text[k * w : k * w + 2 * n]}\n"
         for k, (us, i, n) in enumerate(zip(micros, frames.ident.tolist(), frames.length.tolist(), strict=True))
     ]
-    path.write_text("".join(lines), encoding="ascii")
+    with whole(path, LogError) as part:
+        part.write_text("".join(lines), encoding="ascii")

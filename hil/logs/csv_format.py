@@ -14,6 +14,7 @@ from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers,
 from hil.logs.table import Table, arrow_table, split_unit, time_column
 from hil.logs.times import from_dates
 from hil.logs.units import NO_UNIT, factor_of
+from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
 __all__ = ["open_csv", "write_csv"]
@@ -215,6 +216,6 @@ def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> Non
     from pyarrow import csv as arrow
 
     table = arrow_table(channels)
-    with path.open("wb") as file:
+    with whole(path, LogError) as part, part.open("wb") as file:
         file.write(",".join(table.column_names).encode() + b"\n")  # Arrow would put quotes around every name
         arrow.write_csv(table, file, arrow.WriteOptions(include_header=False, quoting_style="none"))

@@ -15,6 +15,7 @@ import numpy as np
 
 from hil.logs import plausible
 from hil.logs.source import LogError
+from vaneloop.base.files import whole
 
 __all__ = ["DISORDER_S", "EXTENDED", "Frames", "frames_in_order", "in_order", "write_through_can"]
 
@@ -94,7 +95,7 @@ def write_through_can(path: Path, frames: Frames, writer: str) -> None:
     """Write frames with the ``writer`` of python-can that has this name."""
     import can
 
-    with getattr(can, writer)(str(path)) as out:
+    with whole(path, LogError) as part, getattr(can, writer)(str(part)) as out:
         for t, i, n, data in zip(
             frames.t.tolist(), frames.ident.tolist(), frames.length.tolist(), frames.data, strict=True
         ):

@@ -362,7 +362,4 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise LogError(f"{path}: {name}: samples must be finite and their times increasing")
         checked[name] = Channel(t, values)
-    try:
-        write(path, checked, Path(dbc) if dbc is not None else None)
-    except OSError as e:
-        raise LogError(f"{path}: cannot be written ({e.strerror or e})") from None
+    write(path, checked, Path(dbc) if dbc is not None else None)

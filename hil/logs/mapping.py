@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hil.logs.source import LogError, close_names
+from vaneloop.base.files import write
 from vaneloop.base.signals import UNITS
 from vaneloop.base.tables import load_toml
 
@@ -74,10 +75,7 @@ def write_mapping(path: str | Path, bench: Bench, remarks: Mapping[str, str] | N
             said = " ".join(remarks.get(signal, "").split()) if section == "names" else ""
             remark = f"  # {said}" if said else ""
             lines.append(f"{signal} = {_word(value)}{remark}")
-    try:
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as e:
-        raise LogError(f"{path}: cannot be written ({e.strerror or e})") from None
+    write(path, "\n".join(lines) + "\n")
 
 
 def _word(text: str) -> str:

@@ -28,6 +28,7 @@ from hil.logs.frames import EXTENDED, Frames, in_order
 from hil.logs.names import meaning
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
 from vaneloop.base.extras import needs
+from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
 __all__ = ["Groups", "open_mdf", "read_mdf", "write_bus", "write_groups", "write_mdf"]
@@ -298,12 +299,13 @@ def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.n
     """Write channel groups: for each the times and name -> (values, unit)."""
     import asammdf
 
-    with asammdf.MDF(version="4.10") as mdf:
+    with whole(path, LogError) as part, asammdf.MDF(version="4.10") as mdf:
         for t, channels in groups:
             mdf.append(
                 [asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop"
             )
-        mdf.save(path, overwrite=True, compression=2)
+        with open(part, "wb+") as file:  # given the name, asammdf would put a suffix of its own behind it
+            mdf.save(file, compression=2)
 
 
 def write_bus(path: Path, frames: Frames) -> None:
@@ -325,8 +327,9 @@ def write_bus(path: Path, frames: Frames) -> None:
     for k, c in columns.items():
         samples[f"{_BUS}.{k}"] = c
     source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
-    with asammdf.MDF(version="4.10") as mdf:
+    with whole(path, LogError) as part, asammdf.MDF(version="4.10") as mdf:
         mdf.append(
             asammdf.Signal(samples, frames.t, name=_BUS, source=source), comment="VaneLoop", common_timebase=True
         )
-        mdf.save(path, overwrite=True, compression=2)
+        with open(part, "wb+") as file:  # given the name, asammdf would put a suffix of its own behind it
+            mdf.save(file, compression=2)

@@ -9,6 +9,7 @@ import numpy as np
 from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers
 from hil.logs.table import Table, arrow_table, time_column
 from hil.logs.times import from_dates
+from vaneloop.base.files import whole
 
 __all__ = ["FRAME_COLUMNS", "open_parquet", "write_parquet"]
 
@@ -92,4 +93,6 @@ def write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) ->
     """Write a Parquet file: t, then a column a channel on all times of all; null where a channel has no sample."""
     import pyarrow.parquet as pq
 
-    pq.write_table(arrow_table(channels), path, compression="zstd")
+    table = arrow_table(channels)
+    with whole(path, LogError) as part:
+        pq.write_table(table, part, compression="zstd")

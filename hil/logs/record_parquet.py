@@ -7,6 +7,7 @@ obsolete.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 from pathlib import Path
@@ -20,6 +21,8 @@ from hil.logs.parquet_format import FRAME_COLUMNS
 from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, REMOTE, append_whole
 from hil.logs.signals import cut_signal, select
 from hil.logs.source import LogError
+from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 from vaneloop.base.tables import path as table_path
 
 __all__ = ["ParquetRecord", "read_parquet"]
@@ -142,15 +145,13 @@ class ParquetRecord:
         import pyarrow.parquet as pq
 
         os.close(self.fd)
-        new = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        try:
-            file = pq.ParquetFile(self.path)
-            with pq.ParquetWriter(new, self.schema, compression="zstd") as writer:
-                for batch in file.iter_batches(200_000):
-                    writer.write_batch(batch)
-            os.replace(new, self.path)
-        except OSError:  # no room for a second copy: the grown file is whole
-            new.unlink(missing_ok=True)
+        with (
+            contextlib.suppress(InputError),  # no room for a second copy: the grown file is whole
+            whole(self.path) as new,
+            pq.ParquetWriter(new, self.schema, compression="zstd") as writer,
+        ):
+            for batch in pq.ParquetFile(self.path).iter_batches(200_000):
+                writer.write_batch(batch)
 
 
 def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

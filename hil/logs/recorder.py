@@ -28,6 +28,7 @@ from hil.logs.record_parquet import ParquetRecord, read_parquet
 from hil.logs.source import LogError, check_file
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
+from vaneloop.base.files import cannot_write
 
 __all__ = [
     "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message",
@@ -53,11 +54,18 @@ class Recorder:
 
     def __init__(self, path: str | Path, channel: str = "vcan0"):
         self.path = check_name(path)
-        self.kept = _keep_old(self.path)
+        empty, self.kept = self.path.is_file(), _keep_old(self.path)
         try:
             self.file = SUFFIXES[self.path.suffix.lower()](self.path, channel)
         except OSError as e:
-            raise InputError(f"{self.path}: cannot be written ({e.strerror or e})") from None
+            with contextlib.suppress(OSError):  # what was begun goes, and the earlier recording has its name again
+                if self.kept:
+                    self.kept.replace(self.path)
+                elif empty:
+                    os.truncate(self.path, 0)
+                elif self.path.is_file():
+                    self.path.unlink()
+            raise InputError(cannot_write(self.path, e)) from None
         self.frames = 0  # in the file
         self._waiting: list[bytes] = []
         self._next = time.monotonic() + FLUSH
@@ -83,9 +91,7 @@ class Recorder:
             try:
                 self.file.append(frames)
             except OSError as e:
-                raise InputError(
-                    f"{self.path}: cannot be written ({e.strerror or e}); it ends after {self.frames:,} frames"
-                ) from None
+                raise InputError(f"{cannot_write(self.path, e)}; it ends after {self.frames:,} frames") from None
             self.frames += len(frames)
 
     def close(self) -> None:
@@ -107,7 +113,7 @@ def check_name(path: str | Path) -> Path:
     if path.is_dir() or not path.parent.is_dir():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written (permission denied)")
+        raise InputError(f"cannot write {path}: Permission denied")
     return path
 
 

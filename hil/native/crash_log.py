@@ -16,6 +16,7 @@ from hil.native.call import firmware
 from hil.native.program import Program
 from vaneloop.base.compiled import compiled_free
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 
 if TYPE_CHECKING:
     from hil.native.black_box import Box
@@ -36,9 +37,10 @@ def write(path: str, box: Box, line: str) -> str:
     columns = [pa.array(box.inputs[:, i]) for i in range(len(INPUTS))]
     table = pa.table(columns, names=list(INPUTS)).replace_schema_metadata({_KEY: json.dumps(about)})
     try:
-        parquet.write_table(table, path, compression="zstd")
-    except OSError as e:
-        return f"no crash log: {path} cannot be written ({e.strerror or e})"
+        with whole(path) as part:
+            parquet.write_table(table, part, compression="zstd")
+    except InputError as e:
+        return f"no crash log: {e}"
     return f"crash log: {path}"
 
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from vaneloop.base.errors import InputError, meant
+from vaneloop.base.files import write
 
 __all__ = [
     "DEFECT",
@@ -132,12 +133,7 @@ def write_json(args: argparse.Namespace, data: dict[str, Any]) -> None:
     if args.json == "-":
         print(text, flush=True)
         return
-    from pathlib import Path
-
-    try:
-        Path(args.json).write_text(text + "\n", encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{args.json}: cannot be written ({e.strerror})") from None
+    write(args.json, text + "\n")
 
 
 def plain(v: Any) -> Any:

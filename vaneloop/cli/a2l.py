@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from vaneloop.base import terminal
-from vaneloop.base.errors import InputError
+from vaneloop.base.files import write
 from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -40,10 +39,7 @@ def command(args: argparse.Namespace) -> int:
     machine = options.machine_of(args)
     memory = Memory(Node(machine.plant, machine.calibration))
     text = a2l_of(memory, master=MASTER, slave=SLAVE)
-    try:
-        Path(args.out).write_text(text, encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
+    write(args.out, text)
     values = sum(not e.fixed for e in memory.elements)
     terminal.say(
         args,

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vaneloop.base import terminal
+from vaneloop.base.files import write
 from vaneloop.base.kept import AHEAD, sources_digest
 
 __all__ = ["JOBS", "main"]
@@ -114,7 +115,7 @@ def main(words: list[str]) -> int:
                 if process.returncode:
                     print(f"[vaneloop] {job}: not compiled ahead: {said.strip()[-300:]}")
                     return 1
-    done.write_text(what, encoding="utf-8")
+    write(done, what)
     print(f"[vaneloop] compiled in {time.perf_counter() - started:.0f} s")
     return 0
 

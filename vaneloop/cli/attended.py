@@ -10,7 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
+from vaneloop.base.files import cannot_write, check, write
 from vaneloop.cli import station
 
 __all__ = ["accepted", "add_service_options", "attend", "check_service_options", "wanted"]
@@ -124,11 +126,9 @@ class _Keeper:
         self._wake = threading.Event()
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.touch()
         except OSError as e:
-            from vaneloop.base.errors import InputError
-
-            raise InputError(f"--uds-memory {file}: cannot be written ({e.strerror})") from None
+            raise InputError(cannot_write(f"--uds-memory {file}", e)) from None
+        check(file)
         self._thread = threading.Thread(target=self._write, daemon=True)
         self._thread.start()
         atexit.register(self._now)
@@ -145,7 +145,5 @@ class _Keeper:
             time.sleep(0.1)
 
     def _now(self) -> None:
-        beside = self._file.with_name(f".{self._file.name}.new")
-        with contextlib.suppress(OSError):
-            beside.write_text(self._text, encoding="utf-8")
-            beside.replace(self._file)
+        with contextlib.suppress(InputError):
+            write(self._file, self._text)

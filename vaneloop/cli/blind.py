@@ -13,6 +13,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 
 __all__ = [
     "INSIDE", "KINDS", "add_kinds", "as_curve", "from_checkout", "print_shares", "read_rows", "run", "share",
@@ -78,7 +79,8 @@ def write_rows(path: Path, rows: list[Row]) -> None:
     import pyarrow.parquet as pq
 
     names = dict.fromkeys(name for row in rows for name in row)
-    pq.write_table(pa.table({n: [row.get(n) for row in rows] for n in names}), path)
+    with whole(path) as part:
+        pq.write_table(pa.table({n: [row.get(n) for row in rows] for n in names}), part)
 
 
 def read_rows(path: Path, what: str) -> list[Row]:

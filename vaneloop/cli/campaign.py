@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
+from vaneloop.base.files import write
 
 if TYPE_CHECKING:
     from vaneloop.pages.campaign import CampaignView
@@ -140,7 +140,4 @@ def _write_junit(file: str, view: CampaignView) -> None:
             if why:
                 Xml.SubElement(case, "failure", message=why)
     Xml.indent(root)
-    try:
-        Path(file).write_bytes(Xml.tostring(root, encoding="utf-8", xml_declaration=True))
-    except OSError as e:
-        raise InputError(f"{file}: cannot be written ({e.strerror})") from None
+    write(file, Xml.tostring(root, encoding="utf-8", xml_declaration=True))

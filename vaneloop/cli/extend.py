@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import check
 from vaneloop.cli import options, own_model
 from vaneloop.cli.options import chain_of
 
@@ -52,11 +52,7 @@ def command(args: argparse.Namespace) -> int:
     wanted = list(dict.fromkeys(e for group in args.effect for e in group))
     if not wanted:
         raise InputError("extend needs at least one --effect NAME; vaneloop diagnose names candidates")
-    out = Path(args.out)
-    if out.is_dir() or not out.parent.is_dir():  # before the fit, which takes a while
-        raise InputError(
-            f"{args.out}: cannot be written ({'it is a folder' if out.is_dir() else f'no folder {out.parent}'})"
-        )
+    check(args.out)
     if own_model.asked(args):
         answer = own_model.ask(args, "extend", effects=wanted)
     else:

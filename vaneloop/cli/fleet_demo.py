@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vaneloop.base.files import whole, write
 from vaneloop.cli.blind import from_checkout
 
 __all__ = ["fate", "make"]
@@ -68,6 +69,8 @@ def size_at(truth: dict[str, Any], years: float) -> float:
 def _one(folder: str, seed: int, engines: int, each: int, duration: float, number: int) -> None:
     """Simulate one log of one engine, and write it where its engine and date are said by the path."""
     import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
     rig, on_rig, parameters = _rig()
     engine, k = divmod(number, each)
@@ -91,9 +94,8 @@ def _one(folder: str, seed: int, engines: int, each: int, duration: float, numbe
         geometry=geometry,
     )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.stem}.part.parquet")
-    rig.write(run, part)
-    part.replace(path)
+    with whole(path) as part:
+        pq.write_table(pa.table(run.log), part)
 
 
 def make(
@@ -106,7 +108,7 @@ def make(
     each = -(-logs // engines)
     folder.mkdir(parents=True, exist_ok=True)
     truth = {"seed": seed, "begin": BEGIN.isoformat(), "engines": [fate(seed, e, engines) for e in range(engines)]}
-    (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
+    write(folder / "truth.json", json.dumps(truth, indent=2) + "\n")
     one = partial(_one, str(folder), seed, engines, each, duration)
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         jobs = [pool.submit(one, n) for n in range(engines * each)]

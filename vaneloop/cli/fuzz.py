@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -139,18 +137,8 @@ def command(args: argparse.Namespace) -> int:
             args,
             f"FAILED: {campaign.failure.claim}, in episode {campaign.failure.episode}; {n} frames show it: {args.out}",
         )
-        with _written(args):
-            write_attack(args.out, campaign.failure.attack)
+        write_attack(args.out, campaign.failure.attack)
     return 0 if campaign.failure is None else 1
-
-
-@contextlib.contextmanager
-def _written(args: argparse.Namespace) -> Iterator[None]:
-    """Say in one line that the log cannot be written."""
-    try:
-        yield
-    except OSError as e:
-        raise InputError(f"--out {args.out}: cannot be written ({e.strerror})") from None
 
 
 def _tool(args: argparse.Namespace) -> int:
@@ -172,8 +160,7 @@ def _tool(args: argparse.Namespace) -> int:
     terminal.say(args, f"the process has grown by {c.grown:.1f} MB since its first episodes")
     terminal.say(args, f"FAILED: {c.failure}" if c.failure else "held: limits, monitors, memory, recovery to RUN")
     if c.failure:
-        with _written(args):
-            write_frames(args.out, c.sent)
+        write_frames(args.out, c.sent)
         terminal.say(args, f"the {len(c.sent)} frames of the episode: {args.out}; --seed {args.seed} repeats it")
     terminal.write_json(
         args, {"schema": 1, "tool": c.protocol, "seed": c.seed, "frames": c.frames, "episodes": c.episodes,

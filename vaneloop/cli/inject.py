@@ -11,6 +11,7 @@ from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import write
 from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -207,7 +208,4 @@ def _write_junit(file: str, outcomes: list[Outcome], skipped: list[tuple[str, st
     root = Xml.Element("testsuites")
     root.append(suite)
     Xml.indent(root)
-    try:
-        Xml.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
-    except OSError as e:
-        raise InputError(f"{file}: cannot be written ({e.strerror})") from None
+    write(file, Xml.tostring(root, encoding="utf-8", xml_declaration=True))

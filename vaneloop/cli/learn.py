@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
-from vaneloop.base.errors import InputError
+from vaneloop.base.files import check
 from vaneloop.base.signals import heading
 from vaneloop.cli import options, own_model
 
@@ -62,8 +61,7 @@ def command(args: argparse.Namespace) -> int:
     from vaneloop.verbs.search import not_given
 
     for path in filter(None, (args.out, args.python)):
-        if Path(path).is_dir() or not Path(path).parent.is_dir():
-            raise InputError(f"{path}: cannot be written")
+        check(path)
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     checked_shape(args.shape)
     own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import shutil
+import contextlib
 from importlib import resources
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from controller.header import FOLDER
 from hil.inject.any_controller import SHIPPED
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import cannot_write, write_all
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -36,13 +37,23 @@ def command(args: argparse.Namespace) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is there already; a new or an empty folder is needed")
     template = Path(str(resources.files("vaneloop") / "templates" / "own_controller"))
+    sources = [f for f in template.rglob("*") if f.is_file() and f.suffix != ".pyc"]
+    contents = {folder / f.relative_to(template): f.read_bytes() for f in sources}
+    contents[folder / "vaneloop_controller.h"] = (FOLDER / "vaneloop_controller.h").read_bytes()
+    contents[folder / "reactions.toml"] = SHIPPED.read_bytes()
+    new = [] if folder.is_dir() else [folder]
+    new += sorted({f.parent for f in contents} - {folder})
     try:
-        shutil.copytree(template, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__", "*.pyc"))
-        shutil.copy(FOLDER / "vaneloop_controller.h", folder)
-        shutil.copy(SHIPPED, folder / "reactions.toml")
-    except OSError as e:
-        raise InputError(f"{folder}: cannot be written ({e.strerror})") from None
-    files = sorted(f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file())
+        folder.mkdir(parents=True, exist_ok=True)
+        for inner in new:
+            inner.mkdir(exist_ok=True)
+        write_all(contents)
+    except (OSError, InputError) as e:
+        for inner in reversed(new):  # the next try needs a new or an empty folder
+            with contextlib.suppress(OSError):
+                inner.rmdir()
+        raise e if isinstance(e, InputError) else InputError(cannot_write(folder, e)) from None
+    files = sorted(f.relative_to(folder).as_posix() for f in contents)
     terminal.say(args, f"{folder}: {', '.join(files)}")
     terminal.say(args, f"next: cd {folder} && make && make run && make test")
     terminal.write_json(args, {"schema": 1, "folder": str(folder), "files": files})

@@ -88,7 +88,6 @@ def replayed(
     from pathlib import Path
 
     from hil.logs import Channel, write_log
-    from vaneloop.base.errors import InputError
 
     limits = _limits(args.tolerance)
     options.tables_of(args, tell=True)
@@ -126,10 +125,7 @@ def replayed(
         terminal.say(args, f"page: {answer.report(args.report, words)}")
     if args.out:
         channels = {k: Channel(result.t, v) for k, v in result.model.items()}
-        try:
-            write_log(args.out, channels)
-        except OSError as e:
-            raise InputError(f"{args.out}: cannot be written ({e.strerror})") from None
+        write_log(args.out, channels)
         terminal.say(args, f"simulated run: {args.out}")
     return 1 if exceeded else 0
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from plant import Geometry, Schedules
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import write, write_all
 from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.stroke_tables import vane_angle_table
 
@@ -45,23 +46,29 @@ LOOP_FIGURES = (
 
 def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
     """Write stroke_tables, vane_angles, geometry, schedules (.toml) into ``folder``, made where missing; each number
-    with its origin.
+    with its origin. They belong together: all of them are written, or none.
     """
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{folder}: cannot be made ({e.strerror})") from None
-    out = [folder / f"{name}.toml" for name in ("stroke_tables", "geometry", "schedules", "vane_angles")]
-    write_stroke_tables(result.table, out[0], result.origin)
-    write_geometry(result.geometry, out[1], "Linkage of the vane stages, as measured and adjusted: vaneloop schedule.")
-    write_schedules(result.schedules, out[2])
-    write_vane_angles(vane_angle_table(result.geometry), result.geometry, out[3], result.origin)
-    return out
+    linkage = "Linkage of the vane stages, as measured and adjusted: vaneloop schedule."
+    texts = {
+        "stroke_tables": _stroke_tables(result.table, result.origin),
+        "geometry": _geometry(result.geometry, linkage),
+        "schedules": _schedules(result.schedules),
+        "vane_angles": _vane_angles(vane_angle_table(result.geometry), result.geometry, result.origin),
+    }
+    return write_all({folder / f"{name}.toml": text for name, text in texts.items()})
 
 
 def write_stroke_tables(table: Array, path: str | Path, origin: str) -> None:
     """Write ``stroke_tables.toml`` as the controller loads it; ``table`` as from `stroke_tables`."""
+    write(path, _stroke_tables(table, origin))
+
+
+def _stroke_tables(table: Array, origin: str) -> str:
     lines = [
         "# Stroke against rotor speed for the VIGV schedule: one curve per direction of the demand, and their mean.",
         "",
@@ -70,13 +77,17 @@ def write_stroke_tables(table: Array, path: str | Path, origin: str) -> None:
         ("speed", "extension", "retraction", "single"), ("%", "mm", "mm", "mm"), table, strict=True
     ):
         lines += _axis(name, unit, origin, row)
-    _write(path, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin: str) -> None:
     """Write ``vane_angles.toml`` as the controller loads it: ``table`` as from `vane_angle_table`, the plays of
     ``geometry``.
     """
+    write(path, _vane_angles(table, geometry, origin))
+
+
+def _vane_angles(table: Array, geometry: Geometry, origin: str) -> str:
     lines = [
         "# Vane angles against stroke in the middle of the play, and the play: what the strategies inverse and "
         "adaptive know.",
@@ -88,11 +99,15 @@ def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin
     lines.append("")
     for name, unit, row in zip(("stroke", *geometry.vanes), ("mm", *["deg"] * len(geometry.vanes)), table, strict=True):
         lines += _axis(name, unit, origin, row)
-    _write(path, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the vane stages.") -> None:
     """Write a geometry as `plant.load_geometry` reads it, each number with its origin."""
+    write(path, _geometry(geometry, words))
+
+
+def _geometry(geometry: Geometry, words: str) -> str:
     lines = [f"# {words}", ""]
     for name in ("crank", *geometry.vanes):
         lines.append(f"[{name}]")
@@ -102,11 +117,15 @@ def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage o
                 f'{key} = {{ value = {q.value!r}, unit = "{q.unit}"{tolerance}, origin = {_quoted(q.origin)} }}'
             )
         lines.append("")
-    _write(path, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def write_schedules(schedules: Schedules, path: str | Path) -> None:
     """Write schedules as `plant.load_schedules` reads them."""
+    write(path, _schedules(schedules))
+
+
+def _schedules(schedules: Schedules) -> str:
     lines = ["# Target vane angles over rotor speed.", ""]
     for name in ("speed", *schedules.vanes):
         axis = getattr(schedules, name)
@@ -117,7 +136,7 @@ def write_schedules(schedules: Schedules, path: str | Path) -> None:
             f"values = {axis.values!r}",
             "",
         ]
-    _write(path, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def result_json(result: ScheduleResult) -> dict[str, Any]:
@@ -165,10 +184,3 @@ def _quoted(text: str) -> str:
     import json
 
     return json.dumps(text, ensure_ascii=False)
-
-
-def _write(path: str | Path, text: str) -> None:
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror})") from None

@@ -6,12 +6,12 @@ import hashlib
 import json
 import os
 import signal
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import replacing
 
 __all__ = ["create", "digest_of", "passed", "read_json", "whole", "whole_json"]
 
@@ -31,39 +31,24 @@ def passed(point: str) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _temporary(path: Path, write: Callable[[Path], object]) -> Path:
-    """Write a file beside ``path`` to the disk, and return its name; nothing is left of it where that fails."""
+def whole(path: Path, write: Callable[[Path], object], only_new: bool = False) -> None:
+    """Have ``write`` fill a temporary file, which then takes the place of ``path`` (`vaneloop.base.files`)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{uuid.uuid4().hex[:12]}.part"
-    try:
+    with replacing(path, only_new) as temporary:
         _seen[FULL] = _seen.get(FULL, 0) + 1
         if _seen[FULL] >= int(os.environ.get(FULL, "0") or 0) > 0:
             raise OSError(28, "No space left on device")
         write(temporary)
-        with open(temporary, "rb") as f:
-            os.fsync(f.fileno())
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    passed("written")
-    return temporary
-
-
-def whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Have ``write`` fill a temporary file, which then takes the place of ``path``."""
-    os.replace(_temporary(path, write), path)
+        passed("written")
 
 
 def create(path: Path, write: Callable[[Path], object]) -> bool:
     """As `whole`, but only where there is no such file; return whether this process made it, of several that try."""
-    temporary = _temporary(path, write)
     try:
-        os.link(temporary, path)  # one step also on NFS, where an exclusive open was not always
-        return True
+        whole(path, write, only_new=True)
     except FileExistsError:
         return False
-    finally:
-        temporary.unlink(missing_ok=True)
+    return True
 
 
 def whole_json(path: Path, data: Any) -> None:

@@ -18,19 +18,17 @@ from __future__ import annotations
 import html
 import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vaneloop.base.errors import InputError
+from vaneloop.base.files import write
 from vaneloop.pages.figures import Figure
 from vaneloop.pages.style import THEMES, Tone, capital, number
 
-__all__ = ["Link", "Page", "Plot", "Section", "Tile", "write_atomically"]
+__all__ = ["Link", "Page", "Plot", "Section", "Tile"]
 
 _POLICY = (  # no network at all, whatever a page may hold
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
@@ -185,7 +183,7 @@ class Page:
 
     def write(self, path: str | Path) -> Path:
         """Write the page in one go: a reader never sees half of it. Raises InputError when it cannot be written."""
-        return write_atomically(path, self.html())
+        return write(path, self.html().encode(errors="backslashreplace"))
 
     def _body(self) -> list[str]:
         """The parts as HTML; half plots that follow each other stand in one grid."""
@@ -217,32 +215,6 @@ def _tile(t: Tile) -> str:
         f'class="value">{e(t.value)} <span class="unit">{e(t.unit)}</span></div><div '
         f'class="note">{e(t.note)}</div></div>'
     )
-
-
-def write_atomically(path: str | Path, text: str) -> Path:
-    """Write UTF-8 text into a temporary file beside ``path`` and rename it. Raises InputError when it cannot be
-    written.
-    """
-    file = Path(path)
-    temporary = ""
-    try:
-        if file.is_dir():
-            raise IsADirectoryError(21, "it is a folder; a file name is needed")
-        handle, temporary = tempfile.mkstemp(prefix="." + file.name + ".", suffix=".part", dir=file.parent)
-        with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace", newline="\n") as f:
-            f.write(text)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes it private
-        os.replace(temporary, file)
-    except (OSError, ValueError) as error:
-        if temporary and os.path.exists(temporary):
-            os.unlink(temporary)
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            f"{file}: report cannot be written ({reason}); the folder must exist and be writable"
-        ) from None
-    return file
 
 
 def _version() -> str:

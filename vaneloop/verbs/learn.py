@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import write
 from vaneloop.discrepancy import StageError, System
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
@@ -120,8 +121,7 @@ class Learned(Answer):
 
         law = self.laws[0]
         text = python_surface(law) if isinstance(law, LearnedSurface) else python_law(law, system)
-        Path(path).write_text(text, encoding="utf-8")
-        return Path(path)
+        return write(path, text)
 
 
 def law_json(law: LearnedLaw) -> dict[str, Any]:
