@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-import os
-import stat
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
@@ -22,7 +20,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hil.figures import SignalError
 from tests.conftest import examples
 from tests.page_outline import unpacked
-from vaneloop.base.errors import InputError
 from vaneloop.discrepancy.locate import Located, Regime, StageFigures
 from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
 from vaneloop.discrepancy.workflow import Diagnosis
