@@ -53,7 +53,7 @@ def write_all(contents: Mapping[str | Path, str | bytes] | Mapping[Path, str | b
             with open(part, "ab") as f:  # it is empty; the output of this process goes on where it is
                 f.write(content.encode() if isinstance(content, str) else content)
                 f.flush()
-                if f.seekable():
+                if stat.S_ISREG(os.fstat(f.fileno()).st_mode):
                     os.fsync(f.fileno())
     return [Path(path) for path in contents]
 
@@ -80,7 +80,7 @@ def replacing(path: str | Path, only_new: bool = False) -> Iterator[Path]:
             target.finish()
             (os.link if only_new else os.replace)(target.part, target.name)  # a link also on NFS is made by one alone
             with contextlib.suppress(OSError):  # the new name is on the disk; some file systems cannot promise it
-                _sync(os.path.dirname(target.name))
+                _sync(os.path.dirname(target.name) or ".")
     finally:
         target.drop()
 
@@ -114,21 +114,23 @@ class _Target(NamedTuple):
 def _begin(path: str | Path, only_new: bool = False) -> _Target:
     """Make the temporary file. Raises OSError where the target may not be written."""
     try:
-        direct, name = _is_open_file(os.fspath(path)), os.path.realpath(path)
+        name, direct = _behind_links(os.fspath(path))
     except ValueError as e:  # a null byte
         raise OSError(str(e)) from None
     old = None
     with contextlib.suppress(FileNotFoundError):
-        old = os.stat(path if direct else name)
+        old = os.stat(name)
     if old is not None and stat.S_ISDIR(old.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), name)
     if direct or (old is not None and not stat.S_ISREG(old.st_mode)):
-        return _Target(os.fspath(path), os.fspath(path), 0, (0, 0))
+        return _Target(name, name, 0, (0, 0))
     if old is not None:
         if only_new:
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), name)
         os.close(os.open(name, os.O_WRONLY))  # one that is write-protected is not replaced either
     folder, last = os.path.split(name)
+    if not last:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     part = os.path.join(folder, f".{last[:40]}.{uuid.uuid4().hex[:12]}.part")
     try:
         os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -140,19 +142,20 @@ def _begin(path: str | Path, only_new: bool = False) -> _Target:
     return _Target(name, part, stat.S_IMODE(about.st_mode), (about.st_uid, about.st_gid))
 
 
-def _is_open_file(name: str) -> bool:
-    """Whether the name is that of a device or of an open file (/dev/stdout, /proc/self/fd/1), by links or not: behind
-    it may be a regular file, in which the process that opened it goes on writing.
+def _behind_links(name: str) -> tuple[str, bool]:
+    """The name that links lead to, and whether it is one of a device or an open file (/dev/stdout, /proc/self/fd/1).
+
+    Behind an open file may be a regular one, in which the process that opened it goes on writing: it is not replaced.
     """
-    for _ in range(40):  # as many links as the kernel follows
+    for _ in range(40):  # as many as the kernel follows
         folder = os.path.realpath(os.path.dirname(os.path.abspath(name)))
         if folder == "/dev" or folder.startswith("/proc/"):
-            return True
+            return name, True
         try:
-            name = os.path.join(folder, os.readlink(os.path.join(folder, os.path.basename(name))))
+            name = os.path.join(os.path.dirname(name), os.readlink(name))
         except OSError:  # no link
-            return False
-    return False
+            return name, False
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), name)
 
 
 def _sync(name: str) -> None:
