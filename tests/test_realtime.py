@@ -22,7 +22,7 @@ import pytest
 from hil.bus import frames
 from hil.bus.port import Port, open_bus
 from hil.logs import read_log
-from hil.logs.recorder import FRAME, read_record
+from hil.logs.recorder import FRAME, Recorder, read_record
 from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, read_profile
 from hil.loop.node import Ecu, Node, replay
 from hil.loop.realtime import TICK_NS, Lateness, Stop, Ticker, run_realtime, stop_on_signals, undisturbed
@@ -241,11 +241,49 @@ def test_a_pause_drops_the_queue_and_is_a_fault_that_the_bus_sees_and_the_record
     all_frames = np.frombuffer(b"".join(kept), FRAME)
     of = {tx: all_frames[all_frames["tx"] == tx] for tx in (0, 1)}
     assert report.received == len(of[0]) - report.pauses
-    head = of[0]["ident"] | of[0]["length"].astype(np.int64) << 32
+    head = of[0]["ident"] | of[0]["length"].astype(np.int64) << 32 | of[0]["note"].astype(np.int64) << 56
     rows = np.stack([head, np.ascontiguousarray(of[0]["data"][:, :8]).view("<i8")[:, 0]], axis=1)
     again = Node()
-    replay(again, (of[0]["ns"] - report.started_ns) // TICK_NS, frames.noted(rows), node.k)
+    replay(again, (of[0]["ns"] - report.started_ns) // TICK_NS, rows, node.k)
     assert again.fingerprint() == node.fingerprint()
+
+
+class Forger(Queue):
+    """The same, with frames of somebody who knows how notes look among the others, at random moments, of every kind."""
+
+    HEADS = [note & frames.HEAD_MASK | kind for note in (frames.PAUSE, frames.PREPARED, frames.PAUSE + 2)
+             for kind in (0, frames.FD, frames.REMOTE)]  # fmt: skip
+    HEADS += [8 << 32 | frames.ERROR | ident for ident in (0x004, 0x080, 0x0A0, 0x100)] + [8 << 32 | 0x0A0]
+
+    def __init__(self, seed: int):
+        super().__init__(300, 0.06)
+        self.rng = np.random.default_rng(seed)
+
+    def read(self, rows: np.ndarray) -> int:
+        for _ in range(int(self.rng.integers(0, 3))):
+            head = self.HEADS[self.rng.integers(len(self.HEADS))]
+            data = int(self.rng.choice([0, 1, 55, 5000, -1])) if not head & frames.REMOTE else 0
+            self.waiting.insert(int(self.rng.integers(len(self.waiting) + 1)), (head, data))
+        return super().read(rows)
+
+
+def test_a_record_repeats_whatever_frames_others_send_while_it_is_made(tmp_path: Path) -> None:
+    node, bus, kept = Node(seed=3), Forger(8), []
+    report = run_realtime(node, bus, ticks=700, put=kept.append)
+    assert report.pauses >= 1
+    sent = np.array([word for _, word in bus.said], np.int64)
+    for suffix in (".log", ".blf", ".mf4", ".parquet"):
+        recorder = Recorder(tmp_path / f"run{suffix}")
+        recorder.put(b"".join(kept))
+        recorder.close()
+        record = read_record(recorder.path)
+        taken = ~record.sent
+        received = record.rows[taken]
+        assert np.count_nonzero(received[:, 0] & frames.NOTE) == report.pauses
+        assert np.count_nonzero(received[:, 0] == frames.PAUSE & frames.HEAD_MASK) > 10
+        again = Node(seed=3)
+        _, now = replay(again, record.ms[taken] - report.started_ns // TICK_NS, received, node.k)
+        assert now[:, 1].tolist() == sent.tolist() and again.fingerprint() == node.fingerprint(), suffix
 
 
 class StandingClock:

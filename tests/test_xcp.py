@@ -19,7 +19,6 @@ import pytest
 
 from controller import FAULTS, INPUTS, MODES, load_calibration
 from controller.records import STATE
-from hil.bus.frames import HEAD_MASK, noted
 from hil.calibrate import Attended, Memory, Slave, master
 from hil.calibrate.a2l import a2l_of
 from hil.calibrate.memory import CALIBRATION, Refusal
@@ -428,7 +427,7 @@ def test_a_session_in_real_time_is_repeated_from_its_record(tmp_path: Path) -> N
         rows[: len(frames)] = np.array(frames, np.int64).reshape(-1, 2)
         n = bench.attended.heed(rows, len(frames))
         k = bench.node.k
-        taken.extend((k - k0, row) for row in (rows[:n] & [HEAD_MASK, -1]).tolist())
+        taken.extend((k - k0, row) for row in rows[:n].tolist())
         out = bench.attended.tick(rows, n)
         sent.extend((k - k0, row) for row in out.tolist())
         own = out[:, 0] & 0x7FF == SLAVE
@@ -449,7 +448,7 @@ def test_a_session_in_real_time_is_repeated_from_its_record(tmp_path: Path) -> N
     assert (other.node.loop.z == start[0]).all() and (other.node.loop.s == start[1]).all()
     other.attended.told = True
     at, frames = np.array([t for t, _ in taken]), np.array([row for _, row in taken], np.int64)
-    k, again = replay_attended(other.attended, at, noted(frames), bench.node.k - k0)
+    k, again = replay_attended(other.attended, at, frames, bench.node.k - k0)
     assert k.tolist() == [t for t, _ in sent] and again.tolist() == [row for _, row in sent]
     assert other.node.fingerprint() == bench.node.fingerprint() and (other.memory.live() == bench.memory.live()).all()
 

@@ -34,14 +34,14 @@ __all__ = [
     "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
     "VGV_SERVO",
     "VGV_STATUS",
-    "decode", "from_bytes", "from_message", "new_receiver", "noted", "receive", "refused", "stand_still", "to_bytes",
+    "decode", "from_bytes", "from_message", "new_receiver", "receive", "refused", "stand_still", "to_bytes",
     "to_message", "with_demand", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 HEAD_MASK = 0x04FFFFFFFFFF  # what of word 0 has a meaning
 FD = 1 << 42  # bit 2 of the flags byte, CANFD_FDF
-NOTE = 1 << 50  # no frame: the loop's own word to its node. No bus gives it: it is outside `HEAD_MASK`
+NOTE = 1 << 56  # no frame: the loop's own word to its node. No bus gives it: it is outside `HEAD_MASK`
 IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
 CLASSIC = LENGTH << 32  # word 0 without its identifier
@@ -61,8 +61,9 @@ DATA_ID = 0x5600  # plus the identifier
 _CRC = crc_table().astype(np.int64)
 _CRC.setflags(write=False)
 
-# "this node stood still before this tick": word 1 is for how many ticks. In a record it is a frame under an identifier
-# that no node takes.
+# Notes: the loop's own words to its node among a tick's frames. In a record they are on a channel of their own
+# (`hil.logs.record_formats`), so no frame of the bus is ever taken for one, whatever its identifier.
+# "this node stood still before this tick": word 1 is for how many ticks
 PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 # "work for a tool is done, and takes effect before this tick" (`hil.calibrate.prepare`): word 1 is its number
 PREPARED = NOTE | EXTENDED | CLASSIC | 0x1FFFFF51
@@ -252,8 +253,8 @@ def receive(r: np.ndarray, head: int, data: int, now: int) -> int:
 
     A counter that has gone on by 1..MAX_DELTA since the last good frame is good; what lies between is lost. After
     MISSED periods without a good frame a sender may have started anew: a right frame then becomes the candidate, and
-    the next that goes on from it is good. So strays and replayed frames between good ones are refused, and a frame that
-    only repeats is never good, however long.
+    the next that goes on from it is good. So a sender that only repeats a frame is never believed, however long. A
+    frame of another sender is good where its counter is 1..MAX_DELTA ahead: one recorded frame in three.
     """
     if head & ERROR or head & IDENT_MASK != r[R_IDENT]:
         return OTHER
@@ -324,14 +325,6 @@ def stand_still(r: np.ndarray) -> None:
 def refused(r: np.ndarray) -> int:
     """Return how many frames were refused since start."""
     return r[R_WRONG_CRC] + r[R_REPEATED] + r[R_WRONG_SEQUENCE] + r[R_WRONG_LENGTH] + r[R_WRONG_KIND]
-
-
-def noted(rows: np.ndarray) -> np.ndarray:
-    """Return recorded frames as a node has to get them again: what was a note is one."""
-    out = rows.copy()
-    for note in (PAUSE, PREPARED):
-        out[out[:, 0] == note & HEAD_MASK, 0] = note
-    return out
 
 
 def with_demand(rows: np.ndarray, of: Callable[[float, float, int], tuple[float, float, int] | None]) -> np.ndarray:

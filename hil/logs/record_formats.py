@@ -6,6 +6,8 @@ BLF        a container; the file is closed and opened again with python-can's wr
 MDF4       a compressed data block behind the file's end, then its address into the list of blocks, then the number of
            records: two writes of eight bytes, so that a reader meets the state before or after
 Parquet    `hil.logs.record_parquet`
+
+A note of the loop is in each of them a frame on a channel of its own.
 """
 
 from __future__ import annotations
@@ -24,13 +26,13 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "ERROR", "EXTENDED", "FD", "FRAME", "REMOTE", "BlfRecord", "CandumpRecord", "MdfRecord", "RecordFormat",
-    "append_whole", "messages", "packed_message",
+    "ERROR", "EXTENDED", "FD", "FRAME", "NOTE_CHANNEL", "NOTE_KIND", "NOTE_NAME", "REMOTE", "BlfRecord",
+    "CandumpRecord", "MdfRecord", "RecordFormat", "append_whole", "messages", "packed_message",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
 # a frame on its way to the file: time since 1970, then struct canfd_frame, with the direction in one of its unused
-# bytes
+# bytes, and in another whether it is no frame of the bus but a note of the loop (`hil.bus.frames.NOTE`)
 FRAME = np.dtype(
     [
         ("ns", "<i8"),
@@ -38,12 +40,15 @@ FRAME = np.dtype(
         ("length", "u1"),
         ("flags", "u1"),
         ("tx", "u1"),
-        ("unused", "u1"),
+        ("note", "u1"),
         ("data", "u1", (64,)),
     ]
 )
 _FRAME = struct.Struct("<qIBBBx64s")
 FD = 4  # in `flags`; 1 is the bit-rate switch, 2 the error state, as SocketCAN has them
+# The channel of notes. A bus cannot have it: `CandumpRecord` gives no bus a name with a dot, a recording has one bus,
+# number 0 in BLF and 1 in MDF4. In Parquet a note has a kind of its own, NOTE_KIND.
+NOTE_NAME, NOTE_CHANNEL, NOTE_KIND = "vaneloop.note", 254, "note"
 
 
 class RecordFormat(Protocol):
@@ -72,13 +77,13 @@ def messages(frames: np.ndarray) -> Any:
     """Give frames as python-can messages."""
     import can
 
-    columns = (frames["ns"] * 1e-9, frames["ident"], frames["length"], frames["flags"], frames["tx"])
+    columns = (frames["ns"] * 1e-9, *(frames[c] for c in ("ident", "length", "flags", "tx", "note")))
     data = frames["data"].tobytes()
-    for k, (t, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+    for k, (t, ident, n, flags, tx, note) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
         yield can.Message(
             timestamp=t, arbitration_id=ident & 0x1FFFFFFF, is_extended_id=bool(ident & EXTENDED),
             is_remote_frame=bool(ident & REMOTE),
-            is_error_frame=bool(ident & ERROR), channel=0, dlc=n,
+            is_error_frame=bool(ident & ERROR), channel=NOTE_CHANNEL if note else 0, dlc=n,
             data=None if ident & REMOTE else data[64 * k : 64 * k + n], is_rx=not tx,
             is_fd=bool(flags & FD), bitrate_switch=bool(flags & 1), error_state_indicator=bool(flags & 2),
         )  # fmt: skip
@@ -118,8 +123,9 @@ class CandumpRecord:
 
     def append(self, frames: np.ndarray) -> None:
         text, lines = frames["data"].tobytes().hex().upper(), []
-        columns = (frames["ns"] // 1000, frames["ident"], frames["length"], frames["flags"], frames["tx"])
-        for k, (us, ident, n, flags, tx) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+        columns = (frames["ns"] // 1000, *(frames[c] for c in ("ident", "length", "flags", "tx", "note")))
+        for k, (us, ident, n, flags, tx, note) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+            channel = NOTE_NAME if note else self.channel
             name = (
                 f"{ident & 0x1FFFFFFF:08X}"
                 if ident & EXTENDED
@@ -131,7 +137,7 @@ class CandumpRecord:
             if flags & FD:
                 data = f"#{flags & 3:X}{data}"
             lines.append(
-                f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) {self.channel} {name}#{data} {'T' if tx else 'R'}\n"
+                f"({us // 1_000_000:010d}.{us % 1_000_000:06d}) {channel} {name}#{data} {'T' if tx else 'R'}\n"
             )
         append_whole(self.fd, "".join(lines).encode("ascii"))
 
@@ -275,7 +281,8 @@ class MdfRecord:
     def _records(self, k: int, frames: np.ndarray) -> np.ndarray:
         out, name = np.zeros(len(frames), self.kinds[k]), self.KINDS[k]
         length, flags = frames["length"], frames["flags"]
-        values = {"BusChannel": 1, "ID": frames["ident"] & 0x1FFFFFFF, "IDE": frames["ident"] >> 31,
+        values = {"BusChannel": np.where(frames["note"], NOTE_CHANNEL, 1),
+                  "ID": frames["ident"] & 0x1FFFFFFF, "IDE": frames["ident"] >> 31,
                   "DLC": np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], length), "DataLength": length,
                   "DataBytes": frames["data"], "Dir": frames["tx"],
                   "EDL": flags & FD != 0, "BRS": flags & 1, "ESI": flags >> 1 & 1}  # fmt: skip

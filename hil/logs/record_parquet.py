@@ -18,7 +18,7 @@ import numpy as np
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
 from hil.logs.parquet_format import FRAME_COLUMNS
-from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, REMOTE, append_whole
+from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, NOTE_KIND, REMOTE, append_whole
 from hil.logs.signals import cut_signal, select
 from hil.logs.source import LogError
 from vaneloop.base.errors import InputError
@@ -96,7 +96,8 @@ class ParquetRecord:
 
         ident, n = frames["ident"], len(frames)
         error, remote, fd = ident & ERROR != 0, ident & REMOTE != 0, frames["flags"] & FD != 0
-        ours = np.where(error | remote | fd, np.uint32(ERROR), ident)
+        note = frames["note"] != 0
+        ours = np.where(error | remote | fd | note, np.uint32(ERROR), ident)
         plain = Frames(
             np.zeros(n), ours, np.zeros(n, np.int32), frames["length"], np.ascontiguousarray(frames["data"][:, :8])
         )
@@ -104,8 +105,8 @@ class ParquetRecord:
             "t": (frames["ns"] - (self.start or 0)) * 1e-9,
             "time": pa.array(frames["ns"]).cast(pa.timestamp("ns", "UTC")),
             "id": ident & 0x1FFFFFFF, "extended": ident & EXTENDED != 0,
-            "kind": np.select([error, remote, fd], ["error", "remote", "fd"], "data"), "tx": frames["tx"] != 0,
-            "length": frames["length"],
+            "kind": np.select([note, error, remote, fd], [NOTE_KIND, "error", "remote", "fd"], "data"),
+            "tx": frames["tx"] != 0, "length": frames["length"],
             "bytes": [d[:k].tobytes() for d, k in zip(frames["data"], frames["length"].tolist(), strict=True)],
         }  # fmt: skip
         for message in self.messages:
@@ -158,13 +159,15 @@ def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time (us since 1970), both words (`hil.bus.frames`) and direction of each frame of a recording."""
     import pyarrow.parquet as pq
 
+    from hil.bus.frames import NOTE
+
     names = list(FRAME_COLUMNS)
     held = pq.ParquetFile(path).schema_arrow.names
     if missing := [n for n in names if n not in held]:
         raise LogError(f"{path}: no column {missing[0]!r}: holds signals, not frames")
     t = pq.read_table(path, columns=names).to_pydict()
     us = pq.read_table(path, columns=["time"])["time"].cast("int64").to_numpy() // 1000
-    flags = {"data": 0, "fd": FD << 40, "remote": REMOTE, "error": ERROR}
+    flags = {"data": 0, "fd": FD << 40, "remote": REMOTE, "error": ERROR, NOTE_KIND: NOTE}
     rows = [
         (ident | (EXTENDED if extended and kind != "error" else 0) | flags[kind] | length << 32,
          int.from_bytes(data[:8].ljust(8, b"\0"), "little", signed=True))

@@ -17,18 +17,32 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hil.logs.record_formats import FRAME, BlfRecord, CandumpRecord, MdfRecord, RecordFormat, packed_message
+from hil.logs.record_formats import (
+    ERROR,
+    FRAME,
+    NOTE_CHANNEL,
+    NOTE_NAME,
+    BlfRecord,
+    CandumpRecord,
+    MdfRecord,
+    RecordFormat,
+    packed_message,
+)
 from hil.logs.record_parquet import ParquetRecord, read_parquet
 from hil.logs.source import LogError, check_file
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.files import cannot_write
+
+if TYPE_CHECKING:
+    import can
 
 __all__ = [
     "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message",
@@ -137,7 +151,7 @@ def _keep_old(path: Path) -> Path | None:
 @dataclass(frozen=True)
 class Record:
     """Frames of a recording, in order: ms since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), and
-    whether it sent them.
+    whether it sent them. Among them the notes of the loop (`hil.bus.frames.NOTE`).
     """
 
     ms: np.ndarray
@@ -147,7 +161,7 @@ class Record:
 
 def read_record(path: str | Path) -> Record:
     """Read what a `Recorder` wrote, or another program in a format that python-can reads. Raises LogError."""
-    from hil.bus.frames import from_message
+    from hil.bus.frames import NOTE, from_message
 
     path = Path(path)
     check_file(path)
@@ -157,13 +171,14 @@ def read_record(path: str | Path) -> Record:
         else:
             if path.suffix.lower() == ".mf4":
                 needs(f"{path}: MDF4", "asammdf")
-            import can
-
-            with can.LogReader(path) as reader:
-                found = [(round(m.timestamp * 1e6), *from_message(m), not m.is_rx) for m in reader]
+            own = NOTE_NAME if path.suffix.lower() == ".log" else NOTE_CHANNEL
+            found = [
+                (round(m.timestamp * 1e6), *from_message(m), not m.is_rx, m.channel == own) for m in _messages(path)
+            ]
             us = np.array([f[0] for f in found], np.int64)
             rows = np.array([f[1:3] for f in found], np.int64).reshape(-1, 2)
             sent = np.array([f[3] for f in found], bool)
+            rows[np.array([f[4] for f in found], bool), 0] |= NOTE
     except InputError:
         raise
     except Exception as e:  # readers meet a damaged file with any exception there is
@@ -172,6 +187,21 @@ def read_record(path: str | Path) -> Record:
         raise LogError(f"{path}: no CAN frame in it")
     order = np.argsort(us, kind="stable")
     return Record(us[order] // 1000, rows[order], sent[order])
+
+
+def _messages(path: Path) -> Iterator[can.Message]:
+    """Give the frames of a log. python-can takes most error frames of a candump log for data frames."""
+    import can
+
+    with can.LogReader(path) as reader:
+        if path.suffix.lower() != ".log":
+            yield from reader
+            return
+        with path.open() as file:
+            for message, line in zip(reader, (line for line in file if line.strip()), strict=True):
+                if int(line.split()[2].partition("#")[0], 16) & ERROR:
+                    message.is_error_frame, message.is_extended_id = True, False
+                yield message
 
 
 # --- in a process of its own ------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hil.bus.frames import HEAD_MASK, PAUSE
+from hil.bus.frames import HEAD_MASK, NOTE, PAUSE
 
 __all__ = ["POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "stop_on_signals", "undisturbed"]
 
@@ -323,7 +323,7 @@ def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
     """Return the frames of one tick (int64[n, 2] each) as the recorder takes them: from ``ns`` since 1970 on, 1 us
     apart, in order.
     """
-    out = [_pack(ns + 1000 * i, head & HEAD_MASK, data) for i, (head, data) in enumerate(received.tolist())]
+    out = [_pack(ns + 1000 * i, head & (HEAD_MASK | NOTE), data) for i, (head, data) in enumerate(received.tolist())]
     ns += 1000 * len(out)
     out += [_pack(ns + 1000 * i, head | _TX, data) for i, (head, data) in enumerate(sent.tolist())]
     return b"".join(out)

@@ -342,7 +342,7 @@ def _repeat(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from hil.bus.frames import NAMES, noted
+    from hil.bus.frames import HEAD_MASK, NAMES, PAUSE, PREPARED
     from hil.logs.recorder import read_record
     from hil.loop.node import replay
     from vaneloop.base.errors import InputError
@@ -363,7 +363,15 @@ def _repeat(args: argparse.Namespace) -> int:
         last if args.duration is None else round(args.duration * 1000)
     )  # a run ends up to 9 ticks after the last frame it sent
     started = time.perf_counter()
-    received = noted(record.rows[taken])
+    received = record.rows[taken]
+    old = np.isin(received[:, 0], [PAUSE & HEAD_MASK, PREPARED & HEAD_MASK])
+    notes = []
+    if old.any():
+        notes.append(
+            f"{args.inputs}: {int(old.sum()):,} frames 0x1FFFFF50 or 0x1FFFFF51 are taken for frames of the bus; in a "
+            f"record of an earlier vaneloop they are the loop's pauses, and such a record does not repeat"
+        )
+        terminal.say(args, f"note: {notes[0]}")
     if attended.wanted(args):
         from hil.calibrate.station import replay_attended
 
@@ -402,7 +410,8 @@ def _repeat(args: argparse.Namespace) -> int:
     terminal.write_json(args, {
         "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks,
         "simulated_s": ticks / 1000,
-        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "exceeded": exceeded,
+        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "notes": notes,
+        "exceeded": exceeded,
     })  # fmt: skip
     if args.record:
         _write_record(args, received, tick[taken], at, sent, int(start))
