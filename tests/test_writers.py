@@ -29,6 +29,7 @@ KEPT = "an earlier recording keeps its bytes, under another name"
 PIPE = "a pipe or a device, no file"
 PRIVATE = "a new file in a folder of this process, for itself"
 BESIDE = "a file of the fleet's run folder that is read only when it is there whole, or that a restart makes anew"
+CACHE = "a cache: what is cut counts as none, and bringing each of hundreds of files to the disk takes 10 ms"
 REASONS = {
     ("hil/bus/broker.py", "open"): PIPE,
     ("hil/calibrate/prepare.py", "write_bytes"): PRIVATE,
@@ -55,6 +56,8 @@ REASONS = {
     ("hil/native/isolation.py", "fdopen"): PIPE,
     ("hil/native/program.py", "mkstemp"): PRIVATE,
     ("hil/native/program.py", "copyfile"): PRIVATE,
+    ("vaneloop/base/kept.py", "replace"): CACHE,
+    ("vaneloop/base/kept.py", "write_bytes"): CACHE,
     ("vaneloop/base/terminal.py", "NamedTemporaryFile"): "the traceback of a defect, always a new file",
     ("vaneloop/fleet/campaign.py", "copyfile"): BESIDE,
     ("vaneloop/fleet/campaign.py", "write_text"): BESIDE,

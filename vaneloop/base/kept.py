@@ -31,8 +31,6 @@ from numba.core import compiler, config, event, serialize
 from numba.core.caching import FunctionCache
 
 from vaneloop.base import terminal
-from vaneloop.base.errors import InputError
-from vaneloop.base.files import write
 
 __all__ = ["AHEAD", "Waiting", "digest_of", "is_kept", "keep", "kept_njit", "sources_digest"]
 
@@ -149,13 +147,17 @@ class _Files(FunctionCache):
         key = self._index_key(sig, data.codegen)
         folder = self._folders()[0]
         file = folder / self._file(key, INNER if self.inner else ENTERED)
+        writing = file.with_suffix(f".{uuid.uuid4().hex}")
         try:
             if pickle.loads(_dumps(key)) != key:
                 return  # it takes a named tuple of the user's: only part of what is called from outside
             content = _dumps((key, data._reduce()))
             folder.mkdir(parents=True, exist_ok=True)
-            write(file, content)
-        except (OSError, InputError, pickle.PicklingError):
+            writing.write_bytes(content)
+            writing.replace(file)
+        except (OSError, pickle.PicklingError):
+            with contextlib.suppress(OSError):
+                writing.unlink(missing_ok=True)
             return
         if self._folder:
             _prune(folder)
