@@ -82,8 +82,10 @@ docs: $(READY_DOCS)  ## the documentation site, in out/site/index.html; every li
 	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 	@$(SAY) 'open out/site/index.html'
 
-lint: $(READY)  ## ruff and mypy
+lint: $(READY)  ## ruff, mypy, and what the packages allow that are brought in
 	@$(ruff)
+	@$(SAY) 'licences, pins and advisories of the packages'
+	@$(PY) -m tests.audit
 	@$(SAY) 'mypy'
 	@$(PY) -m mypy
 
