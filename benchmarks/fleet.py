@@ -57,13 +57,14 @@ def _many(folder: Path) -> None:
     from tests.test_fleet_report import synthetic
     from vaneloop.cli import fleet
     from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.kinds import DIAGNOSIS
 
     made = synthetic(folder / "made", ENGINES, LOGS // ENGINES)
     logs = folder / "logs"
     parser = argparse.ArgumentParser()
     fleet.add_options(parser)
     options, files = fleet._job(parser.parse_args(["run", str(logs), "--out", "x"]))
-    run = Folder.begin(folder / "run", "vaneloop.fleet.diagnosis:diagnose_log", options, files)
+    run = Folder.begin(folder / "run", DIAGNOSIS, options, files)
     (batch,) = (made.path / "logs").iterdir()
     rows = pq.read_table(batch).to_pylist()
     for row in rows:
@@ -125,6 +126,7 @@ MEASUREMENTS = {"a fleet's run of 100,000 logs": hundred_thousand, "a fleet's wo
 
 STARTER = """
 import sys
+import tests.fleet_jobs
 from vaneloop.fleet import state
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.rent import rent
@@ -155,7 +157,7 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
         path = place / "logs" / f"e{k % 10}" / f"2026-01-{1 + k % 28:02d}_{k:05d}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"log {k}", encoding="utf-8")
-    runs = [Folder.begin(place / name, "tests.fleet_jobs:diagnosed", {}, {}) for name in ("calm", "killed")]
+    runs = [Folder.begin(place / name, "diagnosed", {}, {}) for name in ("calm", "killed")]
     for run in runs:
         run.add(sources.find([str(place / "logs")]))
     script = place / "starter.py"

@@ -1,4 +1,7 @@
-"""Stand-ins for the diagnosis: cheap, and each log says by its text what it does to the process that reads it."""
+"""Stand-ins for the diagnosis: cheap, and each log says by its text what it does to the process that reads it.
+
+A process that imports this module knows them as kinds of work, and so do the processes that it starts.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base.errors import InputError
+from vaneloop.fleet import reader, rent
+from vaneloop.fleet.kinds import KINDS, Kind, Options
 
 
 def read(path: str, options: dict[str, Any], run: str) -> dict[str, Any]:
@@ -62,3 +67,16 @@ def _warm_up(options: dict[str, Any], run: str) -> None:
 
 
 read_cold.warm_up = _warm_up  # type: ignore[attr-defined]
+
+
+class Cold(Options):
+    """What compiling comes to."""
+
+    compiling: str | int
+
+
+KINDS["read"] = Kind((__name__, "read"), Options)
+KINDS["diagnosed"] = Kind((__name__, "diagnosed"), Options)
+KINDS["read_cold"] = Kind((__name__, "read_cold"), Cold)
+reader.SERVE = f"import {__name__}; {reader.SERVE}"
+rent.HIRED = f"import {__name__}; {rent.HIRED}"

@@ -606,7 +606,7 @@ def test_what_a_campaign_is_of_is_in_its_run(tmp_path: Path, monkeypatch: pytest
         "model": False, "plant": False, "vary": {"a.x": "tolerance", "jam.force": [10.0, 20.0]},
         "calibration": [{"name": "soft"}, {"name": "hard"}], "firmware": [{"name": "shipped"}],
     }  # fmt: skip
-    assert run.job["function"] == "vaneloop.fleet.trial:run_trial" and run.of_campaign and plan.confidence == 0.9
+    assert run.job["kind"] == "trial" and run.of_campaign and plan.confidence == 0.9
 
 
 def test_a_trial_has_a_file_for_each_sample_and_each_point_of_the_indices(

@@ -65,7 +65,7 @@ def answer(rng: np.random.Generator, engine: int, years: float, tail: list[float
 def synthetic(tmp: Path, engines: int, each: int, seed: int = 1) -> Folder:
     """A finished run over two years, as the workers would leave it."""
     rng = np.random.default_rng(seed)
-    folder = Folder.begin(tmp / "run", "tests.fleet_jobs:read", {}, {})
+    folder = Folder.begin(tmp / "run", "read", {}, {})
     rows: list[dict[str, Any]] = []
     results: list[dict[str, Any]] = []
     for e in range(engines):
@@ -462,7 +462,7 @@ def test_bad_input_is_one_line_before_anything_is_begun(
 
 
 def test_the_folder_of_a_campaign_is_told_from_a_fleet_s(tmp_path: Path) -> None:
-    run = Folder.begin(tmp_path / "run", "vaneloop.fleet.trial:run_trial", {"plan": {}}, {})
+    run = Folder.begin(tmp_path / "run", "trial", {"plan": {}}, {})
     with pytest.raises(InputError, match=r"is a campaign's run, not a fleet's; vaneloop campaign PLAN\.toml --out"):
         roll_up(run)
 
@@ -568,7 +568,7 @@ def test_logs_of_a_system_of_ones_own_are_followed_over_time(tmp_path: Path, mon
     words = ["run", str(tmp_path / "logs"), "--out", str(tmp_path / "run"), "--system", str(tmp_path / "bench.py")]
     parser = argparse.ArgumentParser()
     fleet.add_options(parser)
-    run = Folder.begin(tmp_path / "run", "vaneloop.fleet.diagnosis:diagnose_log", *fleet._job(parser.parse_args(words)))
+    run = Folder.begin(tmp_path / "run", "diagnosis", *fleet._job(parser.parse_args(words)))
     run.add(sources.find([str(tmp_path / "logs")]))
     assert work(run.path) == {"done": 24}
     view = view_of(roll_up(run), {"flow.bias.offset": 12.0})

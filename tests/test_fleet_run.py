@@ -22,6 +22,7 @@ import pytest
 
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 
+import tests.fleet_jobs  # noqa: F401 (the stand-in is a kind of work)
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.fleet import sources, state
@@ -30,10 +31,10 @@ from vaneloop.fleet.journal import Journal, lines
 from vaneloop.fleet.leases import Leases, Me
 from vaneloop.fleet.worker import DEATHS, work
 
-JOB = "tests.fleet_jobs:read"
+JOB = "read"
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
 WORK = (
-    "import sys; from vaneloop.fleet.worker import work\n"
+    "import sys; import tests.fleet_jobs; from vaneloop.fleet.worker import work\n"
     "from vaneloop.base import terminal\n"
     "sys.exit(terminal.run(lambda: bool(work(sys.argv[1], every=0.2, patience=float(sys.argv[2]))) * 0))"
 )
@@ -380,7 +381,7 @@ def test_a_machine_that_cannot_compile_is_one_line_and_no_log_s_fault(
         monkeypatch.setattr(reader, "WARM_UP", 2.0)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     (tmp_path / "a.csv").write_text("log 1")
-    folder = Folder.begin(tmp_path / "run", "tests.fleet_jobs:read_cold", {"compiling": compiling}, {})
+    folder = Folder.begin(tmp_path / "run", "read_cold", {"compiling": compiling}, {})
     folder.add(sources.find([str(tmp_path / "a.csv")]))
     with pytest.raises(InputError, match=says):
         work(folder.path)
@@ -445,7 +446,8 @@ def test_two_starters_make_one_run(tmp_path: Path, undisturbed: list[tuple[str, 
         (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "logs" / name).write_text(text)
     script = (
-        "import sys; from vaneloop.fleet import sources; from vaneloop.fleet.folder import Folder\n"
+        "import sys; import tests.fleet_jobs; from vaneloop.fleet import sources\n"
+        "from vaneloop.fleet.folder import Folder\n"
         "from vaneloop.fleet.worker import work\n"
         f"folder = Folder.begin(sys.argv[2], {JOB!r}, {{}}, {{'model': sys.argv[3]}})\n"
         "folder.add(sources.find([sys.argv[1]])); work(folder.path, every=0.2)"
@@ -528,13 +530,13 @@ def test_a_worker_that_leaves_while_somebody_looks_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Folder], Any]
 ) -> None:
     folder = fleet(tmp_path, many(1))
-    me, read = Me(folder.path, every=3600.0), state.read_json
+    me, read = Me(folder.path, every=3600.0), state.who_is
 
     def late(file: Path) -> Any:
         me.leave()
         return read(file)
 
-    monkeypatch.setattr(state, "read_json", late)
+    monkeypatch.setattr(state, "who_is", late)
     look(folder)
     assert state.state_of(folder).workers == {}
 
@@ -551,7 +553,7 @@ def test_a_torn_line_of_a_journal_is_left_out(tmp_path: Path) -> None:
 # ---- rented workers --------------------------------------------------------------------------------------------------
 
 RENT = (
-    "import sys; from vaneloop.base import terminal\n"
+    "import sys; import tests.fleet_jobs; from vaneloop.base import terminal\n"
     "from vaneloop.fleet.folder import Folder; from vaneloop.fleet.rent import rent\n"
     "def main(): print(rent(Folder(sys.argv[1]), sys.argv[2], 2, {}, 0.2, lambda n, of: None)); return 0\n"
     "if __name__ == '__main__': sys.exit(terminal.run(main))"
@@ -627,6 +629,7 @@ def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
     file = tmp_path / "scheduler.json"
     runs = ["dask_scheduler", "dask_worker"]
     options = [["--port", "0", "--no-dashboard"], ["--nthreads", "1", "--nworkers", "2", "--no-dashboard"]]
+    options[1] += ["--preload", "tests.fleet_jobs"]
     cluster = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{name}", "--scheduler-file", str(file), *more], env=ENV,

@@ -5,7 +5,6 @@ stand-ins for readers, Dask and Slurm.
 from __future__ import annotations
 
 import json
-import logging
 import os
 import select
 import signal
@@ -28,11 +27,13 @@ from vaneloop.fleet import diagnosis, reader, rent, worker
 from vaneloop.fleet.files import read_json, whole_json
 from vaneloop.fleet.folder import Folder, key_of
 from vaneloop.fleet.journal import lines
+from vaneloop.fleet.kinds import KINDS, Kind, Options
 from vaneloop.fleet.leases import Leases
 from vaneloop.fleet.reader import Died, NotReady, Reader, Stopped, TimedOut
 from vaneloop.fleet.sources import Source
 from vaneloop.fleet.worker import work
 
+ONE = Kind((__name__, "stand_in"), Options)
 DONE = {"status": "done", "reason": "", "verdict": "none", "answer": {}}
 
 
@@ -71,6 +72,7 @@ class Readings:
 def readings(monkeypatch: pytest.MonkeyPatch) -> Iterator[Readings]:
     made = Readings()
     monkeypatch.setattr(worker, "Reader", made)
+    monkeypatch.setitem(KINDS, "one", ONE)
     yield made
 
 
@@ -78,7 +80,7 @@ def fleet(tmp: Path, names: str = "abc", in_chunk: int | None = None, **options:
     """A run of small logs."""
     for name in names:
         (tmp / f"{name}.csv").write_text(name)
-    run = Folder.begin(tmp / "run", "m:f", options, {})
+    run = Folder.begin(tmp / "run", "one", options, {})
     run.add([Source(str(tmp / f"{name}.csv"), "e", 0.0) for name in names], in_chunk)
     return run
 
@@ -108,7 +110,7 @@ def test_a_worker_does_every_log_writes_down_what_it_does_and_leaves_nothing(
     assert work(run.path) == {"done": 3}
     assert sorted(readings.asked) == ["a.csv", "b.csv", "c.csv"]
     assert (
-        readings.words == ("m:f", str(run.path)) and readings.limits == {('{"limit": 7}', 7.0)} and readings.stops == 1
+        readings.words == ("one", str(run.path)) and readings.limits == {('{"limit": 7}', 7.0)} and readings.stops == 1
     )
     first, second = run.chunks()
     said = journal(run)
@@ -442,7 +444,7 @@ class Process:
 
 def reads(*processes: Process, errors: bytes = b"") -> tuple[Reader, list[Any]]:
     """A reader whose processes are these."""
-    r, begun = Reader("m:f", "/run", threading.Event()), []
+    r, begun = Reader("one", "/run", threading.Event()), []
 
     def popen(words: list[str], **more: Any) -> Process:
         begun.append((words, more))
@@ -479,7 +481,8 @@ def test_a_reader_has_its_process_compile_first_and_asks_it_log_by_log(
     assert r.ask("/a", {"x": 1}, 60.0) == {"status": "done"} and r.ask("/b", {"x": 1}, 60.0) == {"b": 2}
     assert p.got == [{"options": {"x": 1}}, {"path": "/a", "options": {"x": 1}}, {"path": "/b", "options": {"x": 1}}]
     ((words, more),) = begun
-    assert words[0] == sys.executable and words[3:] == ["m:f", "/run"] and "serve()" in words[2]
+    assert words[0] == sys.executable and words[1:3] == ["-P", "-c"] and words[4:] == ["one", "/run"]
+    assert "serve()" in words[3]
     assert more["stdin"] == more["stdout"] == subprocess.PIPE and more["env"] == reader._environment()
     assert p.killed == 0 and p.flushed == 3
     r.stop()
@@ -618,7 +621,8 @@ class Served:
             fdopen=os.fdopen, getppid=lambda: 4711,
         )  # fmt: skip
         monkeypatch.setattr(reader, "os", mine)
-        argv = ["-c", f"{__name__}:stand_in", "/run"]
+        argv = ["-c", "one", "/run"]
+        monkeypatch.setitem(KINDS, "one", ONE)
         monkeypatch.setattr(reader, "sys", SimpleNamespace(argv=argv, stdin=lines()))
         monkeypatch.setattr("faulthandler.enable", lambda: self.done.append("faults"))
         monkeypatch.setattr(reader, "threading", SimpleNamespace(Thread=self.thread))
@@ -743,7 +747,9 @@ class Dask:
         dask.distributed = distributed
         distributed.Client = self.client
         distributed.wait = self.wait
-        distributed.LocalCluster = lambda **o: self.cluster("local", o)
+        security = ModuleType("distributed.security")
+        security.Security = SimpleNamespace(temporary=lambda: "keys made for it")
+        monkeypatch.setitem(sys.modules, "distributed.security", security)
         queue.SLURMCluster = lambda **o: self.cluster("slurm", o)
         for name, module in (("dask", dask), ("dask.distributed", distributed), ("dask_jobqueue", queue)):
             monkeypatch.setitem(sys.modules, name, module)
@@ -783,66 +789,140 @@ class Dask:
             raise TimeoutError
 
 
+class Hands:
+    """Workers of this machine without processes: each says what is next in a list; None: it was killed."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, says: list[Any]):
+        """Put them in place of `rent._Hired`."""
+        self.says, self.did, self.words = says, list[str](), set[Any]()
+        monkeypatch.setattr(rent, "_Hired", self.hire)
+
+    def hire(self, words: Any) -> Any:
+        answer = self.says.pop(0)
+        self.words.add(words)
+        self.did.append("hired")
+        looks = iter([None, 0, 0, 0])
+        signalled = lambda n: self.did.append(f"{n}")  # noqa: E731
+        state = SimpleNamespace(poll=lambda: next(looks, 0), wait=self.wait, send_signal=signalled)
+        return SimpleNamespace(process=state, said=lambda: answer, last_words=lambda: "signal 9",
+                               close=lambda: self.did.append("closed"))  # fmt: skip
+
+    def wait(self, timeout: float) -> None:
+        raise subprocess.TimeoutExpired("worker", timeout)
+
+
 def test_as_many_workers_are_rented_as_asked_for_and_what_they_did_is_added_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dask = Dask(monkeypatch, [{"done": 2, "died": 1}, {"done": 3}])
+    for name in ("dask", "distributed", "dask.distributed"):
+        monkeypatch.setitem(sys.modules, name, None)  # workers of this machine need no scheduler
+    hands = Hands(monkeypatch, [{"came": {"done": 2, "died": 1}}, {"came": {"done": 3}}])
     run, told = fleet(tmp_path, "abc"), []
-    assert rent.rent(run, "local", 2, {}, 0.5, lambda n, of: told.append((n, of))) == {"done": 5, "died": 1}
-    assert told == [(0, 3)] * 3
-    settings = {"distributed.scheduler.allowed-failures": 1_000_000, "distributed.worker.daemon": False}
-    assert dask.did[:2] == [("needs", "--on local", "distributed"), ("set", settings)]
-    assert dask.did[2] == ("local", {"n_workers": 2, "threads_per_worker": 1, "processes": True, "memory_limit": 0,
-                                     "silence_logs": logging.CRITICAL, "dashboard_address": "127.0.0.1:0"})  # fmt: skip
-    assert dask.did[3] == ("client", "local", 30.0)
-    (_, f, words, more), (_, _, _, more2) = dask.did[4:6]
-    assert f is rent._work and words[0] == str(run.path.resolve()) and words[2] == 0.5 and not more["pure"]
-    assert more["key"] == f"fleet-{words[1]}-0" and more2["key"] == f"fleet-{words[1]}-1"
-    assert dask.did[6:] == [("wait", 2, 1.0)] * 3 + ["client closed", "local closed"]
-    assert not list((run.path / "workers").iterdir())
+    assert rent.rent(run, "local", 2, {}, 0.5, lambda n, of: told.append((n, of)), "sha") == {"done": 5, "died": 1}
+    assert told and set(told) == {(0, 3)}
+    ((folder, starter, every, trust),) = hands.words
+    assert folder == str(run.path.resolve()) and starter and (every, trust) == (0.5, "sha")
+    assert sorted(hands.did) == ["closed"] * 2 + ["hired"] * 2 and not list((run.path / "workers").iterdir())
+
+
+def test_a_killed_worker_has_a_successor_until_it_is_plain_that_none_gets_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hands = Hands(monkeypatch, [None] * 3 + [{"came": {"done": 1}}])
+    assert rent.rent(fleet(tmp_path, "a"), "local", 1, {}, 0.5, lambda n, of: None) == {"done": 1}
+    assert hands.did == ["hired", "closed"] * 4
+    hands = Hands(monkeypatch, [None] * 30)
+    with pytest.raises(RuntimeError, match="21 workers ended one after the other, the last with signal 9"):
+        rent.rent(fleet(tmp_path, "a"), "local", 1, {}, 0.5, lambda n, of: None)
+
+
+def test_what_a_worker_refuses_is_one_line_and_ctrl_c_ends_all_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Hands(monkeypatch, [{"came": {"done": 1}}, {"refused": "the disk is full"}])
+    with pytest.raises(InputError, match="^the disk is full$"):
+        rent.rent(fleet(tmp_path, "a"), "local", 2, {}, 0.5, lambda n, of: None)
+    hands = Hands(monkeypatch, [{}, {}])
+
+    def interrupt(n: int, of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        rent.rent(fleet(tmp_path, "a"), "local", 2, {}, 0.5, interrupt)
+    assert hands.did == ["hired"] * 2 + [f"{signal.SIGTERM}"] * 2 + ["closed"] * 2
+    assert not list((tmp_path / "run" / "workers").iterdir())
+
+
+@pytest.mark.parametrize("fails", [None, InputError("no room")])
+def test_a_hired_worker_answers_with_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fails: Exception | None
+) -> None:
+    seen: list[Any] = []
+
+    def work(run: str, **more: Any) -> dict[str, int]:
+        seen.append((run, more))
+        if fails:
+            raise fails
+        return {"done": 1}
+
+    monkeypatch.setattr(worker, "work", work)
+    monkeypatch.setattr(rent.sys, "argv", ["-c", "/run", "s", "2.0", "sha"])
+    rent.hired()
+    assert seen == [("/run", {"starter": "s", "every": 2.0, "patience": 24.0, "trust": "sha"})]
+    assert json.loads(capsys.readouterr().out) == ({"refused": "no room"} if fails else {"came": {"done": 1}})
 
 
 def test_a_scheduler_of_others_is_used_and_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from concurrent.futures import CancelledError
 
-    dask = Dask(monkeypatch, [{}])
-    assert rent.rent(fleet(tmp_path, "a"), "tcp://h:1", 1, {}, 0.5, lambda n, of: None) == {}
-    assert ("client", "tcp://h:1", 30.0) in dask.did and dask.did[-1] == "client closed"
+    dask = Dask(monkeypatch, [{"done": 2}, {"done": 3}])
+    run, told = fleet(tmp_path, "abc"), []
+    assert rent.rent(run, "tcp://h:1", 2, {}, 0.5, lambda n, of: told.append((n, of)), "sha") == {"done": 5}
+    assert told == [(0, 3)] * 3
+    settings = {"distributed.scheduler.allowed-failures": 1_000_000, "distributed.worker.daemon": False,
+                "distributed.scheduler.http.routes": []}  # fmt: skip
+    assert dask.did[0][0] == "needs"
+    assert dask.did[1:3] == [("set", settings), ("client", "tcp://h:1", 30.0)]
+    (_, f, words, more), (_, _, _, more2) = dask.did[3:5]
+    assert f is rent._work and words[0] == str(run.path.resolve()) and words[2:] == (0.5, "sha") and not more["pure"]
+    assert more["key"] == f"fleet-{words[1]}-0" and more2["key"] == f"fleet-{words[1]}-1"
+    assert dask.did[5:] == [("wait", 2, 1.0)] * 3 + ["client closed"]
     Dask(monkeypatch, [CancelledError()])
     with pytest.raises(
         InputError, match="the Dask scheduler has gone; what is done is kept, run the same command again"
     ):
-        rent.rent(fleet(tmp_path, "a"), "tcp://h:1", 1, {}, 0.5, lambda n, of: None)
+        rent.rent(run, "tcp://h:1", 1, {}, 0.5, lambda n, of: None)
     for e in (OSError("x"), ValueError("x")):
         dask = Dask(monkeypatch, [], e)
-        with pytest.raises(InputError, match=rf"--on local: no Dask scheduler answers \({type(e).__name__}\)"):
-            rent.rent(fleet(tmp_path, "a"), "local", 1, {}, 0.5, lambda n, of: None)
-        assert dask.did[-1] == "local closed"
+        with pytest.raises(InputError, match=rf"--on slurm: no Dask scheduler answers \({type(e).__name__}\)"):
+            rent.rent(run, "slurm", 1, {}, 0.5, lambda n, of: None)
+        assert dask.did[-1] == "slurm closed"
 
 
-def test_jobs_of_a_queue_have_one_core_and_the_options_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_of_a_queue_have_one_core_the_options_given_and_keys_that_were_made_for_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     dask = Dask(monkeypatch, [])
-    assert rent._cluster("slurm", 3, {"queue": "night", "walltime": "01:00:00"}).kind == "slurm"
-    assert dask.did == [
-        ("needs", "--on slurm", "dask_jobqueue"),
-        ("slurm", {"cores": 1, "processes": 1, "memory": "4GB", "walltime": "01:00:00", "queue": "night"}),
-        ("scale", 3),
-    ]
+    assert rent._cluster("slurm", 3, {"queue": "night", "walltime": "01:00:00"}, "/run").kind == "slurm"
+    (needs, (kind, said), scale) = dask.did
+    assert needs == ("needs", "--on slurm", "dask_jobqueue")
+    assert (kind, scale) == ("slurm", ("scale", 3)) and said == {
+        "cores": 1, "processes": 1, "memory": "4GB", "walltime": "01:00:00", "queue": "night",
+        "security": "keys made for it", "shared_temp_directory": "/run",
+        "scheduler_options": {"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+        "worker_extra_args": ["--no-dashboard", "--dashboard-address", "127.0.0.1:0"],
+    }  # fmt: skip
     for on in ("tcp://h:1", "tls://h:1", "ws://h:1"):
-        assert rent._cluster(on, 3, {}) is None
+        assert rent._cluster(on, 3, {}, "/run") is None
         rent.known(on)
     for on in ("http://h:1", "lokal", "tcp", ""):
         with pytest.raises(InputError, match="is not known.*allowed: local, slurm, tcp"):
-            rent._cluster(on, 3, {})
+            rent.known(on)
+    dask.did.clear()
     rent.known("local")
+    assert dask.did == []
     rent.known("slurm")
-
-
-def test_a_rented_worker_has_the_patience_of_twelve_beats(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Any] = []
-    monkeypatch.setattr(worker, "work", lambda run, **more: seen.append((run, more)) or {"done": 1})
-    assert rent._work("/run", "s", 2.0) == {"done": 1}
-    assert seen == [("/run", {"starter": "s", "every": 2.0, "patience": 24.0})]
+    assert dask.did == [("needs", "--on slurm", "distributed", "dask_jobqueue", "cryptography")]
 
 
 # ---- what is done with a log -----------------------------------------------------------------------------------------

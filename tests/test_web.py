@@ -843,7 +843,7 @@ def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: A
     *_, last = sorted((folder.path / "parts").iterdir())
     last.rename(tmp_path / last.name)  # the last chunk is not done
     so_far = view_of(roll_up(folder), {})
-    Folder.begin(server.folder / "trials", "vaneloop.fleet.trial:run_trial", {"plan": {}}, {})
+    Folder.begin(server.folder / "trials", "trial", {"plan": {}}, {})
     page.goto(server.at("fleet"))
     page.locator(".run-folder").click()
     page.get_by_role("option", name="engines/run").click()

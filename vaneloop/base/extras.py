@@ -14,7 +14,7 @@ __all__ = ["EXTRAS", "is_there", "needed", "needs"]
 EXTRAS = {
     "mdf": {"asammdf": "asammdf"},
     "fleet": {"psutil": "psutil", "duckdb": "duckdb", "distributed": "dask", "dask_jobqueue": "dask-jobqueue",
-              "ruptures": "ruptures"},
+              "cryptography": "cryptography", "ruptures": "ruptures"},
     "web": {"nicegui": "nicegui", "tsdownsample": "tsdownsample"},
     "fmu": {"fmpy": "fmpy"},
     "diagnostics": {"isotp": "can-isotp"},

@@ -21,6 +21,7 @@ __all__ = [
     "DEFECT",
     "Parser",
     "add_output_options",
+    "clean",
     "compiling",
     "defect",
     "pairs",
@@ -86,12 +87,26 @@ def pairs(
     return out
 
 
+_CONTROL = {c: f"\\x{c:02x}" for c in (*range(0x20), *range(0x7F, 0xA0))} | {
+    c: f"\\u{c:04x}" for c in (0x061C, 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A))
+}
+
+
+def clean(text: str, lines: bool = False) -> str:
+    """Text for a terminal: a control character in it, which may come from a file's name, is shown and does nothing.
+    With ``lines``, line ends stay.
+    """
+    kept = text.split("\n") if lines else [text]
+    shown = "\n".join(part.translate(_CONTROL) for part in kept)
+    return shown.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def say(args: argparse.Namespace, text: str) -> None:
     """Tell the user something, unless quiet; where JSON goes to standard output, text goes to standard error."""
     global told_of_compiling
     told_of_compiling = told_of_compiling or text.startswith("compiling")
     if not args.quiet:
-        print(text, file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
+        print(clean(text, lines=True), file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
 
 
 def compiling() -> None:
@@ -111,11 +126,11 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     say(args, title)
     table = Table(box=box.SIMPLE_HEAD)
     for i, c in enumerate(columns):
-        cells = [r[i] for r in rows]
+        cells = [clean(r[i], lines=True) for r in rows]
         text = i == 0 or max(map(len, cells), default=0) > 30 or not any(ch.isdigit() for ch in "".join(cells))
         table.add_column(c, justify="left" if text else "right", overflow="fold")
     for r in rows:
-        table.add_row(*r)
+        table.add_row(*(clean(cell) for cell in r))
     console = Console(
         file=sys.stderr if args.json == "-" else sys.stdout,
         soft_wrap=False,
@@ -202,7 +217,7 @@ def run(command: Callable[[], int]) -> int:
         if not isinstance(e, InputError):
             print(f"vaneloop: {defect(e)}", file=sys.stderr)
             return DEFECT
-        print(f"vaneloop: {e}", file=sys.stderr)
+        print(f"vaneloop: {clean(str(e))}", file=sys.stderr)
         return 2
 
 

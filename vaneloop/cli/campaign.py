@@ -10,6 +10,8 @@ from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.files import write
+from vaneloop.cli import options
+from vaneloop.cli.fleet import tell_damaged, unusable
 
 if TYPE_CHECKING:
     from vaneloop.pages.campaign import CampaignView
@@ -45,14 +47,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=float, default=3600.0, metavar="S", help="s for one trial or one search")
     parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
                         "worker takes over (default 60)")  # fmt: skip
+    options.add_trust_option(parser, "the plan")
     terminal.add_output_options(parser, report=True)
     parser.add_argument("--junit", metavar="FILE", help="write JUnit XML: a suite a combination, a case a requirement")
 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    needs("vaneloop campaign", "psutil", "duckdb", "distributed")
+    needs("vaneloop campaign", "psutil", "duckdb")
+    with unusable():
+        return _command(args)
+
+
+def _command(args: argparse.Namespace) -> int:
     from vaneloop.fleet import campaign
+    from vaneloop.fleet.plan import load_plan
     from vaneloop.fleet.rent import known
     from vaneloop.pages.campaign import campaign_page
 
@@ -63,6 +72,8 @@ def command(args: argparse.Namespace) -> int:
             raise InputError(f"--{option} (={getattr(args, option):g} s) must be in [{low:g}, {high:g}]")
     known(args.on)
     terminal.pairs(args.queue, "queue")
+    own = [c.controller for c in load_plan(args.plan).firmware if c.controller]
+    options.trusted(args, args.plan, own)
     plan, quantities, folder = campaign.begin(args.plan, args.out, args.limit)
     new = campaign.take_samples(plan, quantities, folder)
     terminal.say(args, f"{new} trials to take up")
@@ -74,6 +85,7 @@ def command(args: argparse.Namespace) -> int:
     with terminal.progress_bar(args, "running the worst cases again") as progress:
         view = campaign.judge(plan, quantities, folder, progress or (lambda fraction: None))
     _show(args, view, plan.search)
+    tell_damaged(args, folder.damaged)
     terminal.write_json(args, view.json())
     if args.report:
         words = " ".join(["vaneloop campaign", *sys.argv[2:]])
@@ -96,7 +108,7 @@ def _work(args: argparse.Namespace, folder: object, what: str) -> None:
         return
     with terminal.progress_bar(args, what) as progress:
         rent(folder, args.on, args.workers, terminal.pairs(args.queue, "queue"), args.patience / BEATS,
-             lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
+             lambda n, of: progress(n / max(of, 1)) if progress else None, folder.job["machine"])  # fmt: skip
 
 
 def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:

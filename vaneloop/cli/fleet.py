@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.cli import options
 
-__all__ = ["DESCRIPTION", "add_options", "command"]
+__all__ = ["DESCRIPTION", "add_options", "command", "tell_damaged", "unusable"]
 
 DESCRIPTION = """Diagnose the logs of a fleet, and say which engine lacks what, since when, how fast it grows, and which
 engine is unlike its sisters.
@@ -37,7 +39,8 @@ examples:
   vaneloop fleet report out/fleet --report fleet.html --tables-out TABLES
   vaneloop fleet demo --engines 4 --logs 20 --duration 60 --out out/fleet_logs
 
-exit codes: 0 done (report: nothing found), 1 report: an engine lacks something or is unlike its sisters, 2 bad input"""
+exit codes: 0 done (report: nothing found), 1 a part of the run is damaged (report: or an engine lacks something or is
+unlike its sisters), 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +76,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for part in (work, status, report):
         part.add_argument("run", metavar="RUN", help="folder of the run")
     _add_patience(work)
+    options.add_trust_option(work, "the run's folder")
     report.add_argument("--limits", metavar="F.csv", help="columns quantity, limit: where an effect's parameter or a "
                         "nominal one ends its life; of a nominal one without, the end of its tolerance")  # fmt: skip
     report.add_argument("--tables-out", metavar="DIR", help="write every table as Parquet and CSV")
@@ -90,12 +94,26 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     needs("vaneloop fleet", "psutil", "duckdb", "ruptures")
     parts = {"run": _run, "work": _work, "status": _status, "report": _report, "demo": _demo}
-    return parts[args.part](args)
+    with unusable():
+        return parts[args.part](args)
+
+
+@contextmanager
+def unusable() -> Iterator[None]:
+    """Say in one line which file of a run cannot be used; a disk that is full or a folder of others is no defect."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as e:
+        what = f"{e.filename}: {e.strerror}" if e.filename else str(e.strerror or e)
+        raise InputError(f"{what}; what is done is kept, run the same command again") from None
 
 
 def _run(args: argparse.Namespace) -> int:
-    from vaneloop.fleet import sources, state
+    from vaneloop.fleet import sources, state, tables
     from vaneloop.fleet.folder import Folder
+    from vaneloop.fleet.kinds import DIAGNOSIS
     from vaneloop.fleet.leases import BEATS
     from vaneloop.fleet.rent import known, rent
 
@@ -106,18 +124,20 @@ def _run(args: argparse.Namespace) -> int:
     patience, queue = _patience(args), terminal.pairs(args.queue, "queue")
     known(args.on)
     logs = sources.find(args.logs, args.engines)
-    folder = Folder.begin(args.out, "vaneloop.fleet.diagnosis:diagnose_log", *_job(args))
+    folder = Folder.begin(args.out, DIAGNOSIS, *_job(args))
     state.tidy(folder)
     again = {"changed", "unreadable", *(("died", "timeout", "defect") if args.retry else ())}
     statuses = state.came_to(folder)
-    new = folder.add(logs, again=frozenset(k for k, s in statuses.items() if s in again))
+    keys = {k for k, s in statuses.items() if s in again} | (tables.damaged(folder) if args.retry else set())
+    new = folder.add(logs, again=frozenset(keys))
     left = len(set(folder.chunks()) - folder.finished())
     terminal.say(args, f"{len(logs)} logs, {new} of them new or changed; {left} chunks to do")
     if left:
         with terminal.progress_bar(args, "diagnosing the fleet") as progress:
+            # its code is that of --system and --controller, which the user has named
             rent(folder, args.on, args.workers, queue, patience / BEATS,
-                 lambda n, of: progress(n / max(of, 1)) if progress else None)  # fmt: skip
-    return _show(args, folder)
+                 lambda n, of: progress(n / max(of, 1)) if progress else None, folder.job["machine"])  # fmt: skip
+    return _show(args)
 
 
 def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
@@ -161,16 +181,15 @@ def _work(args: argparse.Namespace) -> int:
     from vaneloop.fleet.leases import BEATS
     from vaneloop.fleet.worker import work
 
-    patience = _patience(args)
-    came = work(args.run, every=patience / BEATS, patience=patience)
+    patience, folder = _patience(args), Folder(args.run)
+    options.trusted(args, str(folder.path), folder.code())
+    came = work(args.run, every=patience / BEATS, patience=patience, trust=folder.job["machine"])
     terminal.say(args, "this worker: " + (", ".join(f"{n} {s}" for s, n in sorted(came.items())) or "nothing to do"))
-    return _show(args, Folder(args.run))
+    return _show(args)
 
 
 def _status(args: argparse.Namespace) -> int:
-    from vaneloop.fleet.folder import Folder
-
-    return _show(args, Folder(args.run))
+    return _show(args)
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -181,7 +200,7 @@ def _report(args: argparse.Namespace) -> int:
     folder = Folder(args.run)
     limits = report.limits_of(args.limits)
     db = tables.roll_up(folder)
-    view = report.view_of(db, limits, str(args.run))
+    view = report.view_of(db, limits, str(args.run), folder.damaged)
     if args.tables_out:
         tables.write_tables(db, args.tables_out, (*tables.TABLES, "lacks", "trends", "outliers"))
     rows = [[r["engine"], r["effect"], f"{r['named']} of {r['able']}", day(r["first"])] for r in view.lacking]
@@ -194,6 +213,7 @@ def _report(args: argparse.Namespace) -> int:
     terminal.print_table(args, "what changes", columns, changes[:40])
     odd = [[r["engine"], r["quantity"], f"{r['value']:.4g}", f"{r['sisters']:.4g}", r["unit"]] for r in view.outliers]
     terminal.print_table(args, "unlike their sisters", ["engine", "quantity", "value", "sisters", "unit"], odd[:40])
+    tell_damaged(args, view.damaged)
     terminal.say(args, view.sentence())
     terminal.write_json(args, view.json())
     if args.report:
@@ -205,7 +225,14 @@ def _report(args: argparse.Namespace) -> int:
         if said:
             report.write_pages(pages, said)
         terminal.say(args, f"page: {page}")
-    return int(view.found)
+    return int(view.found or bool(view.damaged))
+
+
+def tell_damaged(args: argparse.Namespace, damaged: dict[str, str]) -> None:
+    """Print what of a run's folder cannot be used."""
+    if damaged:
+        rows = [[name, why] for name, why in damaged.items()]
+        terminal.print_table(args, "damaged, and left out (the same fleet run does it anew)", ["part", "reason"], rows)
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -233,14 +260,17 @@ def _patience(args: argparse.Namespace) -> float:
     return float(args.patience)
 
 
-def _show(args: argparse.Namespace, folder: Any) -> int:
+def _show(args: argparse.Namespace) -> int:
     """Print how far the run is."""
+    from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.state import state_of
 
+    folder = Folder(args.run if args.part != "run" else args.out)
     s = state_of(folder)
     rows = [[status, f"{n:,}"] for status, n in s.came.items()]
     terminal.print_table(args, f"{s.done:,} of {s.contents:,} contents done ({s.logs:,} logs)", ["came to", "n"], rows)
     for name, kind in s.workers.items():
         terminal.say(args, f"at work: {kind} {name}")
+    tell_damaged(args, s.damaged)
     terminal.write_json(args, {"schema": 1, "run": str(folder.path), **s.json()})
-    return 0
+    return int(bool(s.damaged))

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -24,6 +24,7 @@ __all__ = [
     "add_plant_option",
     "add_reading_options",
     "add_tables_option",
+    "add_trust_option",
     "add_without_option",
     "chain_of",
     "guarded",
@@ -36,6 +37,7 @@ __all__ = [
     "search_bar",
     "tables_of",
     "tell_search",
+    "trusted",
     "warm_up_for",
 ]
 
@@ -149,6 +151,25 @@ def add_tables_option(group: Any, plant: bool = True) -> None:
     )
     if plant:
         add_plant_option(group)
+
+
+def add_trust_option(group: Any, whose: str) -> None:
+    """Declare ``--trust``; the command asks with `trusted`."""
+    group.add_argument(
+        "--trust", action="store_true", help=f"run the code that {whose} brings (own model, own controller), unasked"
+    )
+
+
+def trusted(args: argparse.Namespace, source: str, code: Sequence[str]) -> None:
+    """Ask whether code may run that data name: files of ``source``. Raises InputError where nobody says that it may."""
+    if not code or args.trust:
+        return
+    text = terminal.clean(f"{source}: names code that would run here with your rights: {', '.join(code)}")
+    if not sys.stdin.isatty():
+        raise InputError(f"{text}; --trust says that it may")
+    print(f"{text}\nRun it? [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise InputError(f"{source}: its code was not run")
 
 
 def add_without_option(parser: Any) -> None:

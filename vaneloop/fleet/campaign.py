@@ -8,6 +8,7 @@ A group is one scenario with one calibration and one firmware.
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import shlex
 import shutil
@@ -20,17 +21,17 @@ import numpy as np
 from plant import write_model
 from vaneloop.base.errors import InputError
 from vaneloop.fleet import plan as plans
-from vaneloop.fleet.files import digest_of, whole_json
+from vaneloop.fleet.files import digest_of, read_json, whole_json
 from vaneloop.fleet.folder import Folder, copies_of
+from vaneloop.fleet.kinds import TRIAL
 from vaneloop.fleet.plan import Group, Plan, Varied
 from vaneloop.fleet.sources import Source
 from vaneloop.fleet.tables import answers
-from vaneloop.fleet.trial import model_at, moving, trial_once, worst_share
+from vaneloop.fleet.trial import is_answer, model_at, moving, trial_once, worst_share
 from vaneloop.pages.campaign import CampaignView, GroupView, Requirement
 
-__all__ = ["FUNCTION", "begin", "interval", "judge", "take_samples", "take_searches"]
+__all__ = ["begin", "interval", "judge", "take_samples", "take_searches"]
 
-FUNCTION = "vaneloop.fleet.trial:run_trial"
 KNOWN = 64  # worst samples that a search begins with
 
 
@@ -51,7 +52,7 @@ def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[V
         c.pop("tables"), c.pop("controller")
     told |= {"scenarios": [Path(s).stem for s in plan.scenarios], "model": bool(plan.model), "plant": bool(plan.plant)}
     options = {"files": copies_of(files), "limit": limit, "plan": told, **plans.as_options(plan, quantities)}
-    return plan, quantities, Folder.begin(out, FUNCTION, options, files)
+    return plan, quantities, Folder.begin(out, TRIAL, options, files)
 
 
 def take_samples(plan: Plan, quantities: list[Varied], folder: Folder) -> int:
@@ -82,24 +83,33 @@ def take_searches(plan: Plan, folder: Folder) -> int:
 
 
 def _trial(folder: Folder, g: Group, name: str, asked: dict[str, Any]) -> str:
-    """Write a trial's file, unless it is there as it must be; return its path."""
+    """Write a trial's file, unless it is there as it must be; return its path. Raises InputError and OSError."""
     file = (folder.path / "trials" / g.name / f"{name}.json").absolute()
     content = {"group": [g.scenario, g.calibration, g.firmware], "name": name, **asked}
     try:
-        if json.loads(file.read_text(encoding="utf-8")) == json.loads(json.dumps(content)):
+        if read_json(file) == json.loads(json.dumps(content)):
             return str(file)
-    except (OSError, ValueError):
+        folder.set_aside(file)
+    except FileNotFoundError:
         pass
-    file.parent.mkdir(parents=True, exist_ok=True)
+    except InputError:
+        folder.set_aside(file)
+    folder.room("trials", g.name)
     whole_json(file, content)
     return str(file)
 
 
 def _rows(folder: Folder, g: Group, pattern: str = "[0-9]*.json") -> dict[str, dict[str, Any] | None]:
-    """Answers of a group's trials by their names; None: it has none."""
-    names = {f"{digest_of(f)}.json": f.stem for f in sorted((folder.path / "trials" / g.name).glob(pattern))}
+    """Answers of a group's trials by their names; None: it has none, or one that is damaged."""
+    names: dict[str, str] = {}
+    for name in fnmatch.filter(folder.names("trials", g.name), pattern):
+        file = folder.path / "trials" / g.name / name
+        try:
+            names[f"{digest_of(file)}.json"] = file.stem
+        except OSError as e:
+            folder.note(file, f"cannot be read ({e.strerror})")
     found = answers(folder, list(names)) if names else {}
-    return {name: found.get(key) for key, name in names.items()}
+    return {name: answer if is_answer(answer := found.get(key)) else None for key, name in names.items()}
 
 
 def interval(failed: int, n: int, confidence: float) -> tuple[float, float]:
@@ -171,9 +181,8 @@ def _save(
     folder: Folder, files: dict[str, str], plan: Plan, g: Group, quantities: list[Varied], worst: dict[str, Any]
 ) -> tuple[Path, str, bool]:
     """Save the worst case with the command that runs it again; True: from these files it is the same, bit for bit."""
-    at = folder.path / "worst" / g.name
-    shutil.rmtree(at, ignore_errors=True)
-    at.mkdir(parents=True)
+    shutil.rmtree(folder.room("worst", g.name))
+    at = folder.room("worst", g.name)
     scenario = at / f"{g.scenario}.toml"
     shutil.copyfile(files[f"scenario.{g.scenario}"], scenario)
     made = model_at(files, g, quantities, worst["point"])

@@ -19,7 +19,8 @@ class Journal:
     def __init__(self, run: Path, worker: str):
         """Open it for appending."""
         (run / "journal").mkdir(parents=True, exist_ok=True)
-        self.file = os.open(run / "journal" / f"{worker}.jsonl", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW
+        self.file = os.open(run / "journal" / f"{worker}.jsonl", flags, 0o644)
 
     def note(self, what: str, **more: Any) -> None:
         """Append a line, on the disk before this returns."""

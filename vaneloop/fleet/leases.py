@@ -9,6 +9,7 @@ worker that stands still). A worker that comes back after that sees the greater 
 from __future__ import annotations
 
 import os
+import re
 import socket
 import threading
 import time
@@ -18,11 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base.errors import InputError
-from vaneloop.fleet.files import create, read_json, whole_json
+from vaneloop.fleet.files import create, plain_bytes, read_json, whole_json
 
-__all__ = ["BEATS", "Leases", "Me", "gone"]
+__all__ = ["BEATS", "Leases", "Me", "gone", "who_is"]
 
 BEATS = 12.0  # heartbeats that may fail to come until a worker is taken for dead
+SMALL = 1 << 16  # bytes of a file here, at most
+_LEASE = re.compile(r"([^.]+)\.([0-9]{1,12})")
+_NAME = re.compile(r"[A-Za-z0-9._-]{1,200}")
 
 
 def _host() -> str:
@@ -45,6 +49,17 @@ def _started(pid: int) -> float | None:
         return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
     except psutil.NoSuchProcess:
         return None
+
+
+def who_is(file: Path) -> dict[str, Any]:
+    """What a worker's file says. Raises FileNotFoundError, and InputError where it is damaged."""
+    who = read_json(file, SMALL)
+    kinds = {"host": str, "pid": int, "started": float | int, "kind": str}
+    if not isinstance(who, dict) or not all(isinstance(who.get(k), kind) for k, kind in kinds.items()):
+        raise InputError(f"{file}: does not say host, pid, started and kind; the run folder is damaged")
+    if not 0 < who["pid"] < 1 << 31:
+        raise InputError(f"{file}: pid (={who['pid']}) is no number of a process; the run folder is damaged")
+    return who
 
 
 def gone(who: dict[str, Any]) -> bool:
@@ -114,26 +129,27 @@ class Leases:
         out: dict[str, int] = {}
         try:
             for f in os.scandir(self.folder):
-                chunk, _, number = f.name.partition(".")
-                if chunk and number.isdigit():
-                    out[chunk] = max(out.get(chunk, -1), int(number))
+                if (m := _LEASE.fullmatch(f.name)) is not None:
+                    out[m[1]] = max(out.get(m[1], -1), int(m[2]))
         except FileNotFoundError:
             pass
         return out
 
     def holder(self, chunk: str, number: int) -> str:
-        """Name of the worker that has a lease; "": it has been given back just now."""
+        """Name of the worker that has a lease; "": it has been given back just now, or is damaged."""
         try:
-            return str(read_json(self.folder / f"{chunk}.{number}")["worker"])
+            said = read_json(self.folder / f"{chunk}.{number}", SMALL)
         except (FileNotFoundError, InputError):
             return ""
+        name = said.get("worker") if isinstance(said, dict) else None
+        return name if isinstance(name, str) and _NAME.fullmatch(name) else ""
 
     def dead(self, worker: str) -> bool:
         """Whether a worker is gone, or silent for longer than the patience."""
         try:
-            if gone(read_json(self.workers / f"{worker}.json")):
+            if gone(who_is(self.workers / f"{worker}.json")):
                 return True
-            beat = (self.workers / f"{worker}.beat").read_text()
+            beat = plain_bytes(self.workers / f"{worker}.beat", SMALL).decode("utf-8", "replace")
         except (OSError, InputError):
             return True  # it has left
         now = time.monotonic()

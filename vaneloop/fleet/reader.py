@@ -24,8 +24,12 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
+from vaneloop.fleet.kinds import KINDS
 
-__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "serve"]
+__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "python", "serve"]
+
+SERVE = "from vaneloop.fleet.reader import serve; serve()"
+_ROOT = str(Path(__file__).parents[2])
 
 # one thread a process: several processes that each use all cores are slower than one
 ONE_THREAD = dict.fromkeys(
@@ -55,9 +59,9 @@ class NotReady(InputError):
 class Reader:
     """A worker's process for logs, begun when it is first needed and after it has died."""
 
-    def __init__(self, function: str, folder: str, stopped: threading.Event):
-        """``function``: module:name, called with path, options and the run's folder; returns what JSON holds."""
-        self.function, self.folder, self.stopped = function, folder, stopped
+    def __init__(self, kind: str, folder: str, stopped: threading.Event):
+        """``kind``: one of `KINDS`: what is done with each log."""
+        self.kind, self.folder, self.stopped = kind, folder, stopped
         self.process: subprocess.Popen[bytes] | None = None
 
     def ask(self, path: str, options: dict[str, Any], limit: float) -> dict[str, Any]:
@@ -99,11 +103,11 @@ class Reader:
 
     def _begin(self, options: dict[str, Any]) -> None:
         """Start the process, and have it compile what it needs; other processes of this host wait meanwhile."""
-        words = [sys.executable, "-c", "from vaneloop.fleet.reader import serve; serve()", self.function, self.folder]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (as long as the process)
         self.process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, env=_environment()
-        )
+            python(SERVE, self.kind, self.folder), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+            env=_environment(),
+        )  # fmt: skip
         self._answer({"options": options}, WARM_UP)
 
     def _answer(self, question: dict[str, Any], limit: float) -> dict[str, Any]:
@@ -142,6 +146,14 @@ class Reader:
         return f" ({fatal[0][:120]})" if fatal else ""
 
 
+def python(code: str, *words: str) -> list[str]:
+    """Command of a Python process of ours. It finds this VaneLoop, and no module in the folder where the user stands,
+    which may be a run folder of somebody else.
+    """
+    here = f"import sys; {_ROOT!r} in sys.path or sys.path.insert(0, {_ROOT!r}); "
+    return [sys.executable, "-P", "-c", here + code, *words]
+
+
 def _environment() -> dict[str, str]:
     """Environment of the process: one thread, and a cache of compiled code that no other host or version shares."""
     from vaneloop.base.compiled import cache_folder
@@ -151,14 +163,14 @@ def _environment() -> dict[str, str]:
 
 
 def serve() -> None:
-    """Answer for one log after the other until standard input ends. The words: function, run folder."""
+    """Answer for one log after the other until standard input ends. The words: kind, run folder."""
     import faulthandler
 
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     faulthandler.enable()
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    module, _, name = sys.argv[1].partition(":")
+    module, name = KINDS[sys.argv[1]].function
     function = getattr(importlib.import_module(module), name)
     for line in sys.stdin:
         asked = json.loads(line)

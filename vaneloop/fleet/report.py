@@ -54,8 +54,12 @@ def limits_of(file: str | None) -> dict[str, float]:
         raise InputError(f"--limits {file}: {str(e).splitlines()[0]}; a limit must be a number") from None
 
 
-def view_of(db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str = "") -> FleetView:
-    """Work out what the page shows and the tables ``engines``, ``lacks``, ``trends``, ``outliers`` of the database."""
+def view_of(
+    db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str = "", damaged: dict[str, str] | None = None
+) -> FleetView:
+    """Work out what the page shows and the tables ``engines``, ``lacks``, ``trends``, ``outliers`` of the database.
+    ``damaged``: parts of the run's folder that are, with their reasons.
+    """
     engines = [str(r[0]) for r in db.execute("SELECT DISTINCT engine FROM logs ORDER BY engine").fetchall()]
     statuses = dict(db.execute("SELECT status, count(*) FROM logs GROUP BY status ORDER BY status").fetchall())
     lacks = _lacks(db)
@@ -71,6 +75,7 @@ def view_of(db: duckdb.DuckDBPyConnection, limits: dict[str, float], name: str =
         name=name, engines=engines, statuses=statuses, verdicts=_verdicts(db), lacks=lacks, series=found,
         outliers=outliers, coverage=_coverage(db), refused=_refused(db),
         span=db.execute("SELECT min(time), max(time) FROM logs").fetchall()[0],
+        damaged=dict(sorted((damaged or {}).items())),
     )  # fmt: skip
     _store(db, "lacks", lacks)
     _store(db, "trends", [s.json() for s in found])
@@ -317,6 +322,9 @@ def write_pages(folder: Path, said: dict[str, dict[str, Any]]) -> None:
     """Write the page of each log that the fleet's page leads to."""
     from vaneloop.pages.fleet import log_page
 
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise InputError(f"{folder}: cannot be made for the pages of logs ({e.strerror})") from None
     for key, answer in said.items():
         log_page(key, answer).write(folder / f"{key}.html")

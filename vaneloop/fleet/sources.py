@@ -25,11 +25,14 @@ _DATE = re.compile(
 
 @dataclass(frozen=True)
 class Source:
-    """A log: path, engine ("": not known), time of its start in s since 1970 (None: not known)."""
+    """A log: path, engine ("": not known), time of its start in s since 1970 (None: not known), and why it cannot be
+    taken up ("": it can).
+    """
 
     path: str
     engine: str = ""
     time: float | None = None
+    fault: str = ""
 
     def described(self) -> Source:
         """The same with what the list leaves open, from the file's metadata or else its path."""
@@ -68,7 +71,9 @@ def find(places: Sequence[str], engines: str | None = None) -> list[Source]:
     out = []
     for path in sorted(set(_files(places))):
         said = listed.get(path) or listed.get(Path(path).name) or {}
-        out.append(Source(path, said.get("engine", ""), moment(said.get("time", ""))))
+        shown = path.encode("utf-8", "backslashreplace").decode()
+        fault = "" if shown == path else "its name is not UTF-8; rename it"
+        out.append(Source(shown, said.get("engine", ""), moment(said.get("time", "")), fault))
     if not out:
         raise InputError(f"{', '.join(places)}: holds no log; allowed: {', '.join(SUFFIXES)}")
     return out

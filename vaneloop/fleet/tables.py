@@ -10,19 +10,22 @@ Rows are in the order of path, so that two runs over the same logs give the same
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vaneloop.base.errors import InputError
+from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
 if TYPE_CHECKING:
     import duckdb
+    import pyarrow as pa
 
-    from vaneloop.fleet.folder import Folder
-
-__all__ = ["TABLES", "answers", "database", "roll_up", "write_tables"]
+__all__ = ["TABLES", "answers", "damaged", "database", "roll_up", "write_tables"]
 
 TABLES = ("logs", "effects", "nominal", "coverage")
 MEMORY = "700MB"
@@ -33,11 +36,25 @@ _NOMINAL = """[{"stage": "VARCHAR", "parameter": "VARCHAR", "unit": "VARCHAR", "
 "high": "DOUBLE", "table": "DOUBLE", "tolerance": "DOUBLE"}]"""
 _MISSED = """[{"effect": "VARCHAR", "stage": "VARCHAR", "needs": "VARCHAR"}]"""
 _UNSEEN = """[{"stage": "VARCHAR", "verdict": "VARCHAR", "reason": "VARCHAR"}]"""
+# table, field of an answer, its shape, its texts that must be there, its numbers
+_FIELDS = (
+    ("effects", "sizes", _SIZES, ("effect", "stage", "parameter", "unit"),
+     ("probability", "value", "low", "high", "neutral")),
+    ("nominal", "nominal", _NOMINAL, ("stage", "parameter", "unit"), ("value", "low", "high", "table", "tolerance")),
+    ("missed", "not_observable", _MISSED, ("effect", "stage"), ()),
+    ("unseen", "stages", _UNSEEN, ("stage", "verdict"), ()),
+)  # fmt: skip
+_NEEDED = ("neutral", "table")  # numbers that must be there; others may be null, where a log does not tell them
+_DAMAGED = "its answer is damaged; vaneloop fleet run --retry does it anew"
+TAKEN = 64 << 20  # bytes of answers that are looked into at once
 
 
 def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
     """The tables of a run, in a database in memory. Raises InputError where nothing is finished yet, and for the folder
     of a campaign, which has no logs.
+
+    A part of the run that is damaged is noted (`Folder.damaged`). An answer in which something is not what a diagnosis
+    says is a log with the status damaged.
     """
     if folder.of_campaign:
         raise InputError(
@@ -46,40 +63,105 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
         )
     if not folder.finished():
         raise InputError(f"{folder.path}: no part of the run is finished yet; vaneloop fleet status says how far it is")
+    import pyarrow as pa
+
     db = database()
-    entries, parts = str(folder.path / "logs" / "*.parquet"), str(folder.path / "parts" / "*.parquet")
-    db.execute(  # of a path and of a content the latest counts
-        "CREATE TEMP TABLE entries AS SELECT path, key, engine, time, reason FROM read_parquet($1, filename = true) "
-        "QUALIFY row_number() OVER (PARTITION BY path ORDER BY filename DESC) = 1", [entries]
-    )  # fmt: skip
+    entries = folder.entries()
+    text = {n: pa.array([getattr(e, n) for e in entries], pa.string()) for n in ("path", "key", "engine", "reason")}
+    db.register("_given", pa.table({**text, "time": pa.array([e.time for e in entries], pa.float64())}))
+    db.execute("CREATE TEMP TABLE entries AS SELECT * FROM _given")
+    db.unregister("_given")
+    db.execute("CREATE TEMP TABLE results (key VARCHAR, status VARCHAR, reason VARCHAR, verdict VARCHAR, "
+               "duration_s DOUBLE)")  # fmt: skip
+    for table, _, shape, _, _ in _FIELDS:
+        db.execute(f"CREATE TEMP TABLE raw_{table} AS SELECT '' AS key, x.*, true AS good FROM (SELECT unnest("
+                   f"from_json('[]', '{shape}')) AS x) LIMIT 0")  # fmt: skip
+    seen: set[str] = set()
+    for batch in _batches(folder):
+        _take(db, batch, seen)
+    bad = " UNION ".join(f"SELECT key FROM raw_{table} WHERE NOT good" for table, *_ in _FIELDS)
+    db.execute(f"UPDATE results SET status = 'damaged' WHERE key IN ({bad})")
     db.execute(
-        "CREATE TEMP VIEW latest AS SELECT key, max(filename) AS filename FROM "
-        f"read_parquet('{_quoted(parts)}', filename = true) GROUP BY key"
-    )
-    db.execute(
-        "CREATE TEMP VIEW results AS SELECT r.* FROM "
-        f"read_parquet('{_quoted(parts)}', filename = true) r JOIN latest USING (key, filename)"
+        f"UPDATE results SET reason = '{_DAMAGED}', verdict = NULL, duration_s = NULL WHERE status = 'damaged'"
     )
     db.execute(
         "CREATE TABLE logs AS SELECT e.path, e.engine, e.time, e.key, "
         "CASE WHEN e.key = '' THEN 'unreadable' ELSE coalesce(r.status, 'pending') END AS status, "
         "CASE WHEN e.key = '' THEN e.reason ELSE coalesce(r.reason, '') END AS reason, r.verdict, "
-        "CAST(r.answer ->> '$.duration_s' AS DOUBLE) AS duration_s "
-        "FROM entries e LEFT JOIN results r USING (key) ORDER BY e.path"
+        "r.duration_s FROM entries e LEFT JOIN results r USING (key) ORDER BY e.path"
     )
-    shapes = (("effects", "sizes", _SIZES, "x.effect, "), ("nominal", "nominal", _NOMINAL, ""))
-    for table, field, shape, first in shapes:
-        db.execute(
-            f"CREATE TABLE {table} AS SELECT {_OF}, x.* FROM (SELECT key, unnest(from_json(answer -> '$.{field}', "
-            f"'{shape}')) AS x FROM results) r JOIN logs l USING (key) ORDER BY l.path, {first}x.stage, x.parameter"
-        )
+    whole = "JOIN logs l USING (key) WHERE l.status <> 'damaged' ORDER BY l.path"
+    for table, columns in (("effects", _columns(_SIZES)), ("nominal", _columns(_NOMINAL))):
+        first = "r.effect, " if table == "effects" else ""
+        db.execute(f"CREATE TABLE {table} AS SELECT {_OF}, {columns} FROM raw_{table} r {whole}, {first}r.stage, "
+                   f"r.parameter")  # fmt: skip
     db.execute(
-        f"CREATE TABLE coverage AS SELECT {_OF}, x.* FROM (SELECT key, unnest(from_json(answer -> '$.not_observable', "
-        f"'{_MISSED}')) AS x FROM results UNION ALL SELECT key, struct_pack(effect := '', stage := y.stage, needs := "
-        f"y.reason) FROM (SELECT key, unnest(from_json(answer -> '$.stages', '{_UNSEEN}')) AS y FROM results) WHERE "
-        "y.verdict = 'not_observed') r JOIN logs l USING (key) ORDER BY l.path, x.stage, x.effect"
+        f"CREATE TABLE coverage AS SELECT {_OF}, {_columns(_MISSED)} FROM (SELECT key, effect, stage, needs FROM "
+        "raw_missed UNION ALL SELECT key, '' AS effect, stage, reason AS needs FROM raw_unseen WHERE verdict = "
+        f"'not_observed') r {whole}, r.stage, r.effect"
     )
     return db
+
+
+def damaged(folder: Folder) -> set[str]:
+    """Keys of the logs whose answers are damaged."""
+    if folder.of_campaign or not folder.finished():
+        return set()
+    return {str(key) for (key,) in roll_up(folder).execute("SELECT key FROM logs WHERE status = 'damaged'").fetchall()}
+
+
+def _columns(shape: str) -> str:
+    return ", ".join(f'r."{name}"' for name in json.loads(shape)[0])
+
+
+def _batches(folder: Folder) -> Iterator[pa.Table]:
+    """What came of all logs, the latest first, some `TAKEN` bytes at a time."""
+    import pyarrow as pa
+
+    held: list[pa.Table] = []
+    size = 0
+    for table in folder.parts("key", "status", "reason", "verdict", "answer"):
+        held.append(table)
+        size += table.nbytes
+        if size > TAKEN:
+            yield pa.concat_tables(held)
+            held, size = [], 0
+    if held:
+        yield pa.concat_tables(held)
+
+
+def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table, seen: set[str]) -> None:
+    """Put what came of some logs into the database, but for contents that were ``seen``."""
+    import pyarrow as pa
+
+    keys = batch.column("key").to_pylist()
+    fresh = []
+    for key in reversed(keys):  # of two rows in one part the later counts
+        good = key is not None and KEY.fullmatch(key) is not None and key not in seen
+        fresh.append(good)
+        if good:
+            seen.add(key)
+    db.register("_part", batch.filter(pa.array(fresh[::-1], pa.bool_())))
+    wrong = " OR ".join(f"coalesce(json_type(answer, '$.{field}'), 'NULL') NOT IN ('ARRAY', 'NULL')"
+                        for _, field, *_ in _FIELDS)  # fmt: skip
+    known = ", ".join(f"'{s}'" for s in STATUSES)
+    db.execute(
+        "CREATE OR REPLACE TEMP TABLE part AS SELECT key, status, reason, verdict, CASE WHEN json_valid(answer) THEN "
+        "CASE WHEN json_type(answer) = 'OBJECT' THEN answer END END AS answer FROM _part"
+    )
+    db.unregister("_part")
+    db.execute(
+        f"INSERT INTO results SELECT key, CASE WHEN status IS NULL OR status NOT IN ({known}) OR status = 'done' AND "
+        f"(answer IS NULL OR verdict IS NULL) OR answer IS NOT NULL AND ({wrong}) THEN 'damaged' ELSE status END, "
+        "coalesce(reason, ''), verdict, CASE WHEN isfinite(TRY_CAST(answer ->> '$.duration_s' AS "
+        "DOUBLE)) THEN TRY_CAST(answer ->> '$.duration_s' AS DOUBLE) END FROM part"
+    )
+    for table, field, shape, texts, numbers in _FIELDS:
+        good = [f"x.{c} IS NOT NULL" for c in texts]
+        good += [f'coalesce(isfinite(x."{c}"), {str(c not in _NEEDED).lower()})' for c in numbers]
+        db.execute(f"INSERT INTO raw_{table} SELECT key, x.*, x IS NOT NULL AND {' AND '.join(good)} FROM (SELECT key, "
+                   f"unnest(from_json(answer -> '$.{field}', '{shape}')) AS x FROM part WHERE status = 'done' AND "
+                   f"json_type(answer, '$.{field}') = 'ARRAY')")  # fmt: skip
 
 
 def database() -> duckdb.DuckDBPyConnection:
@@ -89,20 +171,24 @@ def database() -> duckdb.DuckDBPyConnection:
     import duckdb
 
     place = str(Path(tempfile.gettempdir()) / f"vaneloop-fleet-{os.getpid()}")
-    db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2", "temp_directory": place})
+    alone = dict.fromkeys(("autoinstall_known_extensions", "autoload_known_extensions"), "false")
+    db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2", "temp_directory": place, **alone})
     db.execute("SET enable_progress_bar = false")
     return db
 
 
 def answers(folder: Folder, keys: list[str]) -> dict[str, dict[str, Any]]:
-    """The answers to some logs by their keys, as ``vaneloop diagnose --json`` gives them."""
-    import json
+    """The answers to some logs by their keys, as ``vaneloop diagnose --json`` gives them; damaged ones are left out."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
 
-    rows = database().execute(
-        "SELECT key, answer FROM read_parquet($1, filename = true) WHERE list_contains($2, key) AND answer IS NOT NULL "
-        "ORDER BY filename", [str(folder.path / "parts" / "*.parquet"), keys],
-    ).fetchall()  # fmt: skip
-    return {key: json.loads(answer) for key, answer in rows}
+    wanted, found = pa.array(keys, pa.string()), {}
+    for table in folder.parts("key", "answer"):
+        for row in reversed(table.filter(pc.is_in(table["key"], wanted)).to_pylist()):
+            if row["answer"] is not None and row["key"] not in found:
+                with suppress(ValueError, RecursionError):
+                    found[row["key"]] = json.loads(row["answer"])
+    return {key: answer for key, answer in found.items() if isinstance(answer, dict)}
 
 
 def write_tables(db: duckdb.DuckDBPyConnection, to: str | Path, tables: tuple[str, ...] = TABLES) -> list[Path]:

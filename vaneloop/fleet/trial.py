@@ -7,12 +7,12 @@ their margins).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from hil.inject.any_controller import SHIPPED, expected_of_any, load_reactions
 from hil.inject.injection import run
@@ -20,14 +20,17 @@ from hil.inject.margin import margins
 from hil.inject.scenario import Scenario
 from hil.inject.verdict import Outcome
 from plant import Model
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import Finite, Table
+from vaneloop.fleet.files import read_json
 from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of
 
-__all__ = ["model_at", "moving", "run_trial", "trial_once", "worst_share"]
+__all__ = ["is_answer", "model_at", "moving", "run_trial", "trial_once", "worst_share"]
 
 
 def run_trial(path: str, options: dict[str, Any], run_folder: str) -> dict[str, Any]:
     """Do what the file asks for; the answer has the point, the margins and the state's digest of the (worst) run."""
-    asked = json.loads(Path(path).read_text(encoding="utf-8"))
+    asked = _asked(path)
     files = {name: str(Path(run_folder) / f) for name, f in options["files"].items()}
     g, quantities = Group(*asked["group"]), [Varied(**q) for q in options["vary"]]
     if "search" not in asked:
@@ -35,6 +38,58 @@ def run_trial(path: str, options: dict[str, Any], run_folder: str) -> dict[str, 
     else:
         answer = _search(files, g, quantities, asked, int(options["seed"]))
     return {"verdict": "held" if answer["held"] else "failed", "answer": answer}
+
+
+class _Margin(BaseModel):
+    """A claim's margin in an answer."""
+
+    expected: str
+    held: bool
+    value: Finite | None
+    unit: str
+    share: Finite | None
+
+
+class _Answer(BaseModel):
+    """The answer to a trial, as a campaign counts it."""
+
+    point: list[Finite]
+    held: bool
+    margins: list[_Margin]
+    state_hash: str
+    seen: list[str]
+    runs: int = 0
+
+
+class _Asked(Table):
+    """A trial's file."""
+
+    group: Annotated[list[str], Field(min_length=3, max_length=3)]
+    name: str = ""
+    point: list[Finite] = []
+    search: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    among: list[str] = []
+    known: list[tuple[list[Finite], Finite]] = []
+
+
+def is_answer(answer: Any) -> bool:
+    """Whether it is the answer to a trial, whole and undamaged."""
+    try:
+        _Answer.model_validate(answer)
+    except ValidationError:
+        return False
+    return True
+
+
+def _asked(path: str) -> dict[str, Any]:
+    """What a trial's file asks for. Raises InputError where it asks for nothing of ours."""
+    asked = read_json(Path(path))
+    try:
+        _Asked.model_validate(asked)
+    except ValidationError as e:
+        where = ".".join(str(x) for x in e.errors()[0]["loc"])
+        raise InputError(f"{path}: is no trial of a campaign ({where}: {e.errors()[0]['msg']})") from None
+    return dict(asked)
 
 
 def model_at(files: dict[str, str], g: Group, quantities: list[Varied], point: list[float]) -> Model:

@@ -11,29 +11,32 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base.errors import InputError
-from vaneloop.fleet.files import passed, whole_json
+from vaneloop.fleet.files import passed, plain_bytes, whole_json
 from vaneloop.fleet.folder import Entry, Folder, key_of, sources_version
 from vaneloop.fleet.journal import Journal
+from vaneloop.fleet.kinds import checked
 from vaneloop.fleet.leases import Leases, Me
 from vaneloop.fleet.reader import Died, Reader, Stopped, TimedOut
 
-__all__ = ["LIMIT", "work"]
+__all__ = ["work"]
 
-LIMIT = 3600.0  # s for one log, if the run says nothing else
 DEATHS = 3  # of its reader, after which a log is given up
 TRIES = 12  # begun and never ended, also by the death of the whole worker
 
 
 def work(
-    run: str | Path, *, starter: str = "", every: float = 5.0, patience: float = 60.0, wait: bool = True
-) -> dict[str, int]:
+    run: str | Path, *, starter: str = "", every: float = 5.0, patience: float = 60.0, wait: bool = True,
+    trust: str = "",
+) -> dict[str, int]:  # fmt: skip
     """Work on a run until nothing is left to do; return how many logs came to what.
 
     starter   name of the process that rents this one: when it is gone, this one stops too
     every     s between heartbeats
     patience  s without a heartbeat, after which another worker's chunk is taken over
     wait      stay until others have done theirs, and take over what they leave
-    Raises InputError where this VaneLoop is not the run's, or the disk is full: what is done is done.
+    trust     SHA-256 of the machine (run.json) whose code may be run: a model of the user's own, controllers
+    Raises InputError where this VaneLoop is not the run's, its code is not trusted, its machine is damaged, or the disk
+    is full: what is done is done.
     """
     folder = Folder(run)
     if folder.job["version"] != sources_version():
@@ -41,11 +44,18 @@ def work(
             f"{folder.path}: was begun by vaneloop {folder.job['version']}; this is {sources_version()}, whose results "
             f"do not belong beside those"
         )
+    limit = checked(folder.job["kind"], folder.job["options"], folder.path).limit
+    if (code := folder.code()) and trust != folder.job["machine"]:
+        raise InputError(
+            f"{folder.path}: its workers would run code that the folder brings: {', '.join(code)}; --trust of vaneloop "
+            f"fleet work allows it"
+        )
     me: Me | None = None
     try:
+        folder.machine()
         me = Me(folder.path, every, starter)
         with _terminable(me):
-            return _Worker(folder, me, Leases(folder.path, patience)).run(wait)
+            return _Worker(folder, me, Leases(folder.path, patience), limit).run(wait)
     except OSError as e:
         raise InputError(f"{folder.path}: {_short(e)}; what is done is kept, run the same command again") from None
     finally:
@@ -54,10 +64,9 @@ def work(
 
 
 class _Worker:
-    def __init__(self, folder: Folder, me: Me, leases: Leases):
-        self.folder, self.me, self.leases = folder, me, leases
-        self.reader = Reader(folder.job["function"], str(folder.path), me.stopped)
-        self.limit = float(folder.job["options"].get("limit", LIMIT))
+    def __init__(self, folder: Folder, me: Me, leases: Leases, limit: float = 3600.0):
+        self.folder, self.me, self.leases, self.limit = folder, me, leases, limit
+        self.reader = Reader(folder.job["kind"], str(folder.path), me.stopped)
         self.counts: dict[str, int] = {}
         self.journal = Journal(folder.path, me.name)
 
@@ -94,7 +103,7 @@ class _Worker:
             for e in entries:
                 if self.me.stopped.is_set() or not self.leases.mine(chunk, number):
                     return
-                if not (self.folder.results(chunk) / f"{e.key}.json").exists():
+                if self.folder.result(chunk, e.key) is None:
                     self._log(chunk, e)
             self.folder.close(chunk, entries)
         except FileNotFoundError:  # who stood still long enough may find that another has finished, and cleared up
@@ -109,7 +118,11 @@ class _Worker:
         tried = self.folder.results(chunk) / f"{e.key}.tried"
         row: dict[str, Any] | None = None
         while row is None:
-            before = _lines(tried)
+            try:
+                before = _lines(tried)
+            except OSError:  # no plain file
+                self.folder.set_aside(tried)
+                before = []
             row = _given_up(before)
             if row is None:
                 _append(tried, "begin")
@@ -172,14 +185,15 @@ def _unlike(e: Entry) -> dict[str, Any] | None:
 
 def _lines(file: Path) -> list[str]:
     try:
-        return file.read_text(encoding="utf-8").splitlines()
+        return plain_bytes(file).decode("utf-8", "replace").splitlines()
     except FileNotFoundError:
         return []
 
 
 def _append(file: Path, line: str) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with open(file, "a", encoding="utf-8") as f:
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW
+    with open(os.open(file, flags, 0o644), "a", encoding="utf-8") as f:
         f.write(" ".join(line.split()) + "\n")
         f.flush()
         os.fsync(f.fileno())

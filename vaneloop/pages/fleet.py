@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from vaneloop.pages.figures import Figure, Line, Panel, heat, overlay
 from vaneloop.pages.page import Link, Page
@@ -73,6 +74,7 @@ class FleetView:
     verdicts  engine -> verdict -> logs
     lacks     a row an engine and effect: named in how many of the logs that could show it, and whether that is enough
     span      first and last time, s since 1970
+    damaged   what of the run's folder cannot be used: name, reason
     """
 
     name: str
@@ -85,6 +87,7 @@ class FleetView:
     coverage: list[dict[str, Any]]
     refused: list[dict[str, Any]]
     span: tuple[float | None, float | None]
+    damaged: dict[str, str] = field(default_factory=dict)
 
     @property
     def changed(self) -> list[Series]:
@@ -123,6 +126,7 @@ class FleetView:
         return {
             "schema": 1, "run": self.name, "engines": self.engines, "logs": self.statuses, "lacks": self.lacking,
             "trends": [s.json() for s in self.changed], "outliers": self.outliers, "coverage": self.coverage,
+            "damaged": self.damaged,
         }  # fmt: skip
 
 
@@ -154,6 +158,9 @@ def fleet_page(view: FleetView, command: str = "", logs: str = "") -> Page:
         page.section("Logs without an answer", "They are rows, not the end of a run.")
         rows = [[r["engine"], r["path"], r["status"], r["reason"]] for r in view.refused]
         _table(page, ["engine", "log", "what came of it", "reason"], rows)
+    if view.damaged:
+        page.section("Damaged parts of the run", "What they held is not in this report.")
+        _table(page, ["part", "reason"], list(view.damaged.items()))
     return page
 
 
@@ -273,8 +280,46 @@ def _to(key: str, logs: str) -> object:
     return Link(key[:8], f"{logs}/{key}.html") if logs else key[:8]
 
 
+class _Size(BaseModel):
+    value: float | None
+    low: float | None
+    high: float | None
+    unit: str
+
+
+class _Effect(BaseModel):
+    effect: str
+    stage: str
+    probability: float | None
+    parameters: dict[str, _Size]
+    rivals: list[str]
+
+
+class _Nominal(_Size):
+    stage: str
+    parameter: str
+    table: float | None
+    tolerance: float | None
+
+
+class _Answer(BaseModel):
+    """What of an answer the page of a log shows."""
+
+    verdict: str
+    log: str
+    stages: list[dict[str, Any]]
+    effects: list[_Effect]
+    nominal: list[_Nominal] = []
+    notes: list[str] = []
+
+
 def log_page(key: str, answer: dict[str, Any]) -> Page:
-    """The short page of one log, from its answer: tables, no curves."""
+    """The short page of one log, from its answer: tables, no curves. Of a damaged answer it says that it is."""
+    try:
+        _Answer.model_validate(answer)
+    except ValidationError as e:
+        where = ".".join(str(x) for x in e.errors()[0]["loc"])
+        return Page(f"Log {key[:8]}", f"Its answer is damaged ({where}).", tone="bad", subtitle="fleet")
     tones = {"none": "good", "missing": "neutral", "unknown": "bad"}
     page = Page(
         f"Log {key[:8]}", f"Verdict: {verdict_word(answer['verdict'])}.", tone=tones.get(answer["verdict"], "neutral"),  # type: ignore[arg-type]

@@ -187,6 +187,8 @@ class _Page:
         ui.linear_progress(round(share, 3), show_value=False).props('rounded aria-label="share that is done"')
         if s["came_to"]:
             table(["came to", "number"], [[k, f"{n:,}"] for k, n in s["came_to"].items()], numbers=(1,))
+        if s["damaged"]:
+            table(["damaged, and left out", "reason"], [[name, why] for name, why in s["damaged"].items()])
         for name, kind in s["workers"].items():
             ui.label(f"at work: {kind} {name}").classes("small mono")
         if s["campaign"]:

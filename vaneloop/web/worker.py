@@ -407,7 +407,7 @@ def fleet_report(progress: Progress, run: str, logs: str) -> Any:
     from vaneloop.pages.fleet import fleet_page
 
     folder = Folder(run)
-    return None if folder.of_campaign else fleet_page(view_of(roll_up(folder), {}, run), logs=logs)
+    return None if folder.of_campaign else fleet_page(view_of(roll_up(folder), {}, run, folder.damaged), logs=logs)
 
 
 def fleet_log(progress: Progress, run: str, key: str) -> str:

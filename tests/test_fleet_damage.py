@@ -1,0 +1,354 @@
+"""A run folder that a disk has spoilt, or that somebody made to do harm: what is damaged is a row with its reason, the
+rest is reported, and nothing outside of the folder is touched.
+
+Each damage is one of `DAMAGES` at a place drawn by chance. Then status, report and work (or run) look at the folder, in
+this process, with a stand-in for the reader of logs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
+pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
+
+from vaneloop.cli.main import main
+from vaneloop.fleet import folder, kinds, rent, worker
+from vaneloop.fleet.files import whole_json
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.leases import Leases
+from vaneloop.fleet.sources import find
+from vaneloop.fleet.worker import work
+
+KINDS_OF_FILES = ("run.json", "logs", "parts", "results", "leases", "workers", "journal", "machine")
+HANGS = 600  # s after which a command waits for ever: a thousand times what any takes
+BAD_VALUES: tuple[Any, ...] = (
+    None, True, -1, 0.5, 1e308, 10**18, 10**40, float("nan"), float("inf"), "", "../../outside", "/etc/passwd", "a\nb",
+    "\x1b[2Jx", "<script>", "\ud800", "x" * 100_000, [], {}, [[]], {"a": {"b": []}},
+)  # fmt: skip
+
+
+class Stand:
+    """A reader that answers at once."""
+
+    def __init__(self, kind: str, run: str, stopped: threading.Event):
+        """As `vaneloop.fleet.reader.Reader`."""
+
+    def ask(self, path: str, options: dict[str, Any], limit: float) -> dict[str, Any]:
+        """An answer as a diagnosis has it."""
+        return {"status": "done", "reason": "", "verdict": "missing", "answer": answer(len(path))}
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+
+def answer(k: int) -> dict[str, Any]:
+    """The answer to a log."""
+    size = {"effect": "dip", "stage": "s", "probability": 0.5, "parameter": "q", "unit": "MPa", "value": 1.0 + k,
+            "low": 0.5, "high": 1.5, "neutral": 0.0}  # fmt: skip
+    row = {"stage": "s", "parameter": "p", "unit": "deg", "value": 2.0 + k, "low": 1.0, "high": 3.0, "table": 0.0,
+           "tolerance": None}  # fmt: skip
+    return {
+        "log": "a", "verdict": "missing", "duration_s": 60.0, "sizes": [size], "nominal": [row], "notes": ["n"],
+        "not_observable": [{"effect": "x", "stage": "s", "needs": "n"}],
+        "stages": [{"stage": "t", "verdict": "not_observed", "reason": "r"}],
+        "effects": [{**size, "rivals": [], "parameters": {"q": size}}],
+    }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def nearby(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Workers work in this process, and with a stand-in."""
+    monkeypatch.setattr(worker, "Reader", Stand)
+
+    def rented(run: Folder, on: str, n: int, queue: Any, every: float, told: Any, trust: str = "") -> dict[str, int]:
+        return work(run.path, every=every, patience=0.5, wait=False, trust=trust)
+
+    monkeypatch.setattr(rent, "rent", rented)
+    yield
+
+
+def whole(at: Path) -> Folder:
+    """A run of twelve logs: chunks that are finished, in work, and free; workers of other hosts; a table."""
+    logs = at / "logs"
+    for k in range(12):
+        (logs / f"e{k % 3}").mkdir(parents=True, exist_ok=True)
+        (logs / f"e{k % 3}" / f"2026-01-{1 + k:02d}.csv").write_text(f"log {k}")
+    (at / "outside").mkdir()
+    (at / "outside" / "kept.txt").write_text("kept")
+    (at / "tables").mkdir()
+    (at / "tables" / "plant.toml").write_text("a = 1\n")
+    options = {"files": folder.copies_of({"tables": ""}), "reading": {}, "limit": 9.0}
+    run = Folder.begin(at / "run", kinds.DIAGNOSIS, options, {"tables": str(at / "tables")})
+    run.add(find([str(logs)]), 3)
+    for n, (chunk, entries) in enumerate(run.chunks().items()):
+        for k, e in enumerate(entries[: (3, 3, 2, 0)[n]]):
+            row = {"key": e.key, "status": "done", "reason": "", "verdict": "missing", "answer": answer(k)}
+            whole_json(run.results(chunk) / f"{e.key}.json", row)
+        if n < 2:
+            assert run.close(chunk, entries)
+    (run.results("000000-000002") / f"{run.chunks()['000000-000002'][2].key}.tried").write_text("begin\n")
+    whole_json(run.path / "workers" / "far.json", {"host": "far", "pid": 7, "started": 1.0, "kind": "worker"})
+    (run.path / "workers" / "far.beat").write_text("3")
+    assert Leases(run.path).take(["000000-000003"], "gone")
+    (run.path / "journal").mkdir()
+    (run.path / "journal" / "far.jsonl").write_text('{"what": "took", "at": 1.0}\n')
+    return run
+
+
+# ---- damages ---------------------------------------------------------------------------------------------------------
+
+
+def _any(run: Path, draw: random.Random, where: str = "") -> Path:
+    """A file of the run, of a kind drawn first, so that the few are hit as often as the many."""
+    where = where or draw.choice(KINDS_OF_FILES)
+    if where == "run.json":
+        return run / where
+    return draw.choice(sorted(f for f in (run / where).rglob("*") if f.is_file() and not f.is_symlink()))
+
+
+def _truncated(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    os.truncate(file, draw.randrange(max(file.stat().st_size, 1)))
+
+
+def _garbled(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    data = bytearray(file.read_bytes())
+    for _ in range(draw.choice((1, 5, 50))):
+        if data:
+            data[draw.randrange(len(data))] = draw.randrange(256)
+    file.write_bytes(data)
+
+
+def _garbage(run: Path, draw: random.Random) -> None:
+    _any(run, draw).write_bytes(draw.randbytes(draw.choice((1, 100, 10_000))))
+
+
+def _encoded(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    file.write_bytes(file.read_bytes().decode("latin-1").encode(draw.choice(("utf-16", "utf-8-sig", "utf-7"))))
+
+
+def _missing(run: Path, draw: random.Random) -> None:
+    _any(run, draw).unlink()
+
+
+def _folder_for_a_file(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    file.unlink()
+    file.mkdir()
+    (file / "x.parquet").write_text("x")
+
+
+def _pipe_for_a_file(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    file.unlink()
+    os.mkfifo(file)
+
+
+def _link_for_a_file(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw)
+    file.unlink()
+    file.symlink_to(draw.choice((run.parent / "outside" / "kept.txt", run.parent / "outside", Path("/dev/zero"), file)))
+
+
+def _link_for_a_folder(run: Path, draw: random.Random) -> None:
+    room = draw.choice(sorted(p for p in run.rglob("*") if p.is_dir() and not p.is_symlink()))
+    shutil.rmtree(room)
+    room.symlink_to(run.parent / "outside")
+
+
+def _file_for_a_folder(run: Path, draw: random.Random) -> None:
+    room = draw.choice(sorted(p for p in run.rglob("*") if p.is_dir() and not p.is_symlink()))
+    shutil.rmtree(room)
+    room.write_text("x")
+
+
+def _paths(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Every place in JSON."""
+    yield at
+    for k, v in data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ():
+        yield from _paths(v, (*at, k))
+
+
+def _spoilt(data: Any, draw: random.Random) -> Any:
+    """JSON with one value, drawn by chance, that is another, gone, or deeper than any."""
+    place = draw.choice(list(_paths(data)))
+    if not place:
+        return draw.choice(BAD_VALUES)
+    inner = data
+    for k in place[:-1]:
+        inner = inner[k]
+    if draw.random() < 0.2 and isinstance(inner, dict):
+        del inner[place[-1]]
+    else:
+        inner[place[-1]] = draw.choice(BAD_VALUES)
+    return data
+
+
+def _value(run: Path, draw: random.Random) -> None:
+    file = _any(run, draw, draw.choice(("run.json", "results", "leases", "workers")))
+    if file.suffix == ".json" or file.parent.name == "leases":
+        file.write_text(json.dumps(_spoilt(json.loads(file.read_text()), draw)))
+
+
+def _deep(run: Path, draw: random.Random) -> None:
+    text = draw.choice(("[" * 200_000, '{"a":' * 200_000, "[" * 900 + "]" * 900, "9" * 5000))
+    _any(run, draw, draw.choice(("run.json", "results", "leases", "workers"))).write_text(text)
+
+
+def _cell(run: Path, draw: random.Random) -> None:
+    """A value of a table, of the right type or not."""
+    file = _any(run, draw, draw.choice(("logs", "parts")))
+    rows = pq.read_table(file).to_pylist()
+    row = draw.choice(rows)
+    name = draw.choice(list(row))
+    if name == "answer" and draw.random() < 0.8:
+        row[name] = json.dumps(_spoilt(json.loads(row[name]), draw))
+    else:
+        bad = [v for v in BAD_VALUES if v is None or type(v) is type(row[name]) and v != "\ud800" and v != 10**40]
+        row[name] = draw.choice(bad)
+    pq.write_table(pa.Table.from_pylist(rows), file)
+
+
+def _columns(run: Path, draw: random.Random) -> None:
+    """A table that lacks a column, has one of another type, or holds nothing."""
+    file = _any(run, draw, draw.choice(("logs", "parts")))
+    table = pq.read_table(file)
+    name = draw.choice(table.schema.names)
+    kind = draw.randrange(3)
+    if kind == 0:
+        table = table.drop_columns([name])
+    elif kind == 1:
+        at = table.schema.get_field_index(name)
+        table = table.set_column(at, name, pa.array([[1.5]] * table.num_rows))
+    pq.write_table(table.slice(0, 0) if kind == 2 else table, file)
+
+
+def _twice(run: Path, draw: random.Random) -> None:
+    """Rows, chunks or workers that are there twice."""
+    file = _any(run, draw, draw.choice(("logs", "parts", "workers", "leases")))
+    if file.suffix == ".parquet":
+        table = pq.read_table(file)
+        pq.write_table(pa.concat_tables([table, table]), file)
+        shutil.copy(file, file.with_name("000009-000000.parquet" if "-" in file.name else "000009.parquet"))
+    else:
+        shutil.copy(file, file.with_name(f"{file.name.partition('.')[0]}.999999999999"))
+
+
+def _names(run: Path, draw: random.Random) -> None:
+    """Things with names that no run gives."""
+    name = draw.choice(("a\nb", "\x1b[31m", "..x", "[1]*?", "'; DROP TABLE logs; --", "x" * 250, "\udcff", "²"))
+    room = run / draw.choice(("logs", "parts", "results", "leases", "workers", "journal"))
+    for suffix in ("", ".parquet", ".json"):
+        if len(name + suffix) < 255:
+            (room / (name + suffix)).write_text("x")
+    (room / "000000-000001.parquet").write_bytes(_any(run, draw, "parts").read_bytes())
+
+
+def _outward(run: Path, draw: random.Random) -> None:
+    """A file that names things outside."""
+    bad = draw.choice(("../../outside/kept.txt", "/etc/passwd", "machine/../../outside", "machine/.."))
+    job = json.loads((run / "run.json").read_text())
+    kind = draw.randrange(4)
+    if kind == 0:
+        job["files"] = job["options"]["files"] = {"tables": bad}
+    elif kind == 1:
+        job["kind"] = draw.choice(("runpy:run_path", "os:system", "tests.fleet_jobs:read", ""))
+    elif kind == 2:
+        job["options"]["reading"]["dbc"] = bad
+    else:
+        file = _any(run, draw, "logs")
+        rows = pq.read_table(file).to_pylist()
+        for row in rows:
+            row[draw.choice(("chunk", "key", "path"))] = f"../{bad}"
+        pq.write_table(pa.Table.from_pylist(rows), file)
+    (run / "run.json").write_text(json.dumps(job))
+
+
+DAMAGES: tuple[Callable[[Path, random.Random], None], ...] = (
+    _truncated, _garbled, _garbage, _encoded, _missing, _folder_for_a_file, _pipe_for_a_file, _link_for_a_file,
+    _link_for_a_folder, _file_for_a_folder, _value, _deep, _cell, _columns, _twice, _names, _outward,
+)  # fmt: skip
+
+
+# ---- what the commands make of it ------------------------------------------------------------------------------------
+
+
+def outside(at: Path) -> dict[str, bytes]:
+    """All files beside the run, and what they hold."""
+    return {str(f): f.read_bytes() for f in sorted(at.rglob("*")) if (at / "run") not in f.parents and f.is_file()}
+
+
+def ran(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    """Exit code and text of a command, which must not hang."""
+
+    def hangs(*_: Any) -> None:
+        raise AssertionError(f"{' '.join(words)} hangs")
+
+    before = signal.signal(signal.SIGALRM, hangs)
+    signal.setitimer(signal.ITIMER_REAL, HANGS)
+    try:
+        code = main(words)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    said = capsys.readouterr()
+    return code, said.out + said.err
+
+
+def survives(at: Path, seed: int, capsys: pytest.CaptureFixture[str]) -> list[int]:
+    """Do one damage to a run, have every command look at it, and return their exit codes."""
+    draw = random.Random(seed)
+    run = whole(at)
+    damage = DAMAGES[seed % len(DAMAGES)]
+    damage(run.path, draw)
+    before = outside(at)
+    codes = []
+    commands = [
+        ["fleet", "status", str(run.path)],
+        ["fleet", "report", str(run.path)],
+        ["fleet", "work", str(run.path), "--patience", "0.5"] if seed % 2 else
+        ["fleet", "run", str(at / "logs"), "--out", str(run.path), "--tables", str(at / "tables")],
+        ["fleet", "status", str(run.path)],
+        ["fleet", "report", str(run.path)],
+    ]  # fmt: skip
+    for words in commands:
+        code, text = ran(words, capsys)
+        assert code in (0, 1, 2), (damage.__name__, seed, words, text)
+        assert "internal error" not in text and "Traceback" not in text, (damage.__name__, seed, text)
+        assert not any(c in text for c in "\x1b\x07\x9b"), (damage.__name__, seed, text)
+        if code == 2:
+            assert text.startswith("vaneloop: ") and text.count("\n") == 1, (damage.__name__, seed, text)
+        codes.append(code)
+    assert outside(at) == before, (damage.__name__, seed)
+    return codes
+
+
+@pytest.mark.parametrize("seed", range(0, len(DAMAGES), 3))
+def test_a_damage_is_said_and_the_rest_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int
+) -> None:
+    survives(tmp_path, seed, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", range(len(DAMAGES)), ids=[d.__name__.strip("_") for d in DAMAGES])
+def test_of_a_hundred_and_two_damaged_run_folders_none_is_a_defect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: int
+) -> None:
+    for k in range(1, 7):
+        survives(tmp_path / str(k), kind + k * len(DAMAGES), capsys)
