@@ -142,7 +142,7 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
     """Run the same logs undisturbed, and with kills: tables of both, byte for byte.
 
     Killed is one of the processes of the run drawn by chance, after some more logs were begun (0 to 10) and some time
-    (up to 0.3 s), both drawn by chance: the starter (with Dask's scheduler), a worker, its nanny or a reader of logs. A
+    (up to 0.3 s), both drawn by chance: the starter, a worker or a reader of logs. A
     starter that was killed or has ended is started again. The logs are a stand-in's (tests/fleet_jobs.py), 0.1 s each.
     """
     import psutil

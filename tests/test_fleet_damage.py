@@ -7,13 +7,17 @@ this process, with a stand-in for the reader of logs.
 
 from __future__ import annotations
 
+import argparse
+import io
 import json
 import os
 import random
 import shutil
 import signal
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +28,17 @@ import pytest
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
+from tests.conftest import ROOT
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path as shipped
+from vaneloop.cli import options as cli_options
 from vaneloop.cli.main import main
 from vaneloop.fleet import folder, kinds, rent, worker
 from vaneloop.fleet.files import whole_json
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import Leases
+from vaneloop.fleet.reader import python
 from vaneloop.fleet.sources import find
 from vaneloop.fleet.worker import work
 
@@ -89,8 +99,9 @@ def whole(at: Path) -> Folder:
     (at / "outside").mkdir()
     (at / "outside" / "kept.txt").write_text("kept")
     (at / "tables").mkdir()
-    (at / "tables" / "plant.toml").write_text("a = 1\n")
-    options = {"files": folder.copies_of({"tables": ""}), "reading": {}, "limit": 9.0}
+    shutil.copy(shipped("plant.toml"), at / "tables")
+    reading = {"mapping": {}, "units": {}, "design_rpm": None, "guess": True}
+    options = {"files": folder.copies_of({"tables": ""}), "reading": reading, "limit": 3600.0}
     run = Folder.begin(at / "run", kinds.DIAGNOSIS, options, {"tables": str(at / "tables")})
     run.add(find([str(logs)]), 3)
     for n, (chunk, entries) in enumerate(run.chunks().items()):
@@ -352,3 +363,203 @@ def test_of_a_hundred_and_two_damaged_run_folders_none_is_a_defect(
 ) -> None:
     for k in range(1, 7):
         survives(tmp_path / str(k), kind + k * len(DAMAGES), capsys)
+
+
+# ---- a folder that somebody made to do harm --------------------------------------------------------------------------
+
+
+def with_job(run: Folder, **keys: Any) -> None:
+    """Change keys of run.json."""
+    file = run.path / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | keys))
+
+
+@pytest.mark.parametrize("kind", ["runpy:run_path", "vaneloop.fleet.diagnosis:diagnose_log", ""])
+def test_a_run_folder_names_no_function(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    run = whole(tmp_path)
+    with_job(run, kind=kind, function="runpy:run_path")
+    code, text = ran(["fleet", "work", str(run.path)], capsys)
+    assert code == 2 and f"has kind {kind!r}; allowed: diagnosis, trial" in text
+    assert ran(["fleet", "status", str(run.path)], capsys)[0] == 0, "to look at it is no harm"
+
+
+@pytest.mark.parametrize("reading", [{"dbc": "/etc/passwd"}, {"mapping_file": "x"}, {"tables": {}}, {"guess": "yes"}])
+def test_a_run_folder_names_no_file_but_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], reading: dict[str, Any]
+) -> None:
+    run = whole(tmp_path)
+    with_job(run, options=run.job["options"] | {"reading": reading})
+    code, text = ran(["fleet", "work", str(run.path)], capsys)
+    assert code == 2 and f"options with a wrong reading.{next(iter(reading))}" in text
+
+
+@pytest.mark.parametrize(("column", "value"), [
+    ("chunk", "../../outside"), ("chunk", "."), ("key", "../../outside/kept.txt"), ("key", f"{'0' * 64}./../x"),
+    ("path", "logs/e1/x.csv"), ("path", "/a\0b"),
+])  # fmt: skip
+def test_a_name_that_leads_outside_is_a_damaged_row(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str, value: str
+) -> None:
+    run, before = whole(tmp_path), outside(tmp_path)
+    (batch,) = (run.path / "logs").iterdir()
+    rows = pq.read_table(batch).to_pylist()
+    rows[-1][column] = value
+    pq.write_table(pa.Table.from_pylist(rows, schema=folder._schema()), batch)
+    assert ran(["fleet", "work", str(run.path), "--patience", "0.5"], capsys)[0] == 1
+    code, text = ran(["fleet", "status", str(run.path)], capsys)
+    assert code == 1 and "11 of 11 contents done" in text and "000000.parquet" in text and f"row 12: {column}" in text
+    assert outside(tmp_path) == before
+
+
+def test_a_damaged_part_is_a_row_and_the_same_run_heals_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = whole(tmp_path / "a [1]*?'\"")  # what a pattern or a query would take for its own
+    words = ["fleet", "run", str(run.path.parent / "logs"), "--out", str(run.path), "--tables",
+             str(run.path.parent / "tables")]  # fmt: skip
+    (run.path / "parts" / "000000-000001.parquet").write_bytes(b"PAR1 and nothing more")
+    code, text = ran(["fleet", "status", str(run.path)], capsys)
+    assert code == 1 and "5 of 12" in text and "parts/000000-000001.parquet" in text
+    page, tables = tmp_path / "f.html", tmp_path / "t"
+    code, text = ran(["fleet", "report", str(run.path), "--report", str(page), "--tables-out", str(tables)], capsys)
+    assert code == 1 and "parts/000000-000001.parquet" in text and "parts/000000-000001.parquet" in page.read_text()
+    assert pq.read_table(tables / "effects.parquet").num_rows == 3
+    assert ran(words, capsys)[0] == 0
+    code, text = ran(["fleet", "status", str(run.path)], capsys)
+    assert code == 0 and "12 of 12" in text and "damaged" not in text
+
+
+def test_a_damaged_answer_is_a_row_and_a_retry_makes_it_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = whole(tmp_path)
+    part = run.path / "parts" / "000000-000000.parquet"
+    rows = pq.read_table(part).to_pylist()
+    rows[0]["answer"] = json.dumps(answer(0) | {"sizes": [{"effect": None}]})
+    pq.write_table(pa.Table.from_pylist(rows), part)
+    code, text = ran(["fleet", "report", str(run.path), "--report", str(tmp_path / "f.html")], capsys)
+    page = (tmp_path / "f.html").read_text()
+    assert "internal" not in text and "its answer is damaged" in page and len(rows) == 3
+    words = ["fleet", "run", str(tmp_path / "logs"), "--out", str(run.path), "--tables", str(tmp_path / "tables")]
+    for more, left in (([], True), (["--retry"], False)):
+        assert ran([*words, *more], capsys)[0] == 0
+        ran(["fleet", "report", str(run.path), "--report", str(tmp_path / "f.html")], capsys)
+        assert ("its answer is damaged" in (tmp_path / "f.html").read_text()) == left
+
+
+@pytest.mark.parametrize("room", ["results", "leases", "workers", "journal", "parts", "logs", "machine", "worst"])
+def test_a_link_in_place_of_a_folder_is_not_followed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], room: str
+) -> None:
+    run = whole(tmp_path)
+    if (run.path / room).exists():
+        shutil.rmtree(run.path / room)
+    (run.path / room).symlink_to(tmp_path / "outside")
+    before = outside(tmp_path)
+    code, text = ran(["fleet", "work", str(run.path)], capsys)
+    assert code == 2 and f"{room}: is a link; the run folder is damaged" in text and outside(tmp_path) == before
+
+
+@pytest.mark.parametrize("change", ["more", "other", "less"])
+def test_a_machine_is_the_one_that_the_run_was_begun_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str
+) -> None:
+    run = whole(tmp_path)
+    table = run.path / "machine" / "tables" / "plant.toml"
+    if change == "less":
+        table.unlink()
+    else:
+        (table if change == "other" else run.path / "machine" / "json.py").write_text("# 2\n")
+    words = ["fleet", "run", str(tmp_path / "logs"), "--out", str(run.path), "--tables", str(tmp_path / "tables")]
+    for command in (["fleet", "work", str(run.path)], words):
+        code, text = ran(command, capsys)
+        assert code == 2 and "machine: " in text and "the run folder is damaged" in text
+
+
+def test_a_machine_that_was_left_before_its_run_was_begun_is_not_taken_for_it(tmp_path: Path) -> None:
+    (tmp_path / "run" / "machine").mkdir(parents=True)
+    (tmp_path / "run" / "machine" / "model.toml").write_text("a = 1\n")
+    (tmp_path / "mine.toml").write_text("a = 2\n")
+    with pytest.raises(InputError, match="is not the machine that the run was begun with"):
+        Folder.begin(tmp_path / "run", kinds.DIAGNOSIS, {}, {"model": str(tmp_path / "mine.toml")})
+
+
+@pytest.mark.parametrize("name", ["system", "controller", "firmware.mine"])
+def test_code_of_a_run_folder_runs_only_where_the_user_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(Stand, "ask", lambda self, path, options, limit: asked.append(path) or {
+        "status": "done", "reason": "", "verdict": "none", "answer": {}})  # fmt: skip
+    (tmp_path / "mine.py").write_text("raise SystemExit('run')\n")
+    (tmp_path / "a.csv").write_text("log")
+    given = {name: str(tmp_path / "mine.py")}
+    options = {"files": folder.copies_of(given), "reading": {}, "limit": 9.0}
+    run = Folder.begin(tmp_path / "run", kinds.DIAGNOSIS, options, given)
+    run.add(find([str(tmp_path / "a.csv")]))
+    code, text = ran(["fleet", "work", str(run.path)], capsys)
+    assert code == 2 and f"machine/{name}.py" in text and "--trust" in text and not asked
+    with pytest.raises(InputError, match="its workers would run code that the folder brings"):
+        work(run.path)
+    for command in ("status", "report"):
+        ran(["fleet", command, str(run.path)], capsys)
+    assert not asked and ran(["fleet", "work", str(run.path), "--trust"], capsys)[0] == 0 and len(asked) == 1
+
+
+@pytest.mark.parametrize(("said", "trusted"), [("y\n", True), ("yes\n", True), ("n\n", False), ("", False)])
+def test_at_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch, said: str, trusted: bool) -> None:
+    keys = io.StringIO(said)
+    monkeypatch.setattr(keys, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stdin", keys)
+    args = argparse.Namespace(trust=False)
+    with nullcontext() if trusted else pytest.raises(InputError, match="^RUN: its code was not run$"):
+        cli_options.trusted(args, "RUN", ["RUN/machine/system.py"])
+
+
+def test_a_plan_of_a_campaign_brings_no_controller_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "plan.toml").write_text(
+        'title = "of another"\nscenarios = ["demand_stops"]\n[vary]\n"sensors.vigv_bias" = "tolerance"\n'
+        '[[firmware]]\nname = "mine"\ncontroller = "mine.so"\n'
+    )
+    words = ["campaign", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "run")]
+    code, text = ran(words, capsys)
+    assert code == 2 and "mine.so" in text and "--trust" in text and not (tmp_path / "run").exists()
+    code, text = ran([*words, "--trust"], capsys)
+    assert code == 2 and "--trust" not in text, "there is no such library"
+
+
+def test_a_process_of_ours_takes_no_module_from_where_the_user_stands(tmp_path: Path) -> None:
+    (tmp_path / "numba.py").write_text("print('of another')\n")
+    (tmp_path / "colorsys.py").write_text("print('of another')\n")
+    code = "import colorsys, importlib.util as u; print(u.find_spec('numba').origin, u.find_spec('vaneloop').origin)"
+    said = subprocess.run(python(code), cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert "of another" not in said and str(tmp_path) not in said and str(ROOT) in said
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[2Jgone", r"\x1b[2Jgone"), ("a\rb\x07\x9b", r"a\x0db\x07\x9b"), ("\u202egpj", r"\u202egpj"),
+        ("Düse 5 °C", "Düse 5 °C"), ("\udcff", r"\udcff"), ("a\nb", r"a\x0ab"),
+    ],
+)  # fmt: skip
+def test_a_name_does_nothing_to_a_terminal(text: str, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert terminal.clean(text) == shown and terminal.clean("a\nb", lines=True) == "a\nb"
+    args = argparse.Namespace(quiet=False, json=None)
+    terminal.print_table(args, "names", ["name"], [[text]])
+    assert shown in capsys.readouterr().out
+
+    def refuses() -> int:
+        raise InputError(f"{text}: is not there")
+
+    assert terminal.run(refuses) == 2 and capsys.readouterr().err == f"vaneloop: {shown}: is not there\n"
+
+
+def test_a_log_whose_name_is_not_utf_8_is_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = whole(tmp_path)
+    with open(os.fsencode(tmp_path / "logs") + b"/e0/\xff_2026-02-01.csv", "w") as f:
+        f.write("log 99")
+    words = ["fleet", "run", str(tmp_path / "logs"), "--out", str(run.path), "--tables", str(tmp_path / "tables")]
+    for new in (1, 0):
+        code, text = ran(words, capsys)
+        assert code == 0 and f"13 logs, {new} of them new" in text
+    (bad,) = (e for e in run.entries() if e.reason)
+    assert bad.path.endswith(r"e0/\udcff_2026-02-01.csv") and "is not UTF-8" in bad.reason

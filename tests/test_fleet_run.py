@@ -573,11 +573,12 @@ def test_rented_workers_share_a_run_and_end_with_a_starter_that_is_killed(
 ) -> None:
     import psutil
 
-    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
     folder = fleet(tmp_path, {**many(40), "e1/slow.csv": "hang"}, in_chunk=2)
     p = starter(tmp_path, folder, "local")
     until(lambda: len(folder.finished()) >= 3, p)
     rented = psutil.Process(p.pid).children(recursive=True)
+    listening = [c for one in (psutil.Process(p.pid), *rented) for c in one.net_connections("all")]
+    assert len(rented) >= 2 and listening == [], "nobody else can ask them for anything"
     p.kill()
     p.wait()
     psutil.wait_procs(rented)  # scheduler, workers and readers end by themselves, though one log hangs
@@ -595,7 +596,6 @@ def test_a_killed_rented_worker_has_a_successor_and_the_run_ends(
 ) -> None:
     import psutil
 
-    pytest.importorskip("distributed", reason="the extra `fleet` is not installed")
     folder = fleet(tmp_path, many(40), in_chunk=2)
     p = starter(tmp_path, folder, "local")
     until(lambda: any(line["what"] == "begin" for line in lines(folder.path)), p)

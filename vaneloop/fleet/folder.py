@@ -86,8 +86,7 @@ class Entry:
 
 
 def key_of(path: str) -> str:
-    """Key of a log: what is in it, and its suffix, which says how to read it (of an odd one a digest). Raises OSError.
-    """
+    """Key of a log: what is in it, and its suffix, which says how to read it; of an odd one a digest. OSError."""
     suffix = Path(path).suffix.lower()
     if suffix and not _SUFFIX.fullmatch(suffix):
         suffix = f".{hashlib.sha256(os.fsencode(suffix)).hexdigest()[:12]}"
@@ -201,8 +200,7 @@ class Folder:
         self.damaged.setdefault(file.relative_to(self.path).as_posix(), why)
 
     def names(self, *room: str) -> list[str]:
-        """Names in a folder of the run, in order, without hidden ones; none where it is not there or leads elsewhere.
-        """
+        """Names in a folder of the run, in order, without hidden ones; none where it is not there or is a link."""
         at = self.path.joinpath(*room)
         if (bad := _no_room(at)) is not None:
             self.note(at, bad)

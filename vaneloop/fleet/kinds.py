@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Finite, Table
@@ -32,7 +32,7 @@ class Reading(Table):
     mapping: dict[str, str] = {}
     units: dict[str, str] = {}
     design_rpm: Finite | None = None
-    guess: bool = True
+    guess: StrictBool = True
 
 
 class _Diagnosis(Options):
@@ -44,7 +44,7 @@ class _Varied(Table):
     unit: str
     low: Finite
     high: Finite
-    effect: bool
+    effect: StrictBool
 
 
 class _Trial(Options):

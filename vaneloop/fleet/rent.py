@@ -106,9 +106,7 @@ class _Hired:
                 file.close()
 
 
-def _hire(
-    folder: Folder, workers: int, words: tuple[Any, ...], step: Callable[[], None]
-) -> list[dict[str, int]]:
+def _hire(folder: Folder, workers: int, words: tuple[Any, ...], step: Callable[[], None]) -> list[dict[str, int]]:
     """Have processes of this machine work. One that is killed has a successor."""
     at_work = [_Hired(words) for _ in range(workers)]
     came: list[dict[str, Any]] = []

@@ -76,14 +76,11 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
     for table, _, shape, _, _ in _FIELDS:
         db.execute(f"CREATE TEMP TABLE raw_{table} AS SELECT '' AS key, x.*, true AS good FROM (SELECT unnest("
                    f"from_json('[]', '{shape}')) AS x) LIMIT 0")  # fmt: skip
-    seen: set[str] = set()
     for batch in _batches(folder):
-        _take(db, batch, seen)
+        _take(db, batch)
     bad = " UNION ".join(f"SELECT key FROM raw_{table} WHERE NOT good" for table, *_ in _FIELDS)
     db.execute(f"UPDATE results SET status = 'damaged' WHERE key IN ({bad})")
-    db.execute(
-        f"UPDATE results SET reason = '{_DAMAGED}', verdict = NULL, duration_s = NULL WHERE status = 'damaged'"
-    )
+    db.execute(f"UPDATE results SET reason = '{_DAMAGED}', verdict = NULL, duration_s = NULL WHERE status = 'damaged'")
     db.execute(
         "CREATE TABLE logs AS SELECT e.path, e.engine, e.time, e.key, "
         "CASE WHEN e.key = '' THEN 'unreadable' ELSE coalesce(r.status, 'pending') END AS status, "
@@ -115,13 +112,19 @@ def _columns(shape: str) -> str:
 
 
 def _batches(folder: Folder) -> Iterator[pa.Table]:
-    """What came of all logs, the latest first, some `TAKEN` bytes at a time."""
+    """What came of all logs, each content once, as the latest row has it; some `TAKEN` bytes at a time."""
     import pyarrow as pa
 
     held: list[pa.Table] = []
-    size = 0
+    size, seen = 0, set[str]()
     for table in folder.parts("key", "status", "reason", "verdict", "answer"):
-        held.append(table)
+        fresh = []
+        for key in reversed(table.column("key").to_pylist()):
+            good = key is not None and KEY.fullmatch(key) is not None and key not in seen
+            fresh.append(good)
+            if good:
+                seen.add(key)
+        held.append(table.filter(pa.array(fresh[::-1], pa.bool_())))
         size += table.nbytes
         if size > TAKEN:
             yield pa.concat_tables(held)
@@ -130,18 +133,9 @@ def _batches(folder: Folder) -> Iterator[pa.Table]:
         yield pa.concat_tables(held)
 
 
-def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table, seen: set[str]) -> None:
-    """Put what came of some logs into the database, but for contents that were ``seen``."""
-    import pyarrow as pa
-
-    keys = batch.column("key").to_pylist()
-    fresh = []
-    for key in reversed(keys):  # of two rows in one part the later counts
-        good = key is not None and KEY.fullmatch(key) is not None and key not in seen
-        fresh.append(good)
-        if good:
-            seen.add(key)
-    db.register("_part", batch.filter(pa.array(fresh[::-1], pa.bool_())))
+def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table) -> None:
+    """Put what came of some logs into the database."""
+    db.register("_part", batch)
     wrong = " OR ".join(f"coalesce(json_type(answer, '$.{field}'), 'NULL') NOT IN ('ARRAY', 'NULL')"
                         for _, field, *_ in _FIELDS)  # fmt: skip
     known = ", ".join(f"'{s}'" for s in STATUSES)
