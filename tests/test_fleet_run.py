@@ -656,3 +656,33 @@ def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
     state.tidy(folder)
     work(folder.path)
     assert [tuple(r.values()) for r in rows(folder) if r["status"] == "done"] == undisturbed
+
+
+@pytest.mark.slow
+def test_the_scheduler_of_a_queue_s_jobs_takes_nobody_without_the_run_s_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vaneloop.fleet import rent
+
+    for module in ("distributed", "dask_jobqueue", "cryptography"):
+        pytest.importorskip(module, reason="the extra `fleet` is not installed")
+    from dask.distributed import Client
+    from distributed.security import Security
+
+    for command, says in (("sbatch", "Submitted batch job 1"), ("scancel", "")):  # a queue that never begins a job
+        (tmp_path / command).write_text(f"#!/bin/sh\necho {says}\n")
+        (tmp_path / command).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    (tmp_path / "run").mkdir()
+    cluster = rent._cluster("slurm", 1, {}, str(tmp_path / "run"))
+    try:
+        address = str(cluster.scheduler_address)
+        assert address.startswith("tls://")
+        for other, security in ((address.replace("tls://", "tcp://"), None), (address, Security.temporary())):
+            with pytest.raises(OSError):
+                Client(other, security=security, timeout=2.0).close()
+        Client(cluster, timeout=30.0).close()
+        keys = [f for f in (tmp_path / "run").iterdir() if f.name.startswith(".dask")]
+        assert len(keys) == 3 and {f.stat().st_mode & 0o077 for f in keys} == {0}
+    finally:
+        cluster.close()
