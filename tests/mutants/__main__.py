@@ -95,7 +95,7 @@ NEAREST = {
     "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",
     "vaneloop": "verbs",
     "vaneloop.base": (
-        "tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
+        "base_spec lean tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
         "your_own_model verbs help curve_lanes"
     ),
     "vaneloop.discrepancy": (

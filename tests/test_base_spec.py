@@ -1,0 +1,647 @@
+"""What every part of the product stands on, by its specification: names, parts of logs, hulls, splines, formulas, work
+side by side, what a command prints, compiled code that is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit, types
+from numba.core import compiler, config
+from scipy.interpolate import CubicSpline
+
+from vaneloop.base import compiled, curve, durations, extras, forms, hysteresis, kept, lean, spans, terminal, vanes
+from vaneloop.base.errors import InputError, meant
+from vaneloop.base.hull import hull_of, nearest_within, within
+from vaneloop.base.side_by_side import shared_out, side_by_side
+from vaneloop.base.spans import Span
+from vaneloop.base.spline_rates import SplineRates
+
+# ---- names -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seconds, digits, name", [
+    (138.0, 3, "138_s"), (0.138, 3, "138_ms"), (1.5, 3, "1500_ms"), (0.136986, 6, "136986_us"), (0.136986, 3, "137_ms"),
+    (1e-3, 3, "1_ms"), (1.0, 3, "1_s"), (2.5e-7, 3, "250_ns"), (1.23e-9, 3, "1_ns"), (1e-12, 3, "1_ns"),
+    (123456.0, 3, "123000_s"),
+])  # fmt: skip
+def test_a_time_in_a_name_is_a_whole_number_of_the_largest_unit(seconds: float, digits: int, name: str) -> None:
+    assert durations.in_name(seconds, digits) == name
+    if seconds > 2e-9:
+        assert durations.named_lag(f"n_r_lagged_by_{name}") == ("n_r", pytest.approx(seconds, rel=5e-3))
+
+
+@pytest.mark.parametrize("name, channel, period", [
+    ("time_every_137_ms", "time", 0.137), ("time_every_2_s", "time", 2.0), ("x_every_0p8976", "x", 0.8976),
+    ("x_every_1p2em05", "x", 1.2e-5), ("x_every_3e2", "x", 300.0), ("x_every_12", "x", 12.0), ("x_every_0", "", 0.0),
+    ("x_every_0p0", "", 0.0), ("x_every_9e999", "", 0.0), ("time_every_0_s", "", 0.0), ("x_lagged_by_2_s", "", 0.0),
+    ("x", "", 0.0),
+])  # fmt: skip
+def test_a_period_in_a_name_is_above_nothing_and_no_end(name: str, channel: str, period: float) -> None:
+    found = durations.folded(name)
+    assert found == ((channel, pytest.approx(period)) if channel else None)
+    assert durations.within_no_period(name) == (channel or name)
+    assert durations.period_of(name) == (pytest.approx(period) if channel == "time" else 0.0)
+
+
+def test_a_channel_s_period_is_written_without_a_dot() -> None:
+    said = [durations.period_in_name(p, 4) for p in (0.8976, 1.2e-5, 300.0, 1.5e20, 0.12346)]
+    assert said == ["0p8976", "1p2em05", "300", "1p5e20", "0p1235"]
+    for p in (0.8976, 1.2e-5, 300.0, 1.5e20):
+        assert durations.folded(f"x_every_{durations.period_in_name(p, 4)}") == ("x", pytest.approx(p))
+
+
+def test_stages_come_without_a_gap() -> None:
+    assert vanes.vanes_of({"vgv1", "vigv", "x"}) == ("vigv", "vgv1") and vanes.vanes_of(vanes.VANES) == vanes.VANES
+    assert vanes.VANES[0] == "vigv" and vanes.VANES[-1] == "vgv7" and len(vanes.VANES) == 8
+    for present, says in (
+        ({}, "vigv is missing: the"), ({"vgv1"}, "vigv is missing, but vgv1 is there: the"),
+        ({"vigv", "vgv1", "vgv3"}, "vgv2 is missing, but vgv3 is there: the"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=says):
+            vanes.vanes_of(present)
+    names = ["linkage.vigv_play", "stroke", "linkage.vgv1_play", "sensors.vgv2"]
+    assert vanes.own_rows(names, ("vigv", "vgv1")) == [0, 1, 2] and vanes.vane_in("stroke") is None
+    vanes.same_stages(geometry=("vigv",), angles=("vigv",))
+    with pytest.raises(InputError, match=r"angles: stages \(=vigv, vgv1\) must be those of geometry, vigv$"):
+        vanes.same_stages(geometry=("vigv",), angles=("vigv", "vgv1"))
+
+
+def test_the_nearest_word_is_asked_for() -> None:
+    assert meant("vgiv", ["vigv", "vgv1", "other"]) == " (did you mean vigv?)" and meant("qqq", ["vigv"]) == ""
+    assert meant("VIGW", ["Vigv"]) == " (did you mean Vigv?)" and meant("ab", []) == ""
+
+
+def test_what_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert extras.is_there("json") and extras.is_there("os.path") and not extras.is_there("no_such_package.part")
+    assert extras.needed("a thing", "json") is json
+    monkeypatch.setattr(extras, "is_there", lambda m: m != "isotp")
+    extras.needs("a thing", "json", "nicegui")
+    with pytest.raises(InputError, match=r"a thing needs can-isotp, which .*: pip install 'vaneloop\[diagnostics\]'"):
+        extras.needed("a thing", "isotp")
+
+
+# ---- parts of logs ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given, low, high", [
+    ("0:200", 0.0, 200.0), ("200:", 200.0, math.inf), (":200", -math.inf, 200.0), (" : 3 ", -math.inf, 3.0),
+    ((1, 2.5), 1.0, 2.5), ((None, 2.0), -math.inf, 2.0), ([1.0, None], 1.0, math.inf), ("1e2:1.5e2", 100.0, 150.0),
+    (Span(3.0, 4.0), 3.0, 4.0), (":", -math.inf, math.inf),
+])  # fmt: skip
+def test_a_part_of_a_log_has_two_ends_of_which_each_may_be_open(given: Any, low: float, high: float) -> None:
+    assert spans.span_of(given, "--fit") == Span(low, high)
+    assert spans.span_of(str(spans.span_of(given, "--fit")), "--fit") == Span(low, high)
+
+
+@pytest.mark.parametrize("given, says", [
+    ("1", "must be FROM:TO"), ("1:2:3", "must be FROM:TO"), (7, "must be FROM:TO"), ((1,), "must be FROM:TO"),
+    ("a:2", "'a' must be a number of seconds"), ("nan:2", "'nan' must be a number"),
+    ("1:inf", "'inf' must be a number"), ((1, "x"), "'x' must be"), ("3:2", "must be above"),
+    ("2:2", r"the end \(=2 s\) must be above the beginning \(=2 s\)"),
+])  # fmt: skip
+def test_what_is_no_part_of_a_log_is_refused(given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=rf"^--fit .*{says}"):
+        spans.span_of(given, "--fit")
+
+
+def test_a_part_is_told_from_a_file() -> None:
+    for part in ("0:200", ":", " 1e3: ", "nan:1", "1:inf", "1:2:3", (1, 2.0), (None, None), Span(0.0, 1.0)):
+        assert spans.is_span(part), part
+    for other in ("a.csv", "C:\\x", "12", "", (1, 2, 3), (1, "a"), [1, 2], None, 5):
+        assert not spans.is_span(other), other
+    assert spans.spans_of("0:1", "--fit") == [Span(0.0, 1.0)] and spans.spans_of((0, 1), "--fit") == [Span(0.0, 1.0)]
+    assert spans.spans_of(["0:1", (2, 3)], "--fit") == [Span(0.0, 1.0), Span(2.0, 3.0)]
+
+
+def test_parts_may_touch_and_not_share_a_time() -> None:
+    a, b, c = Span(0.0, 10.0), Span(10.0, 20.0), Span(19.0, 30.0)
+    spans.apart([a, b], [])
+    spans.apart([a], [b, Span(20.0, math.inf)])
+    with pytest.raises(InputError, match="--fit '10:20' and --test '19:30' share '19:20'; parts must not overlap"):
+        spans.apart([a, b], [c])
+    with pytest.raises(InputError, match="--fit '10:20' and --fit '19:30' share"):
+        spans.apart([a, b, c], [])
+    with pytest.raises(InputError, match="--test '0:10': a part of the log needs --fit FROM:TO beside it"):
+        spans.apart([], [a])
+    spans.apart([], [])
+
+
+# ---- curves and surfaces ---------------------------------------------------------------------------------------------
+
+
+def test_spline_rates_are_scipy_s() -> None:
+    rng = np.random.default_rng(2)
+    for n in (4, 5, 6, 40):
+        t = np.cumsum(rng.uniform(0.5, 3.0, n))
+        u = rng.standard_normal((2, 3, n))
+        rates = SplineRates(t)(u)
+        assert rates.shape == u.shape and rates.flags.c_contiguous
+        assert rates == pytest.approx(CubicSpline(t, u, axis=-1, bc_type="not-a-knot")(t, 1), rel=1e-9, abs=1e-9)
+        assert SplineRates(t)(t**3) == pytest.approx(3.0 * t**2)
+
+
+def test_splines_sum_to_one_and_stay_as_at_their_ends() -> None:
+    knots = np.array([0.0] * 4 + [1.0, 2.5] + [4.0] * 4)
+    values = curve.splines(knots, np.linspace(0.0, 4.0, 9))
+    assert values.shape == (9, 6) and values.sum(axis=1) == pytest.approx(np.ones(9)) and (values >= 0.0).all()
+    assert curve.splines(knots, [-3.0, 9.0]) == pytest.approx(np.eye(6)[[0, 5]])
+    open_ends = np.arange(10.0)  # not doubled: between the fourth and the last but three
+    assert curve.splines(open_ends, [-1.0]) == pytest.approx(curve.splines(open_ends, [3.0]))
+    assert curve.splines(open_ends, [8.5]) == pytest.approx(curve.splines(open_ends, [6.0]))
+    assert (curve.DEGREE, curve.POINTS, curve.FINE, curve.SIDE, curve.FINE_SIDE) == (3, 257, 1025, 65, 257)
+
+
+@pytest.mark.parametrize("columns", [None, 2])
+def test_stops_make_their_virgin_curve(columns: int | None) -> None:
+    x = np.linspace(0.0, 3.0, 257)
+    table = np.sqrt(x) if columns is None else np.column_stack([np.sqrt(x), x - 0.1 * x**2])
+    weights = hysteresis.weights_of(0.0, 3.0, table, 16)
+    assert weights.shape == ((16,) if columns is None else (16, 2))
+    radii = 3.0 * (np.arange(1, 17) / 16) ** 2
+    made = np.minimum(radii[:, None], radii) @ weights  # each stop follows up to its radius
+    expected = np.stack([np.interp(radii, x, y) for y in table.reshape(257, -1).T], axis=-1).reshape(made.shape)
+    assert made == pytest.approx(expected)
+    assert len(hysteresis.weights_of(0.0, 3.0, np.sqrt(x))) == hysteresis.RADII == 64
+    assert hysteresis.stops_of("stops_of_n_r") == "n_r" and hysteresis.stops_of("n_r") == ""
+
+
+LOW, HIGH = np.array([10.0, -1.0]), np.array([20.0, 1.0])
+
+
+def test_a_hull_has_the_corners_of_its_samples_on_the_grid() -> None:
+    rng = np.random.default_rng(1)
+    x, z = rng.uniform(12.0, 18.0, 400), rng.uniform(-0.5, 0.5, 400)
+    corners = np.array([[10.0, -1.0], [20.0, -1.0], [20.0, 1.0], [10.0, 1.0]])
+    x, z = np.append(x, corners[:, 0]), np.append(z, corners[:, 1])
+    found = hull_of(np.append(x, [25.0, 15.0]), np.append(z, [0.0, 7.0]), LOW, HIGH)  # beyond the range nothing counts
+    assert found is not None and sorted(map(tuple, found)) == sorted(map(tuple, corners))
+    near = hull_of(np.array([10.04, 19.95, 15.0]), np.array([-0.99, -1.0, 0.99]), LOW, HIGH)
+    assert near is not None and {tuple(c) for c in near} == {(10.0, -1.0), (20.0, -1.0), (15.0, 1.0)}
+    assert hull_of(np.array([10.0, 15.0, 20.0]), np.array([-1.0, 0.0, 1.0]), LOW, HIGH) is None  # along a line
+    assert hull_of(np.array([15.0]), np.array([0.0]), LOW, HIGH) is None
+
+
+SQUARE = np.array([[12.5, -0.5], [17.5, -0.5], [17.5, 0.5], [12.5, 0.5]])
+HALF = 0.5 / 64.0  # of a grid's step, of the range
+
+
+def test_within_a_hull_reaches_half_a_step_beyond_it() -> None:
+    x = np.array([15.0, 12.5, 12.5 - 9.9 * HALF, 12.5 - 10.1 * HALF, 17.5 + 9.9 * HALF, 17.5 + 10.1 * HALF, 15.0, 15.0])
+    z = np.array([0.0, -0.5, 0.0, 0.0, 0.0, 0.0, 0.5 + 1.9 * HALF, -0.5 - 2.1 * HALF])
+    assert within(SQUARE, LOW, HIGH, x, z).tolist() == [True, True, True, False, True, False, True, False]
+    with pytest.raises(ValueError, match="corners along a line"):
+        within(np.array([[10.0, 0.0], [15.0, 0.0], [20.0, 0.0]]), LOW, HIGH, x, z)
+
+
+def test_beyond_a_hull_the_nearest_point_of_the_grid_within_it_counts() -> None:
+    found = nearest_within(SQUARE, LOW, HIGH)
+    k, m = np.divmod(np.arange(65 * 65), 65)
+    inside = (k >= 16) & (k <= 48) & (m >= 16) & (m <= 48)
+    assert (found[inside] == np.flatnonzero(inside)).all() and found.shape == (65 * 65,)
+    assert (found == np.clip(k, 16, 48) * 65 + np.clip(m, 16, 48)).all()
+
+
+# ---- formulas --------------------------------------------------------------------------------------------------------
+
+
+def test_a_formula_s_code_gives_its_value() -> None:
+    for form in forms.FORMS:
+        q = np.array([0.2, 0.9, 1.7, 4.1]) if form.positive else np.array([-2.3, -0.4, 0.2, 0.9, 1.7, 4.1])
+        for numbers in ([1.3, 0.7, 0.6], [-0.8, 1.4, 2.0]):
+            used = np.array(numbers[: len(form.numbers)])
+            code = form.code.format(**dict(zip(form.numbers, map(repr, used.tolist()), strict=True)))
+            expected = [float(eval(code, {"math": math, "abs": abs, "q": v})) for v in q.tolist()]
+            assert form.value(q, used) == pytest.approx(expected, rel=1e-9, abs=1e-12), form.name
+        assert len(form.inner) in (0, len(form.numbers) - 1) and form.text and 1 <= form.complexity <= 6
+    assert len(forms.FORMS) == 23 and forms.KELVIN == 273.15
+
+
+VALUES = {  # at q = 2 with a = 3, b = 0.5, c = 0.25
+    "constant": 3.0, "line": 6.0, "straight line": 4.5, "magnitude": 6.0, "sign": 3.0, "square": 12.0,
+    "signed square": 12.0, "cube": 24.0, "root": 3.0 * math.sqrt(2.0), "inverse": 1.5, "power": 3.0 * math.sqrt(2.0),
+    "exponential": 3.0 * (math.e - 1.0), "tanh": 3.0 * math.tanh(1.0), "quotient": 3.0, "above": 4.5, "below": 0.0,
+    "step": 3.0, "gentle step": 3.0 / (1.0 + math.exp(-6.0)), "dead zone": 4.5, "limit to one side": 1.5, "limit": 1.5,
+    "Arrhenius": 3.0 * math.exp(0.5 / 300.0 - 0.5 / 275.15), "sine": 3.0 * math.sin(1.25),
+}  # fmt: skip
+
+
+def test_formulas_have_the_values_of_their_texts() -> None:
+    for form in forms.FORMS:
+        numbers = np.array([3.0, 0.5, 0.25])[: len(form.numbers)]
+        assert float(form.value(np.array(2.0), numbers)) == pytest.approx(VALUES[form.name]), form.name
+        if form.jump:
+            level, half, at = form.jump(numbers)
+            below, above = form.value(np.array([at - 1e-6, at + 1e-6]), numbers)
+            assert (level - half, level + half) == (pytest.approx(below), pytest.approx(above))
+
+
+def test_signs_that_change_nothing_are_dropped_and_only_those() -> None:
+    q = np.linspace(-3.0, 3.0, 25)
+    for form in forms.FORMS:
+        numbers = -np.array([3.0, 0.5, 0.25])[: len(form.numbers)]
+        plain = form.plain(numbers)
+        assert plain.tolist() == [abs(v) if i in form.magnitudes else v for i, v in enumerate(numbers)]
+        assert form.positive or form.value(q, plain) == pytest.approx(form.value(q, numbers)), form.name
+        assert form.magnitudes == {"gentle step": (2,), "dead zone": (1,), "limit": (1,)}.get(form.name, ())
+        assert form.signed == (form.name in ("magnitude", "sign", "signed square", "dead zone")), form.name
+
+
+def test_a_product_multiplies_each_with_each() -> None:
+    by = {form.name: form for form in forms.FORMS}
+    x, z = np.array([1.0, 2.0]), np.array([3.0, 4.0, 5.0])
+    found = forms.product(by["line"], by["above"], x, z, np.array([2.0, 3.5]))  # 2 x max(z - 3.5, 0)
+    assert found.tolist() == [[0.0, 1.0, 3.0], [0.0, 2.0, 6.0]]
+    assert forms.product(by["constant"], by["square"], x, z, np.array([0.5])).tolist() == [[4.5, 8.0, 12.5]] * 2
+
+
+# ---- work side by side -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cores, items, may, shared", [
+    (2, 3, True, True), (2, 2, True, True), (2, 1, True, False), (1, 3, True, False), (2, 3, False, False),
+    (4, 0, True, False),
+])  # fmt: skip
+def test_work_is_shared_out_once_and_answers_keep_their_order(
+    cores: int, items: int, may: bool, shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vaneloop.base.side_by_side.threads", lambda: cores)
+
+    def of(item: int) -> tuple[int, bool, list[bool]]:
+        return item, shared_out(), list(side_by_side(lambda _: shared_out(), range(2)))
+
+    found = list(side_by_side(of, iter(range(items)), may))
+    inner = [True, True] if shared or cores > 1 else [False, False]
+    assert found == [(k, shared, inner) for k in range(items)] and not shared_out()
+
+
+# ---- what a command prints -------------------------------------------------------------------------------------------
+
+
+def said(quiet: bool = False, to: str | None = None) -> argparse.Namespace:
+    """Options of a command about its output."""
+    return argparse.Namespace(quiet=quiet, json=to)
+
+
+def test_text_goes_to_standard_output_unless_json_does(capsys: pytest.CaptureFixture[str]) -> None:
+    for args in (said(), said(to="x.json"), said(to="-"), said(quiet=True)):
+        terminal.say(args, f"text {args.json}")
+    out, err = capsys.readouterr()
+    assert out == "text None\ntext x.json\n" and err == "text -\n"
+
+
+def test_pairs_are_split_and_given_once() -> None:
+    assert terminal.pairs(["a=1", " b = x=y ", "a=1"], "map") == {"a": "1", "b": "x=y"}
+    for wrong in ("a", "=1", "a=", " =1", "a= "):
+        with pytest.raises(InputError, match=r"--map .* must look like NAME=value"):
+            terminal.pairs([wrong], "map")
+    with pytest.raises(InputError, match="'a' has been given '1' before; allowed: once"):
+        terminal.pairs(["a=1", "a=2"], "map")
+    known: Callable[[str], bool] = lambda name: name in ("vigv", "n_r")  # noqa: E731
+    assert terminal.pairs(["n_r=1"], "map", known, "vigv, n_r") == {"n_r": "1"}
+    with pytest.raises(InputError, match=r"'vgiv' is not known \(did you mean vigv\?\); allowed: vigv, n_r"):
+        terminal.pairs(["vgiv=1"], "map", known, "vigv, n_r")
+
+
+def test_json_has_plain_numbers_and_null_for_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    data = {
+        1: np.float64(2.5), "b": np.array([1.0, np.nan]), "c": (np.inf, np.int64(3), True, None, "t"),
+        "d": {"e": [np.array(4)]}, "f": -math.inf, "g": [np.bool_(False)],
+    }  # fmt: skip
+    expected = {
+        "1": 2.5, "b": [1.0, None], "c": [None, 3, True, None, "t"], "d": {"e": [4]}, "f": None, "g": [False],
+    }  # fmt: skip
+    assert terminal.plain(data) == expected and terminal.plain(0.0) == 0.0
+    terminal.write_json(said(), data)
+    assert capsys.readouterr().out == ""
+    terminal.write_json(said(to="-"), data)
+    assert json.loads(capsys.readouterr().out) == expected
+    terminal.write_json(said(to=str(tmp_path / "x.json")), data)
+    written = (tmp_path / "x.json").read_text()
+    assert json.loads(written) == expected and written.endswith("}\n") and written.startswith('{\n  "1"')
+    assert capsys.readouterr().out == ""
+    with pytest.raises(InputError, match="cannot be written"):
+        terminal.write_json(said(to=str(tmp_path / "no" / "x.json")), data)
+
+
+def test_a_table_has_its_numbers_to_the_right(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [["first", "1.5", "on", "7" * 31], ["second", "12.25", "off", "8"]]
+    terminal.print_table(said(), "A title", ["name", "number", "word", "long"], rows)
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[0] == "A title" and len(lines) == 5
+    first, second = lines[3], lines[4]
+    assert first.index("1.5") + 3 == second.index("12.25") + 5  # numbers end together, words begin together
+    assert first.index("on") == second.index("off") and first.index("7" * 31) == second.index("8")
+    assert first.index("first") == second.index("second")
+    terminal.print_table(said(to="-"), "A title", ["[b]x[/b]"], [])
+    out, err = capsys.readouterr()
+    assert out == "" and "[b]x[/b]" in err
+    terminal.print_table(said(quiet=True), "A title", ["x"], rows)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_long_line_of_a_table_has_150_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal.print_table(said(), "t", ["x"], [["word " * 100]])
+    assert 140 < max(map(len, capsys.readouterr().out.splitlines())) <= 150
+
+
+@pytest.mark.parametrize("raised, code, says", [
+    (None, 3, ""), (KeyboardInterrupt(), 130, "stopped\n"),
+    (InputError("x (=1) must be 2"), 2, "vaneloop: x (=1) must be 2\n"),
+    (MemoryError(), 70, "vaneloop: the machine's memory does not suffice for this\n"),
+    (ZeroDivisionError("why\nnot"), 70, "vaneloop: internal error: ZeroDivisionError: why not (test_base_spec.py:"),
+])  # fmt: skip
+def test_how_a_command_ends(
+    raised: BaseException | None, code: int, says: str, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.delenv("VANELOOP_DEBUG", raising=False)
+
+    def command() -> int:
+        if raised is not None:
+            raise raised
+        return 3
+
+    assert terminal.run(command) == code
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith(says) and err.count("\n") == bool(says)
+    if "internal" in says:
+        file = Path(err.split("traceback in ")[1].strip())
+        assert "ZeroDivisionError: why" in file.read_text() and file.name.startswith("vaneloop-")
+        assert file.name.endswith(".traceback")
+        file.unlink()
+    assert terminal.DEFECT == 70
+
+
+def test_a_traceback_is_printed_where_asked_for_and_a_long_complaint_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VANELOOP_DEBUG", "1")
+    line = terminal.defect(ValueError("x" * 500))
+    assert line.startswith(f"internal error: ValueError: {'x' * 188}. This is a defect") and "traceback above" in line
+    assert capsys.readouterr().err.count("x" * 500) == 1
+    killed = type("BrokenProcessPool", (Exception,), {})()
+    assert terminal.defect(killed).startswith("a process of the search was ended from outside")
+
+
+def test_a_reader_that_goes_ends_a_command_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[bool] = []
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(close=lambda: closed.append(True)))
+
+    def command() -> int:
+        raise BrokenPipeError
+
+    assert terminal.run(command) == 0 and closed == [True]
+
+
+def test_a_command_runs_from_its_words(capsys: pytest.CaptureFixture[str]) -> None:
+    module = SimpleNamespace(
+        DESCRIPTION="what it does",
+        add_options=lambda parser: parser.add_argument("--some-option", choices=["one", "two"]),
+        command=lambda args: 1 if args.some_option == "two" else 0,
+    )
+    start = lambda *words: terminal.start("vaneloop do", lambda: module, list(words))  # noqa: E731
+    assert start() == 0 and start("--some-option", "two") == 1
+    for words, says in (
+        (("--some-option", "twoo"), "(did you mean two?) (vaneloop do --help explains)\n"),
+        (("--some-optoin=3",), "unrecognized arguments: --some-optoin=3 (did you mean --some-option?) (vaneloop do"),
+        (("--some", "two"), "unrecognized arguments: --some two"),
+        (("word",), "unrecognized arguments: word (vaneloop do --help explains)\n"),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit) as left:
+            start(*words)
+        err = capsys.readouterr().err
+        assert left.value.code == 2 and err.startswith("vaneloop do: ") and says in err and err.count("\n") == 1
+
+
+def test_progress_is_drawn_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+
+    class Bar:
+        def __init__(self, *_: Any, transient: bool, console: Any):
+            assert transient and console.stderr
+
+        def __enter__(self) -> Bar:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            drawn.append("end")
+
+        def add_task(self, text: str, total: float) -> str:
+            return f"{text} of {total}"
+
+        def update(self, task: str, **now: Any) -> None:
+            drawn.append((task, now))
+
+    monkeypatch.setattr("rich.progress.Progress", Bar)
+    for quiet, terminal_there in ((True, True), (False, False), (False, True)):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda there=terminal_there: there, raising=False)
+        with terminal.progress_bar(said(quiet), "work") as tell:
+            assert (tell is None) == (quiet or not terminal_there)
+            if tell is not None:
+                tell(0.25)
+                tell(0.5, "other work")
+    first, second = ({"completed": f, "description": d} for f, d in ((0.25, "work"), (0.5, "other work")))
+    assert drawn == [("work of 1.0", first), ("work of 1.0", second), "end"]
+
+
+# ---- compiled code ---------------------------------------------------------------------------------------------------
+
+
+def test_compiled_code_is_kept_where_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "package" / "compiled.py"))
+    monkeypatch.setattr(Path, "home", classmethod(lambda cls: cls(tmp_path / "home")))
+    name = f"compiled-{kept.sources_digest()}"
+    assert compiled.cache_folder() == tmp_path / "package" / "__pycache__" / name
+    refused = {tmp_path / "package" / "__pycache__"}
+    monkeypatch.setattr(compiled.os, "access", lambda place, mode: place not in refused and mode == compiled.os.W_OK)
+    assert compiled.cache_folder() == tmp_path / "home" / ".cache" / "vaneloop" / name
+    (tmp_path / "home" / ".cache" / "vaneloop").rmdir()
+    (tmp_path / "home" / ".cache" / "vaneloop").write_text("no folder")
+    assert compiled.cache_folder().name == name and compiled.cache_folder().parent.name.startswith("vaneloop-")
+
+
+def test_code_is_kept_found_and_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kept, "AHEAD", tmp_path / "ahead")
+
+    def twice(x: float) -> float:
+        return 2.0 * x
+
+    one = kept.keep(njit(twice), lambda: "a stamp", "own")
+    files = one._cache
+    assert files.cache_path == str(tmp_path / "own") and not kept.is_kept(one) and one(1.5) == 3.0 and kept.is_kept(one)
+    (made,) = (tmp_path / "own").iterdir()  # nothing half written is left
+    assert made.suffix == kept.ENTERED and made.name.startswith("test_base_spec.twice-")
+    again = kept.keep(njit(twice), lambda: "a stamp", "own")
+    assert again._cache.load_overload((types.float64,), again.targetctx) is not None
+    assert again._cache.load_overload((types.int64,), again.targetctx) is None
+    other = kept.keep(njit(twice), lambda: "another stamp", "own")
+    assert not kept.is_kept(other) and other._cache.load_overload((types.float64,), other.targetctx) is None
+    (tmp_path / "ahead" / "own").mkdir(parents=True)
+    made.rename(tmp_path / "ahead" / "own" / made.name)  # compiled ahead
+    assert kept.is_kept(again) and again._cache.load_overload((types.float64,), again.targetctx) is not None
+    (tmp_path / "ahead" / "own" / made.name).rename(made)
+    again._cache.flush()
+    assert not made.exists() and not kept.is_kept(again) and kept.is_kept(twice)
+
+
+def test_the_latest_files_of_users_functions_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "OWN", 2)
+    for k in (3, 1, 4, 2, 5):
+        file = tmp_path / f"{k}{kept.ENTERED}"
+        file.write_text("x")
+        kept.os.utime(file, (100.0 + k, 100.0 + k))
+    (tmp_path / f"0{kept.INNER}").write_text("x")
+    kept._prune(tmp_path)
+    assert sorted(f.name for f in tmp_path.iterdir()) == [f"0{kept.INNER}", "4.nbc", "5.nbc"]
+    kept._prune(tmp_path)
+    kept._prune(tmp_path / "none")
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_garbage_waits_for_the_outermost_compilation() -> None:
+    quiet, was = lean._NoCollection(), gc.isenabled()
+    try:
+        for before in (True, False):
+            (gc.enable if before else gc.disable)()
+            quiet.on_start(None)
+            quiet.on_start(None)
+            assert not gc.isenabled() and quiet.depth == 2
+            quiet.on_end(None)
+            assert not gc.isenabled()
+            quiet.on_end(None)
+            assert gc.isenabled() == before and quiet.depth == 0
+    finally:
+        (gc.enable if was else gc.disable)()
+
+
+class Dispatcher:
+    """Stands for a function that numba compiles."""
+
+    def __init__(self, **options: bool):
+        self.targetoptions, self.py_func = options, print
+        self.overloads: dict[Any, Any] = {}
+        self._cache, self._compiler = SimpleNamespace(inner=None), SimpleNamespace(_customize_flags=None)
+        self.asked: list[Any] = []
+        self.get_call_template = lambda args, kws: self.asked.append((args, kws, self.calls.within)) or "template"
+        self.compile = lambda sig: self.asked.append((sig, self._cache.inner, dict(self.overloads))) or "code"
+        self.add_overload = self.asked.append
+        self.calls = lean._Calls(self)
+
+
+def made(address: int, *args: Any) -> Any:
+    """Compiled code with an entry for Python at this address."""
+    return SimpleNamespace(
+        library=SimpleNamespace(get_pointer_to_function=lambda name: address if name == "entry" else -1),
+        fndesc=SimpleNamespace(llvm_cpython_wrapper_name="entry"), signature=SimpleNamespace(args=args),
+    )  # fmt: skip
+
+
+def test_what_compiled_code_calls_gets_no_entry_until_python_calls() -> None:
+    of = Dispatcher()
+    assert of.get_call_template((types.literal(3),), {"k": types.literal(4)}) == "template"
+    assert of.asked.pop() == ((types.literal(3),), {"k": types.literal(4)}, True) and not of.calls.within
+    assert Dispatcher(forceinline=False).get_call_template((types.literal(3),), {}) == "template"
+    inline = Dispatcher(forceinline=True)
+    inline.get_call_template((types.literal(3), types.float64), {"k": types.literal(4)})
+    assert inline.asked == [((types.int64, types.float64), {"k": types.int64}, True)]
+    flags = SimpleNamespace(no_cpython_wrapper=False)
+    assert of._compiler._customize_flags(flags) is flags and not flags.no_cpython_wrapper
+    of.calls.within = True
+    assert of._compiler._customize_flags(flags) is flags and flags.no_cpython_wrapper
+    sig, bare, entered = (types.float64,), made(0, types.float64), made(77, types.float64)
+    of.add_overload(bare)
+    assert of.overloads == {sig: bare} and of.asked == []
+    assert of.compile(sig) == "code" and of.asked.pop() == (sig, True, {sig: bare})  # compiled code asks
+    of.calls.within = False
+    assert of.compile(sig) == "code" and of.asked.pop() == (sig, False, {})  # Python asks: once more, with an entry
+    of.overloads[sig] = entered
+    of.compile(sig)
+    assert of.asked.pop() == (sig, False, {sig: entered})
+    of.add_overload(entered)
+    assert of.asked == [entered]
+
+
+def test_a_failed_look_up_leaves_a_function_callable_by_python() -> None:
+    of = Dispatcher()
+    of.calls.template = lambda *_: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        of.get_call_template((), {})
+    assert not of.calls.within
+
+
+def test_only_what_numba_compiles_is_compiled_so() -> None:
+    assert lean.called_by_code(print) is print
+    if lean.is_known():
+        of = njit(lambda x: x)
+        assert lean.called_by_code(of) is of and isinstance(of.compile.__self__, lean._Calls)
+
+
+def test_the_type_of_a_call_of_numbers_is_found_once() -> None:
+    asked: list[Any] = []
+    good = SimpleNamespace(args=("good",))
+
+    def find(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        asked.append(args)
+        return good if types.float64 in args else None if types.int32 in args else SimpleNamespace(args=("other",))
+
+    of = SimpleNamespace(_impl_keys={("good",): "key", ("other",): "compiled"}, typing_key="key")
+    get = lean._remembering(find)
+    for args, kws, times in (
+        ((types.float64,), {}, 1), ((types.float64, types.boolean), {}, 1), ((types.float64,), {"k": 1}, 2),
+        ((types.float64, types.unicode_type), {}, 2), ((types.int32,), {}, 2), ((types.int64,), {}, 2),
+    ):  # fmt: skip
+        asked.clear()
+        first, second = get(of, "context", args, kws), get(of, "context", args, kws)
+        assert len(asked) == times, args
+        assert first is second or first.args == second.args
+    get(of, "another context", (types.float64,), {})
+    assert asked == [(types.int64,), (types.int64,), (types.float64,)]
+
+
+def test_options_that_say_the_same_are_equal() -> None:
+    flags: Any = compiler.Flags
+    a, b = flags(), flags()
+    assert lean._given(a) == {} and lean._same_flags(a, b) and lean._same_flags(a, object()) is NotImplemented
+    a.release_gil = not a.release_gil
+    assert list(lean._given(a)) == ["release_gil"] and not lean._same_flags(a, b)
+    assert lean._hash_of_flags(a) != lean._hash_of_flags(b)
+    b.release_gil = a.release_gil
+    assert lean._same_flags(a, b) and lean._hash_of_flags(a) == lean._hash_of_flags(b)
+    assert lean._plain(None, "text", 1, 2) == "text"
+
+
+def test_functions_that_are_only_declared_are_not_optimised() -> None:
+    done: list[Any] = []
+    functions = [SimpleNamespace(name=n, is_declaration=n == "b") for n in "abc"]
+    module = SimpleNamespace(data_layout="", functions=functions)
+    timed = SimpleNamespace(record=lambda text, _: pytest.MonkeyPatch.context())
+    passes = SimpleNamespace(run=lambda f, builder: done.append((f.name, builder)))
+    codegen = SimpleNamespace(_data_layout="e-p", _function_pass_manager=lambda: (passes, "builder"))
+    lean._optimise_functions(SimpleNamespace(_codegen=codegen, _recorded_timings=timed), module)
+    assert module.data_layout == "e-p" and done == [("a", "builder"), ("c", "builder")]
+
+
+def test_how_functions_are_compiled() -> None:
+    assert kept.sources_digest() == compiled.sources_digest() and len(kept.sources_digest()) == 16
+    assert compiled.threads() == int(config.NUMBA_NUM_THREADS)
+    for of, options in (
+        (compiled.compiled, {}), (compiled.compiled_free, {"nogil": True}), (compiled.in_place, {"_nrt": False}),
+        (compiled.in_place_free, {"nogil": True, "_nrt": False}),
+        (compiled.inlined, {"_nrt": False, "forceinline": True}),
+        (compiled.fused, {"_nrt": False, "forceinline": True, "fastmath": {"contract"}}),
+    ):  # fmt: skip
+        made_of: Any = of(lambda x: x)
+        expected = options | {"error_model": "numpy", "no_cfunc_wrapper": True}
+        assert {k: v for k, v in made_of.targetoptions.items() if k not in ("nopython", "boundscheck")} == expected
