@@ -112,7 +112,7 @@ NEAREST = {
         "same_answer learn_vanes learn_lags learn_stops learn_followers learn_faint learn_screening held "
         "loggers long_logs discrepancy curves directions electromechanical readings"
     ),
-    "vaneloop.design": "design schedule spatial strategies tables tolerances",
+    "vaneloop.design": "design_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
     "vaneloop.pages": (
         "page_parts page_outlines page design campaign fleet_report schedule strategies spatial verbs search_commands "
